@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+# make demo, make test: all that they need is python3 (3.11 or 3.12) with venv, and make.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint types unit bags bench certificate fuzz clean help
+
+help:
+	@echo "make demo         set up .venv, run both nodes on the recorded bags, table and picture in out/"
+	@echo "make test         lint, types and tests"
+	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
+	@echo "make bench        side-by-side timings into docs/benchmarks.md"
+	@echo "make fuzz         damage every kind of byte of a bag, at length"
+	@echo "make clean        remove .venv, out and caches"
+
+# One stamp a set of extras, made anew when the requirements change.
+$(VENV)/demo.stamp: setup.py pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[jazzy]'
+	touch $@
+
+$(VENV)/%.stamp: $(VENV)/demo.stamp
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[jazzy,$*]'
+	touch $@
+
+demo: $(VENV)/demo.stamp
+	$(BIN)/python -m pkm_twin.demo --bags bags --out out
+
+test: lint types unit
+
+lint: $(VENV)/test.stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/test.stamp
+	$(BIN)/mypy
+
+unit: $(VENV)/test.stamp
+	$(BIN)/python -m pytest
+
+bags: $(VENV)/bags.stamp
+	$(BIN)/python -m bags.recording
+
+bench: $(VENV)/bench.stamp
+	$(BIN)/python -m pytest test/benchmarks -m benchmark_run --benchmark-disable-gc
+
+fuzz: $(VENV)/test.stamp
+	$(BIN)/python -m pytest -m long test/bags
+
+clean:
+	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

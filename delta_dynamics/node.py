@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node ``delta_dynamics``: trajectories and joint states in, feedforward torques out."""
+
+from __future__ import annotations
+
+import sys
+from array import array
+from typing import Any
+
+import numpy as np
+from rclpy.parameter import Parameter
+from rclpy.time import Time
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
+
+from delta_dynamics.feedforward import Feedforward, Settings
+from delta_dynamics.virtual_work import kernels
+from pkm_twin import health, load
+from pkm_twin.errors import MessageError, ParameterError, UnknownNameError
+from pkm_twin.mechanisms.robot import Robot
+
+CHANGES = {
+    "payload.mass": ("payload", "mass"),
+    "payload.com": ("payload", "com"),
+    "payload.inertia": ("payload", "inertia"),
+    "friction.viscous": ("friction", "viscous"),
+    "friction.coulomb": ("friction", "coulomb"),
+    "gravity": ("gravity", ""),
+    "effort_limits": ("limits", "effort"),
+}
+"""Parameters that may change while the node runs, and the robot's section and key."""
+
+
+class DeltaDynamics(health.TwinNode):
+    """Feedforward torques from the virtual-work model of any robot with masses."""
+
+    def __init__(self) -> None:
+        super().__init__("delta_dynamics")
+        robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
+        kernels_to_warm = kernels(robot)
+        robot = _changed(robot, self._declare_changes(robot))
+        self._feedforward = Feedforward(robot, self._declare_settings())
+        commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
+        self._trajectory = self.speak(JointTrajectory, "~/joint_trajectory_ff")
+        self._torques = self.speak(JointState, "~/joint_torques")
+        self._residual = self.speak(JointState, "~/torque_residual")
+        self._commands = self.speak(Float64MultiArray, "~/commands") if commands else None
+        for kernel in kernels_to_warm:
+            kernel.warm_up()
+        self._pending: Robot | None = None
+        self.listen(JointTrajectory, "~/joint_trajectory", self._on_trajectory)
+        self.listen(JointState, "joint_states", self._on_joint_state)
+        self.add_on_set_parameters_callback(self._on_set)
+        self.add_post_set_parameters_callback(self._after_set)
+        period = min(0.25 * self._feedforward.settings.stale_after, 0.1)
+        self._last_heard = 0
+        self.create_timer(period, self._watch, clock=self.steady)
+        self.start()
+
+    def summary(self) -> str:
+        """One line that says what the node runs."""
+        robot = self._feedforward.robot
+        return f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}"
+
+    def clock_jumped(self) -> None:
+        """No torque across the seam: the stream starts anew."""
+        self._feedforward.reset()
+
+    def stream_broken(self, where: str) -> None:
+        """A stream whose callback failed is stopped."""
+        if where == "joint_states":
+            self._stop("exception", "a callback raised an exception")
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Level, message and values of the node's diagnostic status."""
+        core = self._feedforward
+        level, message = health.OK, "running"
+        rejected = core.stream.rejected + core.trajectories.rejected
+        if rejected or core.saturations:
+            level = health.WARN
+            last = core.stream if core.stream.rejected else core.trajectories
+            message = f"last reject: {last.text}" if rejected else "an effort limit was passed"
+        if core.stream.stopped:
+            level, message = health.ERROR, f"stopped: {core.stream.reason}: {core.stream.text}"
+        values: dict[str, object] = {
+            "robot": core.robot.name,
+            "payload mass": core.robot.payload.mass,  # type: ignore[attr-defined]
+            "joint states answered": core.stream.accepted,
+            "trajectories answered": core.trajectories.accepted,
+            "effort limit passed": core.saturations,
+            "older stamps dropped": core.dropped,
+            "acceleration delay (samples)": core.differentiator_delay,
+        }
+        values |= {f"joint states rejected: {k}": v for k, v in core.stream.rejected.items()}
+        values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
+        values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
+        return level, message, values
+
+    def _declare_changes(self, robot: Robot) -> dict[str, Any]:
+        changes = {}
+        for name, (section, key) in CHANGES.items():
+            value = getattr(robot, section)
+            value = getattr(value, key) if key else value
+            if value is None:
+                value = np.full(3, np.inf)
+            default = value.ravel().tolist() if isinstance(value, np.ndarray) else value
+            changes[name] = self.declare(name, default, f"robot's {name}, as in its file")
+        return changes
+
+    def _declare_settings(self) -> Settings:
+        acceleration = self.declare(
+            "acceleration", "trajectory", "trajectory | differentiate", read_only=True
+        )
+        if acceleration not in ("trajectory", "differentiate"):
+            raise UnknownNameError("acceleration", acceleration, ("trajectory", "differentiate"))
+
+        def fixed(name: str, default: Any, text: str) -> Any:
+            return self.declare(name, default, text, read_only=True)
+
+        policy = fixed("limit_policy", "warn", "warn | reject | clamp")
+        if policy not in ("warn", "reject", "clamp"):
+            raise UnknownNameError("limit_policy", policy, ("warn", "reject", "clamp"))
+        on_stop = fixed("on_stop", "nothing", "nothing | zeros | gravity: sent once at a stop")
+        if on_stop not in ("nothing", "zeros", "gravity"):
+            raise UnknownNameError("on_stop", on_stop, ("nothing", "zeros", "gravity"))
+        return Settings(
+            differentiate=acceleration == "differentiate",
+            order=_within("differentiator.order", fixed("differentiator.order", 2, "1 to 4"), 1, 4),
+            window=_within(
+                "differentiator.window", fixed("differentiator.window", 25, "samples"), 3, 1000
+            ),
+            limit_policy=policy,
+            stale_after=_within("stale_after", fixed("stale_after", 0.1, "s"), 1e-3, 3600.0),
+            future_tolerance=_within(
+                "future_tolerance", fixed("future_tolerance", 0.1, "s"), 0.0, 3600.0
+            ),
+            accept_zero_stamp=fixed("accept_zero_stamp", False, "use arrival time"),
+            bad_limit=_within("bad_limit", fixed("bad_limit", 5, "rejects to stop"), 1, 10**6),
+            good_needed=_within("good_needed", fixed("good_needed", 5, "to go on"), 1, 10**6),
+            on_stop=on_stop,
+        )
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        efforts = self._feedforward.trajectory(message, self.now())
+        for point, effort in zip(message.points, efforts.tolist(), strict=True):
+            point.effort = effort
+        self._trajectory.publish(message)
+
+    def _on_joint_state(self, message: JointState) -> None:
+        core = self._feedforward
+        self._last_heard = self.steady.now().nanoseconds
+        running = not core.stream.stopped
+        try:
+            torques = core.joint_state(message, self.now())
+        except MessageError:
+            if running and core.stream.stopped:
+                self._send_stop()
+            raise
+        if torques is None:
+            return
+        stamp = message.header.stamp
+        if core.settings.accept_zero_stamp:
+            stamp = Time(nanoseconds=torques.stamp).to_msg()
+        self._publish_effort(self._torques, stamp, torques.effort)
+        if torques.residual is not None:
+            self._publish_effort(self._residual, stamp, torques.residual)
+        if self._commands is not None:
+            self._commands.publish(Float64MultiArray(data=array("d", torques.effort)))
+
+    def _publish_effort(self, publisher: Any, stamp: Any, effort: np.ndarray[Any, Any]) -> None:
+        message = JointState(name=list(self._feedforward.robot.joint_names))
+        message.header.stamp = stamp
+        message.effort = array("d", effort)
+        publisher.publish(message)
+
+    def _watch(self) -> None:
+        """Stop a stream that has gone silent; runs on the steady clock."""
+        core = self._feedforward
+        silent = (self.steady.now().nanoseconds - self._last_heard) / 1e9
+        if self._last_heard and not core.stream.stopped and silent > core.settings.stale_after:
+            self._stop("stale input", f"no joint state for {silent:.3f} s")
+
+    def _stop(self, reason: str, text: str) -> None:
+        if self._feedforward.stream.stop(reason, text):
+            self._feedforward.reset()
+            self._send_stop()
+
+    def _send_stop(self) -> None:
+        core = self._feedforward
+        self.log_throttled("stop", f"stopped: {core.stream.reason}: {core.stream.text}")
+        effort = core.stop_effort()
+        if effort is None:
+            return
+        self._publish_effort(self._torques, self.get_clock().now().to_msg(), effort)
+        if self._commands is not None:
+            self._commands.publish(Float64MultiArray(data=array("d", effort)))
+
+    def _on_set(self, changes: list[Parameter]) -> Any:
+        values = health.values_of(changes)
+
+        def check() -> None:
+            self._pending = _changed(
+                self._feedforward.robot, {k: v for k, v in values.items() if k in CHANGES}
+            )
+
+        return health.verdict(check)
+
+    def _after_set(self, changes: list[Parameter]) -> None:
+        if self._pending is not None:
+            self._feedforward.change_robot(self._pending)
+            self._pending = None
+
+
+def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
+    sections: dict[str, Any] = {}
+    for name, value in values.items():
+        section, key = CHANGES[name]
+        plain = list(value) if hasattr(value, "__len__") else value
+        if name == "payload.inertia" and len(plain) == 9:
+            plain = [plain[0:3], plain[3:6], plain[6:9]]
+        if key:
+            sections.setdefault(section, {})[key] = plain
+        else:
+            sections[section] = plain
+    return robot.changed(**sections)
+
+
+def _within(name: str, value: Any, low: float, high: float) -> Any:
+    if not low <= value <= high:
+        raise ParameterError(name, value, f"{low:g} to {high:g}")
+    return value
+
+
+def main() -> None:
+    """Entry point of ``ros2 run pkm_twin delta_dynamics``."""
+    sys.exit(health.run(DeltaDynamics))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Typed errors: each carries the value and the bound, as text and as attributes."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class PkmTwinError(Exception):
+    """Base of everything that pkm_twin raises on purpose."""
+
+
+class ParameterError(PkmTwinError, ValueError):
+    """A parameter file, key or value that is refused.
+
+    ``field`` is the dotted name, ``value`` what was given, ``bound`` what is allowed.
+    """
+
+    def __init__(self, field: str, value: object, bound: str) -> None:
+        super().__init__(f"{field}: {_short(value)} is refused; allowed: {bound}")
+        self.field = field
+        self.value = value
+        self.bound = bound
+
+
+class UnknownNameError(ParameterError):
+    """A key or name that does not exist; ``closest`` is the nearest valid one, or None."""
+
+    def __init__(self, field: str, name: object, valid: Iterable[str]) -> None:
+        names = sorted(valid)
+        match = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
+        self.closest: str | None = match[0] if match else None
+        hint = f"did you mean {self.closest!r}? " if self.closest else ""
+        super().__init__(field, name, f"{hint}valid: {', '.join(names)}")
+        self.valid = names
+
+
+class UnreachableError(PkmTwinError, ValueError):
+    """A pose or joint state that the mechanism cannot be assembled in.
+
+    ``limb`` is the limb's name, ``index`` the sample's index in the batch (``()`` for one
+    sample), ``miss`` by how much the limb falls short (m).
+    """
+
+    def __init__(self, what: str, limb: str, index: tuple[int, ...], miss: float) -> None:
+        where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
+        super().__init__(f"{what}{where} is unreachable: {limb} misses by {miss:.6g} m")
+        self.limb = limb
+        self.index = index
+        self.miss = miss
+
+
+class SingularityError(PkmTwinError, ValueError):
+    """A pose in which the Jacobian has no usable inverse.
+
+    ``measure`` is the reciprocal condition number, lengths scaled out; ``bound`` the least allowed.
+    """
+
+    def __init__(self, what: str, index: tuple[int, ...], measure: float, bound: float) -> None:
+        where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
+        super().__init__(
+            f"{what}{where} is singular: reciprocal condition {measure:.3g} is below {bound:.3g}"
+        )
+        self.index = index
+        self.measure = measure
+        self.bound = bound
+
+
+class MessageError(PkmTwinError, ValueError):
+    """A ROS message that is rejected whole.
+
+    ``reason`` is a short stable code for counting, the text says what, with values and bounds.
+    """
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+class BagError(PkmTwinError):
+    """A bag that cannot be read or written as asked.
+
+    ``reason`` is a short stable code, ``offset`` the byte in the file where it shows, if known.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        path: str | Path | None = None,
+        reason: str = "damaged",
+        offset: int | None = None,
+    ) -> None:
+        where = f"{path}: " if path is not None else ""
+        at = f" (byte {offset})" if offset is not None else ""
+        super().__init__(f"{where}{message}{at}")
+        self.path = None if path is None else Path(path)
+        self.reason = reason
+        self.offset = offset
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scalar formulas, written once in plain floats, run over any batch of samples.
+
+A mechanism writes each formula as a function of flat sequences (``p[i]``, ``q[0]`` ...) that uses
+only ``math``. With numba it is compiled, cached on disk and broadcast over leading axes;
+without numba the same function runs as Python on lists, with the same results, slower.
+
+May import: numpy, numba if present, the standard library.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+try:
+    if os.environ.get("PKM_TWIN_NO_NUMBA", "0") not in ("", "0"):
+        raise ImportError("numba is switched off by PKM_TWIN_NO_NUMBA")
+    import numba
+except ImportError:
+    numba = None
+
+COMPILED: Final = numba is not None
+"""True where kernels are compiled by numba; PKM_TWIN_NO_NUMBA=1 switches that off."""
+
+OK: Final = 0.0
+UNREACHABLE: Final = 1.0
+SINGULAR: Final = 2.0
+NOT_FINITE: Final = 3.0
+FAULT_SIZE: Final = 3
+"""A fault is three floats: code, limb index, and the miss (m) or the singularity measure."""
+
+_F8: Final = np.dtype(np.float64)
+
+Array = NDArray[np.float64]
+
+
+def scalar(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Mark a helper that kernels call."""
+    if numba is None:
+        return function
+    compiled: Callable[..., Any] = numba.njit(cache=True, error_model="numpy")(function)
+    return compiled
+
+
+class Kernel:
+    """One scalar formula over batches.
+
+    The wrapped function is called as ``f(p, *inputs, *outputs, scratch, fault)``: ``p`` the
+    robot's flat parameters, inputs and outputs flat sequences of the given sizes, ``scratch``
+    a work space, ``fault`` the three floats above, all zero on entry.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., None],
+        inputs: Sequence[int],
+        outputs: Sequence[int],
+        scratch: int = 1,
+    ) -> None:
+        if inputs[0] != FAULT_SIZE:
+            raise ValueError(f"a kernel's first input has {FAULT_SIZE} entries, not {inputs[0]}")
+        self.function = function
+        self.inputs = tuple(inputs)
+        self.outputs = tuple(outputs)
+        self.scratch = scratch
+        self._single = [(size,) for size in inputs]
+        # One sample runs with the interpreter locked, so calls can share the space.
+        self._space = np.empty(scratch)
+        self.__doc__ = function.__doc__
+
+    @cached_property
+    def _one(self) -> Callable[..., None]:
+        """The formula for one sample, compiled for exactly one array type."""
+        read = numba.types.Array(numba.float64, 1, "A", readonly=True)
+        write = numba.types.Array(numba.float64, 1, "C")
+        n_in = 1 + len(self.inputs)
+        n_out = len(self.outputs) + 2
+        signature = numba.void(*[read] * n_in, *[write] * n_out)
+        compiled: Callable[..., None] = numba.njit(signature, cache=True, error_model="numpy")(
+            self.function
+        )
+        return compiled
+
+    @cached_property
+    def _many(self) -> Callable[..., None]:
+        """The formula as a generalised ufunc; results and scratch are arguments, written in place.
+
+        numba wants the size of its one formal output, the fault, from an input: it takes that
+        of the first, which has three entries too (joints or pose).
+        """
+        n_in, n_out = 1 + len(self.inputs), len(self.outputs)
+        sizes = [f"(n{i})" for i in range(n_in + n_out + 1)]
+        vector = numba.float64[:]
+        compiled: Callable[..., None] = numba.guvectorize(
+            [numba.void(*[vector] * (n_in + n_out + 2))],
+            f"{','.join(sizes)}->{sizes[1]}",
+            nopython=True,
+            cache=True,
+            writable_args=tuple(range(n_in, n_in + n_out)),
+        )(self.function)
+        return compiled
+
+    def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[Array, ...]:
+        """Evaluate over leading batch axes.
+
+        :param p: flat parameters, shape (n,).
+        :param inputs: one array per input, shape (..., size), broadcast against each other.
+        :returns: the outputs, shape (..., size) each, then the fault, shape (..., 3).
+        :raises ValueError: an input's last axis has another size.
+        """
+        if COMPILED:
+            for value, shape in zip(inputs, self._single, strict=True):
+                if type(value) is not np.ndarray or value.shape != shape or value.dtype is not _F8:
+                    break
+            else:
+                results = [np.empty(size) for size in self.outputs]
+                fault = np.zeros(FAULT_SIZE)
+                self._one(p, *inputs, *results, self._space, fault)
+                return (*results, fault)
+        arrays = [np.asarray(value, _F8) for value in inputs]
+        for array, size in zip(arrays, self.inputs, strict=True):
+            if array.ndim == 0 or array.shape[-1] != size:
+                raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
+        batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
+        results = [np.empty((*batch, size)) for size in self.outputs]
+        results.append(np.zeros((*batch, FAULT_SIZE)))
+        if COMPILED:
+            self._many(p, *arrays, *results[:-1], np.empty(self.scratch), results[-1])
+        else:
+            self._interpret(p, arrays, results, batch)
+        return tuple(results)
+
+    def _interpret(
+        self, p: Array, arrays: list[Array], results: list[Array], batch: tuple[int, ...]
+    ) -> None:
+        parameters = p.tolist()
+        scratch = [0.0] * self.scratch
+        spread = [np.broadcast_to(a, (*batch, a.shape[-1])) for a in arrays]
+        for index in np.ndindex(batch):
+            outputs = [[0.0] * size for size in self.outputs]
+            fault = [0.0] * FAULT_SIZE
+            samples = [a[index].tolist() for a in spread]
+            self.function(parameters, *samples, *outputs, scratch, fault)
+            for result, values in zip(results, [*outputs, fault], strict=True):
+                result[index] = values
+
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, before the first sample is due."""
+        if COMPILED:
+            _ = self._one, self._many

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS messages to checked arrays, by attributes only: live messages and decoded ones alike.
+
+Every function either returns finite, complete, ordered data or raises
+:class:`~pkm_twin.errors.MessageError` with a short stable reason for counting. Times are
+integers in nanoseconds. May import: numpy, pkm_twin's core, the standard library.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import MessageError
+from pkm_twin.mechanisms.robot import Robot
+
+Array = NDArray[np.float64]
+
+SECOND: Final = 1_000_000_000
+TINY: Final = sys.float_info.min
+"""Smallest normal number: a value below it and not zero is a damaged one, not a measurement."""
+
+MAX_RATE: Final = 1e4
+MAX_ACCELERATION: Final = 1e7
+MAX_EFFORT: Final = 1e7
+MAX_FORCE: Final = 1e7
+MAX_MOMENT: Final = 1e7
+MAX_POINTS: Final = 100_000
+"""Bounds beyond all machines of this kind, for values that no limit of the robot bounds."""
+
+
+@dataclass(frozen=True)
+class StampRules:
+    """What a stamp has to keep to, relative to the node's clock; ns, None where unchecked."""
+
+    accept_zero: bool = False
+    future_tolerance: int = SECOND // 10
+    max_age: int | None = None
+
+    def check(self, stamp: int, now: int) -> int:
+        """The stamp to use: the message's, or the arrival time where zero is accepted."""
+        if stamp == 0:
+            if self.accept_zero:
+                return now
+            raise MessageError("zero stamp", "the stamp is zero; set accept_zero_stamp to allow it")
+        if stamp > now + self.future_tolerance:
+            hint = "; use_sim_time is set and no /clock arrives?" if now == 0 else ""
+            raise MessageError(
+                "future stamp",
+                f"the stamp is {(stamp - now) / SECOND:.3f} s ahead of the clock, "
+                f"allowed {self.future_tolerance / SECOND:g} s{hint}",
+            )
+        if self.max_age is not None and stamp < now - self.max_age:
+            raise MessageError(
+                "stale stamp",
+                f"the stamp is {(now - stamp) / SECOND:.3f} s old, allowed "
+                f"{self.max_age / SECOND:g} s; a replayed bag needs use_sim_time and a /clock",
+            )
+        return stamp
+
+
+@dataclass(frozen=True)
+class JointSample:
+    """One joint state in the robot's joint order; None where the message carries nothing."""
+
+    stamp: int
+    q: Array
+    qd: Array | None
+    effort: Array | None
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A joint trajectory in the robot's joint order.
+
+    ``stamp`` is zero where it starts on receipt. times (n,), s; q, qd, qdd (n, 3); None where
+    absent. ``columns``: for every joint of the message, its place in the robot's order.
+    """
+
+    stamp: int
+    times: Array
+    q: Array
+    qd: Array | None
+    qdd: Array | None
+    columns: tuple[int, ...]
+
+
+@dataclass
+class JointReader:
+    """Reads joint states and trajectories of one robot."""
+
+    robot: Robot
+    _known: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        limits: Any = getattr(self.robot, "limits", None)
+        reach = 100.0 if self.robot.joint_unit == "m" else 2000.0 * math.pi
+        position = getattr(limits, "position", None)
+        velocity = getattr(limits, "velocity", None)
+        self._limited = {"position": position is not None, "velocity": velocity is not None}
+        self._position = [(-reach, reach)] * 3 if position is None else position.tolist()
+        rates = [MAX_RATE] * 3 if velocity is None else velocity.tolist()
+        self._velocity = [(-rate, rate) for rate in rates]
+        self._acceleration = [(-MAX_ACCELERATION, MAX_ACCELERATION)] * 3
+        self._effort = [(-MAX_EFFORT, MAX_EFFORT)] * 3
+
+    def joint_state(self, message: Any, now: int, rules: StampRules) -> JointSample:
+        """A sensor_msgs/JointState, matched by name in any order; other joints are ignored.
+
+        Velocity and effort may be empty; where they are there, they are checked and used.
+        """
+        index = self._match(message.name)
+        count = len(message.name)
+        stamp = rules.check(stamp_of(message.header), now)
+        q = self._take("position", message.position, count, index, self._position)
+        if q is None:
+            raise MessageError("empty", f"no positions; {count} names are given")
+        qd = self._take("velocity", message.velocity, count, index, self._velocity)
+        effort = self._take("effort", message.effort, count, index, self._effort)
+        return JointSample(stamp, q, qd, effort)
+
+    def trajectory(self, message: Any, now: int, rules: StampRules) -> Trajectory:
+        """A trajectory_msgs/JointTrajectory with exactly the robot's joints, in any order.
+
+        A zero stamp means that it starts on receipt, as in ros2_controllers; a later start is
+        allowed, one whose end has passed is not. A derivative is all there or all absent.
+        """
+        names = list(message.joint_names)
+        points = message.points
+        if not names or not points:
+            raise MessageError("empty", f"{len(names)} joint names and {len(points)} points")
+        if len(points) > MAX_POINTS:
+            raise MessageError("bounds", f"{len(points)} points, at most {MAX_POINTS}")
+        unknown = [name for name in names if name not in self.robot.joint_names]
+        if unknown:
+            raise MessageError(
+                "unknown joint",
+                f"joint {unknown[0]!r} is not one of {', '.join(self.robot.joint_names)}",
+            )
+        index = self._match(names)
+        stamp = stamp_of(message.header)
+        nanoseconds = [duration_of(point.time_from_start) for point in points]
+        _check_times(nanoseconds)
+        if stamp != 0 and stamp + nanoseconds[-1] < now:
+            raise MessageError(
+                "over",
+                f"the trajectory ended {(now - stamp - nanoseconds[-1]) / SECOND:.3f} s ago; a "
+                "replayed bag needs use_sim_time and a /clock",
+            )
+        q = self._columns("positions", points, index, self._position)
+        if q is None:
+            raise MessageError("empty", "the points carry no positions")
+        return Trajectory(
+            stamp,
+            np.array(nanoseconds, np.float64) / SECOND,
+            q,
+            self._columns("velocities", points, index, self._velocity),
+            self._columns("accelerations", points, index, self._acceleration),
+            tuple(self.robot.joint_names.index(name) for name in names),
+        )
+
+    def _match(self, names: Sequence[str]) -> list[int]:
+        """Where each of the robot's joints stands among the names."""
+        key = tuple(names)
+        known = self._known.get(key)
+        if known is not None:
+            return known
+        if not key:
+            raise MessageError("empty", "no joint names")
+        for joint in self.robot.joint_names:
+            count = key.count(joint)
+            if count == 0:
+                raise MessageError(
+                    "missing joint", f"joint {joint!r} is missing; given: {', '.join(key)[:200]}"
+                )
+            if count > 1:
+                raise MessageError("duplicated joint", f"joint {joint!r} stands {count} times")
+        index = [key.index(joint) for joint in self.robot.joint_names]
+        if len(self._known) < 16:
+            self._known[key] = index
+        return index
+
+    def _take(
+        self,
+        what: str,
+        values: Sequence[float],
+        count: int,
+        index: list[int],
+        bounds: list[tuple[float, float]],
+    ) -> Array | None:
+        if len(values) == 0:
+            return None
+        if len(values) != count:
+            raise MessageError("length", f"{what}: {len(values)} values for {count} names")
+        picked = [float(values[i]) for i in index]
+        for i, (value, (low, high)) in enumerate(zip(picked, bounds, strict=True)):
+            if not low <= value <= high or (-TINY < value < TINY and value != 0.0):
+                raise self._refusal(what, i, value, low, high)
+        return np.array(picked)
+
+    def _columns(
+        self, what: str, points: Sequence[Any], index: list[int], bounds: list[tuple[float, float]]
+    ) -> Array | None:
+        rows = [getattr(point, what) for point in points]
+        sizes = {len(row) for row in rows}
+        if sizes == {0}:
+            return None
+        for i, row in enumerate(rows):
+            if len(row) != len(index):
+                raise MessageError(
+                    "length", f"point {i}: {len(row)} {what} for {len(index)} joint names"
+                )
+        values = np.array(rows, np.float64)[:, index]
+        box = np.array(bounds)
+        size = np.abs(values)
+        good = (values >= box[:, 0]) & (values <= box[:, 1]) & ((size >= TINY) | (size == 0.0))
+        if not good.all():
+            row, column = np.argwhere(~good)[0]
+            single = {"positions": "position", "velocities": "velocity"}.get(what, "acceleration")
+            low, high = bounds[column]
+            error = self._refusal(single, int(column), float(values[row, column]), low, high)
+            raise MessageError(error.reason, f"point {row}: {error}")
+        return np.ascontiguousarray(values)
+
+    def _refusal(
+        self, what: str, joint: int, value: float, low: float, high: float
+    ) -> MessageError:
+        name = self.robot.joint_names[joint]
+        if not math.isfinite(value):
+            return MessageError("not finite", f"{what} of {name} is {value}")
+        if low <= value <= high:
+            return MessageError("bounds", f"{what} of {name} is {value:g}, a denormal number")
+        reason = "limit" if self._limited.get(what, False) else "bounds"
+        return MessageError(reason, f"{what} of {name} is {value:g}, allowed {low:g} to {high:g}")
+
+
+@dataclass(frozen=True)
+class WrenchSample:
+    """A wrench as it came: force and moment, shape (6,), N and N m, in ``frame``'s axes."""
+
+    stamp: int
+    frame: str
+    wrench: Array
+
+
+def read_wrench(
+    message: Any, now: int, rules: StampRules, frame: str, accept_empty: bool
+) -> WrenchSample:
+    """A geometry_msgs/WrenchStamped in the expected frame; an empty frame only where allowed."""
+    given = message.header.frame_id
+    if given != frame and not (given == "" and accept_empty):
+        hint = "; set accept_empty_frame to allow it" if given == "" else ""
+        raise MessageError("frame", f"frame is {given!r}, expected {frame!r}{hint}")
+    stamp = rules.check(stamp_of(message.header), now)
+    force, torque = message.wrench.force, message.wrench.torque
+    values = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
+    labels = ("force.x", "force.y", "force.z", "torque.x", "torque.y", "torque.z")
+    for i, (label, value) in enumerate(zip(labels, values, strict=True)):
+        bound = MAX_FORCE if i < 3 else MAX_MOMENT
+        if not math.isfinite(value):
+            raise MessageError("not finite", f"{label} is {value}")
+        if abs(value) > bound or 0.0 < abs(value) < TINY:
+            raise MessageError("bounds", f"{label} is {value:g}, allowed up to {bound:g}")
+    return WrenchSample(stamp, given or frame, np.array(values, np.float64))
+
+
+def stamp_of(header: Any) -> int:
+    """A header's stamp in nanoseconds, checked to be a valid time."""
+    return _nanoseconds("stamp", header.stamp)
+
+
+def duration_of(duration: Any) -> int:
+    """A duration in nanoseconds; may be negative."""
+    nanosec = int(duration.nanosec)
+    if not 0 <= nanosec < SECOND:
+        raise MessageError("time", f"nanosec is {nanosec}, allowed 0 to {SECOND - 1}")
+    return int(duration.sec) * SECOND + nanosec
+
+
+def _nanoseconds(what: str, time: Any) -> int:
+    sec, nanosec = int(time.sec), int(time.nanosec)
+    if sec < 0 or not 0 <= nanosec < SECOND:
+        raise MessageError("time", f"{what} is {sec} s and {nanosec} ns")
+    return sec * SECOND + nanosec
+
+
+def _check_times(nanoseconds: list[int]) -> None:
+    if nanoseconds[0] < 0:
+        raise MessageError("time", f"time_from_start begins at {nanoseconds[0] / SECOND:g} s")
+    for i in range(1, len(nanoseconds)):
+        if nanoseconds[i] <= nanoseconds[i - 1]:
+            raise MessageError(
+                "time",
+                f"time_from_start of point {i} is {nanoseconds[i] / SECOND:g} s, not after "
+                f"{nanoseconds[i - 1] / SECOND:g} s",
+            )

@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter files: strict YAML to frozen dataclasses, each refusal naming field and bound.
+
+A mechanism declares its schema as frozen dataclasses whose fields carry a check made by the
+functions below. May import: numpy, yaml, the standard library.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError, UnknownNameError
+
+MAX_FILE_SIZE: Final = 64 * 1024
+"""Largest parameter file that is read, bytes; the shipped ones are below 4 kB."""
+
+Array = NDArray[np.float64]
+Check = Callable[[str, Any], Any]
+T = TypeVar("T")
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Plain YAML only: no object tags, no aliases, no duplicate keys."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("aliases are not allowed in parameter files")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.YAMLError(f"key {key!r} stands twice")
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        return mapping
+
+
+# YAML 1.1 reads 1e-10 as a string; everybody means the number.
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+[eE][-+]?\d+$"), list("-+0123456789")
+)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a parameter file.
+
+    :raises ParameterError: not readable, too large, not plain YAML, or not a mapping.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_FILE_SIZE:
+            raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_FILE_SIZE} bytes")
+        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)  # noqa: S506
+    except (yaml.YAMLError, OSError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        if isinstance(error, ParameterError):
+            raise
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ParameterError(str(path), text, "a readable file of plain YAML") from None
+    if not isinstance(data, dict):
+        raise ParameterError(str(path), type(data).__name__, "a mapping of keys to values")
+    return data
+
+
+def number(
+    *,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    default: Any = dataclasses.MISSING,
+) -> Any:
+    """Field: one finite number within bounds."""
+
+    def check(field: str, value: Any) -> float:
+        return _number(field, value, above, at_least, at_most)
+
+    return _field(check, default)
+
+
+def vector(
+    size: int,
+    *,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    infinite: bool = False,
+    spread: bool = False,
+    default: Any = dataclasses.MISSING,
+) -> Any:
+    """Field: ``size`` numbers, read-only array; with ``spread`` one number stands for all."""
+
+    def check(field: str, value: Any) -> Array:
+        if spread and isinstance(value, (int, float)) and not isinstance(value, bool):
+            value = [value] * size
+        items = _sequence(field, value, size)
+        return frozen(
+            [
+                _number(f"{field}[{i}]", item, above, at_least, math.inf, infinite)
+                for i, item in enumerate(items)
+            ]
+        )
+
+    return _field(check, default)
+
+
+def interval(
+    *, above: float = -math.inf, count: int = 0, default: Any = dataclasses.MISSING
+) -> Any:
+    """Field: ``[min, max]``; with ``count`` one for all or one each, shape (count, 2)."""
+
+    def pair(field: str, value: Any) -> list[float]:
+        low, high = (
+            _number(f"{field}[{i}]", v, above) for i, v in enumerate(_sequence(field, value, 2))
+        )
+        if not low < high:
+            raise ParameterError(field, value, "[min, max] with min below max")
+        return [low, high]
+
+    def check(field: str, value: Any) -> Array:
+        if count and isinstance(value, list) and any(isinstance(v, list) for v in value):
+            items = _sequence(field, value, count)
+            return frozen([pair(f"{field}[{i}]", v) for i, v in enumerate(items)])
+        return frozen([pair(field, value)] * count if count else pair(field, value))
+
+    return _field(check, default)
+
+
+def inertia(*, positive: bool, default: Any = dataclasses.MISSING) -> Any:
+    """Field: an inertia matrix about a centre of mass, 3x3 or its diagonal, kg m2.
+
+    Symmetric, principal moments not negative (``positive``: above zero), triangle rule kept.
+    """
+
+    def check(field: str, value: Any) -> Array:
+        rows = _sequence(field, value, 3)
+        if all(isinstance(row, (int, float)) and not isinstance(row, bool) for row in rows):
+            matrix = np.diag([_number(f"{field}[{i}]", v) for i, v in enumerate(rows)])
+        else:
+            matrix = np.array(
+                [
+                    [
+                        _number(f"{field}[{i}][{j}]", v)
+                        for j, v in enumerate(_sequence(f"{field}[{i}]", row, 3))
+                    ]
+                    for i, row in enumerate(rows)
+                ]
+            )
+        scale = float(np.abs(matrix).max())
+        if scale > 1e12:
+            raise ParameterError(field, value, "at most 1e12 kg m2")
+        if float(np.abs(matrix - matrix.T).max()) > 1e-9 * scale:
+            raise ParameterError(field, value, "a symmetric matrix")
+        a, b, c = np.linalg.eigvalsh(matrix)
+        if a < -1e-12 * scale or (positive and not a > 1e-12 * scale):
+            bound = "above zero" if positive else "zero or more"
+            raise ParameterError(field, value, f"principal moments {bound}; the least is {a:.6g}")
+        if c > (a + b) * (1 + 1e-9):
+            raise ParameterError(
+                field, value, f"triangle rule: {c:.6g} at most {a:.6g} + {b:.6g} (principal)"
+            )
+        return frozen((matrix + matrix.T) / 2)
+
+    return _field(check, default)
+
+
+def names(size: int, *, default: Any = dataclasses.MISSING) -> Any:
+    """Field: ``size`` different non-empty names."""
+
+    def check(field: str, value: Any) -> tuple[str, ...]:
+        items = _sequence(field, value, size)
+        for i, item in enumerate(items):
+            if not isinstance(item, str) or not item:
+                raise ParameterError(f"{field}[{i}]", item, "a non-empty name")
+        if len(set(items)) != size:
+            raise ParameterError(field, value, "different names")
+        return tuple(items)
+
+    return _field(check, default)
+
+
+def choice(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
+    """Field: one of the allowed words."""
+
+    def check(field: str, value: Any) -> str:
+        if value not in allowed:
+            raise UnknownNameError(field, value, allowed)
+        return str(value)
+
+    return _field(check, default)
+
+
+def choices(size: int, *allowed: str, default: Any = dataclasses.MISSING) -> Any:
+    """Field: ``size`` words, each one of the allowed."""
+
+    def check(field: str, value: Any) -> tuple[str, ...]:
+        items = _sequence(field, value, size)
+        for i, item in enumerate(items):
+            if item not in allowed:
+                raise UnknownNameError(f"{field}[{i}]", item, allowed)
+        return tuple(items)
+
+    return _field(check, default)
+
+
+def section(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
+    """Field: a nested mapping with the schema of the dataclass ``kind``."""
+
+    def check(field: str, value: Any) -> Any:
+        return build(kind, value, field)
+
+    return _field(check, default)
+
+
+def build(kind: type[T], data: object, path: str = "") -> T:
+    """A mapping checked against the schema dataclass ``kind``.
+
+    :raises ParameterError: a key missing, a wrong type, a value out of range.
+    :raises UnknownNameError: a key that does not exist, with the closest valid one.
+    """
+    if not isinstance(data, Mapping):
+        raise ParameterError(path or "parameters", data, "a mapping of keys to values")
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    for key in data:
+        if key not in fields:
+            raise UnknownNameError(_join(path, str(key)), key, fields)
+    values: dict[str, Any] = {}
+    for name, field in fields.items():
+        dotted = _join(path, name)
+        if name in data:
+            values[name] = field.metadata["check"](dotted, data[name])
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise ParameterError(dotted, None, "required, and missing")
+    result = kind(**values)
+    verify = getattr(result, "verify", None)
+    if verify is not None:
+        verify(path)
+    return result
+
+
+def replace(section_value: T, changes: Mapping[str, object], path: str) -> T:
+    """A copy of a section with some keys set anew, every one checked; all or none."""
+    fields = {f.name: f for f in dataclasses.fields(section_value)}  # type: ignore[arg-type]
+    checked = {}
+    for key, value in changes.items():
+        if key not in fields:
+            raise UnknownNameError(_join(path, key), key, fields)
+        checked[key] = fields[key].metadata["check"](_join(path, key), value)
+    result: T = dataclasses.replace(section_value, **checked)  # type: ignore[type-var]
+    verify = getattr(result, "verify", None)
+    if verify is not None:
+        verify(path)
+    return result
+
+
+def frozen(values: object) -> Array:
+    """A read-only float array."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def _field(check: Check, default: Any) -> Any:
+    metadata = {"check": check}
+    if default is dataclasses.MISSING:
+        return dataclasses.field(metadata=metadata)
+    if isinstance(default, (list, dict)):
+        return dataclasses.field(metadata=metadata, default_factory=lambda: check("", default))
+    return dataclasses.field(metadata=metadata, default=default)
+
+
+def _number(
+    field: str,
+    value: Any,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    infinite: bool = False,
+) -> float:
+    bound = "a finite number"
+    if above > -math.inf:
+        bound += f" above {above:g}"
+    if at_least > -math.inf:
+        bound += f", at least {at_least:g}"
+    if at_most < math.inf:
+        bound += f", at most {at_most:g}"
+    if infinite:
+        bound += ", or .inf"
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise ParameterError(field, value, bound)
+    try:
+        result = float(value)
+    except OverflowError:
+        raise ParameterError(field, "an integer beyond all floats", bound) from None
+    finite = math.isfinite(result) or (infinite and result == math.inf)
+    if not finite or not result > above or result < at_least or result > at_most:
+        raise ParameterError(field, value, bound)
+    return result
+
+
+def _sequence(field: str, value: Any, size: int) -> Sequence[Any]:
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if not isinstance(value, (list, tuple)):
+        raise ParameterError(field, value, f"a list of {size}")
+    if len(value) != size:
+        raise ParameterError(field, value, f"a list of {size}, not {len(value)}")
+    return value
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+from glob import glob
+
+from setuptools import setup
+
+NAME = "pkm_twin"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Digital twin of parallel kinematic machines",
+    license="Apache-2.0",
+    author="pkm_twin maintainers",
+    maintainer="pkm_twin maintainers",
+    python_requires=">=3.11",
+    packages=[
+        "pkm_twin",
+        "pkm_twin.config",
+        "pkm_twin.mechanisms",
+        "delta_dynamics",
+        "stiffness_monitor",
+    ],
+    # The parameter files stand at the top for people and inside the package for load().
+    package_dir={"pkm_twin.config": "config"},
+    package_data={
+        "pkm_twin": ["py.typed"],
+        "pkm_twin.config": ["*.yaml"],
+        "delta_dynamics": ["py.typed"],
+        "stiffness_monitor": ["py.typed"],
+    },
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+    ],
+    install_requires=[
+        "matplotlib>=3.6",
+        "mcap>=1.2",
+        "mcap-ros2-support>=0.5",
+        "numba>=0.58",
+        "numpy>=1.26",
+        "PyYAML>=6",
+        "rich>=13",
+        "setuptools",
+        "typer>=0.9",
+    ],
+    extras_require={
+        # The real ROS 2 Jazzy as wheels, for machines without a ROS installation. Unpinned names
+        # bring another distribution.
+        "jazzy": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
+        "test": [
+            "hypothesis",
+            "mypy",
+            "pin",
+            "pytest",
+            "pytest-timeout",
+            "ruff",
+            "scipy",
+            "types-PyYAML",
+        ],
+        "bags": ["pin", "PyNiteFEA", "scipy"],
+        "bench": ["pin", "pytest", "pytest-benchmark"],
+    },
+    entry_points={
+        "console_scripts": [
+            "delta_dynamics = delta_dynamics.node:main",
+            "stiffness_monitor = stiffness_monitor.node:main",
+            "pkm-twin = pkm_twin.cli:main",
+        ],
+    },
+    zip_safe=False,
+)

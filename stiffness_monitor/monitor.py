@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stiffness node's core: messages in, compliance and strain energy out. Pure.
+
+May import: numpy, pkm_twin's core, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import MessageError, SingularityError, UnreachableError
+from pkm_twin.guard import Guard
+from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.messages import JointReader, StampRules, read_wrench
+from stiffness_monitor.compliance import StrainEnergy, compliance, strain_energy
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the node pairs and accepts messages."""
+
+    wrench_frame: str = "platform"
+    base_frame: str = "base_link"
+    accept_empty_frame: bool = False
+    max_state_age: float = 0.1
+    future_tolerance: float = 0.1
+    accept_zero_stamp: bool = False
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one wrench did to the platform.
+
+    ``compliance`` (6, 6), ``energy.deflection`` (6,) and ``wrench`` (6,) in fixed axes at the
+    platform's origin; ``rotation`` (3, 3) turns platform axes into fixed ones.
+    """
+
+    stamp: int
+    pose: Array
+    wrench: Array
+    compliance: Array
+    energy: StrainEnergy
+    rotation: Array
+
+
+@dataclass
+class Monitor:
+    """Pairs each wrench with the joint state nearest to it in time."""
+
+    robot: Robot
+    settings: Settings = field(default_factory=Settings)
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        self.states = Guard(bad_limit=2**62, good_needed=1)
+        self.wrenches = Guard(bad_limit=2**62, good_needed=1)
+        self.dropped = 0
+        self._rules = StampRules(s.accept_zero_stamp, round(s.future_tolerance * 1e9))
+        self._reader = JointReader(self.robot)
+        self._recent: deque[tuple[int, Array]] = deque(maxlen=256)
+
+    def reset(self) -> None:
+        """Forget all joint states, as when the clock jumps."""
+        self._recent.clear()
+
+    def joint_state(self, message: Any, now: int) -> None:
+        """Take a joint state; an older one than the last is dropped and counted.
+
+        :raises MessageError: the message is rejected, and counted.
+        """
+        try:
+            sample = self._reader.joint_state(message, now, self._rules)
+            if self._recent and sample.stamp < self._recent[-1][0]:
+                self.dropped += 1
+                raise MessageError(
+                    "stamp order",
+                    f"the stamp is {(self._recent[-1][0] - sample.stamp) / 1e9:.6f} s before "
+                    "the last",
+                )
+        except MessageError as error:
+            self.states.reject(error.reason, str(error))
+            raise
+        self.states.accept()
+        self._recent.append((sample.stamp, sample.q))
+
+    def wrench(self, message: Any, now: int) -> Answer:
+        """Answer a wrench.
+
+        A wrench in the base frame has fixed axes; one in any other frame has the platform's, as a
+        force-torque sensor mounted there measures it.
+
+        :raises MessageError: the message is rejected, and counted.
+        """
+        try:
+            answer = self._wrench(message, now)
+        except MessageError as error:
+            self.wrenches.reject(error.reason, str(error))
+            raise
+        self.wrenches.accept()
+        return answer
+
+    def _wrench(self, message: Any, now: int) -> Answer:
+        s = self.settings
+        sample = read_wrench(message, now, self._rules, s.wrench_frame, s.accept_empty_frame)
+        try:
+            pose = self.robot.forward(self._nearest(sample.stamp))
+            rotation = self.robot.rotation(pose)
+            turn = np.eye(3) if sample.frame == s.base_frame else rotation
+            fixed = np.concatenate((turn @ sample.wrench[:3], turn @ sample.wrench[3:]))
+            energy = strain_energy(self.robot, pose, fixed)
+            matrix = compliance(self.robot, pose)
+        except UnreachableError as error:
+            raise MessageError("unreachable", str(error)) from error
+        except SingularityError as error:
+            raise MessageError("singular", str(error)) from error
+        if not (np.isfinite(matrix).all() and np.isfinite(energy.deflection).all()):
+            raise MessageError("non-finite result", "the model gave a value that is not finite")
+        return Answer(sample.stamp, pose, fixed, matrix, energy, rotation)
+
+    def _nearest(self, stamp: int) -> Array:
+        """Joint positions of the state nearest in time."""
+        if not self._recent:
+            raise MessageError("no pose", "no pose: no joint state has arrived")
+        age, q = min((abs(stamp - at), i) for i, (at, _) in enumerate(self._recent))
+        if age > self.settings.max_state_age * 1e9:
+            raise MessageError(
+                "no pose",
+                f"no pose: the nearest joint state is {age / 1e9:.3f} s away, allowed "
+                f"{self.settings.max_state_age:g} s",
+            )
+        return self._recent[q][1]

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node ``stiffness_monitor``: wrenches in, compliance and dominant element out."""
+
+from __future__ import annotations
+
+import math
+import sys
+from array import array
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TransformStamped, WrenchStamped
+from numpy.typing import NDArray
+from rclpy.time import Time
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
+
+from pkm_twin import health, load
+from pkm_twin.errors import ParameterError
+from stiffness_monitor.compliance import kernels
+from stiffness_monitor.monitor import Answer, Monitor, Settings
+
+
+class StiffnessMonitor(health.TwinNode):
+    """Live compliance and strain energy of any robot with elastic members."""
+
+    def __init__(self) -> None:
+        super().__init__("stiffness_monitor")
+        robot = load(self.declare("mechanism", "upr_rpu", "robot: name or path", read_only=True))
+        for kernel in kernels(robot):
+            kernel.warm_up()
+        self._monitor = Monitor(robot, self._declare_settings())
+        self._compliance = self.speak(Float64MultiArray, "~/compliance")
+        self._energy = self.speak(DiagnosticArray, "~/strain_energy")
+        self._dominant = self.speak(String, "~/dominant_element")
+        self._deflection = self.speak(TransformStamped, "~/deflection")
+        self.listen(JointState, "joint_states", self._on_joint_state)
+        self.listen(WrenchStamped, "wrench", self._on_wrench)
+        self.start()
+
+    def summary(self) -> str:
+        """One line that says what the node runs."""
+        robot, settings = self._monitor.robot, self._monitor.settings
+        return (
+            f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}, "
+            f"wrench in {settings.wrench_frame}"
+        )
+
+    def clock_jumped(self) -> None:
+        """No pose across the seam."""
+        self._monitor.reset()
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Level, message and values of the node's diagnostic status."""
+        core = self._monitor
+        level, message = health.OK, "running"
+        for what in (core.states, core.wrenches):
+            if what.rejected:
+                level, message = health.WARN, f"last reject: {what.text}"
+        values: dict[str, object] = {
+            "robot": core.robot.name,
+            "joint states taken": core.states.accepted,
+            "wrenches answered": core.wrenches.accepted,
+            "older stamps dropped": core.dropped,
+        }
+        values |= {f"joint states rejected: {k}": v for k, v in core.states.rejected.items()}
+        values |= {f"wrenches rejected: {k}": v for k, v in core.wrenches.rejected.items()}
+        return level, message, values
+
+    def _declare_settings(self) -> Settings:
+        d = Settings()
+        frame = self.declare("wrench_frame", d.wrench_frame, "frame of the wrench", read_only=True)
+        base = self.declare("base_frame", d.base_frame, "name of the fixed frame", read_only=True)
+        empty = self.declare(
+            "accept_empty_frame", d.accept_empty_frame, "empty frame is wrench_frame", read_only=True
+        )
+        age = self.declare(
+            "max_state_age", d.max_state_age, "s between wrench and joint state", read_only=True
+        )
+        tolerance = self.declare("future_tolerance", d.future_tolerance, "s", read_only=True)
+        zero = self.declare(
+            "accept_zero_stamp", d.accept_zero_stamp, "use arrival time", read_only=True
+        )
+        for name, value in (("max_state_age", age), ("future_tolerance", tolerance)):
+            if not 0.0 <= value <= 3600.0:
+                raise ParameterError(name, value, "0 to 3600 s")
+        for name, value in (("wrench_frame", frame), ("base_frame", base)):
+            if not value:
+                raise ParameterError(name, value, "a frame's name")
+        return Settings(frame, base, empty, age, tolerance, zero)
+
+    def _on_joint_state(self, message: JointState) -> None:
+        self._monitor.joint_state(message, self.now())
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        answer = self._monitor.wrench(message, self.now())
+        stamp = Time(nanoseconds=answer.stamp).to_msg()
+        self._compliance.publish(_matrix(answer.compliance))
+        energy = DiagnosticArray(status=[self._status(answer)])
+        energy.header.stamp = stamp
+        energy.header.frame_id = self._monitor.settings.base_frame
+        self._energy.publish(energy)
+        self._dominant.publish(String(data=answer.energy.dominant))
+        deflection = _transform(answer)
+        deflection.header.stamp = stamp
+        deflection.header.frame_id = "platform"
+        deflection.child_frame_id = "platform_deflected"
+        self._deflection.publish(deflection)
+
+    def _status(self, answer: Answer) -> DiagnosticStatus:
+        """Factors, energy, pose and frame; factors are absent where no load makes energy."""
+        robot, energy = self._monitor.robot, answer.energy
+        pairs: dict[str, str] = {}
+        if energy.dominant != "none":
+            pairs |= {e: repr(float(f)) for e, f in zip(energy.elements, energy.factors, strict=True)}
+        pairs["total_energy"] = repr(float(energy.total))
+        pairs["tie"] = str(bool(energy.tie)).lower()
+        pairs |= {
+            name: repr(value) for name, value in zip(robot.pose_names, answer.pose.tolist(), strict=True)
+        }
+        pairs["frame"] = self._monitor.settings.base_frame
+        return DiagnosticStatus(
+            level=health.OK,
+            name=f"{self.get_name()}: strain energy",
+            message=energy.dominant,
+            hardware_id=robot.name,
+            values=[KeyValue(key=key, value=value) for key, value in pairs.items()],
+        )
+
+
+def _matrix(values: NDArray[np.float64]) -> Float64MultiArray:
+    rows, columns = values.shape
+    message = Float64MultiArray(data=array("d", values.ravel()))
+    message.layout.dim = [
+        MultiArrayDimension(label="row", size=rows, stride=rows * columns),
+        MultiArrayDimension(label="col", size=columns, stride=columns),
+    ]
+    return message
+
+
+def _transform(answer: Answer) -> TransformStamped:
+    """From the platform to the deflected platform, in the platform's axes."""
+    shift = answer.rotation.T @ answer.energy.deflection[:3]
+    turn = answer.rotation.T @ answer.energy.deflection[3:]
+    angle = math.sqrt(float(turn @ turn))
+    # sin(x/2)/x goes to 1/2: deflections are so small that the quotient would lose digits.
+    scale = 0.5 if angle < 1e-6 else math.sin(angle / 2) / angle
+    message = TransformStamped()
+    move, rotation = message.transform.translation, message.transform.rotation
+    move.x, move.y, move.z = shift.tolist()
+    rotation.x, rotation.y, rotation.z = (scale * turn).tolist()
+    rotation.w = math.cos(angle / 2)
+    return message
+
+
+def main() -> None:
+    """Entry point of ``ros2 run pkm_twin stiffness_monitor``."""
+    sys.exit(health.run(StiffnessMonitor))
+
+
+if __name__ == "__main__":
+    main()
