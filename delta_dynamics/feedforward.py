@@ -180,6 +180,10 @@ class Feedforward:
             raise MessageError("unreachable", str(error)) from error
         except SingularityError as error:
             raise MessageError("singular", str(error)) from error
+        except ValueError as error:
+            # The input was finite: the model overflowed.
+            self.stream.stop("non-finite result", str(error))
+            raise MessageError("non-finite result", str(error)) from error
 
     def _gate(self, effort: Array) -> tuple[Array, bool]:
         """Effort limits by the declared policy; the check for finite values stands last."""

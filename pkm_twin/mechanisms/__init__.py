@@ -13,6 +13,7 @@ from pkm_twin.mechanisms.robot import Robot
 
 CATALOGUE: Final = {
     "delta": "pkm_twin.mechanisms.delta:Delta",
+    "prru": "pkm_twin.mechanisms.prru:Prru",
 }
 """Mechanism name to class: one line a mechanism."""
 

@@ -21,6 +21,7 @@ linear, nine of angular velocity, laid out as in a row.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from pkm_twin.kernels import scalar
@@ -43,7 +44,7 @@ def virtual_work(p, s, bodies, qd, wrench, tau):  # type: ignore[no-untyped-def]
     """Actuator efforts that balance inertia, gravity, friction and the wrench.
 
     tau = sum over bodies of Jv' m (a - g) + Jw' n, less J_platform' wrench, plus friction
-    (Delta-CU paper, step 4; 3-PRRU paper, virtual work).
+    (Delta-CU paper, step 4; 3-PRRU paper, virtual work). False where a result is not finite.
     """
     for j in range(3):
         tau[j] = p[VISCOUS + j] * qd[j]
@@ -71,3 +72,4 @@ def virtual_work(p, s, bodies, qd, wrench, tau):  # type: ignore[no-untyped-def]
         w = o + 9 + 3 * j
         tau[j] -= wrench[0] * s[v] + wrench[1] * s[v + 1] + wrench[2] * s[v + 2]
         tau[j] -= wrench[3] * s[w] + wrench[4] * s[w + 1] + wrench[5] * s[w + 2]
+    return math.isfinite(tau[0] + tau[1] + tau[2])

@@ -570,8 +570,10 @@ def _bodies(p, q, qd, qdd, rows, scratch, fault):  # type: ignore[no-untyped-def
 
 def _inverse_dynamics(p, q, qd, qdd, wrench, tau, scratch, fault):  # type: ignore[no-untyped-def]
     """Arm torques by virtual work, N m."""
-    if _motion(p, q, qd, qdd, scratch, fault):
-        virtual_work(p, scratch, BODIES, qd, wrench, tau)
+    if _motion(p, q, qd, qdd, scratch, fault) and not virtual_work(
+        p, scratch, BODIES, qd, wrench, tau
+    ):
+        fault[0] = NOT_FINITE
 
 
 Delta.inverse_kernel = Kernel(_inverse, (3,), (3,))
