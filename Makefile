@@ -43,7 +43,9 @@ bags: $(VENV)/bags.stamp
 	$(BIN)/python -m bags.recording
 
 bench: $(VENV)/bench.stamp
-	$(BIN)/python -m pytest test/benchmarks -m benchmark_run --benchmark-disable-gc
+	mkdir -p out
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest test/benchmarks -m benchmark_run --benchmark-disable-gc --benchmark-json=out/benchmarks.json
+	$(BIN)/python -m test.benchmarks.report out/benchmarks.json docs/benchmarks.md
 
 fuzz: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m long test/bags

@@ -146,7 +146,9 @@ class Feedforward:
             qd = _gradient(t.q, t.times)
         if qdd is None:
             qdd = _gradient(qd, t.times)
-        efforts, _ = self._gate(self._solve(t.q, qd, qdd))
+        self._reader.check_derived(qd, qdd)
+        efforts, saturated = self._gate(self._solve(t.q, qd, qdd))
+        self.saturations += saturated
         return efforts[:, t.columns]
 
     def _joint_state(self, message: Any, now: int) -> Torques | None:
@@ -168,6 +170,7 @@ class Feedforward:
         rates = self._differentiator.push(sample.stamp, sample.q, sample.qd)
         if rates is None:
             return None
+        self._reader.check_derived(*rates)
         effort, saturated = self._gate(self._solve(sample.q, *rates))
         self._last_good = sample.q
         residual = None if sample.effort is None else sample.effort - effort
@@ -186,7 +189,11 @@ class Feedforward:
             raise MessageError("non-finite result", str(error)) from error
 
     def _gate(self, effort: Array) -> tuple[Array, bool]:
-        """Effort limits by the declared policy; the check for finite values stands last."""
+        """Effort limits by the declared policy, between two checks for finite values.
+
+        The first one keeps a clamp from making a limit of an infinity.
+        """
+        self._finite(effort)
         limits: Array | None = getattr(self.robot, "limits").effort  # noqa: B009
         saturated = False
         if limits is not None and (np.abs(effort) > limits).any():
@@ -201,10 +208,13 @@ class Feedforward:
                 )
             if self.settings.limit_policy == "clamp":
                 effort = np.clip(effort, -limits, limits)
+        self._finite(effort)
+        return effort, saturated
+
+    def _finite(self, effort: Array) -> None:
         if not np.isfinite(effort).all():
             self.stream.stop("non-finite result", "the model gave a value that is not finite")
             raise MessageError("non-finite result", "the model gave a value that is not finite")
-        return effort, saturated
 
 
 def _gradient(values: Array, times: Array) -> Array:

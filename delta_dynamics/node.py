@@ -38,7 +38,9 @@ class DeltaDynamics(health.TwinNode):
     def __init__(self) -> None:
         super().__init__("delta_dynamics")
         robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
-        kernels_to_warm = kernels(robot)
+        # Before there is a topic to be found by: the first start compiles for many seconds.
+        for kernel in kernels(robot):
+            kernel.warm_up()
         robot = _changed(robot, self._declare_changes(robot))
         self._feedforward = Feedforward(robot, self._declare_settings())
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
@@ -46,8 +48,6 @@ class DeltaDynamics(health.TwinNode):
         self._torques = self.speak(JointState, "~/joint_torques")
         self._residual = self.speak(JointState, "~/torque_residual")
         self._commands = self.speak(Float64MultiArray, "~/commands") if commands else None
-        for kernel in kernels_to_warm:
-            kernel.warm_up()
         self._pending: Robot | None = None
         self.listen(JointTrajectory, "~/joint_trajectory", self._on_trajectory)
         self.listen(JointState, "joint_states", self._on_joint_state)

@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -34,6 +36,23 @@ SINGULAR: Final = 2.0
 NOT_FINITE: Final = 3.0
 FAULT_SIZE: Final = 3
 """A fault is three floats: code, limb index, and the miss (m) or the singularity measure."""
+
+
+def _drop_stale_caches() -> None:
+    """Remove compiled kernels older than any formula.
+
+    numba looks at the outermost function's file only, and kernels call into others.
+    """
+    folder = Path(__file__).parent / "mechanisms"
+    newest = max(path.stat().st_mtime for path in (*folder.glob("*.py"), Path(__file__)))
+    for index in (folder / "__pycache__").glob("*.nbi"):
+        with suppress(OSError):
+            if index.stat().st_mtime < newest:
+                index.unlink()
+
+
+if COMPILED:
+    _drop_stale_caches()
 
 _F8: Final = np.dtype(np.float64)
 
@@ -69,7 +88,6 @@ class Kernel:
         self.inputs = tuple(inputs)
         self.outputs = tuple(outputs)
         self.scratch = scratch
-        self._single = [(size,) for size in inputs]
         # One sample runs with the interpreter locked, so calls can share the space.
         self._space = np.empty(scratch)
         self.__doc__ = function.__doc__
@@ -114,15 +132,11 @@ class Kernel:
         :returns: the outputs, shape (..., size) each, then the fault, shape (..., 3).
         :raises ValueError: an input's last axis has another size.
         """
-        if COMPILED:
-            for value, shape in zip(inputs, self._single, strict=True):
-                if type(value) is not np.ndarray or value.shape != shape or value.dtype is not _F8:
-                    break
-            else:
-                results = [np.empty(size) for size in self.outputs]
-                fault = np.zeros(FAULT_SIZE)
-                self._one(p, *inputs, *results, self._space, fault)
-                return (*results, fault)
+        first = inputs[0]
+        if COMPILED and type(first) is np.ndarray and first.ndim == 1:
+            one = self._single(p, inputs)
+            if one is not None:
+                return one
         arrays = [np.asarray(value, _F8) for value in inputs]
         for array, size in zip(arrays, self.inputs, strict=True):
             if array.ndim == 0 or array.shape[-1] != size:
@@ -131,10 +145,25 @@ class Kernel:
         results = [np.empty((*batch, size)) for size in self.outputs]
         results.append(np.zeros((*batch, FAULT_SIZE)))
         if COMPILED:
-            self._many(p, *arrays, *results[:-1], np.empty(self.scratch), results[-1])
+            # What is not finite comes back as a fault, not as a warning.
+            with np.errstate(all="ignore"):
+                self._many(p, *arrays, *results[:-1], np.empty(self.scratch), results[-1])
         else:
             self._interpret(p, arrays, results, batch)
         return tuple(results)
+
+    def _single(self, p: Array, inputs: tuple[ArrayLike, ...]) -> tuple[Array, ...] | None:
+        """One sample, the fast way; None where the inputs are not plain vectors of floats."""
+        try:
+            for value, size in zip(inputs, self.inputs, strict=True):
+                if len(value) != size:  # type: ignore[arg-type]
+                    return None
+            results = [np.empty(size) for size in self.outputs]
+            fault = np.zeros(FAULT_SIZE)
+            self._one(p, *inputs, *results, self._space, fault)
+        except TypeError:  # a plain number, or another type of array
+            return None
+        return (*results, fault)
 
     def _interpret(
         self, p: Array, arrays: list[Array], results: list[Array], batch: tuple[int, ...]

@@ -32,6 +32,7 @@ MAX_EFFORT: Final = 1e7
 MAX_FORCE: Final = 1e7
 MAX_MOMENT: Final = 1e7
 MAX_POINTS: Final = 100_000
+MAX_DURATION: Final = 1_000_000 * SECOND
 """Bounds beyond all machines of this kind, for values that no limit of the robot bounds."""
 
 
@@ -107,6 +108,7 @@ class JointReader:
         self._position = [(-reach, reach)] * 3 if position is None else position.tolist()
         rates = [MAX_RATE] * 3 if velocity is None else velocity.tolist()
         self._velocity = [(-rate, rate) for rate in rates]
+        self._highest_velocity = np.array(rates)
         self._acceleration = [(-MAX_ACCELERATION, MAX_ACCELERATION)] * 3
         self._effort = [(-MAX_EFFORT, MAX_EFFORT)] * 3
 
@@ -164,6 +166,21 @@ class JointReader:
             self._columns("accelerations", points, index, self._acceleration),
             tuple(self.robot.joint_names.index(name) for name in names),
         )
+
+    def check_derived(self, qd: Array, qdd: Array) -> None:
+        """Differentiated rates and accelerations keep the bounds of measured ones, (..., 3)."""
+        for what, values, high in (
+            ("velocity", qd, self._highest_velocity),
+            ("acceleration", qdd, MAX_ACCELERATION),
+        ):
+            good = np.abs(values) <= high
+            if not good.all():
+                worst = tuple(np.argwhere(~good)[0])
+                joint = int(worst[-1])
+                bounds = self._velocity if what == "velocity" else self._acceleration
+                raise self._refusal(
+                    f"differentiated {what}", joint, float(values[worst]), *bounds[joint]
+                )
 
     def _match(self, names: Sequence[str]) -> list[int]:
         """Where each of the robot's joints stands among the names."""
@@ -236,7 +253,7 @@ class JointReader:
             return MessageError("not finite", f"{what} of {name} is {value}")
         if low <= value <= high:
             return MessageError("bounds", f"{what} of {name} is {value:g}, a denormal number")
-        reason = "limit" if self._limited.get(what, False) else "bounds"
+        reason = "limit" if self._limited.get(what.split()[-1], False) else "bounds"
         return MessageError(reason, f"{what} of {name} is {value:g}, allowed {low:g} to {high:g}")
 
 
@@ -293,6 +310,13 @@ def _nanoseconds(what: str, time: Any) -> int:
 def _check_times(nanoseconds: list[int]) -> None:
     if nanoseconds[0] < 0:
         raise MessageError("time", f"time_from_start begins at {nanoseconds[0] / SECOND:g} s")
+    # Float seconds tell two nanoseconds apart up to here.
+    if nanoseconds[-1] > MAX_DURATION:
+        raise MessageError(
+            "bounds",
+            f"time_from_start ends at {nanoseconds[-1] / SECOND:g} s, "
+            f"at most {MAX_DURATION / SECOND:g} s",
+        )
     for i in range(1, len(nanoseconds)):
         if nanoseconds[i] <= nanoseconds[i - 1]:
             raise MessageError(

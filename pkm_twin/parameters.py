@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import stat
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -22,6 +23,8 @@ from pkm_twin.errors import ParameterError, UnknownNameError
 
 MAX_FILE_SIZE: Final = 64 * 1024
 """Largest parameter file that is read, bytes; the shipped ones are below 4 kB."""
+MAX_SIZE: Final = 1e18
+"""Beyond every quantity of a machine in SI units; products of such numbers stay finite."""
 
 Array = NDArray[np.float64]
 Check = Callable[[str, Any], Any]
@@ -29,22 +32,37 @@ T = TypeVar("T")
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Plain YAML only: no object tags, no aliases, no duplicate keys."""
+    """Plain YAML only: no tags, aliases, merges or duplicate keys, no integer beyond all floats."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError("aliases are not allowed in parameter files")
+        event = self.peek_event()  # type: ignore[no-untyped-call]
+        if getattr(event, "tag", None) is not None:
+            raise yaml.YAMLError("tags are not allowed in parameter files")
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise yaml.YAMLError(f"key {key!r} stands twice")
+        if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
+            raise yaml.YAMLError("merge keys are not allowed in parameter files")
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        if len(mapping) < len(node.value):
+            seen = set()
+            for key, _ in node.value:
+                name = self.construct_object(key, deep=True)
+                if name in seen:
+                    raise yaml.YAMLError(f"key {name!r} stands twice")
+                seen.add(name)
         return mapping
 
+    def construct_yaml_int(self, node: Any) -> int:
+        value: int = super().construct_yaml_int(node)
+        if value.bit_length() > 1023:
+            raise yaml.YAMLError("an integer beyond all floats")
+        return value
 
+
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_yaml_int)
 # YAML 1.1 reads 1e-10 as a string; everybody means the number.
 _StrictLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+[eE][-+]?\d+$"), list("-+0123456789")
@@ -57,10 +75,15 @@ def read_yaml(path: Path) -> dict[str, Any]:
     :raises ParameterError: not readable, too large, not plain YAML, or not a mapping.
     """
     try:
-        size = path.stat().st_size
-        if size > MAX_FILE_SIZE:
-            raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_FILE_SIZE} bytes")
-        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_StrictLoader)  # noqa: S506
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise OSError("not a file")
+        with path.open("rb") as file:
+            content = file.read(MAX_FILE_SIZE + 1)
+        if len(content) > MAX_FILE_SIZE:
+            raise ParameterError(
+                str(path), f"{path.stat().st_size} bytes", f"at most {MAX_FILE_SIZE} bytes"
+            )
+        data = yaml.load(content.decode("utf-8"), Loader=_StrictLoader)  # noqa: S506
     except (yaml.YAMLError, OSError, UnicodeDecodeError, RecursionError, ValueError) as error:
         if isinstance(error, ParameterError):
             raise
@@ -299,7 +322,9 @@ def _number(
         result = float(value)
     except OverflowError:
         raise ParameterError(field, "an integer beyond all floats", bound) from None
-    finite = math.isfinite(result) or (infinite and result == math.inf)
+    if math.isfinite(result) and abs(result) > MAX_SIZE:
+        bound += f", at most {MAX_SIZE:g} in size"
+    finite = abs(result) <= MAX_SIZE or (infinite and result == math.inf)
     if not finite or not result > above or result < at_least or result > at_most:
         raise ParameterError(field, value, bound)
     return result

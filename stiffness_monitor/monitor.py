@@ -109,8 +109,9 @@ class Monitor:
     def _wrench(self, message: Any, now: int) -> Answer:
         s = self.settings
         sample = read_wrench(message, now, self._rules, s.wrench_frame, s.accept_empty_frame)
+        q = self._nearest(sample.stamp)
         try:
-            pose = self.robot.forward(self._nearest(sample.stamp))
+            pose = self.robot.forward(q)
             rotation = self.robot.rotation(pose)
             turn = np.eye(3) if sample.frame == s.base_frame else rotation
             fixed = np.concatenate((turn @ sample.wrench[:3], turn @ sample.wrench[3:]))
@@ -120,6 +121,9 @@ class Monitor:
             raise MessageError("unreachable", str(error)) from error
         except SingularityError as error:
             raise MessageError("singular", str(error)) from error
+        except ValueError as error:
+            # The input was finite: the model overflowed.
+            raise MessageError("non-finite result", str(error)) from error
         if not (np.isfinite(matrix).all() and np.isfinite(energy.deflection).all()):
             raise MessageError("non-finite result", "the model gave a value that is not finite")
         return Answer(sample.stamp, pose, fixed, matrix, energy, rotation)

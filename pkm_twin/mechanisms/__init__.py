@@ -14,6 +14,7 @@ from pkm_twin.mechanisms.robot import Robot
 CATALOGUE: Final = {
     "delta": "pkm_twin.mechanisms.delta:Delta",
     "prru": "pkm_twin.mechanisms.prru:Prru",
+    "upr_rpu": "pkm_twin.mechanisms.upr_rpu:UprRpu",
 }
 """Mechanism name to class: one line a mechanism."""
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin import parameters
 from pkm_twin.errors import ParameterError
@@ -33,6 +33,7 @@ from pkm_twin.mechanisms.bodies import (
     TWIST,
     virtual_work,
 )
+from pkm_twin.mechanisms.joints import GROUND, MOVING, Joint, PlatformMotion, joint
 from pkm_twin.mechanisms.robot import (
     SINGULARITY_BOUND,
     Friction,
@@ -111,6 +112,8 @@ class Delta(Robot):
     joints: tuple[str, ...] = parameters.names(3, default=["joint_1", "joint_2", "joint_3"])
     limits: Limits = parameters.section(Limits, default={})
 
+    description: ClassVar[str] = "Delta robot, three arms with forearms, the platform translates"
+    mobility: ClassVar[str] = "3: translations x, y, z"
     pose_names: ClassVar[tuple[str, str, str]] = ("x", "y", "z")
     pose_units: ClassVar[tuple[str, str, str]] = ("m", "m", "m")
     joint_unit: ClassVar[str] = "rad"
@@ -121,6 +124,75 @@ class Delta(Robot):
         "platform",
         "payload",
     )
+
+    def rotation(self, pose: ArrayLike) -> Array:
+        """Always the identity, shape (..., 3, 3): the platform only translates."""
+        return np.broadcast_to(np.eye(3), (*np.shape(pose)[:-1], 3, 3)).copy()
+
+    def pose_rates(self, platform: PlatformMotion) -> tuple[Array, Array]:
+        """First and second derivative of the pose in time: the platform's origin is the pose."""
+        return platform.velocity, platform.acceleration
+
+    def body_joints(self, q: Array, platform: PlatformMotion) -> tuple[Joint, ...]:
+        """Base joints A, elbows B and platform joints C of the limbs, and what they transmit.
+
+        Directions of a limb: r outwards, t = z x r along the arm's axis, w from elbow to platform
+        joint, e = t x w made unit. A revolute at A holds all but the turn about t, which the
+        actuator holds.
+
+        ``rod``: a parallelogram of two equal thin rods, side by side along t, with a ball joint at
+        each end. Their end forces add up to one force at B and one at C; the difference of the
+        two axial forces is a couple along e that passes from arm to platform, the same at B
+        and C, whatever the distance of the rods. The rods' spin about themselves is idle.
+
+        ``rcu``: the cylindrical joint at B holds forces and moments across t. The universal joint
+        at C turns about t on the forearm's side and about r on the platform's side; the
+        platform only translates, so it holds all forces and the moment along r x t = z. (The paper
+        names the joint but not its second axis. With that axis along e the constraint would be
+        the forearm's torsion, which cannot hold the platform's rotation where tan of the
+        forearms' slope is the root of 2: within a degree of the paper's home pose.)
+        """
+        g = self.geometry
+        up = np.array([0.0, 0.0, 1.0])
+        joints: list[Joint] = []
+        for i, limb in enumerate(("I", "II", "III")):
+            r = np.array([math.cos(g.azimuths[i]), math.sin(g.azimuths[i]), 0.0])
+            t = np.cross(up, r)
+            angle = q[..., i, None]
+            pivot = np.broadcast_to(g.base_radius * r, q.shape)
+            elbow = pivot + g.arm_length * (np.cos(angle) * r - np.sin(angle) * up)
+            corner = platform.position + g.platform_radius * r
+            rcu = g.closures[i] == "rcu"
+            if rcu:
+                elbow = elbow + ((corner - elbow) @ t)[..., None] * t
+            w = (corner - elbow) / g.forearm_length
+            e = np.cross(t, w)
+            e /= np.linalg.norm(e, axis=-1, keepdims=True)
+            arm, forearm = f"arm {limb}", f"forearm {limb}"
+            fixed = {"r": r, "t": t, "z": up}
+            joints.append(
+                joint(
+                    f"base joint {limb}",
+                    (GROUND, arm),
+                    pivot,
+                    fixed,
+                    fixed,
+                    actuated="moment along t",
+                )
+            )
+            if rcu:
+                across = {"r": r, "z": up}
+                inner = joint(f"elbow {limb}", (arm, forearm), elbow, across, across)
+                outer = joint(f"platform joint {limb}", (forearm, MOVING), corner, fixed, {"z": up})
+            else:
+                axes = {"w": w, "e": e, "w x e": np.cross(w, e)}
+                couple = {f"limb {limb}: moment along e": e}
+                inner = joint(f"elbow {limb}", (arm, forearm), elbow, axes, {}, passed=couple)
+                outer = joint(
+                    f"platform joint {limb}", (forearm, MOVING), corner, axes, {}, passed=couple
+                )
+            joints += [inner, outer]
+        return tuple(joints)
 
     def _pack(self) -> list[float]:
         g, m = self.geometry, self.inertia

@@ -70,6 +70,10 @@ class Robot:
 
     mechanism: str
 
+    description: ClassVar[str]
+    mobility: ClassVar[str]
+    redundant_constraints: ClassVar[tuple[str, ...]] = ()
+    """What rigid-body statics cannot tell; for robots with masses it follows from reactions."""
     limb_names: ClassVar[tuple[str, str, str]] = ("limb I", "limb II", "limb III")
     pose_names: ClassVar[tuple[str, str, str]]
     pose_units: ClassVar[tuple[str, str, str]]
@@ -81,6 +85,10 @@ class Robot:
     motion_kernel: ClassVar[Kernel | None] = None
     dynamics_kernel: ClassVar[Kernel | None] = None
     body_names: ClassVar[tuple[str, ...]] = ()
+    angles_kernel: ClassVar[Kernel | None] = None
+    elastic_kernel: ClassVar[Kernel | None] = None
+    energy_kernel: ClassVar[Kernel | None] = None
+    element_names: ClassVar[tuple[str, ...]] = ()
     changeable: ClassVar[tuple[str, ...]] = ()
 
     @property
@@ -120,6 +128,15 @@ class Robot:
         self.raise_fault(fault, "joint state")
         return pose
 
+    def home(self) -> Array:
+        """The pose in the middle of the actuated joints' limits, shape (3,)."""
+        limits: Array | None = getattr(self, "limits").position  # noqa: B009
+        return self.forward(self._home_joints() if limits is None else limits.mean(1))
+
+    def _home_joints(self) -> Array:
+        """Joint positions to begin from where the file has no limits, shape (3,)."""
+        return np.zeros(3)
+
     def jacobian(self, q: ArrayLike) -> Array:
         """Pose rates per joint rate, shape (..., 3, 3)."""
         return self._jacobians(q)[0]
@@ -136,6 +153,22 @@ class Robot:
             rates.reshape(*batch, 3, 3).swapaxes(-1, -2),
             twist.reshape(*batch, 2, 3, 3).swapaxes(-1, -2).reshape(*batch, 6, 3),
         )
+
+    def singularity(self, q: ArrayLike) -> Array:
+        """How far a joint state is from a singularity: 0 in one, 1 at best, shape (...).
+
+        The reciprocal condition number of the Jacobian, its angles multiplied by the platform's
+        radius, so that units do not count. Goes to zero at singularities of either kind: where
+        the actuators lose the platform and where they lose a direction.
+        """
+        radius = float(getattr(self, "geometry").platform_radius)  # noqa: B009
+        scale = np.array([1.0 if unit == "m" else radius for unit in self.pose_units])
+        values = np.linalg.svd(scale[:, None] * self.jacobian(q), compute_uv=False)
+        return np.asarray(values[..., -1] / values[..., 0], np.float64)
+
+    def rotation(self, pose: ArrayLike) -> Array:
+        """Platform axes as columns in fixed axes, shape (..., 3, 3)."""
+        raise NotImplementedError(f"{self.mechanism} has no rotation of its platform yet")
 
     def changed(self: R, **sections: Mapping[str, object] | object) -> R:
         """A copy with new values, e.g. ``payload={"mass": 0.2}, gravity=[0, 0, -9.81]``.
@@ -171,7 +204,8 @@ class Robot:
             index = tuple(int(i) for i in np.argwhere(bad)[0])
             code, detail, amount = fault[index].tolist()
         if code == kernels.NOT_FINITE:
-            raise ValueError(f"{what} at sample {index} is not finite")
+            where = f" at sample {index}" if index else ""
+            raise ValueError(f"{what}{where} is not finite, or leads to a result that is not")
         if code == kernels.SINGULAR:
             raise SingularityError(what, index, amount, SINGULARITY_BOUND)
         raise UnreachableError(what, self.limb_names[int(detail)], index, amount)

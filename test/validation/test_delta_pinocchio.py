@@ -8,7 +8,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import SingularityError, UnreachableError
 
 pytest.importorskip("pinocchio")
-from bags.recording.pinocchio_models import AssemblyError, DeltaEngine  # noqa: E402
+from bags.recording.pinocchio_models import AssemblyError, DeltaEngine
 
 STATES = 200
 

@@ -1,0 +1,327 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Safe writing of MCAP bags, live or from data. Imports no ROS."""
+
+from __future__ import annotations
+
+import errno
+import io
+import operator
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from mcap.writer import CompressionType, Writer
+
+from pkm_twin.cdr import MessageCodec, live_type_name, message_definition
+from pkm_twin.errors import BagError
+from pkm_twin.mcap_format import FREE_BYTES, MAX_CHUNK_BYTES, METADATA_CRC, metadata_crc
+
+LIBRARY = "pkm_twin"
+"""What the header of our own bags says wrote them."""
+FLUSH_PERIOD = 0.05
+"""How often a live recording reaches the operating system, s; half of what a kill may cost."""
+
+# What the writer may hold in memory before it slows its caller down.
+_QUEUE_LIMIT = 20_000
+
+
+class Sink:
+    """An unbuffered file for the MCAP writer: what it has written, the system has."""
+
+    def __init__(self, file: io.FileIO) -> None:
+        self._file = file
+        self._position = 0
+
+    def write(self, data: bytes) -> int:
+        """Write all of ``data``; the system may take it in parts."""
+        view = memoryview(data)
+        while view:
+            view = view[self._file.write(view) :]
+        self._position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the position, counted since the start."""
+        return self._position
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+
+def mcap_writer(sink: Sink, chunk_size: int) -> Any:
+    """Return an MCAP writer of which every byte is covered by a CRC."""
+    output: Any = sink
+    return Writer(
+        output,
+        chunk_size=chunk_size,
+        compression=CompressionType.ZSTD,
+        enable_crcs=True,
+        enable_data_crcs=True,
+    )
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Refuse a target that is there, a dangling link too, unless it may be overwritten."""
+    if not overwrite and os.path.lexists(path):
+        raise BagError("exists already", path=path, reason="exists")
+
+
+_REASONS = {
+    errno.ENOSPC: "disk_full",
+    errno.EDQUOT: "disk_full",
+    errno.EFBIG: "disk_full",
+    errno.EEXIST: "exists",
+    errno.ENOENT: "not_found",
+}
+
+
+def write_error(error: OSError, path: Path) -> BagError:
+    """Return what a caller is told when the system refuses to write ``path``."""
+    reason = _REASONS.get(error.errno or 0, "io")
+    return BagError(f"cannot be written: {error.strerror or error}", path=path, reason=reason)
+
+
+def offered_qos(reliability: str, durability: str, depth: int) -> str:
+    """Return a publisher's QoS as rosbag2 of Jazzy (bag format 9) writes it: a YAML sequence."""
+    allowed = {"reliable", "best_effort"}, {"volatile", "transient_local"}
+    for what, value, names in zip(
+        ("reliability", "durability"), (reliability, durability), allowed, strict=True
+    ):
+        if value not in names:
+            raise BagError(
+                f"{what} is {value!r}; expected {' or '.join(sorted(names))}", reason="qos"
+            )
+    if depth < 1:
+        raise BagError(f"depth is {depth}; at least 1", reason="qos")
+    # RMW_DURATION_INFINITE: no deadline, no lifespan, no lease.
+    infinite = "\n    sec: 9223372036\n    nsec: 854775807"
+    return (
+        f"- history: keep_last\n  depth: {depth}\n  reliability: {reliability}\n"
+        f"  durability: {durability}\n  deadline:{infinite}\n  lifespan:{infinite}\n"
+        f"  liveliness: automatic\n  liveliness_lease_duration:{infinite}\n"
+        "  avoid_ros_namespace_conventions: false"
+    )
+
+
+class BagWriter:
+    """Records messages into a new bag that ``ros2 bag play`` takes as it is.
+
+    A thread of its own writes, so a caller is not held up by the disk, and a Ctrl-C in the caller
+    cannot strike in the middle of a record. Every ``flush_period`` seconds of wall time what has
+    come in goes to the operating system as a complete chunk: a killed process loses no more than
+    that, and :func:`recover` saves the rest. With ``flush_period=None`` chunks end by size alone,
+    and equal input gives equal bytes; that is for files that are made, not recorded.
+
+    Use it as a context manager, or call :meth:`close` in a ``finally``. A process that is to
+    survive SIGTERM with all its messages must turn the signal into an exception or a return, as
+    rclpy does.
+
+    ``metadata`` holds records of texts by name, such as the robot's name.
+
+    :raises BagError: the file exists and ``overwrite`` is false, or it cannot be written. A full
+        disk is told by the next call; what was flushed before stays recoverable.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        overwrite: bool = False,
+        chunk_size: int = 16 * 1024,
+        metadata: Mapping[str, Mapping[str, str]] | None = None,
+        flush_period: float | None = FLUSH_PERIOD,
+    ) -> None:
+        if not 1 <= chunk_size <= FREE_BYTES:
+            raise BagError(
+                f"chunk_size is {chunk_size}; expected 1 to {FREE_BYTES}", reason="parameter"
+            )
+        if flush_period is not None and not flush_period > 0:
+            raise BagError(f"flush_period is {flush_period}; expected above 0", reason="parameter")
+        for name, entries in (metadata or {}).items():
+            if not all(isinstance(text, str) for item in entries.items() for text in item):
+                raise BagError(f"metadata {name!r} holds more than texts", reason="parameter")
+        self._path = Path(path)
+        self._period = flush_period
+        self._codecs: dict[str, MessageCodec] = {}
+        self._sequences: dict[str, int] = {}
+        self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._error: BagError | None = None
+        self._closed = False
+        self._schema_numbers: dict[tuple[str, str], int] = {}
+        self._channel_numbers: dict[str, int] = {}
+        refuse_existing(self._path, overwrite)
+        try:
+            self._file = self._path.open("wb" if overwrite else "xb", buffering=0)
+        except OSError as error:
+            raise write_error(error, self._path) from error
+        try:
+            self._writer = mcap_writer(Sink(self._file), chunk_size)
+            self._writer.start(profile="ros2", library=LIBRARY)
+            for name, entries in (metadata or {}).items():
+                crc = metadata_crc(name, entries)
+                self._writer.add_metadata(name, {**entries, METADATA_CRC: crc})
+        except OSError as error:
+            self._file.close()
+            raise write_error(error, self._path) from error
+        self._thread = threading.Thread(target=self._work, name="bag writer", daemon=True)
+        self._thread.start()
+
+    def add_topic(
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        reliability: str = "reliable",
+        durability: str = "volatile",
+        depth: int = 10,
+        definition: str | None = None,
+    ) -> None:
+        """Add a topic of a type such as ``sensor_msgs/msg/JointState``.
+
+        ``definition`` is the type's ros2msg text; by default it is made from the installed message
+        classes. QoS is what a player shall offer.
+        """
+        self._require_open()
+        if topic in self._codecs:
+            raise BagError(f"topic {topic} is there already", path=self._path, reason="topic")
+        if not topic.startswith("/") or topic.endswith("/"):
+            text = f"{topic!r} is not a full topic name, such as /joint_states"
+            raise BagError(text, path=self._path, reason="topic")
+        text = message_definition(type_name) if definition is None else definition
+        qos = offered_qos(reliability, durability, depth)
+        self._codecs[topic] = MessageCodec(type_name, text)
+        self._sequences[topic] = 0
+        self._queue.put(lambda: self._register(topic, type_name, text, qos))
+
+    def write(
+        self,
+        topic: str,
+        message: object,
+        log_time_ns: int,
+        publish_time_ns: int | None = None,
+    ) -> None:
+        """Record one message at its log time; its publish time is the same unless given.
+
+        ``message`` is CDR bytes, which are taken as they are, a live ROS message, a mapping, or an
+        object with the fields as attributes. It is encoded before this returns.
+        """
+        self._require_open()
+        codec = self._codecs.get(topic)
+        if codec is None:
+            known = ", ".join(sorted(self._codecs)) or "none"
+            text = f"topic {topic} was not added; topics: {known}"
+            raise BagError(text, path=self._path, reason="no_topic")
+        logged = operator.index(log_time_ns)
+        published = logged if publish_time_ns is None else operator.index(publish_time_ns)
+        for value in (logged, published):
+            if not 0 <= value < 2**64:
+                raise BagError(f"time {value} ns is outside 0 to 2^64", reason="time")
+        data = _encoded(codec, message)
+        if len(data) > MAX_CHUNK_BYTES // 2:
+            limit = MAX_CHUNK_BYTES // 2
+            raise BagError(f"the message has {len(data)} bytes; at most {limit}", reason="size_cap")
+        self._sequences[topic] += 1
+        sequence = self._sequences[topic]
+        self._queue.put(lambda: self._add(topic, logged, data, published, sequence))
+        while self._queue.qsize() > _QUEUE_LIMIT and self._error is None:
+            time.sleep(0.001)
+
+    def close(self) -> None:
+        """Write what is left, the index and the summary. Further calls do nothing.
+
+        :raises BagError: the bag could not be completed.
+        """
+        if not self._closed:
+            self._closed = True
+            self._queue.put(None)
+        interrupted = None
+        while self._thread.is_alive():
+            try:
+                self._thread.join()
+            except KeyboardInterrupt as interrupt:
+                # Finishing takes milliseconds; leaving now would cost the summary.
+                interrupted = interrupt
+        if interrupted:
+            raise interrupted
+        if self._error:
+            error, self._error = self._error, None
+            raise error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        # The first error is the one to tell.
+        with suppress(*([BagError] if error else [])):
+            self.close()
+
+    def _require_open(self) -> None:
+        if self._error:
+            raise self._error
+        if self._closed:
+            raise BagError("is closed", path=self._path, reason="closed")
+
+    # From here on: the writer's thread.
+
+    def _register(self, topic: str, type_name: str, text: str, qos: str) -> None:
+        key = (type_name, text)
+        if key not in self._schema_numbers:
+            number = self._writer.register_schema(type_name, "ros2msg", text.encode())
+            self._schema_numbers[key] = number
+        self._channel_numbers[topic] = self._writer.register_channel(
+            topic, "cdr", self._schema_numbers[key], {"offered_qos_profiles": qos}
+        )
+
+    def _add(self, topic: str, log_time: int, data: bytes, published: int, sequence: int) -> None:
+        number = self._channel_numbers[topic]
+        self._writer.add_message(number, log_time, data, published, sequence=sequence)
+
+    def _work(self) -> None:
+        try:
+            self._take_in()
+            self._writer.finish()
+        except OSError as error:
+            self._error = write_error(error, self._path)
+        except Exception as error:
+            # The caller is in another thread: without this it would record into nothing.
+            self._error = BagError(f"cannot be written: {error}", path=self._path, reason="io")
+        finally:
+            self._file.close()
+
+    def _take_in(self) -> None:
+        """Do what is in the queue until it is closed, flushing in time."""
+        due: float | None = None
+        while True:
+            if due is not None and time.monotonic() >= due:
+                self._writer.flush()
+                due = None
+            wait = None if due is None else max(0.0, due - time.monotonic())
+            try:
+                job = self._queue.get(timeout=wait)
+            except queue.Empty:
+                continue
+            if job is None:
+                return
+            job()
+            if due is None and self._period is not None:
+                due = time.monotonic() + self._period
+
+
+def _encoded(codec: MessageCodec, message: object) -> bytes:
+    if isinstance(message, bytes | bytearray | memoryview):
+        return bytes(message)
+    live = live_type_name(message)
+    if live not in (None, codec.type_name):
+        raise BagError(f"the message is a {live}; the topic has {codec.type_name}", reason="type")
+    return codec.encode(message)

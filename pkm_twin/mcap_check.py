@@ -1,0 +1,528 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The strict pass over a whole MCAP file. Imports no ROS.
+
+Every statement that the file makes about itself (counts, times, indexes, offsets, CRCs) is compared
+with what is there. Memory holds a few numbers for each chunk, never the file.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pkm_twin.errors import BagError
+from pkm_twin.mcap_format import (
+    ATTACHMENT,
+    ATTACHMENT_INDEX,
+    CHANNEL,
+    CHUNK,
+    CHUNK_INDEX,
+    CRC,
+    DATA_END,
+    FIRST_UNKNOWN,
+    FOOTER,
+    FOOTER_BODY,
+    FRAME,
+    HEADER,
+    INDEX_ENTRY,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_INDEX,
+    METADATA,
+    METADATA_INDEX,
+    SCHEMA,
+    STATISTICS,
+    SUMMARY_OFFSET,
+    Fields,
+    FlawError,
+    Records,
+    Tape,
+    message_head,
+    metadata,
+    opcode_name,
+    read_attachment,
+    read_chunk,
+    read_magic,
+    walk,
+)
+
+# Messages outside chunks are read back in runs of about this size.
+_RUN_BYTES = 1024**2
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One topic of a bag: log times in ns, 0 without messages; QoS as YAML, as in the file."""
+
+    type: str
+    count: int
+    start: int
+    end: int
+    offered_qos: str
+    definition: str
+    """The message definition in the file; empty where it has none."""
+    encoding: str
+    """How messages are encoded, ``cdr`` in ROS 2."""
+    schema_encoding: str
+    """What the definition is written in, ``ros2msg`` or ``ros2idl``; empty where there is none."""
+
+
+@dataclass(frozen=True)
+class BagReport:
+    """What a strict pass over a whole bag found. Times are log times in ns, 0 without messages."""
+
+    path: Path
+    profile: str
+    library: str
+    topics: Mapping[str, TopicInfo]
+    message_count: int
+    start_time: int
+    end_time: int
+    has_crc: bool
+    """Every message is covered by a CRC."""
+    has_index: bool
+    """Every chunk is listed in the summary."""
+    has_summary: bool
+    warnings: tuple[str, ...]
+    out_of_order: int
+    """Messages whose log time is before that of one earlier in the file."""
+    metadata: Mapping[str, Mapping[str, str]]
+
+    @property
+    def duration(self) -> float:
+        """Time from the first message to the last, s."""
+        return (self.end_time - self.start_time) * 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """Part of the file that is loaded at once: a chunk record, or a run of message records."""
+
+    offset: int
+    length: int
+    start: int
+    end: int
+    is_chunk: bool
+
+    def read(self, tape: Tape) -> bytes:
+        """Return the segment's records, checked once more."""
+        tape.seek(self.offset)
+        data = tape.read(self.length, "segment")
+        return read_chunk(data[FRAME.size :], self.offset).data if self.is_chunk else data
+
+
+@dataclass(slots=True)
+class _Span:
+    """How many messages, and from when to when."""
+
+    count: int = 0
+    start: int = 0
+    end: int = 0
+
+    def add(self, log_time: int) -> None:
+        self.start = min(self.start, log_time) if self.count else log_time
+        self.end = max(self.end, log_time) if self.count else log_time
+        self.count += 1
+
+
+class Check:
+    """One pass over a file, in which every statement that it makes about itself is checked."""
+
+    def __init__(self, tape: Tape) -> None:
+        self._tape = tape
+        self.records = Records()
+        self.segments: list[Segment] = []
+        self._spans: dict[int, _Span] = {}
+        self._total = _Span()
+        self._out_of_order = 0
+        self._profile = self._library = ""
+        self._metadata: dict[str, dict[str, str]] = {}
+        self._warnings: list[str] = []
+        # Of the last chunk: (log time, position) by channel, and each index record's offset.
+        self._entries: dict[int, list[tuple[int, int]]] = {}
+        self._index_offsets: dict[int, int] = {}
+        self._index_start = 0
+        self._last_chunk: tuple[int, tuple[object, ...]] | None = None
+        # A digest of what each chunk's index must say, by the chunk's offset.
+        self._chunks: dict[int, int] = {}
+        self._chunks_without_crc = 0
+        self._indexed: set[int] = set()
+        self._metadata_places: list[tuple[int, int, str]] = []
+        self._attachment_places: list[tuple[object, ...]] = []
+        self._unknown = 0
+        self._has_data_crc = False
+        self._has_summary = False
+        self._groups: dict[int, list[int]] = {}
+        self._offsets: list[tuple[int, int, int]] = []
+        self._statistics: tuple[tuple[int, ...], dict[int, int]] | None = None
+        self._in_data: tuple[int, int] = (0, 0)
+
+    def run(self) -> None:
+        """Read the file from its first byte to its last."""
+        read_magic(self._tape)
+        self._read_header()
+        self._read_data()
+        self._read_summary()
+        self._read_end()
+        self._compare_counts()
+
+    def _read_header(self) -> None:
+        at = self._tape.position
+        opcode, length = self._tape.frame()
+        if opcode != HEADER:
+            raise FlawError(f"the first record is {opcode_name(opcode)}, not the header", at)
+        fields = Fields(self._tape.body(opcode, length), "header", at)
+        self._profile, self._library = fields.text(), fields.text()
+        fields.done()
+
+    def _read_data(self) -> None:
+        readers: dict[int, Callable[[int, bytes], None]] = {
+            SCHEMA: lambda at, body: self.records.add(SCHEMA, body, at),
+            CHANNEL: lambda at, body: self.records.add(CHANNEL, body, at),
+            MESSAGE: self._read_message,
+            CHUNK: self._read_chunk,
+            MESSAGE_INDEX: self._read_message_index,
+            METADATA: self._read_metadata,
+        }
+        while True:
+            at, crc = self._tape.position, self._tape.crc
+            opcode, length = self._tape.frame()
+            if opcode != MESSAGE_INDEX:
+                self._close_chunk(at)
+            if opcode == DATA_END:
+                self._read_data_end(at, length, crc)
+                return
+            if opcode == ATTACHMENT:
+                self._read_attachment(at, length)
+            elif opcode >= FIRST_UNKNOWN:
+                self._unknown += 1
+                self._tape.skip(length)
+            elif opcode in readers:
+                readers[opcode](at, self._tape.body(opcode, length))
+            else:
+                raise FlawError(f"a {opcode_name(opcode)} record stands in the data section", at)
+
+    def _read_message(self, at: int, body: bytes) -> None:
+        number, _, log_time, _ = message_head(body, 0, len(body), at)
+        self._count(number, log_time, at)
+        length = FRAME.size + len(body)
+        last = self.segments[-1] if self.segments else None
+        if (
+            last
+            and not last.is_chunk
+            and last.offset + last.length == at
+            and last.length + length <= _RUN_BYTES
+        ):
+            start, end = min(last.start, log_time), max(last.end, log_time)
+            self.segments[-1] = Segment(last.offset, last.length + length, start, end, False)
+            return
+        self.segments.append(Segment(at, length, log_time, log_time, False))
+
+    def _count(self, number: int, log_time: int, at: int) -> None:
+        if number not in self.records.channels:
+            raise FlawError(f"a message has the unknown channel {number}", at)
+        self._out_of_order += self._total.count > 0 and log_time < self._total.end
+        self._total.add(log_time)
+        self._spans.setdefault(number, _Span()).add(log_time)
+
+    def _read_chunk(self, at: int, body: bytes) -> None:
+        chunk = read_chunk(body, at)
+        span = _Span()
+        for opcode, start, end in walk(chunk.data, at):
+            if opcode == MESSAGE:
+                number, _, log_time, _ = message_head(chunk.data, start, end, at)
+                self._count(number, log_time, at)
+                span.add(log_time)
+                self._entries.setdefault(number, []).append((log_time, start - FRAME.size))
+            elif opcode in (SCHEMA, CHANNEL):
+                self.records.add(opcode, chunk.data[start:end], at)
+            elif opcode < FIRST_UNKNOWN:
+                raise FlawError(f"a {opcode_name(opcode)} record stands in a chunk", at)
+            else:
+                self._unknown += 1
+        if (chunk.start, chunk.end) != (span.start, span.end):
+            raise FlawError(
+                f"the chunk's messages span {span.start} to {span.end} ns; "
+                f"the file says {chunk.start} to {chunk.end}",
+                at,
+            )
+        self._chunks_without_crc += not chunk.has_crc
+        length = FRAME.size + len(body)
+        self.segments.append(Segment(at, length, span.start, span.end, True))
+        self._index_start = self._tape.position
+        facts = (chunk.start, chunk.end, length)
+        sizes = (chunk.compression, chunk.packed_size, len(chunk.data))
+        self._last_chunk = (at, (facts, sizes))
+
+    def _read_message_index(self, at: int, body: bytes) -> None:
+        fields = Fields(body, "message index", at)
+        number = fields.number("H")
+        raw = fields.blob("I")
+        fields.done()
+        if self._last_chunk is None or number in self._index_offsets:
+            raise FlawError(f"a message index of channel {number} belongs to no chunk", at)
+        if len(raw) % INDEX_ENTRY.size:
+            raise FlawError(f"a message index has {len(raw)} bytes of 16-byte entries", at)
+        entries = sorted(INDEX_ENTRY.iter_unpack(raw))
+        if entries != sorted(self._entries.get(number, [])):
+            raise FlawError(f"the message index of channel {number} differs from the chunk", at)
+        self._index_offsets[number] = at
+
+    def _close_chunk(self, at: int) -> None:
+        """Note what the index of the last chunk must say; its message indexes end at ``at``."""
+        if self._last_chunk is None:
+            return
+        missing = self._entries.keys() - self._index_offsets.keys()
+        if self._index_offsets and missing:
+            raise FlawError(f"channels {sorted(missing)} have no message index, others have", at)
+        offset, facts = self._last_chunk
+        places = tuple(sorted(self._index_offsets.items()))
+        self._chunks[offset] = hash((*facts, at - self._index_start, places))
+        self._last_chunk = None
+        self._entries = {}
+        self._index_offsets = {}
+
+    def _read_metadata(self, at: int, body: bytes) -> None:
+        name, entries, _ = metadata(body, at)
+        # rosbag2 writes its record anew when it closes a bag: the last one holds.
+        self._metadata[name] = entries
+        self._metadata_places.append((at, FRAME.size + len(body), name))
+
+    def _read_attachment(self, at: int, length: int) -> None:
+        self._attachment_places.append(read_attachment(self._tape, at, length)[1])
+
+    def _read_data_end(self, at: int, length: int, crc: int) -> None:
+        fields = Fields(self._tape.body(DATA_END, length), "data end", at)
+        stated = fields.number("I")
+        fields.done()
+        if stated and stated != crc:
+            raise FlawError(f"the data's CRC is {crc:08x}; the file says {stated:08x}", at, "crc")
+        self._has_data_crc = stated != 0
+        self._in_data = (len(self.records.schemas), len(self.records.channels))
+
+    def _read_summary(self) -> None:
+        begin = self._tape.position
+        self._tape.crc = 0
+        while True:
+            at, crc = self._tape.position, self._tape.crc
+            opcode, length = self._tape.frame()
+            body = b"" if opcode >= FIRST_UNKNOWN else self._tape.body(opcode, length)
+            if opcode == FOOTER:
+                self._read_footer(begin, at, body, crc)
+                return
+            if opcode >= FIRST_UNKNOWN:
+                self._unknown += 1
+                self._tape.skip(length)
+            else:
+                self._read_summary_record(opcode, at, body)
+            group = self._groups.setdefault(opcode, [at, at])
+            if group[1] != at:
+                raise FlawError(
+                    f"the {opcode_name(opcode)} records of the summary are not together", at
+                )
+            group[1] = self._tape.position
+
+    def _read_summary_record(self, opcode: int, at: int, body: bytes) -> None:
+        if opcode in (SCHEMA, CHANNEL):
+            self.records.add(opcode, body, at)
+            return
+        readers: dict[int, Callable[[Fields, int], None]] = {
+            STATISTICS: self._read_statistics,
+            CHUNK_INDEX: self._read_chunk_index,
+            METADATA_INDEX: self._read_metadata_index,
+            ATTACHMENT_INDEX: self._read_attachment_index,
+            SUMMARY_OFFSET: self._read_summary_offset,
+        }
+        if opcode not in readers:
+            raise FlawError(f"a {opcode_name(opcode)} record stands in the summary", at)
+        if SUMMARY_OFFSET in self._groups and opcode != SUMMARY_OFFSET:
+            raise FlawError(f"a {opcode_name(opcode)} record stands among the summary offsets", at)
+        fields = Fields(body, opcode_name(opcode), at)
+        readers[opcode](fields, at)
+        fields.done()
+
+    def _read_statistics(self, fields: Fields, at: int) -> None:
+        if self._statistics:
+            raise FlawError("the summary has two statistics records", at)
+        numbers = fields.numbers("QHIIIIQQ")
+        part = fields.part()
+        counts: dict[int, int] = {}
+        while part.left:
+            number, count = part.numbers("HQ")
+            if number in counts:
+                raise FlawError(f"the statistics count channel {number} twice", at)
+            counts[number] = count
+        self._statistics = (numbers, counts)
+
+    def _read_chunk_index(self, fields: Fields, at: int) -> None:
+        start, end, offset, length = fields.numbers("QQQQ")
+        part = fields.part()
+        places = []
+        while part.left:
+            places.append(part.numbers("HQ"))
+        index_length = fields.number("Q")
+        sizes = (fields.text(), *fields.numbers("QQ"))
+        stated = hash(((start, end, length), sizes, index_length, tuple(sorted(places))))
+        if self._chunks.get(offset) != stated or offset in self._indexed:
+            raise FlawError(f"a chunk index does not match the chunk at byte {offset}", at)
+        self._indexed.add(offset)
+
+    def _read_metadata_index(self, fields: Fields, at: int) -> None:
+        offset, length = fields.numbers("QQ")
+        if (offset, length, fields.text()) not in self._metadata_places:
+            raise FlawError(f"a metadata index does not match the metadata at byte {offset}", at)
+
+    def _read_attachment_index(self, fields: Fields, at: int) -> None:
+        numbers = fields.numbers("QQQQQ")
+        if (*numbers, fields.text(), fields.text()) not in self._attachment_places:
+            raise FlawError(f"an attachment index does not match the one at byte {numbers[0]}", at)
+
+    def _read_summary_offset(self, fields: Fields, at: int) -> None:
+        opcode, start, length = fields.numbers("BQQ")
+        # Writers may list a group that has no records.
+        if length and self._groups.get(opcode) != [start, start + length]:
+            raise FlawError(
+                f"a summary offset does not match the {opcode_name(opcode)} records", at
+            )
+
+    def _read_footer(self, begin: int, at: int, body: bytes, crc: int) -> None:
+        fields = Fields(body, "footer", at)
+        start, offset_start, stated = FOOTER_BODY.unpack(fields.take(FOOTER_BODY.size))
+        fields.done()
+        self._has_summary = at > begin
+        if start != (begin if self._has_summary else 0) and (start, at) != (begin, begin):
+            raise FlawError(f"the footer puts the summary at {start}; it is at {begin}", at)
+        found = self._groups.get(SUMMARY_OFFSET, [0])[0]
+        if offset_start not in (found, found or at):
+            raise FlawError(
+                f"the footer puts the summary offsets at {offset_start}, not {found}", at
+            )
+        actual = zlib.crc32(FRAME.pack(FOOTER, len(body)) + body[: -CRC.size], crc)
+        if stated and stated != actual:
+            raise FlawError(
+                f"the summary's CRC is {actual:08x}; the file says {stated:08x}", at, "crc"
+            )
+        if not stated and self._has_summary:
+            self._warnings.append("the summary has no CRC")
+
+    def _read_end(self) -> None:
+        at = self._tape.position
+        if self._tape.read(len(MAGIC), "closing mark") != MAGIC:
+            raise FlawError("the file does not end with the MCAP mark", at)
+        if self._tape.position != self._tape.size:
+            left = self._tape.size - self._tape.position
+            raise FlawError(f"{left} bytes follow the end of the bag", self._tape.position)
+
+    def _compare_counts(self) -> None:
+        if self._indexed and self._indexed != self._chunks.keys():
+            missing = min(self._chunks.keys() - self._indexed)
+            raise FlawError("the summary does not list the chunk here, though others", missing)
+        if self._statistics is None:
+            return
+        (count, schemas, channels, *places, start, end), counts = self._statistics
+        stated = {number: value for number, value in counts.items() if value}
+        pairs = [
+            ("message count", count, self._total.count),
+            ("attachment count", places[0], len(self._attachment_places)),
+            ("metadata count", places[1], len(self._metadata_places)),
+            ("chunk count", places[2], len(self._chunks)),
+            ("first log time", start, self._total.start),
+            ("last log time", end, self._total.end),
+            ("counts by channel", stated, {n: span.count for n, span in self._spans.items()}),
+        ]
+        for what, said, found in pairs:
+            if said != found:
+                raise FlawError(
+                    f"the {what} is {found}; the statistics say {said}", None, "statistics"
+                )
+        # Writers differ in whether a schema or channel that is only in the summary counts.
+        ranges = [
+            ("schema", schemas, self._in_data[0], len(self.records.schemas)),
+            ("channel", channels, self._in_data[1], len(self.records.channels)),
+        ]
+        for what, said, low, high in ranges:
+            if not low <= said <= high:
+                raise FlawError(
+                    f"the bag has {low} to {high} {what}s; the statistics say {said}",
+                    None,
+                    "statistics",
+                )
+
+    def report(self, path: Path) -> BagReport:
+        """Return what was found, once :meth:`run` has passed."""
+        covered = self._has_data_crc or (
+            not self._chunks_without_crc and all(segment.is_chunk for segment in self.segments)
+        )
+        return BagReport(
+            path=path,
+            profile=self._profile,
+            library=self._library,
+            topics=self._topics(path),
+            message_count=self._total.count,
+            start_time=self._total.start,
+            end_time=self._total.end,
+            has_crc=covered,
+            has_index=bool(self._chunks) and self._indexed == self._chunks.keys(),
+            has_summary=self._has_summary,
+            warnings=tuple(self._all_warnings(covered)),
+            out_of_order=self._out_of_order,
+            metadata=self._metadata,
+        )
+
+    def _all_warnings(self, covered: bool) -> Iterator[str]:
+        if not covered:
+            yield (
+                f"{self._chunks_without_crc} of {len(self._chunks)} chunks have no CRC: a changed "
+                "value would go unseen"
+                if self._chunks
+                else "the messages have no CRC: a changed value would go unseen"
+            )
+        if not self._has_data_crc:
+            yield "the data section has no CRC of its own: metadata and record headers are unproven"
+        yield from self._warnings
+        if not self._has_summary:
+            yield "there is no summary: read by a scan, the message count is unproven"
+        elif self._statistics is None:
+            yield "the summary has no statistics: the message count is unproven"
+        if self._out_of_order:
+            yield f"{self._out_of_order} messages are out of order by log time"
+        if self._unknown:
+            yield f"{self._unknown} records of unknown kinds were passed over"
+
+    def _topics(self, path: Path) -> dict[str, TopicInfo]:
+        topics: dict[str, TopicInfo] = {}
+        for number, channel in self.records.channels.items():
+            kind = self.records.types[number]
+            schema = self.records.schemas.get(channel.schema_id)
+            span = self._spans.get(number, _Span())
+            definition = schema.data.decode(errors="replace") if schema else ""
+            qos = channel.metadata.get("offered_qos_profiles", "")
+            info = TopicInfo(
+                type=kind,
+                count=span.count,
+                start=span.start,
+                end=span.end,
+                offered_qos=qos,
+                definition=definition,
+                encoding=channel.encoding,
+                schema_encoding=schema.encoding if schema else "",
+            )
+            known = topics.get(channel.topic)
+            if known and known.type != kind:
+                raise BagError(
+                    f"topic {channel.topic} has two types, {known.type} and {kind}",
+                    path=path,
+                    reason="type",
+                )
+            topics[channel.topic] = _join(known, info) if known else info
+        return dict(sorted(topics.items()))
+
+
+def _join(one: TopicInfo, other: TopicInfo) -> TopicInfo:
+    """Join two channels of one topic, which is how two publishers are recorded."""
+    if not (one.count and other.count):
+        return one if one.count or not other.count else other
+    start, end = min(one.start, other.start), max(one.end, other.end)
+    return replace(one, count=one.count + other.count, start=start, end=end)

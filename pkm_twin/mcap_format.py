@@ -1,0 +1,446 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The records of an MCAP file, read with every length and CRC checked. Imports no ROS."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import os
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from pkm_twin.errors import BagError
+
+MAX_RECORD_BYTES = 256 * 1024**2
+"""Largest record that is loaded; attachments and unknown records are passed through in blocks."""
+MAX_CHUNK_BYTES = 64 * 1024**2
+"""Largest unpacked chunk."""
+MAX_RATIO = 1000
+"""Largest ratio of unpacked to packed size, for chunks that unpack to more than FREE_BYTES."""
+FREE_BYTES = 8 * 1024**2
+"""A chunk up to this size may have any ratio: a black image packs ten thousand to one."""
+MAGIC = b"\x89MCAP0\r\n"
+_BLOCK_BYTES = 1024**2
+METADATA_CRC = "crc32"
+
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
+ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = range(9, 14)
+SUMMARY_OFFSET, DATA_END = 14, 15
+FIRST_UNKNOWN = 16
+_NAMES = (
+    "zero", "header", "footer", "schema", "channel", "message", "chunk", "message index",
+    "chunk index", "attachment", "attachment index", "statistics", "metadata", "metadata index",
+    "summary offset", "data end",
+)  # fmt: skip
+
+FRAME = struct.Struct("<BQ")
+MESSAGE_HEAD = struct.Struct("<HIQQ")
+_CHUNK_HEAD = struct.Struct("<QQQI")
+INDEX_ENTRY = struct.Struct("<QQ")
+FOOTER_BODY = struct.Struct("<QQI")
+CRC = struct.Struct("<I")
+
+_FOREIGN = {
+    b"SQLite format 3\x00": "an SQLite file (a rosbag2 .db3 bag?), not MCAP; "
+    "`ros2 bag convert` makes an MCAP bag of it",
+    b"#ROSBAG V2.0": "a ROS 1 bag, not MCAP",
+    b"\x28\xb5\x2f\xfd": "a zstd-compressed file; unpack it first",
+    b"\x1f\x8b": "a gzip-compressed file; unpack it first",
+}
+
+
+class FlawError(Exception):
+    """What is wrong and where, before the path is known; never leaves this module."""
+
+    def __init__(self, text: str, offset: int | None, reason: str = "damaged") -> None:
+        super().__init__(text)
+        self.text = text
+        self.offset = offset
+        self.reason = reason
+
+
+class Tape:
+    """A file read forward, with its position and the CRC of all that was read."""
+
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        self._file = file
+        self.size = size
+        self.position = 0
+        self.crc = 0
+
+    def seek(self, position: int) -> None:
+        """Go to a byte; the CRC is then no longer that of the file from its start."""
+        self._file.seek(position)
+        self.position = position
+
+    def read(self, count: int, what: str) -> bytes:
+        """Read exactly ``count`` bytes."""
+        left = self.size - self.position
+        if count > left:
+            raise FlawError(
+                f"the {what} needs {count} bytes, the file has {left} left: it is cut short",
+                self.position,
+                "truncated",
+            )
+        data = self._file.read(count)
+        if len(data) != count:
+            raise FlawError("the file shrank while it was read", self.position, "truncated")
+        self.position += count
+        self.crc = zlib.crc32(data, self.crc)
+        return data
+
+    def frame(self) -> tuple[int, int]:
+        """Read a record's opcode and length; the length is known to lie within the file."""
+        at = self.position
+        opcode, length = FRAME.unpack(self.read(FRAME.size, "next record"))
+        if opcode == 0:
+            raise FlawError("a record has the opcode 0", at)
+        if length > self.size - self.position:
+            raise FlawError(
+                f"the {opcode_name(opcode)} record has {length} bytes, the file has "
+                f"{self.size - self.position} left: it is cut short",
+                at,
+                "truncated",
+            )
+        return opcode, length
+
+    def body(self, opcode: int, length: int) -> bytes:
+        """Read a record's content."""
+        if length > MAX_RECORD_BYTES:
+            raise FlawError(
+                f"the {opcode_name(opcode)} record has {length} bytes; at most {MAX_RECORD_BYTES}",
+                self.position,
+                "size_cap",
+            )
+        return self.read(length, f"{opcode_name(opcode)} record")
+
+    def skip(self, length: int) -> int:
+        """Pass over ``length`` bytes in blocks; return their CRC."""
+        crc = 0
+        while length:
+            block = self.read(min(length, _BLOCK_BYTES), "record")
+            crc = zlib.crc32(block, crc)
+            length -= len(block)
+        return crc
+
+
+@contextmanager
+def open_tape(path: Path) -> Iterator[Tape]:
+    """Open a file for reading; whatever the system refuses becomes a BagError."""
+    try:
+        if path.is_dir():
+            inside = ", ".join(sorted(p.name for p in path.glob("*.mcap"))) or "no .mcap file"
+            raise BagError(f"is a folder; name a file in it: {inside}", path=path, reason="folder")
+        with path.open("rb") as file:
+            yield Tape(file, os.fstat(file.fileno()).st_size)
+    except FileNotFoundError as error:
+        raise BagError("does not exist", path=path, reason="not_found") from error
+    except OSError as error:
+        raise BagError(f"cannot be read: {error.strerror}", path=path, reason="io") from error
+
+
+def opcode_name(opcode: int) -> str:
+    """Return the name of a kind of record, for error texts."""
+    return _NAMES[opcode] if opcode < FIRST_UNKNOWN else f"unknown (0x{opcode:02x})"
+
+
+def utf8(raw: bytes, what: str, offset: int | None) -> str:
+    """Decode a text of the record ``what``."""
+    try:
+        return raw.decode()
+    except UnicodeDecodeError:
+        raise FlawError(f"a text of the {what} record is not UTF-8", offset) from None
+
+
+class Fields:
+    """The fields of one record, read in turn; nothing is read past its end."""
+
+    def __init__(self, body: bytes, what: str, offset: int) -> None:
+        self._body = body
+        self._what = what
+        self._offset = offset
+        self._position = 0
+
+    def take(self, count: int) -> bytes:
+        """Read ``count`` bytes."""
+        start = self._position
+        if count > len(self._body) - start:
+            raise FlawError(
+                f"a field of the {self._what} record reaches past its end", self._offset
+            )
+        self._position += count
+        return self._body[start : self._position]
+
+    def numbers(self, layout: str) -> tuple[int, ...]:
+        """Read little-endian numbers, ``layout`` as in struct."""
+        return struct.unpack(f"<{layout}", self.take(struct.calcsize(f"<{layout}")))
+
+    def number(self, code: str) -> int:
+        """Read one number, ``code`` as in struct."""
+        return self.numbers(code)[0]
+
+    def blob(self, code: str) -> bytes:
+        """Read a length of type ``code`` and as many bytes."""
+        return self.take(self.number(code))
+
+    def text(self) -> str:
+        """Read a length-prefixed text."""
+        return utf8(self.blob("I"), self._what, self._offset)
+
+    def part(self) -> Fields:
+        """Read a length-prefixed block as fields of its own."""
+        return Fields(self.blob("I"), self._what, self._offset)
+
+    def texts(self) -> dict[str, str]:
+        """Read a map of texts; a key given twice is an error."""
+        part = self.part()
+        result: dict[str, str] = {}
+        while part.left:
+            key = part.text()
+            if key in result:
+                raise FlawError(f"the {self._what} record has the key {key!r} twice", self._offset)
+            result[key] = part.text()
+        return result
+
+    @property
+    def left(self) -> int:
+        """How many bytes have not been read."""
+        return len(self._body) - self._position
+
+    def done(self) -> None:
+        """Refuse bytes after the last field."""
+        if self.left:
+            raise FlawError(f"the {self._what} record has {self.left} bytes too many", self._offset)
+
+
+def walk(data: bytes, offset: int) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, start and end of each record in unpacked data of the chunk at ``offset``."""
+    position = 0
+    size = len(data)
+    while position < size:
+        if size - position < FRAME.size:
+            raise FlawError(f"{size - position} stray bytes end the chunk", offset)
+        opcode, length = FRAME.unpack_from(data, position)
+        start = position + FRAME.size
+        if opcode == 0 or length > size - start:
+            raise FlawError(
+                f"record 0x{opcode:02x} with {length} bytes at {position} of the unpacked chunk "
+                f"does not fit its {size} bytes",
+                offset,
+            )
+        position = start + length
+        yield opcode, start, position
+
+
+def message_head(data: bytes, start: int, end: int, offset: int) -> tuple[int, int, int, int]:
+    """Return channel, sequence, log time and publish time of the message record."""
+    if end - start < MESSAGE_HEAD.size:
+        raise FlawError(
+            f"a message record has {end - start} bytes; at least {MESSAGE_HEAD.size}", offset
+        )
+    number, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(data, start)
+    return number, sequence, log_time, publish_time
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """What a type is called, and its definition in the language ``encoding``."""
+
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One publisher's topic, its type by number, and how its messages are encoded."""
+
+    schema_id: int
+    topic: str
+    encoding: str
+    metadata: Mapping[str, str]
+
+
+class Records:
+    """Schemas and channels seen so far; one number may not mean two things."""
+
+    def __init__(self) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.types: dict[int, str] = {}
+
+    def add(self, opcode: int, body: bytes, offset: int) -> None:
+        """Take in a schema or channel record."""
+        fields = Fields(body, opcode_name(opcode), offset)
+        number = fields.number("H")
+        if opcode == SCHEMA:
+            self._add_schema(number, fields, offset)
+        else:
+            self._add_channel(number, fields, offset)
+
+    def _add_schema(self, number: int, fields: Fields, offset: int) -> None:
+        schema = Schema(fields.text(), fields.text(), fields.blob("I"))
+        fields.done()
+        if number == 0:
+            raise FlawError("a schema has the number 0", offset)
+        if self.schemas.setdefault(number, schema) != schema:
+            raise FlawError(f"schema {number} is defined twice, differently", offset)
+
+    def _add_channel(self, number: int, fields: Fields, offset: int) -> None:
+        channel = Channel(fields.number("H"), fields.text(), fields.text(), fields.texts())
+        fields.done()
+        schema = self.schemas.get(channel.schema_id)
+        if channel.schema_id and schema is None:
+            raise FlawError(f"channel {number} has the unknown schema {channel.schema_id}", offset)
+        if self.channels.setdefault(number, channel) != channel:
+            raise FlawError(f"channel {number} is defined twice, differently", offset)
+        self.types[number] = schema.name if schema else ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """A chunk record's fields, its data unpacked and checked."""
+
+    start: int
+    end: int
+    compression: str
+    packed_size: int
+    data: bytes
+    has_crc: bool
+
+
+def read_chunk(body: bytes, offset: int) -> _Chunk:
+    """Unpack the chunk record at ``offset`` and compare its CRC, if it has one."""
+    fields = Fields(body, "chunk", offset)
+    start, end, size, crc = _CHUNK_HEAD.unpack(fields.take(_CHUNK_HEAD.size))
+    compression = fields.text()
+    packed = fields.blob("Q")
+    fields.done()
+    data = _unpack(compression, packed, size, offset)
+    if crc and zlib.crc32(data) != crc:
+        raise FlawError(
+            f"the chunk's CRC is {zlib.crc32(data):08x}; the file says {crc:08x}", offset, "crc"
+        )
+    return _Chunk(start, end, compression, len(packed), data, crc != 0)
+
+
+def _unpack(compression: str, packed: bytes, size: int, offset: int) -> bytes:
+    """Unpack a chunk to exactly ``size`` bytes, having checked the size first."""
+    if compression not in ("", "zstd", "lz4"):
+        raise FlawError(
+            f"unknown compression {compression!r}; known: zstd, lz4, none", offset, "compression"
+        )
+    if size > MAX_CHUNK_BYTES:
+        raise FlawError(
+            f"the chunk unpacks to {size} bytes; at most {MAX_CHUNK_BYTES}", offset, "size_cap"
+        )
+    if size > FREE_BYTES and size > MAX_RATIO * len(packed):
+        raise FlawError(
+            f"the chunk unpacks from {len(packed)} to {size} bytes; at most {MAX_RATIO} to 1",
+            offset,
+            "size_cap",
+        )
+    data = packed
+    if compression:
+        # One byte more than declared is let out, to tell a longer content from an exact one.
+        data = _decompress(compression, packed, size + 1, offset)
+    if len(data) != size:
+        more = "more" if len(data) > size else str(len(data))
+        raise FlawError(f"the chunk unpacks to {more} bytes; the file says {size}", offset)
+    return data
+
+
+def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> bytes:
+    """Unpack at most ``limit`` bytes."""
+    name = "zstandard" if compression == "zstd" else "lz4.frame"
+    try:
+        library: Any = importlib.import_module(name)
+    except ImportError:
+        text = f"the chunk is packed with {compression}; its Python package {name} is missing"
+        raise FlawError(text, offset, "compression") from None
+    failures = (library.ZstdError,) if compression == "zstd" else (RuntimeError, EOFError)
+    try:
+        if compression == "lz4":
+            unpacked: bytes = library.LZ4FrameDecompressor().decompress(packed, max_length=limit)
+            return unpacked
+        window = library.ZstdDecompressor(max_window_size=2 * MAX_CHUNK_BYTES)
+        with window.stream_reader(io.BytesIO(packed)) as reader:
+            return bytes(reader.read(limit))
+    except failures as error:
+        raise FlawError(f"the chunk does not unpack: {error}", offset) from None
+
+
+def metadata(body: bytes, offset: int) -> tuple[str, dict[str, str], bool]:
+    """Return a metadata record's name and entries, and whether a CRC of its own confirms them."""
+    fields = Fields(body, "metadata", offset)
+    name, entries = fields.text(), fields.texts()
+    fields.done()
+    crc = entries.pop(METADATA_CRC, None)
+    if crc is not None and crc != metadata_crc(name, entries):
+        raise FlawError(f"metadata {name!r} does not match its CRC", offset, "crc")
+    return name, entries, crc is not None
+
+
+def metadata_crc(name: str, entries: Mapping[str, str]) -> str:
+    """CRC over a metadata record; MCAP has none there, and recovery needs one."""
+    texts = [name, *(text for item in sorted(entries.items()) for text in item)]
+    packed = b"".join(struct.pack("<I", len(text.encode())) + text.encode() for text in texts)
+    return f"{zlib.crc32(packed):08x}"
+
+
+def read_magic(tape: Tape) -> None:
+    """Read the opening mark; say in plain words what a file without it is."""
+    if tape.size == 0:
+        raise FlawError("the file is empty", 0, "empty")
+    head = tape.read(min(tape.size, 16), "opening mark")
+    for magic, text in _FOREIGN.items():
+        if head.startswith(magic):
+            raise FlawError(f"this is {text}", 0, "not_mcap")
+    if tape.size < len(MAGIC) and MAGIC.startswith(head):
+        raise FlawError(f"the file ends after {tape.size} bytes: it is cut short", 0, "truncated")
+    if not head.startswith(MAGIC):
+        raise FlawError(
+            "this is not an MCAP file: it does not start with the MCAP mark", 0, "not_mcap"
+        )
+    tape.seek(len(MAGIC))
+    tape.crc = zlib.crc32(MAGIC)
+    if tape.size == len(MAGIC):
+        raise FlawError("the file holds the MCAP mark and nothing else", 0, "truncated")
+
+
+def read_attachment(tape: Tape, at: int, length: int) -> tuple[bytes, tuple[object, ...]]:
+    """Pass over an attachment in blocks; return its head and what its index must say."""
+    end = tape.position + length
+    if length < 16 + 4 + 4 + 8 + CRC.size:
+        raise FlawError(f"the attachment record has {length} bytes, too few for its fields", at)
+    head = tape.read(16, "attachment")
+    texts = []
+    for _ in range(2):
+        prefix = tape.read(4, "attachment")
+        (count,) = struct.unpack("<I", prefix)
+        if count > end - tape.position:
+            raise FlawError("a field of the attachment record reaches past its end", at)
+        texts.append(tape.body(ATTACHMENT, count))
+        head += prefix + texts[-1]
+    prefix = tape.read(8, "attachment")
+    (size,) = struct.unpack("<Q", prefix)
+    if size != end - tape.position - CRC.size:
+        raise FlawError(f"the attachment says {size} bytes of data; its record differs", at)
+    head += prefix
+    log_time, create_time = struct.unpack("<QQ", head[:16])
+    crc = zlib.crc32(head)
+    left = size
+    while left:
+        block = tape.read(min(left, _BLOCK_BYTES), "attachment")
+        crc = zlib.crc32(block, crc)
+        left -= len(block)
+    (stated,) = CRC.unpack(tape.read(CRC.size, "attachment"))
+    if stated and stated != crc:
+        raise FlawError(f"the attachment's CRC is {crc:08x}; the file says {stated:08x}", at, "crc")
+    name, media = (utf8(text, "attachment", at) for text in texts)
+    return head, (at, FRAME.size + length, log_time, create_time, size, name, media)

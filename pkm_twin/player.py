@@ -1,0 +1,363 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replays a bag onto ROS topics, for machines without rosbag2.
+
+ROS is imported inside the functions, so that a command line can show its help without it.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pkm_twin.bags import Bag, TopicInfo, open_bag
+from pkm_twin.cdr import message_class, message_definition, parse_definition
+from pkm_twin.errors import BagError, ParameterError, PkmTwinError
+
+CLOCK_TOPIC = "/clock"
+# Fewer would let a burst in the bag overwrite messages before they are sent.
+_MIN_DEPTH = 100
+# How long the last messages may take to reach reliable subscribers, s.
+_DELIVERY_TIME = 1.0
+# A wait of the operating system overshoots by less than this, s; the rest is short sleeps.
+_COARSE = 0.002
+_FINE = 0.0001
+
+_RELIABILITIES = {"1": "reliable", "2": "best_effort"}
+_DURABILITIES = {"1": "transient_local", "2": "volatile"}
+
+
+@dataclass(frozen=True)
+class PlayResult:
+    """What was played. ``duration`` and ``late_max`` (the worst delay of a message) are in s."""
+
+    messages: int
+    loops: int
+    """Passes through the bag that were completed."""
+    duration: float
+    late_max: float
+    interrupted: bool
+
+
+def play(
+    path: str | Path,
+    *,
+    rate: float = 1.0,
+    loop: bool = False,
+    clock: float | None = None,
+    topics: Iterable[str] | None = None,
+    remap: Mapping[str, str] | None = None,
+    wait_for_subscribers: float = 0.0,
+    progress: bool = True,
+) -> PlayResult:
+    """Publish a bag's messages in log-time order, as far apart as they were recorded.
+
+    The whole bag is checked first; of a damaged one nothing is published. The schedule is absolute,
+    on the monotonic clock: delays do not add up. Messages go out as the recorded bytes, with the
+    recorded QoS. SIGINT and SIGTERM end the replay, which then returns as usual.
+
+    :param rate: bag seconds per second.
+    :param loop: start again at the end, until interrupted. Bag time jumps back at the seam.
+    :param clock: publish bag time (log time) on /clock this many times per second of wall time, and
+        once before the first message; None or 0 for no clock. A recorded /clock is then left out.
+    :param topics: what to play; by default everything.
+    :param remap: recorded topic to topic to publish on.
+    :param wait_for_subscribers: wait up to this long (s) until each topic has a subscriber; those
+        still missing are named on standard error, and the replay starts.
+    :param progress: draw a progress bar on standard error.
+    :raises BagError: the bag is damaged, lacks a topic, or holds a type that is not installed or
+        differs from the installed one.
+    :raises ParameterError: a number is out of range.
+    """
+    _require("rate", rate, rate > 0, "a finite number above 0")
+    _require("clock", clock or 0.0, (clock or 0.0) >= 0, "0 or more, Hz")
+    _require(
+        "wait_for_subscribers", wait_for_subscribers, wait_for_subscribers >= 0, "0 or more, s"
+    )
+    bag = open_bag(path)
+    names = _selected(bag, topics, bool(clock))
+    targets = _targets(bag, names, remap or {})
+    stop = threading.Event()
+    with _signals(stop), _publishers(bag, targets, bool(clock)) as (publishers, clock_publisher):
+        _await_subscribers(publishers, wait_for_subscribers, stop)
+        replay = _Replay(bag, publishers, rate, stop)
+        if clock and clock_publisher:
+            replay.add_clock(clock_publisher, clock)
+        with _bar(bag, progress) as update:
+            result = replay.run(loop=loop, update=update)
+        if not result.interrupted:
+            _await_delivery(publishers)
+    return result
+
+
+def _require(name: str, value: float, holds: bool, bound: str) -> None:
+    if not (math.isfinite(value) and holds):
+        raise ParameterError(name, value, bound)
+
+
+def _selected(bag: Bag, topics: Iterable[str] | None, own_clock: bool) -> list[str]:
+    """Return the topics to play, checked to be playable here."""
+    known = bag.report.topics
+    names = list(known) if topics is None else list(dict.fromkeys(topics))
+    for name in names:
+        if name not in known:
+            raise BagError(
+                f"no topic {name}; topics: {', '.join(known)}",
+                path=bag.report.path,
+                reason="no_topic",
+            )
+    names = [name for name in names if not (own_clock and name == CLOCK_TOPIC)]
+    for name in names:
+        _check_type(bag, name, known[name])
+    return names
+
+
+def _check_type(bag: Bag, name: str, info: TopicInfo) -> None:
+    """Refuse a type whose recorded definition is not the installed one.
+
+    The recorded bytes are published as they are: subscribers would misread them without notice.
+    """
+    if info.encoding != "cdr" or info.schema_encoding != "ros2msg":
+        raise BagError(
+            f"topic {name}, type {info.type}, is encoded as {info.encoding!r} by "
+            f"{info.schema_encoding!r}; playable are 'cdr' by 'ros2msg'",
+            path=bag.report.path,
+            reason="encoding",
+        )
+    recorded = parse_definition(info.type, info.definition)
+    installed = parse_definition(info.type, message_definition(info.type))
+    for held, fields in installed.items():
+        if recorded.get(held) != fields:
+            raise BagError(
+                f"topic {name}: {held} was recorded with other fields than are installed here",
+                path=bag.report.path,
+                reason="type",
+            )
+
+
+def _targets(bag: Bag, names: list[str], remap: Mapping[str, str]) -> dict[str, str]:
+    unknown = sorted(remap.keys() - bag.report.topics.keys())
+    if unknown:
+        raise BagError(
+            f"cannot remap {', '.join(unknown)}; topics: {', '.join(bag.report.topics)}",
+            path=bag.report.path,
+            reason="no_topic",
+        )
+    return {name: remap.get(name, name) for name in names}
+
+
+@contextmanager
+def _signals(stop: threading.Event) -> Iterator[None]:
+    """Let SIGINT and SIGTERM set ``stop``; only the main thread can have it so."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _publishers(
+    bag: Bag, targets: Mapping[str, str], with_clock: bool
+) -> Iterator[tuple[dict[str, Any], Any]]:
+    """Yield a publisher for each recorded topic, and one for the clock or None."""
+    try:
+        import rclpy
+        from rclpy.node import Node
+        from rclpy.qos import QoSProfile
+        from rclpy.signals import SignalHandlerOptions
+    except ImportError as error:
+        raise PkmTwinError(
+            f"playing needs ROS 2: source its setup, or pip install pkm_twin[jazzy] ({error})"
+        ) from error
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = None
+    try:
+        node = Node("pkm_twin_player", context=context, start_parameter_services=False)
+        publishers = {
+            name: node.create_publisher(
+                message_class(bag.report.topics[name].type),
+                target,
+                _qos(bag.report.topics[name].offered_qos),
+            )
+            for name, target in targets.items()
+        }
+        clock = None
+        if with_clock:
+            kind = message_class("rosgraph_msgs/msg/Clock")
+            clock = node.create_publisher(kind, CLOCK_TOPIC, QoSProfile(depth=10))
+        yield publishers, clock
+    finally:
+        if node:
+            node.destroy_node()
+        context.try_shutdown()
+
+
+def _qos(text: str) -> Any:
+    """Return the publisher's QoS of a recorded offer; reliable and volatile where there is none.
+
+    rosbag2 writes names since Jazzy, numbers before. Deadline, lifespan and liveliness are not
+    taken over: a replay does not keep such promises. Of several publishers the first counts.
+    """
+    import yaml
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    try:
+        offers = yaml.safe_load(text)
+        offer = offers[0] if isinstance(offers, list) and isinstance(offers[0], dict) else {}
+        depth = int(offer.get("depth", 0))
+    except (yaml.YAMLError, IndexError, ValueError, TypeError):
+        offer, depth = {}, 0
+    reliability = str(offer.get("reliability", "reliable"))
+    durability = str(offer.get("durability", "volatile"))
+    best_effort = _RELIABILITIES.get(reliability, reliability) == "best_effort"
+    latched = _DURABILITIES.get(durability, durability) == "transient_local"
+    return QoSProfile(
+        depth=max(depth, 1 if latched else _MIN_DEPTH),
+        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _await_subscribers(
+    publishers: Mapping[str, Any], seconds: float, stop: threading.Event
+) -> None:
+    give_up = time.monotonic() + seconds
+    missing = list(publishers) if seconds else []
+    while missing and not stop.is_set():
+        missing = [name for name in missing if not publishers[name].get_subscription_count()]
+        if missing and time.monotonic() >= give_up:
+            topics = ", ".join(publishers[name].topic_name for name in missing)
+            print(f"no subscriber after {seconds:g} s: {topics}", file=sys.stderr)
+            return
+        stop.wait(0.02 if missing else 0.0)
+
+
+def _await_delivery(publishers: Mapping[str, Any]) -> None:
+    """Give reliable subscribers time to get the last messages before the publishers are gone."""
+    from rclpy.duration import Duration
+
+    give_up = time.monotonic() + _DELIVERY_TIME
+    for publisher in publishers.values():
+        left = max(0.0, give_up - time.monotonic())
+        publisher.wait_for_all_acked(Duration(seconds=left))
+
+
+@contextmanager
+def _bar(bag: Bag, shown: bool) -> Iterator[Callable[[float, int], None]]:
+    """Yield a function that takes bag time since the start (s) and messages so far."""
+    if not shown:
+        yield lambda _seconds, _messages: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    total = bag.report.duration
+    columns = (
+        TextColumn(bag.report.path.name),
+        BarColumn(),
+        TextColumn(
+            "{task.completed:.1f} of {task.total:.1f} s, {task.fields[speed]:.0f} messages/s"
+        ),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as drawing:
+        task = drawing.add_task("", total=total, speed=0.0)
+        begin = time.monotonic()
+
+        def update(seconds: float, messages: int) -> None:
+            speed = messages / max(time.monotonic() - begin, 1e-3)
+            drawing.update(task, completed=min(seconds, total), speed=speed)
+
+        yield update
+
+
+class _Replay:
+    """Passes through a bag on an absolute schedule."""
+
+    def __init__(
+        self, bag: Bag, publishers: Mapping[str, Any], rate: float, stop: threading.Event
+    ) -> None:
+        self._bag = bag
+        self._publishers = publishers
+        self._rate = rate
+        self._stop = stop
+        self._clock: Callable[[int], None] | None = None
+        self._clock_period = math.inf
+        self._messages = 0
+        self._late = 0.0
+
+    def add_clock(self, publisher: Any, frequency: float) -> None:
+        """Publish bag time ``frequency`` times a second of wall time."""
+        kind = publisher.msg_type
+
+        def publish(now: int) -> None:
+            message = kind()
+            message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
+            publisher.publish(message)
+
+        self._clock = publish
+        self._clock_period = 1 / frequency
+
+    def run(self, *, loop: bool, update: Callable[[float, int], None]) -> PlayResult:
+        begin = time.monotonic()
+        loops = 0
+        while not self._stop.is_set():
+            self._pass(update)
+            loops += not self._stop.is_set()
+            if not loop or not self._publishers:
+                break
+        return PlayResult(
+            messages=self._messages,
+            loops=loops,
+            duration=time.monotonic() - begin,
+            late_max=self._late,
+            interrupted=self._stop.is_set(),
+        )
+
+    def _pass(self, update: Callable[[float, int], None]) -> None:
+        """Play the bag once; ``begin`` is the monotonic time of its first message."""
+        first = self._bag.report.start_time
+        begin = time.monotonic()
+        tick = begin
+        drawn = -math.inf
+        for message in self._bag.messages(self._publishers):
+            due = begin + (message.log_time - first) * 1e-9 / self._rate
+            while self._clock and tick <= due:
+                if not self._sleep_until(tick):
+                    return
+                self._clock(first + round((tick - begin) * self._rate * 1e9))
+                tick += self._clock_period
+            if not self._sleep_until(due):
+                return
+            self._publishers[message.topic].publish(message.data)
+            now = time.monotonic()
+            self._messages += 1
+            self._late = max(self._late, now - due)
+            if now - drawn > 0.1:
+                drawn = now
+                update((message.log_time - first) * 1e-9, self._messages)
+        update(self._bag.report.duration, self._messages)
+
+    def _sleep_until(self, due: float) -> bool:
+        """Wait; return whether to go on."""
+        while (left := due - time.monotonic()) > 0:
+            if self._stop.is_set():
+                return False
+            if left > _COARSE:
+                self._stop.wait(left - _COARSE / 2)
+            else:
+                time.sleep(min(left, _FINE))
+        return not self._stop.is_set()

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torques, their terms and the joint reactions of a recorded or tabulated motion, as a table."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics import dynamics_terms, inverse_dynamics, reactions
+from pkm_twin import load
+from pkm_twin.check import motion
+from pkm_twin.errors import ParameterError
+from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.recorded import read_recording
+
+Array = NDArray[np.float64]
+BLOCK = 4096
+"""Samples computed at a time, so that memory stays flat."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion of one robot: time (n,), s; q, qd, qdd (n, 3); wrench (n, 6), fixed axes."""
+
+    robot: Robot
+    time: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    wrench: Array
+    measured: Array | None = None
+
+
+def motion_of_bag(path: Path, robot: str | None) -> Motion:
+    """The motion that a bag recorded, accelerations by the node's differentiator."""
+    r = read_recording(path, robot)
+    qd, qdd, used = motion(r)
+    wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
+    return Motion(
+        r.robot,
+        r.time[used],
+        r.q[used],
+        qd[used],
+        qdd[used],
+        wrench[used],
+        None if r.effort is None else r.effort[used],
+    )
+
+
+def motion_of_csv(path: Path, robot: str) -> Motion:
+    """A motion from a CSV with a head line.
+
+    Columns, in any order: ``time``; for every joint NAME ``NAME.position``, and optionally
+    ``NAME.velocity`` and ``NAME.acceleration`` (all of them or none); optionally the wrench
+    ``fx fy fz mx my mz``. What is absent is differentiated by second-order differences.
+
+    :raises ParameterError: a column is missing, or a value is no finite number.
+    """
+    machine = load(robot)
+    columns = _read_columns(path)
+
+    def stack(what: str) -> Array | None:
+        names = [f"{joint}.{what}" for joint in machine.joint_names]
+        present = [name in columns for name in names]
+        if not any(present):
+            return None
+        missing = [n for n, there in zip(names, present, strict=True) if not there]
+        if missing:
+            raise ParameterError(str(path), None, f"a column {missing[0]!r} beside the others")
+        return np.stack([columns[name] for name in names], -1)
+
+    q = stack("position")
+    if q is None or "time" not in columns:
+        needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
+        raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
+    time = columns["time"]
+    if not (np.diff(time) > 0).all():
+        raise ParameterError(f"{path}: time", "not rising", "strictly rising times")
+    qd, qdd = stack("velocity"), stack("acceleration")
+    if (qd is None or qdd is None) and len(time) < 3:
+        raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
+    rates = np.gradient(q, time, axis=0, edge_order=2) if qd is None else qd
+    wrench = [columns.get(name, np.zeros(len(time))) for name in ("fx", "fy", "fz")]
+    wrench += [columns.get(name, np.zeros(len(time))) for name in ("mx", "my", "mz")]
+    return Motion(
+        machine,
+        time,
+        q,
+        rates,
+        np.gradient(rates, time, axis=0, edge_order=2) if qdd is None else qdd,
+        np.stack(wrench, -1),
+    )
+
+
+def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str, Array]:
+    """Named columns: time, positions, torques, terms, and every joint's reaction.
+
+    A reaction that rigid bodies do not determine is left empty (NaN) in the table.
+    """
+    columns: dict[str, list[Array]] = {}
+
+    def put(name: str, values: Array) -> None:
+        columns.setdefault(name, []).append(values)
+
+    for begin in range(0, len(m.time), BLOCK):
+        part = slice(begin, begin + BLOCK)
+        state = (m.robot, m.q[part], m.qd[part], m.qdd[part], m.wrench[part])
+        tau, terms, react = inverse_dynamics(*state), dynamics_terms(*state), reactions(*state)
+        put("time", m.time[part])
+        for i, joint in enumerate(m.robot.joint_names):
+            put(f"{joint}.position", m.q[part][:, i])
+            put(f"{joint}.velocity", m.qd[part][:, i])
+            put(f"{joint}.acceleration", m.qdd[part][:, i])
+            put(f"{joint}.effort", tau[:, i])
+            if m.measured is not None:
+                put(f"{joint}.measured", m.measured[part][:, i])
+            for field in fields(terms):
+                put(f"{joint}.{field.name}", getattr(terms, field.name)[:, i])
+        for k, name in enumerate(react.names):
+            for i, axis in enumerate(("fx", "fy", "fz", "mx", "my", "mz")):
+                put(f"{name}.{axis}", react.wrenches[:, k, i])
+        if progress is not None:
+            progress(min(begin + BLOCK, len(m.time)))
+    return {name: np.concatenate(parts) for name, parts in columns.items()}
+
+
+def write_table(columns: dict[str, Array], path: Path) -> None:
+    """Write CSV, or Parquet where the name ends so (needs pyarrow).
+
+    :raises ParameterError: another ending, or pyarrow is missing.
+    """
+    if path.suffix == ".csv":
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            for row in zip(*(values.tolist() for values in columns.values()), strict=True):
+                # An undetermined reaction is an empty cell; repr keeps every digit.
+                writer.writerow(["" if value != value else repr(value) for value in row])
+    elif path.suffix == ".parquet":
+        try:
+            import pyarrow
+            from pyarrow import parquet
+        except ImportError as error:
+            raise ParameterError("out", str(path), "CSV; Parquet needs pyarrow") from error
+        parquet.write_table(pyarrow.table(columns), path)
+    else:
+        raise ParameterError("out", str(path), "a name that ends in .csv or .parquet")
+
+
+def _read_columns(path: Path) -> dict[str, Array]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ParameterError(str(path), str(error), "a readable CSV file") from None
+    if len(rows) < 2:
+        raise ParameterError(str(path), f"{len(rows)} lines", "a head line and rows")
+    head = [name.strip() for name in rows[0]]
+    if len(set(head)) != len(head):
+        raise ParameterError(f"{path}: head line", ", ".join(head), "different names")
+    data = []
+    for number, row in enumerate(rows[1:], 2):
+        if len(row) != len(head):
+            raise ParameterError(f"{path}: line {number}", len(row), f"{len(head)} values")
+        try:
+            values = [float(cell) for cell in row]
+        except ValueError as error:
+            raise ParameterError(f"{path}: line {number}", str(error), "numbers") from None
+        if not np.isfinite(values).all():
+            raise ParameterError(f"{path}: line {number}", row, "finite numbers")
+        data.append(values)
+    return dict(zip(head, np.array(data).T, strict=True))

@@ -1,0 +1,473 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of compliance and strain energy, over random machines, poses and loads."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pkm_twin import load, parameters
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.mechanisms import config_folder
+from pkm_twin.mechanisms.upr_rpu import UprRpu
+from stiffness_monitor import compliance, reachable, stiffness, strain_energy
+from stiffness_monitor.compliance import kernels
+from stiffness_monitor.workspace import regular_workspace
+
+ROBOT = load("upr_rpu")
+FILE = parameters.read_yaml(config_folder() / "upr_rpu.yaml")
+HOME = np.array([-0.6, 0.0, 0.0])
+SWAPPED = [3, 4, 5, 0, 1, 2, 6, 7, 8]
+
+
+def random_machine(rng):
+    """Another size, other bars, other joints: compliances over two decades."""
+
+    def joint(free):
+        values = 10.0 ** rng.uniform([-10.5] * 3 + [-11.5] * 3, [-8.5] * 3 + [-9.5] * 3)
+        return [math.inf if i in free else v for i, v in enumerate(values.tolist())]
+
+    return parameters.build(
+        UprRpu,
+        {
+            "mechanism": "upr_rpu",
+            "geometry": {
+                "base_radius": float(rng.uniform(0.2, 0.6)),
+                "platform_radius": float(rng.uniform(0.1, 0.5)),
+            },
+            "members": {
+                "youngs_modulus": float(rng.uniform(50e9, 250e9)),
+                "shear_modulus": float(rng.uniform(20e9, 90e9)),
+                "diameter": rng.uniform(0.02, 0.15, 3).tolist(),
+                "shear_factor": float(rng.uniform(0.5, 2.0)),
+            },
+            "joints_compliance": {
+                "upr_revolute": joint((4,)),
+                "upr_universal": joint((3, 4)),
+                "rpu_universal": joint((3, 4)),
+                "rpu_revolute": joint((3,)),
+            },
+        },
+    )
+
+
+def random_poses(rng, count):
+    """Tilts up to 25 degrees at heights where no machine above is singular."""
+    return rng.uniform((-1.2, -0.44, -0.44), (-0.55, 0.44, 0.44), (count, 3))
+
+
+CASES = [(ROBOT, random_poses(np.random.default_rng(1), 20))] + [
+    (random_machine(np.random.default_rng(seed)), random_poses(np.random.default_rng(seed), 20))
+    for seed in range(2, 22)
+]
+
+
+def loads(count, seed):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(count, 6)) * [50, 50, 50, 20, 20, 20]
+
+
+# --- The second route: minimum complementary energy, written from internal forces alone.
+
+
+def limb_frames(robot, pose):
+    """Per limb: unit wrenches at o (6, 3), its two ends, and its elements' axes."""
+    z, beta, _ = pose
+    o = np.array([0.0, -z * np.tan(beta), z])
+    rotation = robot.rotation(pose)
+    pattern = np.array([[-1.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    upper = o + robot.geometry.platform_radius * pattern @ rotation.T
+    lower = robot.geometry.base_radius * pattern
+    x, y = np.array([1.0, 0, 0]), rotation[:, 1]
+    tau = np.cross(x, y)
+    for i in range(3):
+        at, line = (lower[i], y) if i < 2 else (upper[i], x)
+        along = upper[i] - lower[i] if i < 2 else lower[i] - upper[i]
+        along = along / np.linalg.norm(along)
+        wrenches = np.zeros((6, 3))
+        wrenches[:3, 0], wrenches[3:, 0] = along, np.cross(upper[i] - o, along)
+        wrenches[:3, 1], wrenches[3:, 1] = line, np.cross(at - o, line)
+        wrenches[3:, 2] = tau
+        down = (lower[i] - upper[i]) / np.linalg.norm(lower[i] - upper[i])
+        universal = np.column_stack((x, y, tau))
+        if i < 2:
+            revolute = np.column_stack((np.cross(y, down), y, down))
+        else:
+            revolute = np.column_stack((x, np.cross(down, x), down))
+        yield o, wrenches, upper[i], lower[i], revolute, universal
+
+
+def joint_compliance(wrenches, o, centre, axes, diagonal):
+    """Energy of a joint under unit wrenches, moved to its centre and into its axes."""
+    force = axes.T @ wrenches[:3]
+    moment = axes.T @ (wrenches[3:] - np.cross(centre - o, wrenches[:3], axisb=0).T)
+    load = np.vstack((force, moment))
+    free = np.isinf(diagonal)
+    assert np.abs(load[free]).max() < 1e-12, "a free axis carries load"
+    return load.T @ np.diag(np.where(free, 0.0, diagonal)) @ load
+
+
+def bar_compliance(wrenches, o, upper, lower, members, diameter):
+    """Energy of a beam by Gauss quadrature of its internal forces."""
+    length = np.linalg.norm(lower - upper)
+    along = (lower - upper) / length
+    area, second = math.pi * diameter**2 / 4, math.pi * diameter**4 / 64
+    across = np.eye(3) - np.outer(along, along)
+    line = np.outer(along, along)
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    force = wrenches[:3]
+    result = np.zeros((3, 3))
+    for node, weight in zip(nodes, weights, strict=True):
+        point = upper + along * length * (node + 1) / 2
+        moment = wrenches[3:] - np.cross(point - o, force, axisb=0).T
+        dv = weight * length / 2
+        result += dv * force.T @ line @ force / (members.youngs_modulus * area)
+        result += (
+            dv * members.shear_factor * force.T @ across @ force / (members.shear_modulus * area)
+        )
+        result += dv * moment.T @ across @ moment / (members.youngs_modulus * second)
+        result += dv * moment.T @ line @ moment / (members.shear_modulus * 2 * second)
+    return result
+
+
+def second_route(robot, pose):
+    """Compliance and, per unit load, energy matrices of the nine elements, shape (9, 6, 6).
+
+    Of all internal forces with sum J_i W_i = P, those of least complementary energy: one linear
+    system in W and the multipliers, which are the deflection.
+    """
+    elements, wrenches = [], []
+    j = robot.joints_compliance
+    frames = limb_frames(robot, pose)
+    for i, (o, unit, upper, lower, revolute, universal) in enumerate(frames):
+        if i < 2:
+            r = joint_compliance(unit, o, upper, revolute, j.upr_revolute)
+            u = joint_compliance(unit, o, lower, universal, j.upr_universal)
+        else:
+            r = joint_compliance(unit, o, lower, revolute, j.rpu_revolute)
+            u = joint_compliance(unit, o, upper, universal, j.rpu_universal)
+        b = bar_compliance(unit, o, upper, lower, robot.members, robot.members.diameter[i])
+        wrenches.append(unit)
+        elements += [(i, r), (i, b), (i, u)]
+    statics = np.hstack(wrenches)
+    block = np.zeros((9, 9))
+    for i, matrix in elements:
+        block[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += matrix
+    # Units of micrometres, so that the system's two halves are of one size.
+    system = np.block([[1e9 * block, statics.T], [statics, np.zeros((6, 6))]])
+    solution = np.linalg.solve(system, np.vstack((np.zeros((9, 6)), np.eye(6))))
+    forces, c = solution[:9], -solution[9:] / 1e9
+    parts = [
+        forces[3 * i : 3 * i + 3].T @ matrix @ forces[3 * i : 3 * i + 3] for i, matrix in elements
+    ]
+    return c, np.array(parts)
+
+
+@pytest.mark.parametrize(("robot", "poses"), CASES)
+def test_second_route(robot, poses):
+    wrench = loads(len(poses), 3)
+    c = compliance(robot, poses)
+    energy = strain_energy(robot, poses, wrench)
+    for k, pose in enumerate(poses):
+        expected, parts = second_route(robot, pose)
+        size = np.sqrt(np.diag(expected))
+        assert c[k] / np.outer(size, size) == pytest.approx(
+            expected / np.outer(size, size), abs=1e-9
+        )
+        energies = 0.5 * np.einsum("i,eij,j->e", wrench[k], parts, wrench[k])
+        assert energy.energies[k] == pytest.approx(energies, abs=1e-8 * energies.sum())
+
+
+# --- Laws of the matrices.
+
+
+@pytest.mark.parametrize(("robot", "poses"), CASES)
+def test_symmetric_positive_definite_and_inverse(robot, poses):
+    c, k = compliance(robot, poses), stiffness(robot, poses)
+    assert (c == c.swapaxes(-1, -2)).all()
+    assert (k == k.swapaxes(-1, -2)).all()
+    size = np.sqrt(np.einsum("...ii->...i", c))
+    scaled = c / size[..., None] / size[:, None, :]
+    assert np.linalg.eigvalsh(scaled).min() > 0
+    assert np.linalg.eigvalsh(k).min() > 0
+    product = k @ c * size[:, :, None] / size[:, None, :]
+    assert np.abs(product - np.eye(6)).max() < 1e-9
+
+
+@pytest.mark.parametrize(("robot", "poses"), CASES)
+def test_energies_and_factors(robot, poses):
+    wrench = loads(len(poses), 4)
+    e = strain_energy(robot, poses, wrench)
+    c = compliance(robot, poses)
+    assert e.elements == ("1R", "1B", "1U", "2R", "2B", "2U", "3R", "3B", "3U")
+    assert e.factors.sum(-1) == pytest.approx(1, abs=1e-14)
+    assert (e.factors >= 0).all()
+    assert e.energies.sum(-1) == pytest.approx(e.total, rel=1e-14)
+    assert e.total == pytest.approx(
+        0.5 * np.einsum("...i,...ij,...j->...", wrench, c, wrench), rel=1e-9
+    )
+    deflection = np.einsum("...ij,...j->...i", c, wrench)
+    size = np.abs(deflection).max(axis=-1, keepdims=True)
+    assert e.deflection / size == pytest.approx(deflection / size, abs=1e-10)
+    assert (e.dominant == np.array(e.elements)[e.factors.argmax(-1)]).all()
+    assert not e.tie.any()
+
+
+@pytest.mark.parametrize(("robot", "poses"), CASES[:6])
+def test_castigliano(robot, poses):
+    """The deflection is the energy's gradient by the wrench; energy is quadratic, so h is free."""
+    pose, wrench = poses[:5, None], loads(5, 5)[:, None]
+    step = np.array([10.0, 10, 10, 5, 5, 5])
+    more, less = (strain_energy(robot, pose, wrench + s * np.diag(step)).total for s in (1, -1))
+    gradient = (more - less) / (2 * step)
+    deflection = strain_energy(robot, pose, wrench).deflection[:, 0]
+    assert gradient == pytest.approx(deflection, rel=1e-9, abs=1e-10 * np.abs(deflection).max())
+
+
+def test_reciprocity():
+    """Work of one load on the other's deflection is mutual (Maxwell-Betti)."""
+    for robot, poses in CASES[:6]:
+        one, two = loads(len(poses), 6), loads(len(poses), 7)
+        first, second = (strain_energy(robot, poses, w).deflection for w in (one, two))
+        a, b = (first * two).sum(-1), (second * one).sum(-1)
+        assert a == pytest.approx(b, rel=1e-9, abs=1e-9 * np.abs(a).max())
+
+
+def test_linear_in_the_wrench():
+    for robot, poses in CASES[:6]:
+        one, two = loads(len(poses), 8), loads(len(poses), 9)
+        a, b, both = (strain_energy(robot, poses, w) for w in (one, two, 2 * one - 3 * two))
+        size = np.abs(both.deflection).max()
+        assert both.deflection == pytest.approx(
+            2 * a.deflection - 3 * b.deflection, abs=1e-12 * size
+        )
+        scaled = strain_energy(robot, poses, -7 * one)
+        assert scaled.total == pytest.approx(49 * a.total, rel=1e-13)
+        assert scaled.factors == pytest.approx(a.factors, abs=1e-13)
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e-20, 1e20, 1e140])
+def test_factors_hold_for_tiny_and_huge_loads(size):
+    wrench = loads(1, 10)[0]
+    one, other = (strain_energy(ROBOT, HOME, w) for w in (wrench, wrench * size))
+    assert other.factors == pytest.approx(one.factors, rel=1e-12, abs=1e-15)
+    assert other.deflection / size == pytest.approx(one.deflection, rel=1e-12)
+    assert other.dominant == one.dominant
+
+
+def test_mirror():
+    """x to -x exchanges limbs 1 and 2 and turns gamma over."""
+    sign = np.array([-1, 1, 1, 1, -1, -1])
+    robot, poses = CASES[3]
+    d = robot.members.diameter
+    twin = robot.changed(members={"diameter": [d[1], d[0], d[2]]})
+    c, mirrored = compliance(robot, poses), compliance(twin, poses * [1, 1, -1])
+    size = np.sqrt(np.einsum("...ii->...i", c))
+    scale = size[..., None] * size[..., None, :]
+    assert mirrored * np.outer(sign, sign) / scale == pytest.approx(c / scale, abs=1e-12)
+    wrench = loads(len(poses), 11)
+    one = strain_energy(robot, poses, wrench)
+    other = strain_energy(twin, poses * [1, 1, -1], wrench * sign)
+    assert other.factors[:, SWAPPED] == pytest.approx(one.factors, abs=1e-12)
+
+
+def test_softer_by_a_factor_everywhere():
+    """Halved moduli and doubled joints double the compliance and leave the factors."""
+    robot, poses = CASES[4]
+    m, j = robot.members, robot.joints_compliance
+    soft = robot.changed(
+        members={"youngs_modulus": m.youngs_modulus / 2, "shear_modulus": m.shear_modulus / 2},
+        joints_compliance={
+            name: (2 * getattr(j, name)).tolist()
+            for name in ("upr_revolute", "upr_universal", "rpu_universal", "rpu_revolute")
+        },
+    )
+    assert compliance(soft, poses) == pytest.approx(2 * compliance(robot, poses), rel=1e-13)
+    wrench = loads(len(poses), 12)
+    one, other = (strain_energy(r, poses, wrench) for r in (robot, soft))
+    assert other.factors == pytest.approx(one.factors, abs=1e-13)
+
+
+def test_similar_machines():
+    """All lengths times k: translations times 1/k, rotations times 1/k^3, couplings 1/k^2."""
+    robot, poses = CASES[5]
+    k = 2.5
+    j = robot.joints_compliance
+    names = ("upr_revolute", "upr_universal", "rpu_universal", "rpu_revolute")
+    by = np.array([1 / k] * 3 + [1 / k**3] * 3)
+    large = parameters.build(
+        UprRpu,
+        {
+            "mechanism": "upr_rpu",
+            "geometry": {
+                "base_radius": k * robot.geometry.base_radius,
+                "platform_radius": k * robot.geometry.platform_radius,
+            },
+            "members": {
+                "youngs_modulus": robot.members.youngs_modulus,
+                "shear_modulus": robot.members.shear_modulus,
+                "diameter": (k * robot.members.diameter).tolist(),
+                "shear_factor": robot.members.shear_factor,
+            },
+            "joints_compliance": {name: (by * getattr(j, name)).tolist() for name in names},
+        },
+    )
+    scale = np.array([k**-0.5] * 3 + [k**-1.5] * 3)
+    expected = compliance(robot, poses) * np.outer(scale, scale)
+    size = np.sqrt(np.einsum("...ii->...i", expected))
+    both = size[..., None] * size[..., None, :]
+    actual = compliance(large, poses * [k, 1, 1])
+    assert actual / both == pytest.approx(expected / both, abs=1e-12)
+
+
+def test_stiffer_parts_make_a_stiffer_machine():
+    """With rigid joints the joints store nothing, and no direction gets softer."""
+    zero = {
+        "upr_revolute": [0, 0, 0, 0, math.inf, 0],
+        "upr_universal": [0, 0, 0, math.inf, math.inf, 0],
+        "rpu_universal": [0, 0, 0, math.inf, math.inf, 0],
+        "rpu_revolute": [0, 0, 0, math.inf, 0, 0],
+    }
+    for robot, poses in CASES[:6]:
+        rigid = robot.changed(joints_compliance=zero)
+        gain = compliance(robot, poses) - compliance(rigid, poses)
+        size = np.sqrt(np.einsum("...ii->...i", compliance(robot, poses)))
+        scaled = gain / size[..., None] / size[..., None, :]
+        assert np.linalg.eigvalsh(scaled).min() > -1e-11
+        e = strain_energy(rigid, poses, loads(len(poses), 13))
+        assert e.factors[:, [0, 2, 3, 5, 6, 8]] == pytest.approx(0, abs=0)
+        assert e.factors[:, [1, 4, 7]].sum(-1) == pytest.approx(1, abs=1e-14)
+
+
+def test_direction_without_load_does_not_enter():
+    """The revolute of a UPR carries no force along its u (equation 5)."""
+    entries = ROBOT.joints_compliance.upr_revolute.tolist()
+    entries[0] = 0.5
+    other = ROBOT.changed(joints_compliance={"upr_revolute": entries})
+    assert (compliance(other, HOME) == compliance(ROBOT, HOME)).all()
+
+
+# --- Interface: shapes, ties, zero loads, refusals.
+
+
+def test_broadcasting():
+    rng = np.random.default_rng(14)
+    poses, wrench = random_poses(rng, 8).reshape(4, 2, 3), loads(1, 15)[0]
+    e = strain_energy(ROBOT, poses, wrench)
+    assert compliance(ROBOT, poses).shape == (4, 2, 6, 6)
+    assert stiffness(ROBOT, poses).shape == (4, 2, 6, 6)
+    assert e.factors.shape == e.energies.shape == (4, 2, 9)
+    assert e.total.shape == e.dominant.shape == e.tie.shape == (4, 2)
+    assert e.deflection.shape == (4, 2, 6)
+    for index in np.ndindex(4, 2):
+        one = strain_energy(ROBOT, poses[index].copy(), wrench)
+        assert one.factors == pytest.approx(e.factors[index], abs=1e-14)
+        assert one.total == pytest.approx(e.total[index], rel=1e-13)
+        assert one.dominant == e.dominant[index]
+        assert one.tie == e.tie[index]
+    wide = strain_energy(ROBOT, poses[:, :1], loads(3, 16))
+    assert wide.factors.shape == (4, 3, 9)
+    assert strain_energy(ROBOT, HOME, loads(3, 16)).total.shape == (3,)
+
+
+def test_one_sample_has_plain_values():
+    e = strain_energy(ROBOT, HOME, [1, 2, 3, 4, 5, 6])
+    assert isinstance(e.dominant, str)
+    assert isinstance(e.tie, bool)
+    assert isinstance(e.total, float)
+    assert e.factors.shape == (9,)
+    for array in (e.factors, e.energies, e.deflection):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
+def test_zero_wrench_has_no_dominant_element():
+    e = strain_energy(ROBOT, HOME, np.zeros(6))
+    assert e.dominant == "none"
+    assert e.tie is False
+    assert e.total == 0
+    assert (e.factors == 0).all()
+    assert (e.energies == 0).all()
+    assert (e.deflection == 0).all()
+    batch = strain_energy(ROBOT, HOME, [[0.0] * 6, [0, 0, 1, 0, 0, 0], [-0.0] * 6])
+    assert batch.dominant.tolist() == ["none", "1U", "none"]
+    assert batch.tie.tolist() == [False, True, False]
+    assert batch.factors.sum(-1) == pytest.approx([0, 1, 0], abs=1e-15)
+
+
+@pytest.mark.parametrize("beta", np.linspace(-0.4, 0.4, 17))
+@pytest.mark.parametrize("wrench", [(0, 0, 1, 0, 0, 0), (0, 3, -7, 0.1, 0, 0)])
+def test_ties_by_symmetry(beta, wrench):
+    """With gamma = 0 and a load in the plane x = 0, limbs 1 and 2 store the same."""
+    e = strain_energy(ROBOT, [-0.6, beta, 0.0], wrench)
+    assert e.factors[SWAPPED] == pytest.approx(e.factors, rel=1e-11, abs=1e-15)
+    if e.dominant[0] != "3":
+        assert e.tie
+        assert e.dominant[0] == "1"
+    batch = strain_energy(ROBOT, [[-0.6, beta, 0.0]] * 3, wrench)
+    assert set(batch.dominant.tolist()) == {e.dominant}
+    assert set(batch.tie.tolist()) == {e.tie}
+    # A thousandth of a radian of gamma is no tie.
+    assert not strain_energy(ROBOT, [-0.6, beta, 1e-3], wrench).tie
+
+
+def test_robot_without_members():
+    for call in (
+        lambda r: compliance(r, [0, 0, -0.4]),
+        lambda r: stiffness(r, [0, 0, -0.4]),
+        lambda r: strain_energy(r, [0, 0, -0.4], np.zeros(6)),
+        kernels,
+        lambda r: regular_workspace(r, [-0.4]),
+    ):
+        with pytest.raises(ParameterError, match="upr_rpu") as caught:
+            call(load("delta"))
+        assert caught.value.value == "delta"
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_not_finite_is_refused(bad):
+    poses = np.tile(HOME, (4, 1))
+    poses[2, 1] = bad
+    for call in (compliance, stiffness, lambda r, p: strain_energy(r, p, np.ones(6))):
+        with pytest.raises(ValueError, match=r"pose at sample \(2,\) is not finite"):
+            call(ROBOT, poses)
+        with pytest.raises(ValueError, match=r"pose at sample .* is not finite"):
+            call(ROBOT, poses[2].copy())
+    with pytest.raises(ValueError, match="a pose is not finite"):
+        reachable(ROBOT, poses)
+    for i in range(6):
+        wrench = np.ones((2, 6))
+        wrench[1, i] = bad
+        with pytest.raises(ValueError, match=r"wrench.* at sample \(1,\) is not finite"):
+            strain_energy(ROBOT, HOME, wrench)
+    with pytest.raises(ValueError, match=r"wrench, or its energy, .* not finite"):
+        strain_energy(ROBOT, HOME, np.full(6, 1e200))
+
+
+def test_wrong_shapes():
+    with pytest.raises(ValueError, match="last axis"):
+        compliance(ROBOT, [0.0, 0.0])
+    with pytest.raises(ValueError, match="last axis"):
+        strain_energy(ROBOT, HOME, [1.0, 2.0, 3.0])
+
+
+def test_pose_that_is_none():
+    with pytest.raises(UnreachableError):
+        compliance(ROBOT, [0.6, 0, 0])
+    with pytest.raises(UnreachableError) as caught:
+        strain_energy(ROBOT, [HOME, HOME * [-1, 1, 1]], np.ones(6))
+    assert caught.value.index == (1,)
+
+
+def test_not_positive_definite_is_refused():
+    """A3 in the base plane: with locked drives the platform is still free to turn about X."""
+    beta = 0.5
+    z = -ROBOT.geometry.platform_radius * math.sin(beta)
+    for call in (compliance, stiffness, lambda r, p: strain_energy(r, p, np.ones(6))):
+        with pytest.raises(SingularityError):
+            call(ROBOT, [z, beta, 0.0])
+    c = compliance(ROBOT, [z - 1e-4, beta, 0.0])
+    assert c[3, 3] > 1e5 * compliance(ROBOT, HOME)[3, 3]

@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kinematics of the 2UPR-RPU: inverse, forward, Jacobians, refusals, over random machines."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from pkm_twin import load, parameters
+from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
+from pkm_twin.mechanisms import config_folder
+from pkm_twin.mechanisms.upr_rpu import UprRpu
+
+ROBOT = load("upr_rpu")
+FILE = parameters.read_yaml(config_folder() / "upr_rpu.yaml")
+SIZES = [(0.39, 0.26), (0.26, 0.39), (0.3, 0.3), (1.5, 0.2), (0.1, 0.45)]
+
+
+def machine(base, platform):
+    return parameters.build(
+        UprRpu, FILE | {"geometry": {"base_radius": base, "platform_radius": platform}}
+    )
+
+
+def branch_poses(robot, count, seed, margin=0.05):
+    """Random poses of the home branch, clear of its singularities by ``margin``."""
+    a, b = robot.geometry.platform_radius, robot.geometry.base_radius
+    size = a + b
+    rng = np.random.default_rng(seed)
+    low, high = (-2.0 * size, -1.5, -1.5), (-0.1 * size, 1.5, 1.5)
+    poses = rng.uniform(low, high, (20 * count, 3))
+    z, beta, gamma = poses.T
+    rho = z / np.cos(beta)
+    pair = (rho**2 * np.cos(gamma) - a * b * np.sin(gamma) ** 2) / (rho**2 + a * b)
+    slope = -(a * np.sin(beta) + z) / np.hypot(a, rho)
+    kept = poses[(pair > margin) & (slope > margin) & (rho > -5 * size)]
+    assert len(kept) >= count
+    return kept[:count]
+
+
+def points(robot, pose):
+    """Ends A and B of the limbs by plain vector algebra, each (3, 3), one row a limb."""
+    z, beta, gamma = pose
+    pattern = np.array([[-1.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    cb, sb, cg, sg = math.cos(beta), math.sin(beta), math.cos(gamma), math.sin(gamma)
+    rx = np.array([[1, 0, 0], [0, cb, -sb], [0, sb, cb]])
+    ry = np.array([[cg, 0, sg], [0, 1, 0], [-sg, 0, cg]])
+    o = np.array([0.0, -z * math.tan(beta), z])
+    a, b = robot.geometry.platform_radius, robot.geometry.base_radius
+    return o, rx @ ry, o + a * pattern @ (rx @ ry).T, b * pattern
+
+
+def test_inverse_is_the_distance_of_the_ends():
+    for pose in branch_poses(ROBOT, 50, 1):
+        _, rotation, upper, lower = points(ROBOT, pose)
+        lengths = np.linalg.norm(upper - lower, axis=1)
+        assert ROBOT.inverse(pose) == pytest.approx(lengths, rel=1e-13)
+        assert ROBOT.rotation(pose) == pytest.approx(rotation, abs=1e-15)
+
+
+def test_constraints_of_the_limbs_hold():
+    """Limbs 1 and 2 stay normal to y, limb 3 to X: what makes the pose three parameters."""
+    for pose in branch_poses(ROBOT, 50, 2):
+        _, rotation, upper, lower = points(ROBOT, pose)
+        limb = upper - lower
+        assert limb[:2] @ rotation[:, 1] == pytest.approx(0, abs=1e-14)
+        assert limb[2, 0] == pytest.approx(0, abs=1e-14)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_forward_of_inverse_is_the_pose(size):
+    robot = machine(*size)
+    poses = branch_poses(robot, 20_000, 3)
+    back = robot.forward(robot.inverse(poses))
+    # The margin of 0.05 from the singularities costs up to 1 / 0.05 in digits.
+    assert np.abs(back - poses).max() < 5e-13
+
+
+def test_forward_of_inverse_in_the_working_range():
+    rng = np.random.default_rng(4)
+    poses = rng.uniform((-1.0, -0.5, -0.5), (-0.3, 0.5, 0.5), (100_000, 3))
+    assert np.abs(ROBOT.forward(ROBOT.inverse(poses)) - poses).max() < 1e-14
+
+
+def test_inverse_of_forward_is_the_joint_state():
+    """Any lengths that assemble, also far from where they were made."""
+    q = np.random.default_rng(5).uniform(0.2, 1.2, (4000, 3))
+    poses, fault = ROBOT.forward_kernel(ROBOT.parameters, q)
+    good = fault[:, 0] == 0
+    assert 500 < good.sum() < 4000
+    assert np.abs(ROBOT.inverse(poses[good]) - q[good]).max() < 1e-12
+    a, b = ROBOT.geometry.platform_radius, ROBOT.geometry.base_radius
+    z, beta, gamma = poses[good].T
+    rho = z / np.cos(beta)
+    assert (z < 0).all()
+    assert (rho**2 * np.cos(gamma) >= a * b * np.sin(gamma) ** 2 - 1e-9).all()
+    assert (z + a * np.sin(beta) <= 1e-9).all()
+
+
+def test_forward_follows_the_home_pose():
+    """Along paths that stay in the branch's middle, small steps in q are small steps in pose."""
+    ends = branch_poses(ROBOT, 200, 6, margin=0.2)
+    home = np.array([-0.6, 0.0, 0.0])
+    path = home + np.linspace(0, 1, 200)[:, None, None] * (ends - home)
+    a, b = ROBOT.geometry.platform_radius, ROBOT.geometry.base_radius
+    rho = path[..., 0] / np.cos(path[..., 1])
+    clear = (rho**2 * np.cos(path[..., 2]) > 1.1 * a * b * np.sin(path[..., 2]) ** 2) & (
+        path[..., 0] + a * np.sin(path[..., 1]) < -0.01
+    )
+    whole = clear.all(axis=0)
+    assert whole.sum() > 100
+    assert ROBOT.forward(ROBOT.inverse(path[:, whole])) == pytest.approx(path[:, whole], abs=1e-11)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_jacobians_against_differences(size):
+    robot = machine(*size)
+    poses = branch_poses(robot, 40, 7, margin=0.15)
+    scale = sum(size)
+    h = 1e-5 * scale
+    for pose in poses:
+        q = robot.inverse(pose)
+        rates = robot.jacobian(q)
+        twist = robot.platform_jacobian(q)
+        steps = h * np.eye(3)
+        # Fourth order: the truncation error is far below the rounding error.
+        around = [robot.forward(q + k * steps) for k in (-2, -1, 1, 2)]
+        numeric = ((around[0] - around[3]) / 12 + (around[2] - around[1]) * 2 / 3) / h
+        assert rates == pytest.approx(numeric.T, rel=1e-6, abs=1e-6 * np.abs(rates).max())
+        for j in range(3):
+            o, rotation = zip(*(points(robot, p[j])[:2] for p in around), strict=True)
+            v = ((o[0] - o[3]) / 12 + (o[2] - o[1]) * 2 / 3) / h
+            spin = ((rotation[0] - rotation[3]) / 12 + (rotation[2] - rotation[1]) * 2 / 3) / h
+            spin = spin @ robot.rotation(pose).T
+            omega = [spin[2, 1], spin[0, 2], spin[1, 0]]
+            tolerance = {"rel": 1e-6, "abs": 1e-6 * np.abs(twist).max()}
+            assert twist[:3, j] == pytest.approx(v, **tolerance)
+            assert twist[3:, j] == pytest.approx(np.array(omega), **tolerance)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_twists_move_the_limbs_and_nothing_else(size):
+    """Each joint rate lengthens its own limb; no twist works on the limbs' constraints."""
+    robot = machine(*size)
+    for pose in branch_poses(robot, 50, 8):
+        o, rotation, upper, lower = points(robot, pose)
+        twist = robot.platform_jacobian(robot.inverse(pose))
+        x, y = np.array([1.0, 0, 0]), rotation[:, 1]
+        scale = np.abs(twist).max()
+        for i in range(3):
+            arm = upper[i] - o
+            along = (upper[i] - lower[i]) / np.linalg.norm(upper[i] - lower[i])
+            rate = along @ twist[:3] + np.cross(arm, along) @ twist[3:]
+            assert rate == pytest.approx(np.eye(3)[i], abs=1e-12 * scale)
+            at, line = (lower[i], y) if i < 2 else (upper[i], x)
+            held = line @ twist[:3] + np.cross(at - o, line) @ twist[3:]
+            assert held == pytest.approx(0, abs=1e-13 * scale)
+        assert np.cross(x, y) @ twist[3:] == pytest.approx(0, abs=1e-13 * scale)
+
+
+def test_batches_are_their_samples():
+    poses = branch_poses(ROBOT, 24, 9).reshape(4, 2, 3, 3)
+    q = ROBOT.inverse(poses)
+    assert q.shape == (4, 2, 3, 3)
+    assert ROBOT.jacobian(q).shape == (4, 2, 3, 3, 3)
+    assert ROBOT.platform_jacobian(q).shape == (4, 2, 3, 6, 3)
+    assert ROBOT.rotation(poses).shape == (4, 2, 3, 3, 3)
+    for index in np.ndindex(4, 2, 3):
+        one = np.ascontiguousarray(poses[index])
+        assert ROBOT.inverse(one) == pytest.approx(q[index], rel=1e-15)
+        assert ROBOT.forward(q[index].copy()) == pytest.approx(one, rel=1e-13, abs=1e-13)
+        assert ROBOT.jacobian(q[index].copy()) == pytest.approx(ROBOT.jacobian(q)[index], rel=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("entry", range(3))
+def test_not_finite_is_refused(bad, entry):
+    pose = [-0.6, 0.0, 0.0]
+    pose[entry] = bad
+    with pytest.raises(ValueError, match="not finite"):
+        ROBOT.inverse(pose)
+    with pytest.raises(ValueError, match=r"sample \(1,\) is not finite"):
+        ROBOT.inverse([[-0.6, 0, 0], pose])
+    q = [0.6, 0.6, 0.6]
+    q[entry] = bad
+    for call in (ROBOT.forward, ROBOT.jacobian, ROBOT.platform_jacobian):
+        with pytest.raises(ValueError, match="not finite"):
+            call(q)
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        (0.0, 0, 0),
+        (0.3, 0, 0),
+        (-0.6, math.pi / 2, 0),
+        (-0.6, -2.0, 0),
+        (-0.6, 7.0, 0),
+        (-1e9, 0, 0),
+    ],
+)
+def test_inverse_refuses_what_is_no_pose(pose):
+    with pytest.raises(UnreachableError) as caught:
+        ROBOT.inverse(pose)
+    assert caught.value.limb == "limb 3"
+    with pytest.raises(UnreachableError) as caught:
+        ROBOT.inverse([[-0.6, 0, 0], pose])
+    assert caught.value.index == (1,)
+
+
+@pytest.mark.parametrize(
+    ("q", "limb"),
+    [
+        ((0.9, 0.3, 0.6), None),
+        ((0.3, 0.9, 0.6), None),
+        ((0.1, 0.6, 0.6), "limb 1"),
+        ((0.6, 0.1, 0.6), "limb 2"),
+        ((0.614, 0.614, 2.0), "limb 3"),
+        ((0.614, 0.614, 0.05), "limb 3"),
+    ],
+)
+def test_miss_is_what_the_named_limb_lacks(q, limb):
+    """Moved by the miss and a hair more, the limb assembles; by a hair less, it does not."""
+    with pytest.raises(UnreachableError) as caught:
+        ROBOT.forward(q)
+    i = ROBOT.limb_names.index(caught.value.limb)
+    assert limb in (None, caught.value.limb)
+    assert caught.value.miss > 0
+    states = [
+        [length + (sign * part * caught.value.miss if k == i else 0) for k, length in enumerate(q)]
+        for sign in (-1, 1)
+        for part in (0.999, 1.001)
+    ]
+    _, fault = ROBOT.forward_kernel(ROBOT.parameters, np.array(states))
+    # Limb 3 may be what fails next, once limbs 1 and 2 fit.
+    mended = (fault[:, 0] == 0) | ((fault[:, 1] == 2) & (i != 2))
+    assert mended.tolist() in ([False, True, False, False], [False, False, False, True])
+
+
+def test_both_limbs_too_short():
+    """Shorter than |b - a| = 0.13 m neither of limbs 1 and 2 reaches the platform."""
+    with pytest.raises(UnreachableError) as caught:
+        ROBOT.forward([0.1, 0.1, 0.5])
+    assert caught.value.limb in ("limb 1", "limb 2")
+    assert caught.value.miss == pytest.approx(0.03, abs=1e-9)
+
+
+@pytest.mark.parametrize("q", [(0, 0.6, 0.6), (-0.6, 0.6, 0.6), (0.6, 0.6, -1), (1e9, 0.6, 0.6)])
+def test_lengths_that_are_none(q):
+    with pytest.raises(UnreachableError):
+        ROBOT.forward(q)
+
+
+def test_jacobian_at_a_singularity():
+    """A3 in the base plane: limb 3 cannot turn the platform."""
+    beta = 0.5
+    z = -ROBOT.geometry.platform_radius * math.sin(beta)
+    q = ROBOT.inverse([z, beta, 0.0])
+    with pytest.raises((SingularityError, UnreachableError)):
+        ROBOT.jacobian(q)
+
+
+def test_passive_angles():
+    for pose in branch_poses(ROBOT, 50, 10):
+        _, rotation, upper, lower = points(ROBOT, pose)
+        limb = lower - upper
+        unit = limb / np.linalg.norm(limb, axis=1)[:, None]
+        expected = np.arccos(np.stack((unit[:, 2], unit @ rotation[:, 2]), axis=1))
+        angles, _ = ROBOT.angles_kernel(ROBOT.parameters, pose)
+        assert angles.reshape(3, 2) == pytest.approx(expected, abs=1e-7)
+
+
+def test_limits_have_the_common_shape():
+    assert ROBOT.limits.position.tolist() == [[0.3, 1.0]] * 3
+    assert ROBOT.limits.velocity is None
+    assert ROBOT.limits.effort is None
+    assert ROBOT.joint_names == ("limb_1", "limb_2", "limb_3")
+    bare = parameters.build(UprRpu, {k: v for k, v in FILE.items() if k != "limits"})
+    assert bare.limits.position is None
+    assert bare.limits.joint_angle is None
+
+
+def changed_file(dotted, value):
+    data = copy.deepcopy(FILE)
+    *path, last = dotted.split(".")
+    section = data
+    for key in path:
+        section = section[key]
+    if isinstance(last, str) and last.isdigit():
+        section[int(last)] = value
+    else:
+        section[last] = value
+    return data
+
+
+@pytest.mark.parametrize(
+    ("dotted", "value", "field"),
+    [
+        ("geometry.base_radius", 0.0, "geometry.base_radius"),
+        ("geometry.platform_radius", math.nan, "geometry.platform_radius"),
+        ("members.youngs_modulus", -1.0, "members.youngs_modulus"),
+        ("members.shear_modulus", 0.0, "members.shear_modulus"),
+        ("members.diameter", [0.1, -0.1, 0.1], "members.diameter[1]"),
+        ("members.diameter", 1e-90, "members.diameter[0]"),
+        ("members.diameter", [0.1, 0.1], "members.diameter"),
+        ("members.shear_factor", -0.1, "members.shear_factor"),
+        ("joints_compliance.upr_revolute", [1e-10] * 5, "joints_compliance.upr_revolute"),
+        (
+            "joints_compliance.upr_revolute",
+            [1e-10, math.inf, 1e-10, 1e-11, math.inf, 1e-11],
+            "joints_compliance.upr_revolute[1]",
+        ),
+        (
+            "joints_compliance.upr_revolute",
+            [1e-10, 1e-10, 1e-10, 1e-11, 1e-11, 1e-11],
+            "joints_compliance.upr_revolute[4]",
+        ),
+        (
+            "joints_compliance.upr_universal",
+            [1e-10, 1e-10, 1e-10, math.inf, math.inf, math.inf],
+            "joints_compliance.upr_universal[5]",
+        ),
+        (
+            "joints_compliance.rpu_universal",
+            [1e-10, 1e-10, -1e-10, math.inf, math.inf, 1e-11],
+            "joints_compliance.rpu_universal[2]",
+        ),
+        (
+            "joints_compliance.rpu_revolute",
+            [1e-10, 1e-10, math.nan, math.inf, 1e-11, 1e-11],
+            "joints_compliance.rpu_revolute[2]",
+        ),
+        ("limits.limb_length", [1.0, 0.3], "limits.limb_length"),
+        ("limits.limb_length", [0.0, 0.3], "limits.limb_length[0]"),
+        ("limits.joint_angle", 0.0, "limits.joint_angle"),
+        ("joints", ["a", "a", "b"], "joints"),
+    ],
+)
+def test_refused_values_are_named(dotted, value, field):
+    with pytest.raises(ParameterError) as caught:
+        parameters.build(UprRpu, changed_file(dotted, value))
+    assert caught.value.field == field
+
+
+def test_misspelt_key_has_its_neighbour_named():
+    with pytest.raises(UnknownNameError) as caught:
+        parameters.build(UprRpu, changed_file("members.young_modulus", 2e11))
+    assert caught.value.closest == "youngs_modulus"
+
+
+PROGRAM = """
+import json, sys
+import numpy as np
+from pkm_twin import load, kernels
+from stiffness_monitor import compliance, strain_energy
+robot = load("upr_rpu")
+poses = np.array(json.loads(sys.stdin.read()))
+q = robot.inverse(poses)
+wrench = np.array([30.0, -50, -40, 10, -20, 50])
+energy = strain_energy(robot, poses, wrench)
+angles, _ = robot.angles_kernel(robot.parameters, poses)
+faults = [robot.forward_kernel(robot.parameters, l)[1].tolist()
+          for l in ([0.9, 0.3, 0.6], [0.1, 0.1, 0.5], [0.6, 0.6, 2.0], [-1.0, 1, 1])]
+print(json.dumps({
+    "compiled": kernels.COMPILED, "q": q.tolist(), "pose": robot.forward(q).tolist(),
+    "rates": robot.jacobian(q).tolist(), "twist": robot.platform_jacobian(q).tolist(),
+    "compliance": (1e9 * compliance(robot, poses)).tolist(), "factors": energy.factors.tolist(),
+    "total": (1e6 * energy.total).tolist(), "deflection": (1e6 * energy.deflection).tolist(),
+    "angles": angles.tolist(), "dominant": energy.dominant.tolist(), "faults": faults,
+    "one": (1e9 * compliance(robot, poses[0])).tolist(),
+    "single": strain_energy(robot, poses[0], wrench).dominant,
+}))
+"""
+
+
+def test_with_and_without_numba():
+    pytest.importorskip("numba")
+    poses = json.dumps(branch_poses(ROBOT, 20, 11, margin=0.2).tolist())
+    results = []
+    for off in ("0", "1"):
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM],
+            input=poses,
+            capture_output=True,
+            text=True,
+            check=True,
+            env=os.environ | {"PKM_TWIN_NO_NUMBA": off, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        results.append(json.loads(done.stdout))
+    fast, slow = results
+    assert (fast.pop("compiled"), slow.pop("compiled")) == (True, False)
+    for word in ("dominant", "single"):
+        assert fast.pop(word) == slow.pop(word)
+    for name, values in fast.items():
+        expected = np.array(slow[name])
+        assert np.array(values) == pytest.approx(
+            expected, rel=1e-12, abs=1e-12 * np.abs(expected).max()
+        ), name
