@@ -36,14 +36,15 @@ setup(
     ],
     install_requires=[
         "matplotlib>=3.6",
-        "mcap>=1.2",
-        "mcap-ros2-support>=0.5",
+        "lz4",
+        "mcap>=1.6",
         "numba>=0.58",
         "numpy>=1.26",
         "PyYAML>=6",
         "rich>=13",
         "setuptools",
         "typer>=0.9",
+        "zstandard",
     ],
     extras_require={
         # The real ROS 2 Jazzy as wheels, for machines without a ROS installation. Unpinned names
@@ -51,6 +52,7 @@ setup(
         "jazzy": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
         "test": [
             "hypothesis",
+            "mcap-ros2-support",
             "mypy",
             "pin",
             "pytest",

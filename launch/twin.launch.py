@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Both nodes, for a Delta and an overconstrained head; every argument has a default."""
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+
+from launch import LaunchDescription
 
 
 def generate_launch_description() -> LaunchDescription:

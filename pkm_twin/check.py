@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The headless verdict on a recorded bag: is it what the twin says this machine does?"""
+"""The headless verdict: whether a recorded bag is what the twin says of its machine."""
 
 from __future__ import annotations
 
@@ -222,8 +222,7 @@ def motion(r: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:
     gap = 10 * float(np.median(np.diff(r.time))) if len(r.time) > 1 else 1.0
     qd, qdd = np.zeros_like(r.q), np.zeros_like(r.q)
     used = np.zeros(len(r.time), bool)
-    stamps = np.round(r.time * 1e9).astype(np.int64)
-    for i, stamp in enumerate(stamps.tolist()):
+    for i, stamp in enumerate(r.stamps.tolist()):
         if i and r.time[i] - r.time[i - 1] > gap:
             differentiator.reset()
         try:

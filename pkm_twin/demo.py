@@ -64,6 +64,13 @@ STAGES = (
         DYNAMICS_OUTPUTS,
     ),
     Stage(
+        "prru_milling",
+        "delta_dynamics.node",
+        ("mechanism:=prru", "qos_overrides./joint_states.subscription.depth:=1000"),
+        ("/joint_states", "/delta_dynamics/joint_trajectory"),
+        DYNAMICS_OUTPUTS,
+    ),
+    Stage(
         "upr_rpu_milling",
         "stiffness_monitor.node",
         (
@@ -181,7 +188,7 @@ def process(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def child_environment() -> dict[str, str]:
-    """This environment, so that the ROS wheels of a child find their libraries again."""
+    """The environment, changed so that a child's ROS wheels find their libraries again."""
     environment = dict(os.environ)
     environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
     return environment
@@ -197,6 +204,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(options.domain)
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=120)
     options.out.mkdir(parents=True, exist_ok=True)
     recording = options.out / "demo.mcap"
     context = Context()

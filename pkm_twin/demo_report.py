@@ -17,8 +17,9 @@ from rich.table import Table
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, plots
 from pkm_twin.bags import inspect, read_messages
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.check import motion
 from pkm_twin.messages import stamp_of
+from pkm_twin.recorded import Recording, read_recording
 
 Array = NDArray[np.float64]
 
@@ -55,6 +56,8 @@ class DynamicsSeries:
     measured: Array
     predicted: Array
     residual: Array
+    free: NDArray[np.bool_]
+    """Where neither payload nor cutting force is on the platform, which the node cannot know."""
     loaded: tuple[float, float] | None
 
 
@@ -75,93 +78,100 @@ def report_dynamics(
     bag: Path, recording: Path, prefix: str
 ) -> tuple[list[Finding], DynamicsSeries]:
     """Compare recorded efforts with the answered ones."""
-    metadata = inspect(bag).metadata["pkm_twin"]
-    robot = load(metadata["robot"])
-    states = _by_stamp(bag, "/joint_states")
+    r = read_recording(bag)
+    robot, unit = r.robot, r.robot.effort_unit
     torques = _by_stamp(recording, f"/{prefix}/delta_dynamics/joint_torques")
     residuals = _by_stamp(recording, f"/{prefix}/delta_dynamics/torque_residual")
-    sent = sum(1 for _ in read_messages(bag, ["/delta_dynamics/joint_trajectory"]))
-    answered = sum(
-        1 for _ in read_messages(recording, [f"/{prefix}/delta_dynamics/joint_trajectory_ff"])
-    )
-    start = min(states)
-    common = sorted(set(states) & set(torques) & set(residuals))
-    if not common:
-        return [Finding(prefix, "torques published", "none", "some", good=False)], _silent(robot)
-    time = (np.array(common) - start) / 1e9
+    answered = [i for i, s in enumerate(r.stamps.tolist()) if s in torques and s in residuals]
+    stamps = r.stamps[answered].tolist()
+    measured = np.zeros((len(stamps), 3)) if r.effort is None else r.effort[answered]
     series = DynamicsSeries(
         f"{prefix}: {robot.name}",
         robot.joint_names,
-        robot.effort_unit,
-        time,
-        _column(states, common, "effort", robot),
-        _column(torques, common, "effort", robot),
-        _column(residuals, common, "effort", robot),
-        _loaded(metadata),
+        unit,
+        r.time[answered],
+        measured,
+        _efforts(torques, stamps),
+        _efforts(residuals, stamps),
+        _free(r)[answered],
+        r.loaded,
     )
+    sent = sum(1 for _ in read_messages(bag, ["/delta_dynamics/joint_trajectory"]))
+    filled = read_messages(recording, [f"/{prefix}/delta_dynamics/joint_trajectory_ff"])
     findings = [
-        _share(prefix, "joint states answered", len(common), len(states)),
-        _share(prefix, "trajectories answered", answered, sent),
+        _share(prefix, "joint states answered", len(stamps), len(r.stamps)),
+        _share(prefix, "trajectories answered", sum(1 for _ in filled), sent),
     ]
+    if not stamps:
+        return findings, series
     peak = np.abs(series.predicted).max(0)
-    findings.append(Finding(prefix, "peak effort", _listed(peak, robot.effort_unit)))
+    findings.append(Finding(prefix, "peak effort", _listed(peak, unit)))
     rms = np.sqrt(np.mean(series.predicted**2, 0))
-    findings.append(Finding(prefix, "RMS effort", _listed(rms, robot.effort_unit)))
-    free = np.ones(len(time), bool)
-    if series.loaded is not None:
-        # The gripper closes and opens in between: half a second around both counts for neither.
-        free = (time < series.loaded[0] - 0.5) | (time > series.loaded[1] + 0.5)
+    findings.append(Finding(prefix, "RMS effort", _listed(rms, unit)))
+    free = series.free
     part = np.sqrt(np.mean(series.residual[free] ** 2, 0)) / np.abs(series.measured).max(0)
     findings.append(
         Finding(
             prefix,
-            "residual RMS without payload" if series.loaded else "residual RMS",
+            "residual RMS without load",
             _listed(100 * part, "% of peak"),
             f"below {100 * MAX_RESIDUAL:g} %",
             bool((part < MAX_RESIDUAL).all()),
         )
     )
     if series.loaded is not None:
-        findings += _payload(prefix, metadata, robot, states, common, series)
+        findings += _payload(prefix, r, answered, series)
     return findings, series
 
 
+def _free(r: Recording) -> NDArray[np.bool_]:
+    """Where nothing is held and nothing cut; half a second around either counts for neither."""
+    if r.loaded is not None:
+        loaded = (r.time > r.loaded[0]) & (r.time < r.loaded[1])
+    elif r.wrench is not None:
+        force = np.linalg.norm(r.wrench[:, :3], axis=1)
+        loaded = force > 0.1 * force.max()
+    else:
+        loaded = np.zeros(len(r.time), bool)
+    edge = r.time[loaded]
+    if not len(edge):
+        return ~loaded
+    after = np.minimum(np.searchsorted(edge, r.time), len(edge) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.minimum(np.abs(edge[after] - r.time), np.abs(edge[before] - r.time))
+    return np.asarray(nearest > 0.5, np.bool_)
+
+
 def _payload(
-    prefix: str,
-    metadata: Mapping[str, str],
-    robot: Robot,
-    states: Mapping[int, Any],
-    common: list[int],
-    series: DynamicsSeries,
+    prefix: str, r: Recording, answered: list[int], series: DynamicsSeries
 ) -> list[Finding]:
     """The step that the payload makes in the residual, and the mass that it means."""
     assert series.loaded is not None  # noqa: S101
+    free = series.free
     held = (series.time > series.loaded[0] + 0.5) & (series.time < series.loaded[1] - 0.5)
-    free = (series.time < series.loaded[0] - 0.5) | (series.time > series.loaded[1] + 0.5)
     step = np.linalg.norm(series.residual[held].mean(0) - series.residual[free].mean(0))
-    noise = np.linalg.norm(np.std(series.residual[free], 0))
-    # Weight alone: the motion's mean acceleration over many cycles is zero.
-    q = _column(states, common, "position", robot)[held]
-    zero = np.zeros(3)
-    weight = inverse_dynamics(robot.changed(payload={"mass": 1.0}), q, zero, zero)
-    weight -= inverse_dynamics(robot, q, zero, zero)
+    scatter = np.linalg.norm(np.std(series.residual[free], 0))
+    # What one kilogram would need, along the recorded motion.
+    qd, qdd, _ = motion(r)
+    state = [values[answered][held] for values in (r.q, qd, qdd)]
+    kilogram = inverse_dynamics(r.robot.changed(payload={"mass": 1.0}), *state)
+    kilogram -= inverse_dynamics(r.robot, *state)
     change = series.residual[held] - series.residual[free].mean(0)
-    mass = float(np.sum(weight * change) / np.sum(weight**2))
-    true = float(metadata["payload_mass_kg"])
+    mass = float(np.sum(kilogram * change) / np.sum(kilogram**2))
     return [
         Finding(
             prefix,
             "step of the residual at the pick",
-            f"{step:.3f} {robot.effort_unit}, {step / noise:.1f} times its scatter",
+            f"{step:.3f} {series.unit}, {step / scatter:.1f} times its scatter",
             "above 3 times",
-            bool(step > 3 * noise),
+            bool(step > 3 * scatter),
         ),
         Finding(
             prefix,
             "payload mass seen in the residual",
-            f"{mass:.3f} kg (recorded with {true:.3f} kg)",
+            f"{mass:.3f} kg (recorded with {r.payload_mass:.3f} kg)",
             "within 10 %",
-            abs(mass - true) < 0.1 * true,
+            abs(mass - r.payload_mass) < 0.1 * r.payload_mass,
         ),
     ]
 
@@ -209,6 +219,7 @@ def report_stiffness(
     findings.append(_share(prefix, "deflections with ground truth", len(judged), len(truth)))
     if judged:
         place = np.searchsorted(common, judged)
+        greatest = 1e6 * np.linalg.norm(true, axis=1).max()
         error = np.sqrt(
             np.mean(np.sum((fixed[place] - true) ** 2, 1)) / np.mean(np.sum(true**2, 1))
         )
@@ -216,7 +227,7 @@ def report_stiffness(
             Finding(
                 prefix,
                 "RMS difference to the frame's deflection",
-                f"{100 * error:.1f} % (frame's largest {1e6 * np.linalg.norm(true, axis=1).max():.2f} um)",
+                f"{100 * error:.1f} % (frame's largest {greatest:.2f} um)",
                 f"below {100 * MAX_DEFLECTION_ERROR:g} %",
                 bool(error < MAX_DEFLECTION_ERROR),
             )
@@ -260,21 +271,9 @@ def _by_stamp(bag: Path, topic: str) -> dict[int, Any]:
     return {stamp_of(m.message.header): m.message for m in read_messages(bag, [topic])}
 
 
-def _column(messages: Mapping[int, Any], stamps: list[int], what: str, robot: Robot) -> Array:
-    """A field of joint states in the robot's joint order, shape (n, 3)."""
-    rows = []
-    for stamp in stamps:
-        message = messages[stamp]
-        index = [list(message.name).index(name) for name in robot.joint_names]
-        values = getattr(message, what)
-        rows.append([values[i] for i in index])
-    return np.array(rows)
-
-
-def _loaded(metadata: Mapping[str, str]) -> tuple[float, float] | None:
-    if "payload_picked_s" not in metadata:
-        return None
-    return float(metadata["payload_picked_s"]), float(metadata["payload_released_s"])
+def _efforts(messages: Mapping[int, Any], stamps: list[int]) -> Array:
+    """Efforts in the order that the node publishes, the robot's, shape (n, 3)."""
+    return np.array([messages[stamp].effort for stamp in stamps]).reshape(-1, 3)
 
 
 def _share(bag: str, what: str, count: int, total: int) -> Finding:
@@ -293,10 +292,3 @@ def _listed(values: Array, unit: str) -> str:
 
 def _xyz(vector: Any) -> list[float]:
     return [vector.x, vector.y, vector.z]
-
-
-def _silent(robot: Robot) -> DynamicsSeries:
-    none = np.zeros((0, 3))
-    return DynamicsSeries(
-        "silent", robot.joint_names, robot.effort_unit, np.zeros(0), none, none, none, None
-    )

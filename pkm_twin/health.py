@@ -56,7 +56,7 @@ class TwinNode(Node):
     def start(self) -> None:
         """Refuse unknown parameters, begin the diagnostics, and say where the node listens."""
         self.refuse_unknown_parameters()
-        self.create_timer(1.0, self._publish_diagnostics, clock=self.steady)
+        self.every(1.0, self._publish_diagnostics)
         self.get_clock().create_jump_callback(
             JumpThreshold(
                 min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
@@ -112,8 +112,8 @@ class TwinNode(Node):
                 callback(message)
             except MessageError as error:
                 self.log_throttled(error.reason, f"{topic}: rejected, {error.reason}: {error}")
-            except Exception:
-                self.caught(topic)
+            except Exception as error:
+                self.caught(topic, error)
 
         self.create_subscription(
             kind,
@@ -132,8 +132,24 @@ class TwinNode(Node):
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
-    def caught(self, where: str) -> None:
-        """An exception in a callback: the node lives; one traceback a kind."""
+    def every(self, period: float, callback: Callable[[], None]) -> None:
+        """A timer on the steady clock, with a callback that cannot end the node; period in s."""
+
+        def guarded() -> None:
+            try:
+                callback()
+            except Exception as error:
+                self.caught(callback.__name__, error)
+
+        self.create_timer(period, guarded, clock=self.steady)
+
+    def caught(self, where: str, error: Exception) -> None:
+        """An exception in a callback: the node lives; one traceback a kind.
+
+        :raises ExternalShutdownException: it came from a signal in the middle of the callback.
+        """
+        if not self.context.ok():
+            raise ExternalShutdownException from error
         self._seen["exceptions"] += 1
         text = traceback.format_exc()
         if text != self._last_exception:
@@ -199,16 +215,23 @@ def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None)
     :returns: 0 after a signal, 1 where the node refuses its configuration.
     """
     node: TwinNode | None = None
+    begun = False
     try:
         rclpy.init(args=None if arguments is None else list(arguments))
+        begun = True
         node = factory()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except PkmTwinError as error:
-        print(f"refused to start: {error}", file=sys.stderr)
+    except (PkmTwinError, ParameterException, RuntimeError) as error:
+        if begun and not rclpy.ok():
+            return 0  # A signal in the middle of a call of the middleware.
+        if node is not None:
+            raise
+        # The middleware's own refusals (arguments, types, QoS overrides) have many lines.
+        print(f"refused to start: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     finally:
         if node is not None:

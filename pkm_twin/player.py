@@ -22,8 +22,8 @@ from pkm_twin.cdr import message_class, message_definition, parse_definition
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError
 
 CLOCK_TOPIC = "/clock"
-# Fewer would let a burst in the bag overwrite messages before they are sent.
-_MIN_DEPTH = 100
+# A second at 1 kHz: a subscriber that the machine leaves waiting so long still gets everything.
+_MIN_DEPTH = 1000
 # How long the last messages may take to reach reliable subscribers, s.
 _DELIVERY_TIME = 1.0
 # A wait of the operating system overshoots by less than this, s; the rest is short sleeps.
@@ -86,7 +86,8 @@ def play(
     targets = _targets(bag, names, remap or {})
     stop = threading.Event()
     with _signals(stop), _publishers(bag, targets, bool(clock)) as (publishers, clock_publisher):
-        _await_subscribers(publishers, wait_for_subscribers, stop)
+        awaited = {**publishers, CLOCK_TOPIC: clock_publisher} if clock else publishers
+        _await_subscribers(awaited, wait_for_subscribers, stop)
         replay = _Replay(bag, publishers, rate, stop)
         if clock and clock_publisher:
             replay.add_clock(clock_publisher, clock)

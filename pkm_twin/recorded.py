@@ -29,13 +29,14 @@ BASE_FRAME = "base_link"
 class Recording:
     """Accepted joint states on a common time axis.
 
-    time (n,) in s since the first stamp; q, qd, effort (n, 3), None where the bag has none;
-    wrench (n, 6) in fixed axes at the platform's origin, the one nearest in time, None without
+    stamps (n,) in ns; time (n,) in s since the first stamp; q, qd, effort (n, 3), None where the
+    bag has none; wrench (n, 6) in fixed axes at the platform's origin, the one nearest in time, None without
     a wrench topic. ``rejected`` counts refused messages by reason.
     """
 
     robot: Robot
     bag: Bag
+    stamps: NDArray[np.int64]
     time: Array
     q: Array
     qd: Array | None
@@ -116,6 +117,7 @@ def read_recording(
     return Recording(
         machine,
         bag,
+        stamps,
         (stamps - stamps[0]) / 1e9,
         np.array([s.q for s in samples]),
         _stacked([s.qd for s in samples]),

@@ -72,7 +72,7 @@ class StiffnessMonitor(health.TwinNode):
         frame = self.declare("wrench_frame", d.wrench_frame, "frame of the wrench", read_only=True)
         base = self.declare("base_frame", d.base_frame, "name of the fixed frame", read_only=True)
         empty = self.declare(
-            "accept_empty_frame", d.accept_empty_frame, "empty frame is wrench_frame", read_only=True
+            "accept_empty_frame", d.accept_empty_frame, "empty: wrench_frame", read_only=True
         )
         age = self.declare(
             "max_state_age", d.max_state_age, "s between wrench and joint state", read_only=True
@@ -112,12 +112,12 @@ class StiffnessMonitor(health.TwinNode):
         robot, energy = self._monitor.robot, answer.energy
         pairs: dict[str, str] = {}
         if energy.dominant != "none":
-            pairs |= {e: repr(float(f)) for e, f in zip(energy.elements, energy.factors, strict=True)}
+            factors = energy.factors.tolist()
+            pairs |= {e: repr(f) for e, f in zip(energy.elements, factors, strict=True)}
         pairs["total_energy"] = repr(float(energy.total))
         pairs["tie"] = str(bool(energy.tie)).lower()
-        pairs |= {
-            name: repr(value) for name, value in zip(robot.pose_names, answer.pose.tolist(), strict=True)
-        }
+        pose = answer.pose.tolist()
+        pairs |= {name: repr(x) for name, x in zip(robot.pose_names, pose, strict=True)}
         pairs["frame"] = self._monitor.settings.base_frame
         return DiagnosticStatus(
             level=health.OK,
