@@ -1,6 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigid-body dynamics of parallel kinematic machines."""
 
+from delta_dynamics.isotropy import (
+    Extremes,
+    JointMotion,
+    energy_matrices,
+    energy_transfer,
+    energy_transfer_range,
+    joint_motion,
+    max_driving_force,
+    max_driving_force_range,
+    sphere_directions,
+    spread,
+    tilted_pose,
+)
+from delta_dynamics.reactions import Reactions, least_norm_reactions, reactions
+from delta_dynamics.terms import Terms, dynamics_terms
 from delta_dynamics.virtual_work import (
     Energy,
     energy,
@@ -9,4 +24,26 @@ from delta_dynamics.virtual_work import (
     mass_matrix,
 )
 
-__all__ = ["Energy", "energy", "forward_dynamics", "inverse_dynamics", "mass_matrix"]
+__all__ = [
+    "Energy",
+    "Extremes",
+    "JointMotion",
+    "Reactions",
+    "Terms",
+    "dynamics_terms",
+    "energy",
+    "energy_matrices",
+    "energy_transfer",
+    "energy_transfer_range",
+    "forward_dynamics",
+    "inverse_dynamics",
+    "joint_motion",
+    "least_norm_reactions",
+    "mass_matrix",
+    "max_driving_force",
+    "max_driving_force_range",
+    "reactions",
+    "sphere_directions",
+    "spread",
+    "tilted_pose",
+]

@@ -70,6 +70,7 @@ class Feedforward:
         self.trajectories = Guard(bad_limit=2**62, good_needed=1)
         self.saturations = 0
         self.dropped = 0
+        self.last_reject = ""
         self._last_stamp = 0
         self._last_good: Array | None = None
         self._differentiator = Differentiator(s.order, s.window)
@@ -104,6 +105,7 @@ class Feedforward:
             efforts = self._trajectory(message, now)
         except MessageError as error:
             self.trajectories.reject(error.reason, str(error))
+            self.last_reject = str(error)
             raise
         self.trajectories.accept()
         return efforts
@@ -117,6 +119,7 @@ class Feedforward:
             torques = self._joint_state(message, now)
         except MessageError as error:
             self.stream.reject(error.reason, str(error))
+            self.last_reject = str(error)
             raise
         if torques is None or not self.stream.accept():
             return None

@@ -55,7 +55,7 @@ class DeltaDynamics(health.TwinNode):
         self.add_post_set_parameters_callback(self._after_set)
         period = min(0.25 * self._feedforward.settings.stale_after, 0.1)
         self._last_heard = 0
-        self.create_timer(period, self._watch, clock=self.steady)
+        self.every(period, self._watch)
         self.start()
 
     def summary(self) -> str:
@@ -76,11 +76,11 @@ class DeltaDynamics(health.TwinNode):
         """Level, message and values of the node's diagnostic status."""
         core = self._feedforward
         level, message = health.OK, "running"
-        rejected = core.stream.rejected + core.trajectories.rejected
-        if rejected or core.saturations:
+        if core.last_reject or core.saturations:
             level = health.WARN
-            last = core.stream if core.stream.rejected else core.trajectories
-            message = f"last reject: {last.text}" if rejected else "an effort limit was passed"
+            message = "an effort limit was passed"
+        if core.last_reject:
+            message = f"last reject: {core.last_reject}"
         if core.stream.stopped:
             level, message = health.ERROR, f"stopped: {core.stream.reason}: {core.stream.text}"
         values: dict[str, object] = {

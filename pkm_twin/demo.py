@@ -156,18 +156,19 @@ def run_stage(
         command += ["--clock", "200", "--wait", "20"]
         command += [word for topic in stage.inputs for word in ("--topic", topic)]
         with process([*command, "--quiet"]) as player:
-            begin = time.monotonic()
+            begin, before = time.monotonic(), sum(recorder.counts.values())
             while player.poll() is None:
                 executor.spin_once(timeout_sec=0.05)
                 progress.update(
                     bar,
                     completed=min(seconds, time.monotonic() - begin),
-                    messages=sum(recorder.counts.values()),
+                    messages=sum(recorder.counts.values()) - before,
                 )
             if player.returncode != 0:
                 raise BagError(f"the player ended with code {player.returncode}", path=bag)
         _drain(executor, recorder)
-        progress.update(bar, completed=seconds, messages=sum(recorder.counts.values()))
+        answers = sum(recorder.counts.values()) - before
+        progress.update(bar, completed=seconds, messages=answers)
     recorder.stop()
 
 

@@ -11,6 +11,7 @@ May import: numpy, numba if present, the standard library.
 from __future__ import annotations
 
 import os
+import types
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -60,11 +61,23 @@ Array = NDArray[np.float64]
 
 
 def scalar(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Mark a helper that kernels call."""
+    """Mark a helper that kernels call.
+
+    It is not cached by itself but within each kernel that calls it: numba's cache of a function
+    with several signatures can mix them up when two processes write it at once.
+    """
     if numba is None:
         return function
-    compiled: Callable[..., Any] = numba.njit(cache=True, error_model="numpy")(function)
+    compiled: Callable[..., Any] = numba.njit(error_model="numpy")(function)
     return compiled
+
+
+def _renamed(function: Callable[..., None], suffix: str) -> Callable[..., None]:
+    """The same function under a name, and so with a cache file, of its own."""
+    copy = types.FunctionType(function.__code__, function.__globals__, function.__name__ + suffix)
+    copy.__qualname__ = function.__qualname__ + suffix
+    copy.__module__ = function.__module__
+    return copy
 
 
 class Kernel:
@@ -121,7 +134,7 @@ class Kernel:
             nopython=True,
             cache=True,
             writable_args=tuple(range(n_in, n_in + n_out)),
-        )(self.function)
+        )(_renamed(self.function, "_many"))
         return compiled
 
     def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[Array, ...]:

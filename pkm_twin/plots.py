@@ -52,8 +52,17 @@ def efforts(axes: Sequence[Any], data: DynamicsSeries) -> None:
     for i, joint in enumerate(data.joints):
         whole.plot(data.time, data.predicted[:, i], color=COLOURS[i], lw=0.7, label=joint)
         rest.plot(data.time, data.residual[:, i], color=COLOURS[i], lw=0.5, label=joint)
-    if data.loaded is not None:
-        rest.axvspan(*data.loaded, color="0.9", zorder=0, label="payload held")
+    if not data.free.all():
+        what = "cutting" if data.loaded is None else "payload held"
+        rest.fill_between(
+            data.time,
+            *(0, 1),
+            where=~data.free,
+            transform=rest.get_xaxis_transform(),
+            color="0.9",
+            zorder=0,
+            label=f"{what},\nunknown to the node",
+        )
     for ax in axes:
         ax.set_xlabel("time (s)")
         ax.set_ylabel(f"effort ({data.unit})")

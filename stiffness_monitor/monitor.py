@@ -62,6 +62,7 @@ class Monitor:
         self.states = Guard(bad_limit=2**62, good_needed=1)
         self.wrenches = Guard(bad_limit=2**62, good_needed=1)
         self.dropped = 0
+        self.last_reject = ""
         self._rules = StampRules(s.accept_zero_stamp, round(s.future_tolerance * 1e9))
         self._reader = JointReader(self.robot)
         self._recent: deque[tuple[int, Array]] = deque(maxlen=256)
@@ -86,6 +87,7 @@ class Monitor:
                 )
         except MessageError as error:
             self.states.reject(error.reason, str(error))
+            self.last_reject = str(error)
             raise
         self.states.accept()
         self._recent.append((sample.stamp, sample.q))
@@ -102,6 +104,7 @@ class Monitor:
             answer = self._wrench(message, now)
         except MessageError as error:
             self.wrenches.reject(error.reason, str(error))
+            self.last_reject = str(error)
             raise
         self.wrenches.accept()
         return answer

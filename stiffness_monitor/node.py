@@ -54,9 +54,8 @@ class StiffnessMonitor(health.TwinNode):
         """Level, message and values of the node's diagnostic status."""
         core = self._monitor
         level, message = health.OK, "running"
-        for what in (core.states, core.wrenches):
-            if what.rejected:
-                level, message = health.WARN, f"last reject: {what.text}"
+        if core.last_reject:
+            level, message = health.WARN, f"last reject: {core.last_reject}"
         values: dict[str, object] = {
             "robot": core.robot.name,
             "joint states taken": core.states.accepted,

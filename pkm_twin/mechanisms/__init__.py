@@ -48,7 +48,7 @@ def load(robot: str | Path) -> Robot:
     mechanism = data.get("mechanism")
     if mechanism is None:
         raise ParameterError("mechanism", None, f"one of {', '.join(sorted(CATALOGUE))}")
-    if mechanism not in CATALOGUE:
+    if not isinstance(mechanism, str) or mechanism not in CATALOGUE:
         raise UnknownNameError("mechanism", mechanism, CATALOGUE)
     module, kind = CATALOGUE[mechanism].split(":")
     result: Robot = parameters.build(getattr(importlib.import_module(module), kind), data)
