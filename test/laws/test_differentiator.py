@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The causal differentiator: exact on polynomials, on any stamps, and never guessing."""
+
+import numpy as np
+import pytest
+
+from delta_dynamics.differentiator import Differentiator
+from pkm_twin.errors import MessageError
+
+SECOND = 10**9
+STEP = SECOND // 1000
+
+
+def stamps_of(rng, count, jitter):
+    """Rising stamps (ns) of a 1 kHz stream, unevenly spaced by up to ``jitter`` of a step."""
+    begin = 1_700_000_000 * SECOND
+    shift = rng.uniform(-jitter / 2, jitter / 2, count) * STEP
+    return [begin + i * STEP + round(s) for i, s in enumerate(shift)]
+
+
+def polynomial(rng, degree):
+    """Positions as a polynomial of time, its rate and its acceleration, each (3,) of s."""
+    c = rng.normal(size=(degree + 1, 3))
+    k = np.arange(degree + 1)
+
+    def at(t):
+        q = (t**k) @ c
+        qd = (k[1:] * t ** (k[1:] - 1)) @ c[1:]
+        qdd = (k[2:] * (k[2:] - 1) * t ** (k[2:] - 2)) @ c[2:]
+        return q, qd, qdd
+
+    return at
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+@pytest.mark.parametrize("window", [6, 25, 101])
+@pytest.mark.parametrize("jitter", [0.0, 0.8])
+def test_a_velocity_polynomial_of_the_order_is_differentiated_exactly(rng, order, window, jitter):
+    stamps = stamps_of(rng, window + 7, jitter)
+    motion = polynomial(rng, order + 1)
+    differentiator = Differentiator(order, window)
+    for i, stamp in enumerate(stamps):
+        q, qd, qdd = motion((stamp - stamps[0]) / SECOND)
+        result = differentiator.push(stamp, q, qd)
+        assert (result is None) == (i < window - 1)
+        if result is not None:
+            assert (result[0] == qd).all()
+            # The end of a short window sees rounding over its length.
+            assert np.abs(result[1] - qdd).max() < 1e-11 * SECOND / STEP
+            assert differentiator.delay == (0.0 if order > 1 else (window - 1) / 2)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("jitter", [0.0, 0.8])
+def test_positions_alone_give_rates_and_accelerations(rng, order, jitter):
+    window = 25
+    stamps = stamps_of(rng, window + 3, jitter)
+    motion = polynomial(rng, order + 1)
+    differentiator = Differentiator(order, window)
+    for stamp in stamps:
+        q, qd, qdd = motion((stamp - stamps[0]) / SECOND)
+        result = differentiator.push(stamp, q, None)
+    assert np.abs(result[0] - qd).max() < 1e-10
+    assert np.abs(result[1] - qdd).max() < 1e-7
+
+
+def test_order_one_gives_the_acceleration_half_a_window_ago(rng):
+    window = 21
+    differentiator = Differentiator(1, window)
+    stamps = stamps_of(rng, 60, 0.0)
+    for stamp in stamps:
+        t = (stamp - stamps[0]) / SECOND
+        result = differentiator.push(stamp, np.zeros(3), np.full(3, 3 * t**2))
+    middle = (stamps[-1] - stamps[0]) / SECOND - differentiator.delay * STEP / SECOND
+    assert np.allclose(result[1], 6 * middle, rtol=1e-9)
+
+
+def test_white_noise_shrinks_with_the_window(rng):
+    spread = []
+    for window in (10, 40):
+        differentiator = Differentiator(2, window)
+        noise = 1e-3 * rng.normal(size=(2000, 3))
+        results = [
+            differentiator.push((i + 1) * STEP, np.zeros(3), value) for i, value in enumerate(noise)
+        ]
+        spread.append(np.std([r[1] for r in results if r is not None]))
+    # The end slope of a fit has a deviation that falls with window to the power 3/2.
+    assert spread[0] / spread[1] == pytest.approx(4**1.5, rel=0.2)
+
+
+def test_scaled_motion_scales_and_a_shift_of_the_stamps_changes_nothing(rng):
+    stamps = stamps_of(rng, 12, 0.5)
+    values = rng.normal(size=(12, 3))
+
+    def last(shift, factor):
+        differentiator = Differentiator(2, 12)
+        for stamp, value in zip(stamps, values, strict=True):
+            result = differentiator.push(stamp + shift, value, factor * value)
+        return result[1]
+
+    assert (last(86_400 * SECOND, 1.0) == last(0, 1.0)).all()
+    assert np.allclose(last(0, 4.0), 4.0 * last(0, 1.0), rtol=1e-12)
+
+
+def test_a_reset_or_another_kind_of_stream_fills_the_window_anew():
+    differentiator = Differentiator(2, 5)
+    stamps = iter(range(STEP, 1000 * STEP, STEP))
+
+    def push(count, rates):
+        zero = np.zeros(3)
+        return [
+            differentiator.push(next(stamps), zero, zero if rates else None) is not None
+            for _ in range(count)
+        ]
+
+    filling = [False] * 4 + [True] * 2
+    assert push(6, True) == filling
+    differentiator.reset()
+    assert push(6, True) == filling
+    assert push(6, False) == filling
+    assert push(6, True) == filling
+
+
+@pytest.mark.parametrize("cluster", [1, 10, 1000])
+def test_stamps_that_tell_no_polynomial_are_rejected(cluster):
+    # All samples but one within a few nanoseconds, then a gap: any curvature fits these.
+    differentiator = Differentiator(3, 25)
+    for i in range(24):
+        assert differentiator.push(SECOND + i * cluster, np.zeros(3), np.ones(3)) is None
+    with pytest.raises(MessageError) as caught:
+        differentiator.push(SECOND + 3600 * SECOND, np.zeros(3), np.ones(3))
+    assert caught.value.reason == "uneven stamps"

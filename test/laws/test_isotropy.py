@@ -1,0 +1,366 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the two isotropy indices, and the statements that the 3-PRRU paper makes of them."""
+
+import numpy as np
+import pytest
+
+from delta_dynamics import (
+    energy,
+    energy_matrices,
+    energy_transfer,
+    energy_transfer_range,
+    inverse_dynamics,
+    joint_motion,
+    mass_matrix,
+    max_driving_force,
+    max_driving_force_range,
+    sphere_directions,
+    spread,
+    tilted_pose,
+)
+from delta_dynamics.isotropy import _least_direction
+from pkm_twin import load, robot_names
+from pkm_twin.errors import ParameterError, SingularityError
+from pkm_twin.mechanisms.joints import platform_motion
+from test.conftest import random_joints
+
+MASSIVE = [name for name in robot_names() if load(name).dynamics_kernel is not None]
+LOADED = {
+    "payload": {"mass": 0.3, "com": [0.01, -0.02, -0.04], "inertia": [4e-4, 5e-4, 3e-4]},
+    "gravity": [0.5, -1.0, -9.7],
+    "friction": {"viscous": [0.1, 0.2, 0.3], "coulomb": [0.05, 0.06, 0.07]},
+}
+THIRD = 2 * np.pi / 3
+TURN = np.array([[np.cos(THIRD), -np.sin(THIRD), 0], [np.sin(THIRD), np.cos(THIRD), 0], [0, 0, 1]])
+
+massive = pytest.mark.parametrize("name", MASSIVE)
+
+
+@pytest.fixture
+def robot(name):
+    return load(name).changed(**LOADED)
+
+
+@pytest.fixture
+def head():
+    if "prru" not in MASSIVE:
+        pytest.skip("no 3-PRRU in config")
+    return load("prru")
+
+
+def energy_of(robot):
+    """A platform energy at which both gravity and velocity count, J."""
+    return 100.0 if robot.joint_unit == "m" else 1.0
+
+
+@massive
+def test_the_platform_frame_is_that_of_the_kinematics(name, robot, rng):
+    q = random_joints(robot, rng, 100)
+    qd = rng.normal(size=q.shape)
+    platform = platform_motion(robot, q, qd)
+    pose = robot.forward(q)
+    np.testing.assert_allclose(platform.axes, robot.rotation(pose), atol=1e-13)
+    twist = np.einsum("nij,nj->ni", robot.platform_jacobian(q), qd)
+    np.testing.assert_allclose(platform.velocity, twist[:, :3], atol=1e-12)
+    turned = np.cross(twist[:, None, 3:], platform.axes.swapaxes(-1, -2)).swapaxes(-1, -2)
+    np.testing.assert_allclose(platform.axes_rate, turned, atol=1e-12)
+    rates, _ = robot.pose_rates(platform)
+    np.testing.assert_allclose(rates, np.einsum("nij,nj->ni", robot.jacobian(q), qd), atol=1e-12)
+
+
+@massive
+def test_joint_motion_follows_the_pose_in_time(name, robot, rng):
+    """q(t) of X(t) = X + t Xdot + t^2/2 Xddot has these derivatives, by five-point stencils."""
+    q = random_joints(robot, rng, 50)
+    pose, h = robot.forward(q), 2e-3
+    rates, accelerations = 0.1 * rng.normal(size=(2, *q.shape))
+    motion = joint_motion(robot, pose, rates, accelerations)
+    np.testing.assert_allclose(motion.q, q, atol=1e-10)
+    at = {k: robot.inverse(pose + k * h * rates + (k * h) ** 2 / 2 * accelerations)
+          for k in (-2, -1, 0, 1, 2)}  # fmt: skip
+    first = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h)
+    second = (16 * (at[1] + at[-1]) - (at[2] + at[-2]) - 30 * at[0]) / (12 * h * h)
+    np.testing.assert_allclose(motion.qd, first, atol=1e-9)
+    np.testing.assert_allclose(motion.qdd, second, atol=1e-6)
+
+
+@massive
+def test_the_quadratic_part_of_qdd_is_symmetric(name, robot, rng):
+    """qdd at Xddot = 0 is a quadratic form of Xdot to rounding: the parallelogram law holds."""
+    pose = robot.forward(random_joints(robot, rng, 50))
+    a, b = rng.normal(size=(2, 50, 3))
+    qa, qb, plus, minus = (joint_motion(robot, pose, v).qdd for v in (a, b, a + b, a - b))
+    size = max(np.abs(plus).max(), np.abs(minus).max())
+    np.testing.assert_allclose(plus + minus, 2 * qa + 2 * qb, atol=1e-12 * size)
+
+
+@massive
+def test_energy_matrices_are_the_robots_energy(name, robot, rng):
+    q = random_joints(robot, rng, 50)
+    pose = robot.forward(q)
+    rates = rng.normal(size=q.shape)
+    platform, everything = energy_matrices(robot, pose)
+    inverse = np.linalg.inv(robot.jacobian(q))
+    expected = inverse.swapaxes(-1, -2) @ mass_matrix(robot, q) @ inverse
+    np.testing.assert_allclose(everything, expected, atol=1e-11 * np.abs(expected).max())
+    kinetic = energy(robot, q, np.einsum("nij,nj->ni", inverse, rates)).kinetic
+    form = np.einsum("ni,nij,nj->n", rates, everything, rates) / 2
+    np.testing.assert_allclose(form, kinetic, rtol=1e-11)
+    assert (np.linalg.eigvalsh(platform) > 0).all()
+    assert (np.linalg.eigvalsh(everything - platform) > 0).all()
+
+
+@massive
+def test_a_payload_moves_with_the_platform(name, rng):
+    """It adds the same energy to the platform as to the whole machine."""
+    robot = load(name)
+    pose = robot.forward(random_joints(robot, rng, 20))
+    empty, loaded = energy_matrices(robot, pose), energy_matrices(robot.changed(**LOADED), pose)
+    added = loaded[0] - empty[0]
+    np.testing.assert_allclose(added, loaded[1] - empty[1], atol=1e-12 * np.abs(empty[1]).max())
+    assert (np.linalg.eigvalsh(added) > 0).all()
+
+
+@massive
+def test_energy_transfer_range_holds_all_samples_and_is_attained(name, robot, rng):
+    pose = robot.forward(random_joints(robot, rng, 20))
+    ends = energy_transfer_range(robot, pose)
+    samples = energy_transfer(robot, pose[:, None], sphere_directions(2000))
+    assert (samples >= ends.least[:, None] * (1 - 1e-12)).all()
+    assert (samples <= ends.greatest[:, None] * (1 + 1e-12)).all()
+    np.testing.assert_allclose(samples.min(-1), ends.least, rtol=1e-2)
+    np.testing.assert_allclose(samples.max(-1), ends.greatest, rtol=1e-2)
+    at = energy_transfer(robot, pose[:, None], ends.directions)
+    np.testing.assert_allclose(at, np.stack([ends.least, ends.greatest], -1), rtol=1e-12)
+    assert (ends.least > 0).all()
+    assert (ends.greatest < 1).all()
+    np.testing.assert_array_equal(ends.spread, ends.greatest - ends.least)
+
+
+@massive
+def test_max_driving_force_is_inverse_dynamics_at_the_energy(name, robot, rng):
+    pose = robot.forward(random_joints(robot, rng, 30))
+    direction, acceleration = rng.normal(size=(2, 30, 3))
+    amount = energy_of(robot)
+    force = max_driving_force(robot, pose, direction, amount, acceleration)
+    platform, _ = energy_matrices(robot, pose)
+    length = np.sqrt(2 * amount / np.einsum("ni,nij,nj->n", direction, platform, direction))
+    motion = joint_motion(robot, pose, length[:, None] * direction, acceleration)
+    free = robot.changed(friction={"viscous": 0.0, "coulomb": 0.0})
+    tau = inverse_dynamics(free, *motion)
+    np.testing.assert_allclose(force, np.abs(tau).max(-1), rtol=1e-11)
+    # The velocity part is even, and direction counts without its length.
+    np.testing.assert_allclose(
+        max_driving_force(robot, pose, -3 * direction, amount, acceleration), force, rtol=1e-11
+    )
+
+
+@massive
+def test_max_driving_force_range_holds_all_samples_and_is_attained(name, robot, rng):
+    pose = robot.forward(random_joints(robot, rng, 12)).reshape(3, 4, 3)
+    amount = energy_of(robot)
+    ends = max_driving_force_range(robot, pose, amount)
+    assert ends.least.shape == ends.greatest.shape == (3, 4)
+    assert ends.directions.shape == (3, 4, 2, 3)
+    samples = max_driving_force(robot, pose[..., None, :], sphere_directions(3000), amount)
+    assert (samples >= ends.least[..., None] * (1 - 1e-11)).all()
+    assert (samples <= ends.greatest[..., None] * (1 + 1e-11)).all()
+    np.testing.assert_allclose(samples.max(-1), ends.greatest, rtol=2e-2)
+    at = max_driving_force(robot, pose[..., None, :], ends.directions, amount)
+    np.testing.assert_allclose(at, np.stack([ends.least, ends.greatest], -1), rtol=1e-10)
+    # Directions one hair away from the least are not lower.
+    near = ends.directions[..., :1, :] + 1e-4 * sphere_directions(200)
+    around = max_driving_force(robot, pose[..., None, :], near, amount)
+    assert (around >= ends.least[..., None] * (1 - 1e-11)).all()
+
+
+def test_the_least_direction_is_global():
+    """Against a dense sphere for random forms, kinked minima and smooth ones.
+
+    In 14, 28 and 136 the descent from the best of a coarse grid ends in another minimum.
+    """
+    dense = sphere_directions(40_000)
+    for shift in (0.0, 2.0, 5.0, [[[4.0]], [[0.0]], [[-1.0]]]):
+        for seed in (1, 2, 3, 14, 28, 136):
+            forms = np.random.default_rng(seed).normal(size=(3, 3, 3))
+            forms = forms + forms.swapaxes(-1, -2) + shift * np.eye(3)
+            y = _least_direction(forms)
+            value = np.abs(np.einsum("i,kij,j->k", y, forms, y)).max()
+            sampled = np.abs(np.einsum("ni,kij,nj->nk", dense, forms, dense)).max(-1).min()
+            assert np.linalg.norm(y) == pytest.approx(1, abs=1e-14)
+            assert value <= sampled
+            assert sampled - value < 0.02 * np.abs(forms).max()
+
+
+@massive
+def test_acceleration_enters_as_a_constant(name, robot, rng):
+    pose = robot.forward(random_joints(robot, rng, 3))
+    acceleration = rng.normal(size=(3, 3))
+    amount = energy_of(robot)
+    ends = max_driving_force_range(robot, pose, amount, acceleration)
+    at = max_driving_force(robot, pose[:, None], ends.directions, amount, acceleration[:, None])
+    np.testing.assert_allclose(at, np.stack([ends.least, ends.greatest], -1), rtol=1e-10)
+
+
+def axis_of(pose):
+    a, b = pose[..., 1], pose[..., 2]
+    return np.stack([np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], -1)
+
+
+def turned_motion(pose, rates):
+    """A 3-PRRU motion with Xddot = 0, seen turned by a third of a turn: pose, rates, Xddot."""
+    a, b = pose[..., 1], pose[..., 2]
+    ad, bd = rates[..., 1], rates[..., 2]
+    sa, ca, sb, cb = np.sin(a), np.cos(a), np.sin(b), np.cos(b)
+    first = np.stack([cb * bd, -ca * cb * ad + sa * sb * bd, -sa * cb * ad - ca * sb * bd], -1)
+    both = ad * ad + bd * bd
+    cross = 2 * sb * ad * bd
+    second = np.stack([-sb * bd * bd, sa * cb * both + ca * cross, sa * cross - ca * cb * both], -1)
+    n, nd, ndd = (v @ TURN.T for v in (axis_of(pose), first, second))
+    beta = np.arcsin(n[..., 0])
+    alpha = np.arctan2(-n[..., 1], n[..., 2])
+    cos = np.cos(beta)
+    beta_d = nd[..., 0] / cos
+    beta_dd = (ndd[..., 0] + n[..., 0] * beta_d**2) / cos
+    square = cos**2
+    alpha_d = (n[..., 1] * nd[..., 2] - nd[..., 1] * n[..., 2]) / square
+    swell = 2 * (n[..., 1] * nd[..., 1] + n[..., 2] * nd[..., 2])
+    alpha_dd = (n[..., 1] * ndd[..., 2] - ndd[..., 1] * n[..., 2] - alpha_d * swell) / square
+    z, zd = pose[..., 0], rates[..., 0]
+    return (
+        np.stack([z, alpha, beta], -1),
+        np.stack([zd, alpha_d, beta_d], -1),
+        np.stack([0 * zd, alpha_dd, beta_dd], -1),
+    )
+
+
+def test_tilted_pose_leans_the_axis(rng):
+    azimuth, tilt = rng.uniform(-np.pi, np.pi, 50), rng.uniform(0, 1.2, 50)
+    out = np.sin(tilt)
+    lean = np.stack([out * np.cos(azimuth), out * np.sin(azimuth), np.cos(tilt)], -1)
+    pose = tilted_pose(0.9, azimuth, tilt)
+    np.testing.assert_allclose(axis_of(pose), lean, atol=1e-15)
+    assert (pose[:, 0] == 0.9).all()
+
+
+def test_zero_torsion_is_the_prrus_own_motion(head):
+    azimuth, tilt = 0.7, 0.5
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    c, s = np.cos(tilt), np.sin(tilt)
+    lean = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    pose = tilted_pose(0.9, azimuth, tilt)
+    np.testing.assert_allclose(head.rotation(pose), turn @ lean @ turn.T, atol=1e-13)
+
+
+def test_prru_indices_repeat_after_a_third_of_a_turn(head, rng):
+    """The same machine turned: same eta; same F_max where the turned motion keeps its Xddot."""
+    azimuth, tilt = rng.uniform(-np.pi, np.pi, 40), rng.uniform(0, np.radians(45), 40)
+    pose = tilted_pose(0.9, azimuth, tilt)
+    direction = sphere_directions(40)
+    there, rates, _ = turned_motion(pose, direction)
+    np.testing.assert_allclose(there, tilted_pose(0.9, azimuth + THIRD, tilt), atol=1e-14)
+    np.testing.assert_allclose(
+        energy_transfer(head, pose, direction), energy_transfer(head, there, rates), rtol=1e-12
+    )
+    ends, others = energy_transfer_range(head, pose), energy_transfer_range(head, there)
+    np.testing.assert_allclose(ends.least, others.least, rtol=1e-12)
+    np.testing.assert_allclose(ends.greatest, others.greatest, rtol=1e-12)
+
+    platform, _ = energy_matrices(head, pose)
+    length = np.sqrt(200.0 / np.einsum("ni,nij,nj->n", direction, platform, direction))
+    _, rates, acceleration = turned_motion(pose, length[:, None] * direction)
+    force = max_driving_force(head, pose, direction)
+    turned = max_driving_force(head, there, rates, acceleration=acceleration)
+    np.testing.assert_allclose(force, turned, rtol=1e-11)
+
+
+def test_prru_poses_60_180_and_300_degrees_have_the_same_sphere(head):
+    """The paper's atlas at a tilt of 45 degrees: eta exactly, F_max nearly (its Xddot = 0 is
+    meant in alpha and beta, which a turn does not keep: 0.6 % between 60 and 180 degrees)."""
+    poses = tilted_pose(0.9, np.radians([60, 180, 300]), np.radians(45))
+    eta = energy_transfer_range(head, poses)
+    for values in (eta.least, eta.greatest):
+        np.testing.assert_allclose(values, values[0], rtol=1e-12)
+    force = max_driving_force_range(head, poses)
+    np.testing.assert_allclose(force.least, force.least[0], rtol=1e-2)
+    np.testing.assert_allclose(force.greatest, force.greatest[0], rtol=1e-2)
+    assert force.greatest[0] == pytest.approx(force.greatest[2], rel=1e-11)  # mirror images
+    # Other azimuths differ from these.
+    other = energy_transfer_range(head, tilted_pose(0.9, 0.0, np.radians(45)))
+    assert abs(other.greatest - eta.greatest[0]) > 0.05
+
+
+def test_prru_indices_do_not_depend_on_height(head, rng):
+    low, high = (
+        tilted_pose(z, np.linspace(-3, 3, 20), np.linspace(0, 0.7, 20)) for z in (0.7, 1.1)
+    )
+    direction = sphere_directions(20)
+    for index in (energy_transfer, max_driving_force):
+        np.testing.assert_allclose(
+            index(head, low, direction), index(head, high, direction), rtol=1e-11
+        )
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 0.5, np.pi / 3, np.pi])
+def test_prru_spread_grows_with_tilt(head, azimuth):
+    """F_max from the level pose on; eta_KE from 25 degrees on, for with these masses the level
+    pose itself is not isotropic and a small tilt evens it out a little."""
+    tilt = np.radians([0, 10, 20, 25, 30, 35, 40, 45])
+    poses = tilted_pose(0.9, azimuth, tilt)
+    force = max_driving_force_range(head, poses).spread
+    assert (np.diff(force) > 0).all()
+    eta = energy_transfer_range(head, poses).spread
+    assert (np.diff(eta[3:]) > 0).all()
+    assert eta[-1] > 1.5 * eta[:4].max()
+    sampled = spread(energy_transfer(head, poses[:, None], sphere_directions(1000)))
+    np.testing.assert_allclose(sampled, eta, rtol=5e-2)
+
+
+def test_sphere_directions_are_even_unit_vectors():
+    points = sphere_directions(1000)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=-1), 1.0, atol=1e-15)
+    assert np.abs(points.mean(0)).max() < 1e-3
+    np.testing.assert_allclose(points.T @ points / 1000, np.eye(3) / 3, atol=1e-3)
+    near = np.sort(points @ points.T, axis=-1)[:, -2]
+    assert np.arccos(near).min() > 0.5 * np.sqrt(4 * np.pi / 1000)
+    assert sphere_directions(1).shape == (1, 3)
+    with pytest.raises(ValueError, match="at least 1"):
+        sphere_directions(0)
+
+
+@massive
+def test_bad_directions_and_energies_are_refused(name, robot, rng):
+    pose = robot.forward(random_joints(robot, rng, 1)[0])
+    for bad in (np.zeros(3), [np.nan, 1, 0], [np.inf, 1, 0]):
+        with pytest.raises(ValueError, match="direction"):
+            energy_transfer(robot, pose, bad)
+    with pytest.raises(ValueError, match="last axis"):
+        energy_transfer(robot, pose, [1.0, 0.0])
+    for amount in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="energy"):
+            max_driving_force(robot, pose, [1, 0, 0], amount)
+        with pytest.raises(ValueError, match="energy"):
+            max_driving_force_range(robot, pose, amount)
+
+
+def test_a_massless_platform_has_no_driving_force(variant):
+    robot, _ = variant("delta", inertia={"platform_mass": 0.0})
+    pose = robot.forward([0.1, 0.2, 0.3])
+    assert energy_transfer_range(robot, pose).greatest == pytest.approx(0, abs=1e-15)
+    with pytest.raises(ParameterError, match="inertia"):
+        max_driving_force_range(robot, pose)
+
+
+@pytest.mark.parametrize("angle", [None, 2.0])
+def test_stretched_limbs_are_singular(angle):
+    """Arm and forearm on one line, in all limbs or in limb I: joint rates do not move that way."""
+    robot = load("delta")
+    g = robot.geometry
+    reach, off = g.arm_length + g.forearm_length, g.base_radius - g.platform_radius
+    angle = np.arccos(-off / reach) if angle is None else angle
+    out = off + reach * np.cos(angle)
+    azimuth = g.azimuths[0]
+    pose = np.array([out * np.cos(azimuth), out * np.sin(azimuth), -reach * np.sin(angle)])
+    with pytest.raises(SingularityError):
+        energy_transfer(robot, pose + np.array([0, 0, 1e-15]), [1, 0, 0])

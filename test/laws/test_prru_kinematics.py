@@ -1,0 +1,543 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the 3-PRRU head that hold for any dimensions: closure, derivatives, power, symmetry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.virtual_work import bodies, energy
+from pkm_twin import parameters
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.mechanisms.prru import Prru
+
+Array = NDArray[np.float64]
+
+THIRDS = (math.pi, 5 * math.pi / 3, math.pi / 3)
+MACHINES: dict[str, dict[str, Any]] = {
+    "paper": {"azimuths": THIRDS, "branch": "below"},
+    "hanging": {"azimuths": THIRDS, "branch": "above"},
+    "turned": {"azimuths": (0.4 + 2 * math.pi / 3, 0.4, 0.4 - 2 * math.pi / 3), "branch": "below"},
+    "uneven": {"azimuths": (0.2, 1.9, 4.4), "branch": "above"},
+    "wide": {
+        "azimuths": THIRDS,
+        "branch": "below",
+        "base_radius": 0.3,
+        "platform_radius": 0.4,
+        "limb_length": 0.7,
+    },
+}
+TILTED_INERTIA = ((0.6, 0.05, -0.02), (0.05, 0.5, 0.03), (-0.02, 0.03, 0.8))
+
+
+MASSES = ("slider_mass", "lower_link_mass", "upper_link_mass", "platform_mass")
+
+
+def machine(
+    name: str, symmetric: bool = False, geometry: Mapping[str, Any] = {}, **inertia: Any
+) -> Prru:
+    """A machine with all masses and inertias; ``symmetric``: equal for all three limbs."""
+    lengths = {"base_radius": 0.35, "platform_radius": 0.25, "limb_length": 0.6}
+    masses = {
+        "slider_mass": 8.0,
+        "lower_link_mass": 3.5,
+        "upper_link_mass": 2.5,
+        "platform_mass": 25.0,
+        "link_com": 0.4,
+        "lower_link_inertia": [0.11, 0.02],
+        "upper_link_inertia": [0.08, 0.03],
+        "platform_com": [0, 0, 0.03] if symmetric else [0.02, -0.03, 0.05],
+        "platform_inertia": [0.5, 0.5, 0.8] if symmetric else [list(r) for r in TILTED_INERTIA],
+    }
+    payload = {"mass": 3.0, "com": [0.05, 0.02, 0.1], "inertia": [0.02, 0.03, 0.04]}
+    return parameters.build(
+        Prru,
+        {
+            "mechanism": "prru",
+            "geometry": lengths | MACHINES[name] | dict(geometry),
+            "inertia": masses | inertia,
+            "payload": {} if symmetric else payload,
+        },
+    )
+
+
+@pytest.fixture(params=list(MACHINES))
+def robot(request: pytest.FixtureRequest) -> Prru:
+    return machine(request.param)
+
+
+def reach(robot: Prru) -> float:
+    """Tilt (degrees) that the machine keeps at every azimuth; less with uneven limbs."""
+    uneven = abs(np.exp(1j * robot.geometry.azimuths).sum()) > 1e-9
+    return 40.0 if uneven else 60.0
+
+
+def poses(count: int, tilt: float, seed: int = 0) -> Array:
+    """Poses of any azimuth, tilted up to ``tilt`` (degrees), shape (count, 3)."""
+    rng = np.random.default_rng(seed)
+    lean = np.radians(tilt) * np.sqrt(rng.random(count))
+    azimuth = rng.uniform(0, 2 * math.pi, count)
+    x, y, z = np.sin(lean) * np.cos(azimuth), np.sin(lean) * np.sin(azimuth), np.cos(lean)
+    return np.stack([rng.uniform(-1, 1, count), np.arctan2(-y, z), np.arcsin(x)], axis=-1)
+
+
+def rotations(alpha: Array, beta: Array, gamma: Array) -> Array:
+    """Rx(alpha) Ry(beta) Rz(gamma), shape (..., 3, 3)."""
+    one, nil = np.ones_like(alpha), np.zeros_like(alpha)
+
+    def stack(rows: list[list[Array]]) -> Array:
+        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+    ca, sa, cb, sb, cg, sg = (f(x) for x in (alpha, beta, gamma) for f in (np.cos, np.sin))
+    rx = stack([[one, nil, nil], [nil, ca, -sa], [nil, sa, ca]])
+    ry = stack([[cb, nil, sb], [nil, one, nil], [-sb, nil, cb]])
+    rz = stack([[cg, -sg, nil], [sg, cg, nil], [nil, nil, one]])
+    return rx @ ry @ rz
+
+
+def place(robot: Prru, pose: Array) -> tuple[Array, Array, Array]:
+    """Centre, rotation and limb axes' ends of poses, by Newton's method on the three planes.
+
+    Shapes (n, 3), (n, 3, 3) and (n, 3 limbs, 3): nothing of the twin's formulas.
+    """
+    g = robot.geometry
+    e = np.stack([np.cos(g.azimuths), np.sin(g.azimuths), np.zeros(3)], axis=-1)
+    t = np.stack([-e[:, 1], e[:, 0], np.zeros(3)], axis=-1)
+    unknown = np.zeros((len(pose), 3))
+
+    def joints(u: Array) -> tuple[Array, Array, Array]:
+        rotation = rotations(pose[:, 1], pose[:, 2], u[:, 2])
+        centre = np.concatenate([u[:, :2], pose[:, :1]], axis=-1)
+        arms = -g.platform_radius * np.einsum("nij,kj->nki", rotation, e)
+        return centre, rotation, centre[:, None] + arms
+
+    for _ in range(20):
+        centre, rotation, ends = joints(unknown)
+        error = np.einsum("nki,ki->nk", ends, t)
+        slope = np.empty((len(pose), 3, 3))
+        slope[..., 0], slope[..., 1] = t[:, 0], t[:, 1]
+        turned = np.cross(rotation[:, None, :, 2], ends - centre[:, None])
+        slope[..., 2] = np.einsum("nki,ki->nk", turned, t)
+        unknown = unknown - np.linalg.solve(slope, error[..., None])[..., 0]
+    return joints(unknown)
+
+
+def sliders(robot: Prru, q: Array) -> Array:
+    """Slider joints C_i, shape (n, 3 limbs, 3)."""
+    g = robot.geometry
+    flat = -g.base_radius * np.stack([np.cos(g.azimuths), np.sin(g.azimuths)], axis=-1)
+    return np.concatenate([np.broadcast_to(flat, (*q.shape, 2)), q[..., None]], axis=-1)
+
+
+class Motion:
+    """A smooth motion of the sliders about a tilted pose."""
+
+    def __init__(self, robot: Prru, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.start = robot.inverse(poses(1, 25, seed)[0])
+        self.size = rng.uniform(0.03, 0.06, 3)
+        self.rate = rng.uniform(2.0, 5.0, 3)
+        self.phase = rng.uniform(0, 2 * math.pi, 3)
+
+    def __call__(self, t: Array) -> tuple[Array, Array, Array]:
+        angle = self.rate * t[..., None] + self.phase
+        return (
+            self.start + self.size * np.sin(angle),
+            self.size * self.rate * np.cos(angle),
+            -self.size * self.rate**2 * np.sin(angle),
+        )
+
+
+TIMES = np.linspace(0.0, 2.0, 25)
+STEP = 2e-3
+
+
+def in_time(values: Array, step: float = STEP) -> Array:
+    """Derivative of seven samples on the first axis, sixth order."""
+    weights = np.array([-1, 9, -45, 0, 45, -9, 1]) / (60 * step)
+    result: Array = np.tensordot(weights, values, axes=1)
+    return result
+
+
+def around(step: float = STEP) -> Array:
+    return TIMES + step * np.arange(-3, 4)[:, None]
+
+
+@pytest.mark.parametrize("tilt", [5, 30, 55])
+def test_closure(robot: Prru, tilt: float) -> None:
+    pose = poses(500, min(tilt, reach(robot)))
+    q = robot.inverse(pose)
+    centre, rotation, ends = place(robot, pose)
+    np.testing.assert_allclose(robot.rotation(pose), rotation, atol=1e-13)
+    limbs = ends - sliders(robot, q)
+    assert np.linalg.norm(limbs, axis=-1) == pytest.approx(robot.geometry.limb_length, abs=1e-13)
+    up = limbs[..., 2] if robot.geometry.branch == "below" else -limbs[..., 2]
+    assert (up > 0).all()
+    rows, _ = bodies(robot, q, np.zeros(3), np.zeros(3))
+    com = centre + rotation @ robot.inertia.platform_com
+    np.testing.assert_allclose(rows[:, 9, 1:4], com, atol=1e-13)
+    payload = centre + rotation @ robot.payload.com
+    np.testing.assert_allclose(rows[:, 10, 1:4], payload, atol=1e-13)
+
+
+def test_forward_undoes_inverse(robot: Prru) -> None:
+    pose = poses(20000, reach(robot))
+    np.testing.assert_allclose(robot.forward(robot.inverse(pose)), pose, atol=1e-12)
+
+
+@pytest.mark.parametrize("branch", ["below", "above"])
+@pytest.mark.parametrize("seed", range(6))
+def test_forward_undoes_inverse_for_any_size(branch: str, seed: int) -> None:
+    """Over all that inverse accepts, up to the singularity, where the platform is not the wider."""
+    rng = np.random.default_rng(seed)
+    base = rng.uniform(0.2, 0.6)
+    geometry = {
+        "base_radius": base,
+        "platform_radius": base * rng.uniform(0.4, 1.1),
+        "limb_length": base * rng.uniform(0.8, 3.0),
+        "azimuths": rng.uniform(-3, 3) + np.array(THIRDS)[rng.permutation(3)],
+        "branch": branch,
+    }
+    robot = machine("paper", geometry=geometry)
+    pose = poses(5000, 85, seed)
+    q, fault = robot.inverse_kernel(robot.parameters, pose)
+    kept = fault[:, 0] == 0.0
+    assert kept.sum() > 300
+    again = robot.forward(q[kept])
+    # At the singularity the pose turns without the sliders: the bound is on the sliders.
+    np.testing.assert_allclose(robot.inverse(again), q[kept], atol=1e-13)
+    np.testing.assert_allclose(again, pose[kept], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "geometry",
+    [
+        {"base_radius": 0.36, "platform_radius": 0.58, "limb_length": 0.46},
+        {"base_radius": 0.2, "platform_radius": 0.53, "azimuths": [0.0, 0.6, 5.6]},
+    ],
+)
+def test_forward_follows_the_level_platform(geometry: dict[str, Any]) -> None:
+    """Where many assemblies stand side by side, the one that a fine walk from level leads to."""
+    robot = machine("paper", geometry=geometry)
+    q, fault = robot.inverse_kernel(robot.parameters, poses(3000, 85))
+    q = q[fault[:, 0] == 0.0]
+    _, fault = robot.forward_kernel(robot.parameters, q)
+    q = q[fault[:, 0] == 0.0][:400]
+    assert len(q) == 400
+    way = np.linspace(0.0, 1.0, 2001)[:, None, None]
+    level = q.mean(axis=-1, keepdims=True)
+    walked = robot.rotation(robot.forward(level + way * (q - level)))
+    # The last step may end next to a singularity; another assembly is farther away.
+    assert np.abs(np.diff(walked, axis=0)).max() < 0.2
+
+
+def test_parasitic_motions_at_thirds() -> None:
+    robot = machine("paper", platform_com=[0.0, 0.0, 0.0])
+    pose = poses(200, 60)
+    a, b = pose[:, 1], pose[:, 2]
+    gamma = np.arctan2(-np.sin(a) * np.sin(b), np.cos(a) + np.cos(b))
+    _, rotation, _ = place(robot, pose)
+    np.testing.assert_allclose(rotation, rotations(a, b, gamma), atol=1e-13)
+    rows, _ = bodies(robot, robot.inverse(pose), np.zeros(3), np.zeros(3))
+    x, y, _ = rows[:, 9, 1:4].T
+    r = robot.geometry.platform_radius
+    m, n, o = rotation[:, 0, 0], rotation[:, 1, 1], rotation[:, 1, 0]
+    np.testing.assert_allclose(x, r * (m - n) / 2, atol=1e-13)
+    np.testing.assert_allclose(y, -r * o, atol=1e-13)
+
+
+def test_jacobians(robot: Prru) -> None:
+    pose = poses(200, 40)
+    q = robot.inverse(pose)
+    rates, twist = robot.jacobian(q), robot.platform_jacobian(q)
+    steps = 1e-3 * np.arange(-3, 4)[:, None]
+    for j in range(3):
+        near = robot.forward(q + (steps * np.eye(3)[j])[:, None])
+        np.testing.assert_allclose(rates[..., j], in_time(near, 1e-3), rtol=1e-8, atol=1e-8)
+        placed = [place(robot, p) for p in near]
+        centres = np.array([c for c, _, _ in placed])
+        frames = np.array([r for _, r, _ in placed])
+        np.testing.assert_allclose(twist[:, :3, j], in_time(centres, 1e-3), atol=1e-8)
+        np.testing.assert_allclose(twist[:, 3:, j], spins(frames, 1e-3), atol=1e-7)
+
+
+def spins(frames: Array, step: float = STEP) -> Array:
+    """Angular velocity in the middle of seven rotation matrices, world axes."""
+    w = in_time(frames, step) @ frames[3].swapaxes(-1, -2)
+    return np.stack([w[..., 2, 1], w[..., 0, 2], w[..., 1, 0]], axis=-1)
+
+
+def frames_of_bodies(robot: Prru, q: Array) -> Array:
+    """Rotation of all bodies, shape (n, 11, 3, 3), from the limbs' lines and hinges alone."""
+    flat = q.reshape(-1, 3)
+    _, rotation, ends = place(robot, robot.forward(flat))
+    e = np.stack([np.cos(robot.geometry.azimuths), np.sin(robot.geometry.azimuths)], axis=-1)
+    result = np.empty((len(flat), 11, 3, 3))
+    limbs = ends - sliders(robot, flat)
+    for i in range(3):
+        d = limbs[:, i] / np.linalg.norm(limbs[:, i], axis=-1, keepdims=True)
+        t = np.broadcast_to([-e[i, 1], e[i, 0], 0.0], d.shape)
+        hinge = rotation @ t[0]
+        fixed = np.cross(hinge, d)
+        fixed /= np.linalg.norm(fixed, axis=-1, keepdims=True)
+        result[:, 3 * i] = np.eye(3)
+        result[:, 3 * i + 1] = np.stack([np.cross(t, d), t, d], axis=-1)
+        result[:, 3 * i + 2] = np.stack([fixed, np.cross(d, fixed), d], axis=-1)
+    result[:, 9:] = rotation[:, None]
+    return result.reshape(*q.shape[:-1], 11, 3, 3)
+
+
+def inertias(robot: Prru) -> Array:
+    """Inertia of all bodies about their centres in their own axes, shape (11, 3, 3)."""
+    m = robot.inertia
+    assert m.lower_link_inertia is not None and m.upper_link_inertia is not None
+    assert m.platform_inertia is not None
+    lower = np.diag(m.lower_link_inertia[[0, 0, 1]])
+    upper = np.diag(m.upper_link_inertia[[0, 0, 1]])
+    return np.array(
+        [np.zeros((3, 3)), lower, upper] * 3 + [m.platform_inertia, robot.payload.inertia]
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rows_along_a_motion(robot: Prru, seed: int) -> None:
+    motion = Motion(robot, seed)
+    q, qd, qdd = motion(TIMES)
+    rows, _ = bodies(robot, q, qd, qdd)
+    velocity = np.einsum("nbji,nj->nbi", rows[..., 10:19].reshape(-1, 11, 3, 3), qd)
+    spin = np.einsum("nbji,nj->nbi", rows[..., 19:28].reshape(-1, 11, 3, 3), qd)
+    near_q, near_qd, near_qdd = motion(around())
+    near, _ = bodies(robot, near_q, near_qd, near_qdd)
+    np.testing.assert_allclose(velocity, in_time(near[..., 1:4]), atol=1e-9)
+    near_velocity = np.einsum("tnbji,tnj->tnbi", near[..., 10:19].reshape(7, -1, 11, 3, 3), near_qd)
+    np.testing.assert_allclose(rows[..., 4:7], in_time(near_velocity), atol=1e-7)
+    frames = frames_of_bodies(robot, near_q)
+    np.testing.assert_allclose(spin, spins(frames), atol=1e-8)
+    near_spin = np.einsum("tnbji,tnj->tnbi", near[..., 19:28].reshape(7, -1, 11, 3, 3), near_qd)
+    momentum = np.einsum("tnbij,bjk,tnblk,tnbl->tnbi", frames, inertias(robot), frames, near_spin)
+    np.testing.assert_allclose(rows[..., 7:10], in_time(momentum), atol=1e-7)
+    assert np.abs(rows[:, [2, 5, 8], 7:10]).max() > 1e-2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_power_balance(robot: Prru, seed: int) -> None:
+    """The actuators' power is the rate of the energy that the rows hold."""
+    motion = Motion(robot, seed)
+    q, qd, qdd = motion(TIMES)
+    power = np.einsum("ni,ni->n", inverse_dynamics(robot, q, qd, qdd), qd)
+    near_q, near_qd, near_qdd = motion(around())
+    near, _ = bodies(robot, near_q, near_qd, near_qdd)
+    velocity = np.einsum("tnbji,tnj->tnbi", near[..., 10:19].reshape(7, -1, 11, 3, 3), near_qd)
+    spin = np.einsum("tnbji,tnj->tnbi", near[..., 19:28].reshape(7, -1, 11, 3, 3), near_qd)
+    frames = frames_of_bodies(robot, near_q)
+    local = np.einsum("tnbji,tnbj->tnbi", frames, spin)
+    kinetic = 0.5 * np.einsum("tnb,tnbi,tnbi->tn", near[..., 0], velocity, velocity)
+    kinetic += 0.5 * np.einsum("tnbi,bij,tnbj->tn", local, inertias(robot), local)
+    potential = -np.einsum("tnb,tnbi,i->tn", near[..., 0], near[..., 1:4], robot.gravity)
+    np.testing.assert_allclose(power, in_time(kinetic + potential), atol=1e-6, rtol=1e-8)
+    twin = energy(robot, near_q, near_qd)
+    np.testing.assert_allclose(twin.kinetic, kinetic, rtol=1e-11)
+    np.testing.assert_allclose(twin.potential, potential, rtol=1e-11)
+
+
+def test_wrench_works_through_the_platform(robot: Prru) -> None:
+    q, qd, qdd = Motion(robot, 4)(TIMES)
+    wrench = np.random.default_rng(0).normal(size=(len(q), 6)) * 100
+    less = inverse_dynamics(robot, q, qd, qdd) - inverse_dynamics(robot, q, qd, qdd, wrench)
+    jacobian = robot.platform_jacobian(q)
+    np.testing.assert_allclose(less, np.einsum("nij,ni->nj", jacobian, wrench), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["paper", "hanging", "turned"])
+def test_a_third_of_a_turn_permutes_the_limbs(name: str) -> None:
+    robot = machine(name, symmetric=True)
+    q, qd, qdd = Motion(robot, 5)(TIMES)
+    force = inverse_dynamics(robot, q, qd, qdd)
+    rolled = inverse_dynamics(robot, *(np.roll(x, 1, axis=-1) for x in (q, qd, qdd)))
+    np.testing.assert_allclose(rolled, np.roll(force, 1, axis=-1), rtol=1e-11, atol=1e-9)
+    step = robot.geometry.azimuths[1] - robot.geometry.azimuths[0]
+    turn = rotations(np.zeros(1), np.zeros(1), np.array([step]))[0]
+    centre, rotation, _ = place(robot, robot.forward(q))
+    other, tilted, _ = place(robot, robot.forward(np.roll(q, 1, axis=-1)))
+    np.testing.assert_allclose(other, centre @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(tilted, turn @ rotation @ turn.T, atol=1e-12)
+
+
+def test_limbs_in_any_order() -> None:
+    order = [2, 0, 1]
+    robot = machine("uneven")
+    other = machine("uneven", geometry={"azimuths": robot.geometry.azimuths[order].tolist()})
+    q, qd, qdd = Motion(robot, 6)(TIMES)
+    force = inverse_dynamics(robot, q, qd, qdd)
+    again = inverse_dynamics(other, q[:, order], qd[:, order], qdd[:, order])
+    np.testing.assert_allclose(again, force[:, order], rtol=1e-11, atol=1e-9)
+
+
+def test_hanging_is_the_mirror_of_standing() -> None:
+    below = machine("paper", symmetric=True)
+    above = machine("hanging", symmetric=True, platform_com=[0.0, 0.0, -0.03])
+    above = above.changed(gravity=[0.0, 0.0, 9.81])
+    q, qd, qdd = Motion(below, 7)(TIMES)
+    force = inverse_dynamics(below, q, qd, qdd)
+    mirrored = inverse_dynamics(above, -q, -qd, -qdd)
+    np.testing.assert_allclose(mirrored, -force, rtol=1e-11, atol=1e-9)
+
+
+def test_level_platform_shares_the_weight() -> None:
+    robot = machine("paper", symmetric=True)
+    q = robot.inverse([0.7, 0.0, 0.0])
+    total = 9.81 * (3 * (8.0 + 3.5 + 2.5) + 25.0)
+    force = inverse_dynamics(robot, q, np.zeros(3), np.zeros(3))
+    assert force == pytest.approx([total / 3] * 3, rel=1e-12)
+
+
+def test_lifting_all_sliders_lifts_the_platform(robot: Prru) -> None:
+    q = robot.inverse(poses(50, 40))
+    lifted = robot.forward(q) + np.array([0.3, 0.0, 0.0])
+    np.testing.assert_allclose(robot.forward(q + 0.3), lifted, atol=1e-12)
+    rate = robot.platform_jacobian(q).sum(axis=-1)
+    np.testing.assert_allclose(rate, np.tile([0, 0, 1.0, 0, 0, 0], (50, 1)), atol=1e-12)
+
+
+def test_slider_out_of_reach() -> None:
+    robot = machine("paper")
+    q = robot.inverse([0.7, 0.0, 0.0])
+    far = q + np.array([0.0, 1.2, 0.0])
+    with pytest.raises(UnreachableError, match="sample 1 is unreachable: limb II misses") as caught:
+        robot.forward([q, far])
+    assert caught.value.index == (1,)
+    for function in (robot.jacobian, robot.platform_jacobian):
+        with pytest.raises(UnreachableError):
+            function(far)
+    with pytest.raises(UnreachableError):
+        inverse_dynamics(robot, far, np.zeros(3), np.zeros(3))
+
+
+@pytest.mark.parametrize("away", [[0.5, -0.2, -0.3], [-0.4, 0.3, 0.1]])
+def test_miss_is_what_the_slider_has_to_come_back(away: list[float]) -> None:
+    """Back by the miss (towards the mean height) the machine can be assembled, short of it not."""
+    robot = machine("paper")
+    level = robot.inverse([0.7, 0.0, 0.0])
+    with pytest.raises(UnreachableError) as caught:
+        robot.forward(level + away)
+    assert caught.value.limb == "limb I"
+    edge = 1.0 - caught.value.miss / abs(away[0])
+    robot.forward(level + np.array(away) * (edge - 1e-5))
+    with pytest.raises(UnreachableError):
+        robot.forward(level + np.array(away) * (edge + 1e-5))
+
+
+def test_pose_beyond_the_limb() -> None:
+    robot = machine("paper", geometry={"limb_length": 0.15})
+    pose = np.array([0.7, 0.0, 1.0])
+    _, _, ends = place(robot, pose[None])
+    away = np.linalg.norm(ends[0, :, :2] - sliders(robot, np.zeros((1, 3)))[0, :, :2], axis=-1)
+    with pytest.raises(UnreachableError) as caught:
+        robot.inverse(pose)
+    limb = robot.limb_names.index(caught.value.limb)
+    assert caught.value.miss == pytest.approx(away[limb] - 0.15, abs=1e-13)
+    assert caught.value.miss > 0.0
+
+
+@pytest.mark.parametrize("pose", [[0.7, 0.0, 1.3], [0.7, -1.3, 0.0], [0.7, math.pi, 0.0]])
+def test_pose_beyond_the_singularity(pose: list[float]) -> None:
+    with pytest.raises(SingularityError) as caught:
+        machine("paper").inverse(pose)
+    assert caught.value.measure < caught.value.bound
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_not_finite(value: float) -> None:
+    robot = machine("paper")
+    with pytest.raises(ValueError, match="not finite"):
+        robot.inverse([0.7, value, 0.0])
+    with pytest.raises(ValueError, match="not finite"):
+        robot.rotation([0.7, value, 0.0])
+    for function in (robot.forward, robot.jacobian):
+        with pytest.raises(ValueError, match="not finite"):
+            function([0.1, 0.1, value])
+    with pytest.raises(ValueError, match="not finite"):
+        inverse_dynamics(robot, [0.1] * 3, [0.0, value, 0.0], np.zeros(3))
+
+
+@pytest.mark.parametrize("value", [1e9, 1e160, 1e300])
+def test_huge_values_end_in_a_fault(value: float) -> None:
+    robot = machine("paper")
+    for q in ([0.1, 0.1, value], [0.1, -value, value]):
+        with pytest.raises(ValueError, match=r"unreachable|not finite"):
+            robot.forward(q)
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [
+        ("geometry", "azimuths", [0.0, 0.0, 2.0]),
+        ("geometry", "azimuths", [0.0, 2.0, 2.0 + 2 * math.pi]),
+        ("geometry", "limb_length", 0.05),
+        ("geometry", "branch", "beside"),
+        ("inertia", "link_com", 1.5),
+        ("inertia", "slider_mass", -1.0),
+        ("inertia", "upper_link_inertia", [0.1, 0.3]),
+        ("inertia", "platform_inertia", [0.1, 0.1, 0.5]),
+    ],
+)
+def test_refused_parameters(section: str, key: str, value: object) -> None:
+    robot = machine("paper")
+    data = {
+        "mechanism": "prru",
+        "geometry": {
+            "base_radius": 0.35,
+            "platform_radius": 0.25,
+            "limb_length": 0.6,
+            "azimuths": list(THIRDS),
+            "branch": "below",
+        },
+        "inertia": dict.fromkeys(MASSES, 1.0),
+    }
+    assert parameters.build(Prru, data).joint_names == robot.joint_names
+    data[section][key] = value  # type: ignore[index]
+    with pytest.raises(ParameterError) as caught:
+        parameters.build(Prru, data)
+    assert caught.value.field.startswith(f"{section}.{key}")
+
+
+def test_defaults_are_thin_rods_and_a_thin_disc() -> None:
+    """Left out, the inertias are those of rods and a disc with the masses given."""
+    full = machine(
+        "paper",
+        link_com=0.5,
+        lower_link_inertia=[3.5 * 0.36 / 12, 0.0],
+        upper_link_inertia=[2.5 * 0.36 / 12, 0.0],
+        platform_com=[0.0, 0.0, 0.0],
+        platform_inertia=[25 * 0.0625 / 4, 25 * 0.0625 / 4, 25 * 0.0625 / 2],
+    )
+    short = parameters.build(
+        Prru,
+        {
+            "mechanism": "prru",
+            "geometry": {
+                "base_radius": 0.35,
+                "platform_radius": 0.25,
+                "limb_length": 0.6,
+                "azimuths": list(THIRDS),
+                "branch": "below",
+            },
+            "inertia": {
+                "slider_mass": 8.0,
+                "lower_link_mass": 3.5,
+                "upper_link_mass": 2.5,
+                "platform_mass": 25.0,
+            },
+        },
+    )
+    state = Motion(short, 9)(TIMES)
+    full = full.changed(payload={"mass": 0.0, "inertia": [0.0, 0.0, 0.0]})
+    np.testing.assert_allclose(
+        inverse_dynamics(short, *state), inverse_dynamics(full, *state), rtol=1e-12
+    )

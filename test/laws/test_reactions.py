@@ -1,0 +1,463 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the joint reactions: the force route has to agree with the power route."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
+from delta_dynamics.virtual_work import bodies
+from pkm_twin import load, parameters, robot_names
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.mechanisms.delta import Delta
+from pkm_twin.mechanisms.joints import platform_motion
+from test.conftest import parameters_of, random_joints
+
+MASSIVE = [name for name in robot_names() if load(name).dynamics_kernel is not None]
+MASSLESS = [name for name in robot_names() if load(name).dynamics_kernel is None]
+LOADED = {
+    "payload": {"mass": 0.3, "com": [0.01, -0.02, -0.04], "inertia": [4e-4, 5e-4, 3e-4]},
+    "gravity": [0.5, -1.0, -9.7],
+    "friction": {"viscous": [0.1, 0.2, 0.3], "coulomb": [0.05, 0.06, 0.07]},
+}
+FREE = {"viscous": [0.0] * 3, "coulomb": [0.0] * 3}
+
+massive = pytest.mark.parametrize("name", MASSIVE)
+
+
+def states(robot, rng, count):
+    scale = 1.0 if robot.joint_unit == "rad" else 0.2
+    q = random_joints(robot, rng, count)
+    qd, qdd = (scale * rng.normal(0.0, size, (count, 3)) for size in (3.0, 30.0))
+    return q, qd, qdd, rng.normal(0.0, 10.0, (count, 6))
+
+
+def imbalance(robot, result, q, qd, qdd, wrench):
+    """Greatest force or moment (about the world's origin) that is missing on any body, relative.
+
+    Written without the matrix of the solver: sums wrench by wrench.
+    """
+    rows, _ = bodies(robot, q, qd, qdd)
+    worst = 0.0
+    names = [n for n in robot.body_names if n != "payload"]
+    for name in names:
+        force, moment = np.zeros((2, len(q), 3))
+        size = np.zeros(len(q))
+        for k, (inner, outer) in enumerate(result.bodies):
+            sign = (outer == name) - (inner == name)
+            f, m = result.wrenches[:, k, :3], result.wrenches[:, k, 3:]
+            force += sign * f
+            moment += sign * (m + np.cross(result.points[:, k], f))
+            if sign:
+                size = np.maximum(size, np.abs(f).max(-1))
+        for k, body in enumerate(robot.body_names):
+            if body == name or (name == "platform" and body == "payload"):
+                row = rows[:, k]
+                inertial = row[:, :1] * (row[:, 4:7] - robot.gravity)
+                force -= inertial
+                moment -= row[:, 7:10] + np.cross(row[:, 1:4], inertial)
+        if name == "platform":
+            origin = platform_motion(robot, q).position
+            force += wrench[:, :3]
+            moment += wrench[:, 3:] + np.cross(origin, wrench[:, :3])
+        worst = max(
+            worst, (np.abs(force).max(-1) / size).max(), (np.abs(moment).max(-1) / size).max()
+        )
+    return worst
+
+
+@massive
+def test_every_body_is_balanced(name, rng):
+    robot = load(name).changed(**LOADED)
+    motion = states(robot, rng, 200)
+    result = reactions(robot, *motion)
+    assert imbalance(robot, result, *motion) < 1e-10
+    assert result.residual.max() < 1e-10
+
+
+@massive
+def test_the_force_route_gives_the_power_routes_efforts(name, rng):
+    robot = load(name).changed(**LOADED)
+    motion = states(robot, rng, 300)
+    tau = inverse_dynamics(robot.changed(friction=FREE), *motion)
+    efforts = reactions(robot, *motion).efforts
+    assert (np.abs(efforts - tau).max(-1) <= 1e-9 * np.abs(tau).max(-1)).all()
+
+
+@massive
+def test_the_shipped_mechanisms_are_determinate(name, rng):
+    robot = load(name).changed(**LOADED)
+    result = reactions(robot, *states(robot, rng, 100))
+    assert result.indeterminate == ()
+    assert result.determinate.all()
+    assert np.isfinite(result.wrenches).all()
+    count = {"delta": 9, "prru": 12}[robot.mechanism]
+    assert len(result.names) == len(set(result.names)) == count
+    assert result.wrenches.shape == result.determinate.shape == (100, count, 6)
+    assert result.bodies[0][0] == "base"
+
+
+@massive
+def test_reactions_are_linear_in_the_wrench(name, rng):
+    robot = load(name)
+    q, qd, qdd, wrench = states(robot, rng, 50)
+    none, one, many = (reactions(robot, q, qd, qdd, k * wrench).wrenches for k in (0, 1, -3))
+    expected = none - 3 * (one - none)
+    np.testing.assert_allclose(many, expected, atol=1e-10 * np.abs(expected).max())
+
+
+@massive
+def test_no_joint_does_work_against_its_freedoms(name, rng):
+    """Power of all constraint wrenches on the actual motion is that of the actuators."""
+    robot = load(name).changed(friction=FREE)
+    q, qd, qdd, wrench = states(robot, rng, 50)
+    result = reactions(robot, q, qd, qdd, wrench)
+    rows, twist = bodies(robot, q, qd, qdd)
+    origin = platform_motion(robot, q).position
+
+    def motion_of(body):
+        """Velocity of the world's origin as a point of the body, and angular velocity."""
+        if body == "base":
+            return np.zeros((2, 50, 3))
+        if body == "platform":
+            v, w = np.split(np.einsum("nij,nj->ni", twist, qd), 2, -1)
+            return v - np.cross(w, origin), w
+        row = rows[:, robot.body_names.index(body)]
+        v, w = (np.einsum("nji,nj->ni", row[:, s].reshape(-1, 3, 3), qd)
+                for s in (slice(10, 19), slice(19, 28)))  # fmt: skip
+        return v - np.cross(w, row[:, 1:4]), w
+
+    power = np.zeros(50)
+    for k, (inner, outer) in enumerate(result.bodies):
+        (vi, wi), (vo, wo) = motion_of(inner), motion_of(outer)
+        v, w = vo - vi, wo - wi
+        f, m = result.wrenches[:, k, :3], result.wrenches[:, k, 3:]
+        power += np.sum(f * (v + np.cross(w, result.points[:, k])) + m * w, -1)
+    np.testing.assert_allclose(power, np.sum(result.efforts * qd, -1), rtol=1e-9, atol=1e-8)
+
+
+@massive
+@pytest.mark.parametrize("batch", [(), (3,), (3, 2), (0,)])
+def test_batches_equal_single_samples(name, rng, batch):
+    robot = load(name).changed(**LOADED)
+    motion = [v[: int(np.prod(batch))].reshape(*batch, v.shape[-1]) for v in states(robot, rng, 6)]
+    result = reactions(robot, *motion)
+    assert result.wrenches.shape == (*batch, len(result.names), 6)
+    assert result.residual.shape == batch
+    for index in np.ndindex(batch):
+        single = reactions(robot, *(v[index] for v in motion))
+        size = np.abs(single.wrenches).max()
+        np.testing.assert_allclose(result.wrenches[index], single.wrenches, atol=1e-12 * size)
+    wide = reactions(robot, motion[0], np.zeros(3), [0, 0, 0])
+    assert wide.values.shape == (*batch, len(wide.components))
+
+
+@massive
+def test_results_are_read_only_and_found_by_name(name, rng):
+    robot = load(name)
+    result = reactions(robot, *states(robot, rng, 2))
+    with pytest.raises(ValueError, match="read-only"):
+        result.wrenches[0] = 0.0
+    last = result.names[-1]
+    np.testing.assert_array_equal(result.wrench(last), result.wrenches[:, -1])
+
+
+def test_a_hanging_delta_carries_its_weight():
+    """At rest in a symmetric pose the base joints carry a third of the weight each."""
+    robot = load("delta")
+    result = reactions(robot, np.full(3, 0.3), np.zeros(3), np.zeros(3))
+    inertia = robot.inertia
+    total = inertia.platform_mass + 3 * (inertia.arm_mass + inertia.forearm_mass)
+    for limb in ("I", "II", "III"):
+        assert result.wrench(f"base joint {limb}")[2] == pytest.approx(total * 9.81 / 3, rel=1e-12)
+        platform = result.wrench(f"platform joint {limb}")
+        assert platform[2] == pytest.approx(inertia.platform_mass * 9.81 / 3, rel=1e-12)
+        assert np.abs(platform[3:]).max() < 1e-14
+
+
+def test_a_moment_on_the_delta_platform_loads_the_parallelograms():
+    """Without weight the three couples alone balance a moment, each alike at both ends."""
+    robot = load("delta").changed(gravity=[0, 0, 0])
+    moment = np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.5])
+    result = reactions(robot, [0.2, 0.4, -0.1], np.zeros(3), np.zeros(3), moment)
+    platform = sum(result.wrench(f"platform joint {limb}") for limb in ("I", "II", "III"))
+    np.testing.assert_allclose(platform[3:], -moment[3:], atol=1e-14)
+    for limb in ("I", "II", "III"):
+        at_c, at_b = (result.wrench(f"{j} {limb}") for j in ("platform joint", "elbow"))
+        np.testing.assert_allclose(at_b, at_c, atol=1e-14)
+        assert np.abs(at_c[:3]).max() < 1e-14
+        assert np.abs(at_c[3:]).max() > 0.01
+    assert np.abs(result.efforts).max() < 1e-14
+
+
+def test_the_rcu_limb_transmits_what_its_joints_hold(rng):
+    robot = load("delta_cu").changed(**LOADED)
+    result = reactions(robot, *states(robot, rng, 50))
+    azimuth = robot.geometry.azimuths[2]
+    t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    elbow, corner = result.wrench("elbow III"), result.wrench("platform joint III")
+    size = np.abs(result.wrenches).max()
+    assert np.abs(elbow[:, :3] @ t).max() < 1e-14 * size
+    assert np.abs(elbow[:, 3:] @ t).max() < 1e-14 * size
+    assert np.abs(corner[:, 3:5]).max() < 1e-14 * size
+    assert np.abs(corner[:, 5]).max() > 1e-3
+
+
+def test_prru_joints_hold_no_moment_about_their_axes(rng, variant):
+    if "prru" not in MASSIVE:
+        pytest.skip("no 3-PRRU in config")
+    # Links with inertia about the limb: thin ones leave the universal joint without a moment.
+    robot = variant("prru", inertia={"upper_link_inertia": [0.1, 0.02]})[0].changed(**LOADED)
+    q, *rest = states(robot, rng, 50)
+    result = reactions(robot, q, *rest)
+    platform = platform_motion(robot, q)
+    size = np.abs(result.wrenches).max()
+    for i, limb in enumerate(("I", "II", "III")):
+        azimuth = robot.geometry.azimuths[i]
+        t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        points = [result.points[:, result.names.index(f"{j} {limb}")]
+                  for j in ("slider joint", "platform joint")]  # fmt: skip
+        d = (points[1] - points[0]) / robot.geometry.limb_length
+        np.testing.assert_allclose(np.linalg.norm(d, axis=-1), 1.0, atol=1e-12)
+        assert np.abs(result.wrench(f"slider joint {limb}")[:, 3:] @ t).max() < 1e-13 * size
+        assert (
+            np.abs(np.sum(result.wrench(f"link joint {limb}")[:, 3:] * d, -1)).max() < 1e-13 * size
+        )
+        last = result.wrench(f"platform joint {limb}")[:, 3:]
+        h = platform.axes @ t
+        assert np.abs(last).min(-1).max() > 1e-5
+        assert np.abs(np.sum(last * h, -1)).max() < 1e-13 * size
+        assert np.abs(np.sum(last * np.cross(d, h), -1)).max() < 1e-13 * size
+
+
+class RevoluteParallelograms(Delta):
+    """Parallelograms with four pins: each also holds the couple along t x e, three too many."""
+
+    def body_joints(self, q, platform):
+        joints = super().body_joints(q, platform)
+        result = []
+        for joint in joints:
+            limb = joint.name.split()[-1]
+            if not joint.name.startswith("base"):
+                azimuth = self.geometry.azimuths[("I", "II", "III").index(limb)]
+                t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+                extra = np.zeros((*joint.basis.shape[:-1], 1))
+                extra[..., 3:, 0] = np.cross(t, joint.basis[..., 3:, -1])
+                joint = dataclasses.replace(
+                    joint,
+                    components=(*joint.components, f"limb {limb}: moment along t x e"),
+                    basis=np.concatenate([joint.basis, extra], -1),
+                )
+            result.append(joint)
+        return tuple(result)
+
+
+@pytest.fixture
+def overconstrained():
+    robot = parameters.build(RevoluteParallelograms, parameters_of("delta"))
+    return robot.changed(**LOADED)
+
+
+def test_an_overconstrained_mechanism_names_what_statics_cannot_tell(overconstrained, rng):
+    motion = states(overconstrained, rng, 60)
+    result = reactions(overconstrained, *motion)
+    limbs = ("I", "II", "III")
+    assert set(result.indeterminate) == {
+        *(f"limb {limb}: moment along {axis}" for limb in limbs for axis in ("e", "t x e")),
+        *(f"base joint {limb}: moment along {axis}" for limb in limbs for axis in ("r", "z")),
+    }
+    np.testing.assert_array_equal(result.determinate, np.isfinite(result.wrenches))
+    np.testing.assert_array_equal(result.determinate_components, np.isfinite(result.values))
+    assert result.determinate[..., :3].all()
+    # Arm II turns about the world's x axis, along which no surplus couple acts.
+    along_t = np.array([name.endswith(" II") for name in result.names])
+    expected = along_t[:, None] & np.array([True, False, False])
+    np.testing.assert_array_equal(result.determinate[..., 3:], np.tile(expected, (60, 1, 1)))
+    tau = inverse_dynamics(overconstrained.changed(friction=FREE), *motion)
+    np.testing.assert_allclose(result.efforts, tau, rtol=1e-9, atol=1e-10)
+
+
+def test_determinate_components_are_the_same_in_every_solution(overconstrained, rng):
+    """With a self-stress of the surplus couples added, the balance stays and so do these."""
+    motion = states(overconstrained, rng, 60)
+    known = reactions(overconstrained, *motion)
+    least = least_norm_reactions(overconstrained, *motion)
+    assert imbalance(overconstrained, least, *motion) < 1e-10
+    wrenches = least.wrenches.copy()
+    base = overconstrained.body_joints(motion[0], platform_motion(overconstrained, motion[0]))
+    couples = np.concatenate(
+        [j.basis[..., 3:, -2:] for j in base if j.name.startswith("elbow")], -1
+    )
+    # Six couples on the platform's three rotations: any null vector of theirs is a self-stress.
+    null = np.linalg.svd(couples)[2][:, 3:]
+    stress = np.einsum("nsk,ns->nk", null, rng.normal(0.0, 5.0, (60, 3)))
+    slope = np.zeros(60)
+    for i, limb in enumerate(("I", "II", "III")):
+        along = couples[:, :, 2 * i : 2 * i + 2] @ stress[:, 2 * i : 2 * i + 2, None]
+        # Elbow and platform joint share one unknown, so it counts once.
+        for joint in ("base joint", "elbow"):
+            slope += np.sum(least.wrench(f"{joint} {limb}")[:, 3:] * along[..., 0], -1)
+        for joint in ("base joint", "elbow", "platform joint"):
+            wrenches[:, least.names.index(f"{joint} {limb}"), 3:] += along[..., 0]
+    other = dataclasses.replace(least, wrenches=wrenches)
+    assert imbalance(overconstrained, other, *motion) < 1e-10
+    size = np.abs(wrenches).max()
+    for solution in (least, other):
+        difference = np.abs(solution.wrenches - known.wrenches)[known.determinate]
+        assert difference.max() < 1e-10 * size
+    assert np.abs(wrenches - least.wrenches)[~known.determinate].max() > 0.1
+    # The least of all solutions is normal to every self-stress.
+    assert np.abs(slope).max() < 1e-10 * size**2
+
+
+def test_a_single_faulty_pose_in_a_batch_is_told_apart(rng):
+    """Where the three couples are dependent, they are indeterminate, there and only there."""
+    robot = load("delta").changed(gravity=[0, 0, 0])
+    inside, beyond = np.array([0.98, 1.36, 0.785]), np.array([1.758, -0.796, 1.362])
+
+    def couples(way):
+        q = (1 - way) * inside + way * beyond
+        joints = robot.body_joints(q, platform_motion(robot, q))
+        return q, np.stack([j.basis[:, -1][3:] for j in joints if j.name.startswith("elbow")], -1)
+
+    low, high = 0.0, 1.0
+    for _ in range(80):
+        middle = (low + high) / 2
+        if np.linalg.det(couples(middle)[1]) > 0:
+            low = middle
+        else:
+            high = middle
+    q, matrix = couples(low)
+    assert np.linalg.svd(matrix)[1][-1] < 1e-12
+    batch = np.array([inside, q])
+    wrench = np.concatenate([np.zeros(3), matrix @ [0.1, 0.2, -0.3]])
+    result = reactions(robot, batch, np.zeros(3), np.zeros(3), wrench * [[0], [1]])
+    assert result.determinate[0].all()
+    assert set(result.indeterminate) == {
+        *(f"limb {limb}: moment along e" for limb in ("I", "II", "III")),
+        *(f"base joint {limb}: moment along {a}" for limb in ("I", "II", "III") for a in "rz"),
+    }
+    out_of_hold = np.concatenate([np.zeros(3), np.linalg.svd(matrix)[0][:, -1]])
+    with pytest.raises(SingularityError) as caught:
+        reactions(robot, batch, np.zeros(3), np.zeros(3), out_of_hold)
+    assert caught.value.index == (1,)
+
+
+VARIANTS = [
+    ("delta", {"inertia": {"arm_com": 0.3, "rotor_inertia": 0.002, "arm_inertia": 0.001}}),
+    ("delta", {"geometry": {"azimuths": [0.1, 2.0, 4.4], "closures": ["rcu", "rod", "rod"]}}),
+    ("prru", {"inertia": {"link_com": 0.0, "upper_link_inertia": [0.1, 0.02]}}),
+    ("prru", {"geometry": {"branch": "above", "azimuths": [0.1, 2.0, 4.4]}}),
+    ("prru", {"inertia": {"platform_com": [0.02, -0.05, 0.1], "link_com": 0.8}}),
+]
+
+
+@pytest.mark.parametrize(("name", "sections"), VARIANTS)
+def test_other_machines_are_balanced_too(variant, rng, name, sections):
+    if name not in MASSIVE:
+        pytest.skip(f"no {name} in config")
+    robot = variant(name, **sections)[0].changed(**LOADED)
+    q, qd, qdd, wrench = states(robot, rng, 100)
+    q = q.mean(-1, keepdims=True) + 0.5 * (q - q.mean(-1, keepdims=True))
+    result = reactions(robot, q, qd, qdd, wrench)
+    assert result.determinate.all()
+    assert imbalance(robot, result, q, qd, qdd, wrench) < 1e-10
+    tau = inverse_dynamics(robot.changed(friction=FREE), q, qd, qdd, wrench)
+    assert (np.abs(result.efforts - tau).max(-1) <= 1e-9 * np.abs(tau).max(-1)).all()
+
+
+class RodByRod:
+    """A Delta with every rod a body of its own; moments about the world's origin."""
+
+    def __init__(self, robot):
+        self.robot = robot
+        self.loads, self.columns = [], []
+
+    def body(self, row, share=1.0, shift=0.0):
+        force = share * row[0] * (row[4:7] - self.robot.gravity)
+        moment = share * row[7:10] + np.cross(row[1:4] + shift, force)
+        self.loads.append(np.concatenate([force, moment]))
+        return len(self.loads) - 1
+
+    def unknown(self, inner, outer, force, moment):
+        self.columns.append((inner, outer, np.concatenate([force, moment])))
+        return len(self.columns) - 1
+
+    def ball(self, inner, outer, point):
+        return [self.unknown(inner, outer, axis, np.cross(point, axis)) for axis in np.eye(3)]
+
+    def solve(self):
+        matrix = np.zeros((len(self.loads), 6, len(self.columns)))
+        for k, (inner, outer, wrench) in enumerate(self.columns):
+            matrix[outer, :, k] += wrench
+            if inner is not None:
+                matrix[inner, :, k] -= wrench
+        matrix = matrix.reshape(-1, len(self.columns))
+        solution, _, rank, _ = np.linalg.lstsq(matrix, np.concatenate(self.loads), rcond=1e-12)
+        assert rank == len(self.columns) == 54
+        return solution
+
+
+@pytest.mark.parametrize("half_width", [0.02, 0.05])
+def test_a_parallelogram_rod_by_rod_gives_the_same(half_width, rng):
+    """Six rods with ball ends, each with half a limb's mass, beside one limb body with a couple."""
+    robot = load("delta").changed(**LOADED)
+    motion = states(robot, rng, 20)
+    result = reactions(robot, *motion)
+    for rows, points, wrenches, wrench in zip(
+        bodies(robot, *motion[:3])[0], result.points, result.wrenches, motion[3], strict=True
+    ):
+        model = RodByRod(robot)
+        platform = model.body(rows[6])
+        held = model.loads.pop(model.body(rows[7]))
+        about = np.cross(rows[6, 1:4], wrench[:3])
+        model.loads[platform] += held - wrench - np.concatenate([np.zeros(3), about])
+        rods = {}
+        for i in range(3):
+            azimuth = robot.geometry.azimuths[i]
+            t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+            a, b, c = points[3 * i : 3 * i + 3]
+            arm = model.body(rows[2 * i])
+            model.ball(None, arm, a)
+            for axis in np.eye(3):
+                model.unknown(None, arm, np.zeros(3), axis)
+            for lever in (-half_width * t, half_width * t):
+                rod = model.body(rows[2 * i + 1], 0.5, lever)
+                at_b, at_c = model.ball(arm, rod, b + lever), model.ball(rod, platform, c + lever)
+                rods.setdefault(3 * i + 1, []).append((lever, at_b))
+                rods.setdefault(3 * i + 2, []).append((lever, at_c))
+        solution = model.solve()
+        for joint, ends in rods.items():
+            force = sum(solution[where] for _, where in ends)
+            couple = sum(np.cross(lever, solution[where]) for lever, where in ends)
+            np.testing.assert_allclose(
+                wrenches[joint], [*force, *couple], atol=1e-10 * np.abs(solution).max()
+            )
+
+
+@massive
+def test_values_that_are_not_finite_or_of_a_wrong_size_are_refused(name, rng):
+    robot = load(name)
+    motion = [v[0] for v in states(robot, rng, 1)]
+    for k in range(4):
+        bad = [v.copy() for v in motion]
+        bad[k][1] = np.nan
+        with pytest.raises(ValueError, match="finite"):
+            reactions(robot, *bad)
+        bad[k] = motion[k][:2]
+        with pytest.raises(ValueError, match="last axis"):
+            reactions(robot, *bad)
+
+
+def test_an_unreachable_state_is_named(variant):
+    robot, _ = variant("delta", geometry={"arm_length": 0.6})
+    with pytest.raises(UnreachableError) as caught:
+        reactions(robot, [[1.2] * 3, [0.0] * 3], np.zeros(3), np.zeros(3))
+    assert caught.value.index == (1,)
+
+
+@pytest.mark.parametrize("name", MASSLESS)
+def test_a_robot_without_masses_is_refused(name):
+    with pytest.raises(ParameterError):
+        reactions(load(name), np.ones(3), np.zeros(3), np.zeros(3))

@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Zhang, Wang, Wu: dynamic isotropy of a 3-PRRU manipulator (J. Tsinghua Univ. 57, 2017).
+
+The paper prints no numbers, so its equations themselves are the reference: written here in numpy in
+the paper's own variables, differentiated by complex steps, and solved for the driving forces in the
+paper's way (equation 41) and by Lagrange's equations.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.virtual_work import bodies
+from pkm_twin import load, parameters
+from pkm_twin.mechanisms.prru import Prru
+
+Array = NDArray[Any]
+
+LOWER = (0.11, 0.02)
+UPPER = (0.08, 0.03)
+INERTIA = ((0.6, 0.05, -0.02), (0.05, 0.5, 0.03), (-0.02, 0.03, 0.8))
+
+
+def machine(branch: str, link_com: float, platform_com: tuple[float, ...] = (0, 0, 0)) -> Prru:
+    robot = load("prru")
+    assert isinstance(robot, Prru)
+    inertia = {
+        "slider_mass": 8.0,
+        "lower_link_mass": 3.5,
+        "upper_link_mass": 2.5,
+        "platform_mass": 25.0,
+        "link_com": link_com,
+        "lower_link_inertia": list(LOWER),
+        "upper_link_inertia": list(UPPER),
+        "platform_com": list(platform_com),
+        "platform_inertia": [list(row) for row in INERTIA],
+    }
+    g = robot.geometry
+    return parameters.build(
+        Prru,
+        {
+            "mechanism": "prru",
+            "geometry": {
+                **{f.name: getattr(g, f.name) for f in dataclasses.fields(g)},
+                "branch": branch,
+            },
+            "inertia": inertia,
+        },
+    )
+
+
+def turn(axis: int, angle: Any) -> Array:
+    """Rotation matrix about x, y or z (0, 1, 2)."""
+    c, s = np.cos(angle), np.sin(angle)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3, dtype=np.result_type(c))
+    matrix[i, i] = matrix[j, j] = c
+    matrix[i, j], matrix[j, i] = -s, s
+    return matrix
+
+
+@dataclasses.dataclass
+class Position:
+    """All that the paper derives from X = (z, alpha, beta); analytic, so X may be complex."""
+
+    q: Array
+    centre: Array
+    rotation: Array
+    swing: Array
+    spin: Array
+    links: list[tuple[Array, Array]]
+    """Rotations of the lower and the upper link, one pair a limb (equations 2 and 4)."""
+
+
+def paper(robot: Prru, pose: Array) -> Position:
+    """Equations 1 to 17, equation 17 with the tangential vector of equation 13."""
+    g = robot.geometry
+    z, a, b = pose
+    sa, ca, sb, cb = np.sin(a), np.cos(a), np.sin(b), np.cos(b)
+    gamma = -np.arctan(sa * sb / (ca + cb))
+    sg, cg = np.sin(gamma), np.cos(gamma)
+    r = g.platform_radius
+    x = r * (cb * cg - ca * cg + sa * sb * sg) / 2
+    y = -r * (ca * sg + sa * sb * cg)
+    centre = np.array([x, y, z])
+    rotation = turn(0, a) @ turn(1, b) @ turn(2, gamma)
+    q, swing, spin, links = [], [], [], []
+    for phi in g.azimuths:
+        c, s = math.cos(phi), math.sin(phi)
+        u = centre + rotation @ np.array([-r * c, -r * s, 0])
+        root = np.sqrt(
+            g.limb_length**2 - (u[0] + g.base_radius * c) ** 2 - (u[1] + g.base_radius * s) ** 2
+        )
+        below = g.branch == "below"
+        q.append(u[2] - root if below else u[2] + root)
+        # Equation 12 has the arc cosine, which loses the sign of an inward swing.
+        lean = np.arcsin((u[0] * c + u[1] * s + g.base_radius) / g.limb_length)
+        swing.append(lean if below else math.pi - lean)
+        frame = turn(2, phi) @ turn(1, swing[-1])
+        v = frame.T @ rotation @ np.array([-r * s, r * c, 0])
+        spin.append(np.arctan(-v[0] / v[1]))
+        links.append((frame, frame @ turn(2, spin[-1])))
+    return Position(np.array(q), centre, rotation, np.array(swing), np.array(spin), links)
+
+
+def columns(function: Any, pose: Array) -> Array:
+    """Derivative of an analytic function by the pose, on a new last axis; complex steps."""
+    step = 1e-30
+    return np.stack([function(pose + 1j * step * unit).imag / step for unit in np.eye(3)], axis=-1)
+
+
+def spins(frame: Any, pose: Array) -> Array:
+    """Angular velocity per pose rate, shape (3, 3), of the rotation frame(pose)."""
+    w = np.einsum("ijk,lj->ilk", columns(frame, pose), np.asarray(frame(pose)).real)
+    return np.stack([w[2, 1], w[0, 2], w[1, 0]])
+
+
+@dataclasses.dataclass
+class Maps:
+    """Velocity maps of a pose, each body's shape (3 or 1, 3 pose rates)."""
+
+    slider: Array
+    centre: Array
+    platform: Array
+    links: list[Array]
+    """Angular velocity maps in the order of limb and level (equations 27 and 29)."""
+
+    def flat(self) -> Array:
+        return np.concatenate([self.slider, self.centre, self.platform, *self.links])
+
+
+def maps(robot: Prru, pose: Array) -> Maps:
+    """Velocity maps of equations 18 to 30 (angular velocities from equations 19 and 27)."""
+    swing = columns(lambda x: paper(robot, x).swing, pose)
+    spin = columns(lambda x: paper(robot, x).spin, pose)
+    here = paper(robot, pose)
+    links = []
+    for i, phi in enumerate(robot.geometry.azimuths):
+        across = np.array([-math.sin(phi), math.cos(phi), 0.0])
+        links.append(np.outer(across, swing[i]))
+        links.append(links[-1] + np.outer(here.links[i][0][:, 2], spin[i]))
+    return Maps(
+        columns(lambda x: paper(robot, x).q, pose),
+        columns(lambda x: paper(robot, x).centre, pose),
+        spins(lambda x: paper(robot, x).rotation, pose),
+        links,
+    )
+
+
+STENCIL = (np.array([-3, -2, -1, 1, 2, 3]), np.array([-1, 9, -45, 45, -9, 1]) / 60)
+
+
+def along(function: Any, pose: Array, rate: Array, step: float = 1e-3) -> Array:
+    """Derivative of a function of the pose in the direction ``rate``, sixth order."""
+    values = [weight * function(pose + k * step * rate) for k, weight in zip(*STENCIL, strict=True)]
+    total: Array = np.sum(values, axis=0) / step
+    return total
+
+
+def states(count: int, seed: int) -> list[tuple[Array, Array, Array]]:
+    rng = np.random.default_rng(seed)
+    return [
+        (
+            np.array([0.7, *rng.uniform(-0.5, 0.5, 2)]),
+            rng.uniform(-2, 2, 3),
+            rng.uniform(-10, 10, 3),
+        )
+        for _ in range(count)
+    ]
+
+
+def sliders(robot: Prru, pose: Array, rate: Array, twice: Array) -> tuple[Array, Array, Array]:
+    """q, its rate and acceleration (equations 24 and 25)."""
+
+    def jacobian(x: Array) -> Array:
+        return columns(lambda c: paper(robot, c).q, x)
+
+    j = jacobian(pose)
+    return paper(robot, pose).q, j @ rate, j @ twice + along(jacobian, pose, rate) @ rate
+
+
+@pytest.mark.parametrize("branch", ["below", "above"])
+def test_position(branch: str) -> None:
+    """Equations 9, 11 and 12 against the twin's own closed form."""
+    robot = machine(branch, 0.3)
+    for pose, _, _ in states(50, 0):
+        here = paper(robot, pose)
+        np.testing.assert_allclose(robot.inverse(pose), here.q, atol=1e-14)
+        rows, _ = bodies(robot, here.q, np.zeros(3), np.zeros(3))
+        np.testing.assert_allclose(rows[9, 1:4], here.centre, atol=1e-13)
+        for i in range(3):
+            lever = rows[3 * i + 1, 1:4] - rows[3 * i, 1:4]
+            direction = lever / (0.3 * robot.geometry.limb_length)
+            np.testing.assert_allclose(direction, here.links[i][1][:, 2], atol=1e-12)
+            assert direction[2] == pytest.approx(math.cos(here.swing[i]), abs=1e-12)
+
+
+def test_upper_link_follows_the_platform() -> None:
+    """Equations 13 to 17: the link's x axis stays at a right angle to the tangential axis."""
+    robot = machine("below", 0.5)
+    for pose, _, _ in states(20, 1):
+        here = paper(robot, pose)
+        for i, phi in enumerate(robot.geometry.azimuths):
+            tangent = here.rotation @ np.array([-math.sin(phi), math.cos(phi), 0.0])
+            assert here.links[i][1][:, 0] @ tangent == pytest.approx(0.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("branch", ["below", "above"])
+def test_velocity_maps(branch: str) -> None:
+    """Equations 22, 24 and 30 against the twin's maps on joint rates."""
+    robot = machine(branch, 0.5)
+    for pose, _, _ in states(20, 2):
+        j = maps(robot, pose)
+        back = np.linalg.inv(j.slider)
+        q = robot.inverse(pose)
+        np.testing.assert_allclose(robot.jacobian(q), back, atol=1e-12)
+        twist = np.concatenate([j.centre, j.platform]) @ back
+        np.testing.assert_allclose(robot.platform_jacobian(q), twist, atol=1e-11)
+        rows, _ = bodies(robot, q, np.zeros(3), np.zeros(3))
+        for k in range(6):
+            body = 3 * (k // 2) + 1 + k % 2
+            spin = rows[body, 19:28].reshape(3, 3).T
+            np.testing.assert_allclose(spin, j.links[k] @ back, atol=1e-11)
+
+
+@pytest.mark.parametrize("branch", ["below", "above"])
+def test_driving_forces_with_the_links_at_the_sliders(branch: str) -> None:
+    """Equation 41: F_d = -J^-T (J_M' Q_M + sum J_Hij' Q_Hij) - Q_S, every term as printed."""
+    robot = machine(branch, link_com=0.0)
+    gravity = robot.gravity
+    m = robot.inertia
+    rng = np.random.default_rng(3)
+    for pose, rate, twice in states(25, 3):
+        q, qd, qdd = sliders(robot, pose, rate, twice)
+        wrench = rng.normal(size=6) * 200
+        here, j = paper(robot, pose), maps(robot, pose)
+        bias = along(lambda x: maps(robot, x).flat(), pose, rate) @ rate
+        # Equations 32 and 33.
+        inertia = here.rotation @ np.array(INERTIA) @ here.rotation.T
+        w = j.platform @ rate
+        alpha = j.platform @ twice + bias[6:9]
+        force = wrench[:3] + m.platform_mass * (gravity - j.centre @ twice - bias[3:6])
+        couple = wrench[3:] - inertia @ alpha - np.cross(w, inertia @ w)
+        total = j.centre.T @ force + j.platform.T @ couple
+        # Equations 36 and 37, linear velocity of both links that of the slider (equation 26).
+        for k in range(6):
+            i, level = divmod(k, 2)
+            moments = (LOWER, UPPER)[level]
+            link = here.links[i][level]
+            inertia = link @ np.diag([moments[0], moments[0], moments[1]]) @ link.T
+            w = j.links[k] @ rate
+            alpha = j.links[k] @ twice + bias[9 + 3 * k : 12 + 3 * k]
+            weight = (m.lower_link_mass, m.upper_link_mass)[level]
+            total += j.slider[i] * weight * (gravity[2] - qdd[i])
+            total += j.links[k].T @ (-inertia @ alpha - np.cross(w, inertia @ w))
+        # Equation 34, its g being the amount of gravity.
+        q_s = m.slider_mass * (gravity[2] - qdd)
+        force = -np.linalg.solve(j.slider.T, total) - q_s
+        twin = inverse_dynamics(robot, q, qd, qdd, wrench)
+        np.testing.assert_allclose(twin, force, rtol=1e-10, atol=1e-9 * np.abs(force).max())
+
+
+def energies(robot: Prru, pose: Array) -> tuple[Array, Any]:
+    """Mass matrix on the pose rates, shape (3, 3), and the gradient of the potential, (3,)."""
+    g, m = robot.geometry, robot.inertia
+    payload = robot.payload
+
+    def points(x: Array) -> Array:
+        here = paper(robot, x)
+        result = []
+        for i, phi in enumerate(g.azimuths):
+            flat = -g.base_radius * np.array([math.cos(phi), math.sin(phi)])
+            slider = np.array([*flat, here.q[i]])
+            com = slider + m.link_com * g.limb_length * here.links[i][0][:, 2]
+            result += [slider, com, com]
+        result.append(here.centre + here.rotation @ m.platform_com)
+        result.append(here.centre + here.rotation @ payload.com)
+        return np.array(result)
+
+    weights = np.array(
+        [m.slider_mass, m.lower_link_mass, m.upper_link_mass] * 3 + [m.platform_mass, payload.mass]
+    )
+    moved = columns(points, pose)
+    matrix = np.einsum("b,bij,bik->jk", weights, moved, moved)
+    here = paper(robot, pose)
+    for i in range(3):
+        for level, (across, axial) in enumerate((LOWER, UPPER)):
+            spin = spins(lambda x, i=i, level=level: paper(robot, x).links[i][level], pose)
+            local = here.links[i][level].T @ spin
+            matrix += local.T @ np.diag([across, across, axial]) @ local
+    local = here.rotation.T @ spins(lambda x: paper(robot, x).rotation, pose)
+    matrix += local.T @ (np.array(INERTIA) + payload.inertia) @ local
+    return matrix, -np.einsum("b,i,bij->j", weights, robot.gravity, moved)
+
+
+@pytest.mark.parametrize("branch", ["below", "above"])
+@pytest.mark.parametrize("link_com", [0.0, 0.4, 1.0])
+def test_lagrange(branch: str, link_com: float) -> None:
+    """d/dt dT/dXd - dT/dX + dV/dX = J' F, with exact centres of mass, an own payload included."""
+    robot = machine(branch, link_com, (0.02, -0.03, 0.05)).changed(
+        payload={"mass": 3.0, "com": [0.05, 0.02, 0.1], "inertia": [0.02, 0.03, 0.04]}
+    )
+    for pose, rate, twice in states(6, 4):
+        q, qd, qdd = sliders(robot, pose, rate, twice)
+        matrix, gradient = energies(robot, pose)
+
+        def mass(x: Array) -> Array:
+            return energies(robot, x)[0]
+
+        slope = np.stack([along(mass, pose, unit) for unit in np.eye(3)], axis=-1)
+        momentum_rate = matrix @ twice + np.einsum("ijk,k,j->i", slope, rate, rate)
+        kinetic = 0.5 * np.einsum("ijk,i,j->k", slope, rate, rate)
+        j = columns(lambda x: paper(robot, x).q, pose)
+        force = np.linalg.solve(j.T, momentum_rate - kinetic + gradient)
+        twin = inverse_dynamics(robot, q, qd, qdd)
+        np.testing.assert_allclose(twin, force, rtol=1e-9, atol=1e-9 * np.abs(force).max())
+
+
+def test_forces_do_not_depend_on_the_height() -> None:
+    """Section 2.3: q shifts with z, and nothing else does."""
+    robot = machine("below", 0.5)
+    for pose, rate, twice in states(10, 5):
+        q, qd, qdd = sliders(robot, pose, rate, twice)
+        force = inverse_dynamics(robot, q, qd, qdd)
+        np.testing.assert_allclose(inverse_dynamics(robot, q + 0.4, qd, qdd), force, rtol=1e-10)
