@@ -12,8 +12,7 @@ May import: numpy, pkm_twin's core, the standard library.
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -39,13 +38,15 @@ class Differentiator:
     order: int = 2
     window: int = 25
     middle: bool = False
-    _stamps: deque[int] = field(init=False)
-    _values: deque[Array] = field(init=False)
     _carries_velocity: bool | None = None
 
     def __post_init__(self) -> None:
-        self._stamps = deque(maxlen=self.window)
-        self._values = deque(maxlen=self.window)
+        # Rings: a fit does not ask for the order of its samples.
+        self._stamps = np.zeros(self.window, np.int64)
+        self._values = np.zeros((self.window, 3))
+        self._powers = np.ones((self.window, self.order + 2))
+        self._count = 0
+        self._ends = [_derivatives(degree, 1.0) for degree in range(self.order + 2)]
 
     @property
     def delay(self) -> float:
@@ -54,8 +55,7 @@ class Differentiator:
 
     def reset(self) -> None:
         """Forget all samples."""
-        self._stamps.clear()
-        self._values.clear()
+        self._count = 0
 
     def push(self, stamp: int, q: Array, qd: Array | None) -> tuple[Array, Array] | None:
         """Add a sample with a later stamp (ns); rates and accelerations once the window is full.
@@ -68,16 +68,23 @@ class Differentiator:
         if carries is not self._carries_velocity:
             self.reset()
             self._carries_velocity = carries
-        self._stamps.append(stamp)
-        self._values.append(q if qd is None else qd)
-        if len(self._stamps) < self.window:
+        slot = self._count % self.window
+        self._stamps[slot] = stamp
+        self._values[slot] = q if qd is None else qd
+        self._count += 1
+        if self._count < self.window:
             return None
         # From -1 at the oldest sample to 1 at the newest, so that the normal equations of a
         # degree up to 5 stay far from rounding.
-        half = (stamp - self._stamps[0]) / (2 * SECOND)
-        t = 1.0 - (stamp - np.array(self._stamps, np.int64)) / (half * SECOND)
+        oldest = self._count % self.window
+        half = float(stamp - self._stamps[oldest]) / 2
         degree = self.order if carries else self.order + 1
-        powers = t[:, None] ** np.arange(degree + 1)
+        powers = self._powers[:, : degree + 1]
+        t = powers[:, 1]
+        np.divide(self._stamps - stamp, half, out=t)
+        t += 1.0
+        for k in range(2, degree + 1):
+            np.multiply(powers[:, k - 1], t, out=powers[:, k])
         try:
             inverse = np.linalg.inv(powers.T @ powers)
         except np.linalg.LinAlgError:
@@ -86,11 +93,19 @@ class Differentiator:
             raise MessageError(
                 "uneven stamps", "the stamps of the window are too uneven to differentiate"
             )
-        c = inverse @ (powers.T @ np.array(self._values))
-        at = t[self.window // 2] if self.middle else 1.0
-        k = np.arange(degree + 1)
-        first = k * at ** np.maximum(k - 1, 0)
-        if qd is not None:
-            return self._values[self.window // 2] if self.middle else qd, (first @ c) / half
-        second = k * (k - 1) * at ** np.maximum(k - 2, 0)
-        return (first @ c) / half, (second @ c) / half**2
+        c = inverse @ (powers.T @ self._values)
+        half /= SECOND
+        middle = (oldest + self.window // 2) % self.window
+        first, second = self._ends[degree]
+        if self.middle:
+            first, second = _derivatives(degree, float(t[middle]))
+        if qd is None:
+            return (first @ c) / half, (second @ c) / half**2
+        return self._values[middle].copy() if self.middle else qd, (first @ c) / half
+
+
+def _derivatives(degree: int, at: float) -> tuple[Array, Array]:
+    """What 1, t, t^2 ... contribute to the first and second derivative at ``at``."""
+    first = np.array([k * at ** max(k - 1, 0) for k in range(degree + 1)])
+    second = np.array([k * (k - 1) * at ** max(k - 2, 0) for k in range(degree + 1)])
+    return first, second

@@ -30,8 +30,8 @@ class Recording:
     """Accepted joint states on a common time axis.
 
     stamps (n,) in ns; time (n,) in s since the first stamp; q, qd, effort (n, 3), None where the
-    bag has none; wrench (n, 6) in fixed axes at the platform's origin, the one nearest in time, None without
-    a wrench topic. ``rejected`` counts refused messages by reason.
+    bag has none; wrench (n, 6) in fixed axes at the platform's origin, the one nearest in time,
+    None without a wrench topic. ``rejected`` counts refused messages by reason.
     """
 
     robot: Robot

@@ -426,7 +426,6 @@ def test_robot_without_members():
         assert caught.value.value == "delta"
 
 
-@pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_not_finite_is_refused(bad):
     poses = np.tile(HOME, (4, 1))
@@ -434,7 +433,7 @@ def test_not_finite_is_refused(bad):
     for call in (compliance, stiffness, lambda r, p: strain_energy(r, p, np.ones(6))):
         with pytest.raises(ValueError, match=r"pose at sample \(2,\) is not finite"):
             call(ROBOT, poses)
-        with pytest.raises(ValueError, match=r"pose at sample .* is not finite"):
+        with pytest.raises(ValueError, match="pose is not finite"):
             call(ROBOT, poses[2].copy())
     with pytest.raises(ValueError, match="a pose is not finite"):
         reachable(ROBOT, poses)

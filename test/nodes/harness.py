@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages for the pure cores, and node processes in a ROS domain of their own.
+
+Nothing here sleeps to synchronise: every wait is for a condition, with a deadline.
+"""
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+try:
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+except ImportError:  # The tests of the pure cores run without ROS.
+    rclpy = None
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DEADLINE = 20.0
+"""How long a condition is waited for, s."""
+SECOND = 10**9
+
+
+class Plain:
+    """Message classes with attributes only, as a bag decoder makes them."""
+
+    def __call__(self, **fields):
+        return SimpleNamespace(**fields)
+
+    time = duration = header = __call__
+    joint_state = point = trajectory = __call__
+    vector = wrench = wrench_stamped = __call__
+
+
+class Ros:
+    """The real message classes."""
+
+    def __init__(self):
+        from builtin_interfaces.msg import Duration, Time
+        from geometry_msgs.msg import Vector3, Wrench, WrenchStamped
+        from sensor_msgs.msg import JointState
+        from std_msgs.msg import Header
+        from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+        self.time, self.duration, self.header = Time, Duration, Header
+        self.joint_state = JointState
+        self.point, self.trajectory = JointTrajectoryPoint, JointTrajectory
+        self.vector, self.wrench, self.wrench_stamped = Vector3, Wrench, WrenchStamped
+
+
+class Maker:
+    """Builds messages of one kind (Plain or Ros); times in ns."""
+
+    def __init__(self, kind):
+        self.kind = kind
+
+    def header(self, stamp, frame=""):
+        sec, nanosec = divmod(stamp, SECOND)
+        return self.kind.header(stamp=self.kind.time(sec=sec, nanosec=nanosec), frame_id=frame)
+
+    def joint_state(self, names, position, velocity=(), effort=(), stamp=0):
+        return self.kind.joint_state(
+            header=self.header(stamp),
+            name=list(names),
+            position=list(position),
+            velocity=list(velocity),
+            effort=list(effort),
+        )
+
+    def trajectory(self, names, times, positions, velocities=None, accelerations=None, stamp=0):
+        """One point for each of ``times``; a derivative that is None is absent."""
+        points = []
+        for i, (start, position) in enumerate(zip(times, positions, strict=True)):
+            sec, nanosec = divmod(start, SECOND)
+            points.append(
+                self.kind.point(
+                    positions=list(position),
+                    velocities=[] if velocities is None else list(velocities[i]),
+                    accelerations=[] if accelerations is None else list(accelerations[i]),
+                    effort=[],
+                    time_from_start=self.kind.duration(sec=sec, nanosec=nanosec),
+                )
+            )
+        return self.kind.trajectory(
+            header=self.header(stamp), joint_names=list(names), points=points
+        )
+
+    def wrench(self, values, stamp=0, frame="platform"):
+        fx, fy, fz, mx, my, mz = values
+        return self.kind.wrench_stamped(
+            header=self.header(stamp, frame),
+            wrench=self.kind.wrench(
+                force=self.kind.vector(x=fx, y=fy, z=fz),
+                torque=self.kind.vector(x=mx, y=my, z=mz),
+            ),
+        )
+
+
+class Domain:
+    """A ROS domain that no other test on this machine uses, until it is closed."""
+
+    def __init__(self):
+        folder = Path(tempfile.gettempdir())
+        for number in range(20, 102):
+            lock = (folder / f"ros_domain_{number}.lock").open("w")
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                lock.close()
+                continue
+            self.number, self._lock = number, lock
+            return
+        raise RuntimeError("no ROS domain is free")
+
+    def environment(self):
+        """For a node process: the wheels set their own library path anew at its start."""
+        names = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE",)
+        kept = {key: value for key, value in os.environ.items() if key not in names}
+        return kept | {
+            "ROS_DOMAIN_ID": str(self.number),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "PYTHONPATH": str(REPOSITORY),
+            "PYTHONUNBUFFERED": "1",
+        }
+
+    def close(self):
+        self._lock.close()
+
+
+def _end_with_parent():
+    """In a new process, on Linux: a test run that is killed leaves no node behind."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
+class NodeProcess:
+    """``python -m MODULE --ros-args -p ...`` in a session of its own, output kept.
+
+    ``arguments`` are further ROS arguments; ``code`` is run instead of the module.
+    """
+
+    def __init__(self, domain, module, *parameters, arguments=(), code=None):
+        self._output = tempfile.TemporaryFile("w+")  # noqa: SIM115
+        flags = [flag for parameter in parameters for flag in ("-p", parameter)]
+        run = ["-m", module] if code is None else ["-c", code]
+        self.process = subprocess.Popen(
+            [sys.executable, *run, "--ros-args", *flags, *arguments],
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            cwd=tempfile.gettempdir(),
+            env=domain.environment(),
+            start_new_session=True,
+            preexec_fn=_end_with_parent,
+        )
+
+    @property
+    def output(self):
+        self._output.seek(0)
+        return self._output.read()
+
+    def alive(self):
+        return self.process.poll() is None
+
+    def wait(self, timeout=60.0):
+        """The exit code of a process that ends by itself."""
+        return self.process.wait(timeout)
+
+    def stop(self, number=signal.SIGINT):
+        """Signal the process: its exit code, and how long it took to end, s."""
+        began = time.monotonic()
+        self.process.send_signal(number)
+        return self.process.wait(DEADLINE), time.monotonic() - began
+
+    def close(self):
+        """End the process by its id, whatever state it is in."""
+        if self.alive():
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.stop()
+        if self.alive():
+            self.process.kill()
+            self.process.wait()
+        self._output.close()
+
+
+class Peer:
+    """The other side of the topics: a node of this process that sends and collects."""
+
+    def __init__(self, domain):
+        # The middleware reads the range when the context is made, and only from here.
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=domain.number)
+        self.node = rclpy.create_node("peer", context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._publishers = {}
+        self._received = {}
+
+    def now(self):
+        return self.node.get_clock().now().nanoseconds
+
+    def talk(self, kind, topic):
+        self._publishers[topic] = self.node.create_publisher(kind, topic, 10)
+
+    def hear(self, kind, topic):
+        received = self._received[topic] = []
+        self.node.create_subscription(kind, topic, received.append, 100)
+
+    def send(self, topic, message):
+        self._publishers[topic].publish(message)
+
+    def received(self, topic):
+        return self._received[topic]
+
+    def clear(self):
+        for received in self._received.values():
+            received.clear()
+
+    def matched(self):
+        """Every publisher has a subscriber."""
+        return all(p.get_subscription_count() >= 1 for p in self._publishers.values())
+
+    def diagnostics(self, node, condition=lambda array: True):
+        """The next diagnostics of a node, by its full name, that meet the condition."""
+        received = self._received["/diagnostics"]
+        received.clear()
+
+        def found():
+            own = [array for array in received if array.status[0].name == node]
+            return next((array for array in own if condition(array)), None)
+
+        return self.until(found)
+
+    def until(self, condition, timeout=DEADLINE, repeat=None):
+        """Spin until the condition is true; ``repeat`` is called every 50 ms until then.
+
+        :returns: what the condition gave.
+        """
+        deadline = time.monotonic() + timeout
+        due = 0.0
+        while True:
+            result = condition()
+            if result:
+                return result
+            now = time.monotonic()
+            assert now < deadline, f"not so within {timeout:g} s"
+            if repeat is not None and now >= due:
+                repeat()
+                due = now + 0.05
+            self._executor.spin_once(timeout_sec=0.01)
+
+    def call(self, kind, service, request):
+        client = self.node.create_client(kind, service)
+        self.until(client.service_is_ready)
+        future = client.call_async(request)
+        self.until(future.done)
+        self.node.destroy_client(client)
+        return future.result()
+
+    def close(self):
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+def one_line_refusal(process):
+    """The one line that a process which refuses to start says, after its exit with 1."""
+    assert process.wait() == 1, process.output
+    lines = process.output.strip().splitlines()
+    assert len(lines) == 1, process.output
+    assert "Traceback" not in lines[0]
+    return lines[0]
+
+
+def stamp_of(message):
+    """The header's stamp, ns."""
+    stamp = message.header.stamp
+    return stamp.sec * SECOND + stamp.nanosec
+
+
+def values_of(array):
+    """A DiagnosticArray's only status: its values as a dict."""
+    (status,) = array.status
+    return {pair.key: pair.value for pair in status.values}
+
+
+def counts_of(array, what):
+    """The counters of a DiagnosticArray whose keys are ``what: reason``, by reason."""
+    pairs = values_of(array).items()
+    return {key[len(what) + 2 :]: int(n) for key, n in pairs if key.startswith(f"{what}: ")}

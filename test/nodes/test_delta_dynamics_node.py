@@ -1,0 +1,598 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node delta_dynamics over the real middleware, as a process of its own."""
+
+import ast
+import math
+import signal
+import subprocess
+import sys
+import threading
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.feedforward import Feedforward, Settings
+from pkm_twin import load
+from test.nodes.harness import (
+    REPOSITORY,
+    SECOND,
+    Maker,
+    Ros,
+    counts_of,
+    one_line_refusal,
+    stamp_of,
+    values_of,
+)
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
+
+MODULE = "delta_dynamics.node"
+ROBOT = load("delta_cu")
+NAMES = ROBOT.joint_names
+STEP = SECOND // 1000
+WINDOW = 4
+MAKE = Maker(Ros())
+COMMON = (f"differentiator.window:={WINDOW}", "good_needed:=2", "publish_commands:=true")
+Q = np.array([0.1, 0.2, 0.3])
+
+
+class Twin:
+    """A running node and its topics, seen from this side."""
+
+    def __init__(self, peer, process, name):
+        self.peer, self.process, self.name = peer, process, name
+        peer.talk(JointTrajectory, f"/{name}/joint_trajectory")
+        peer.talk(JointState, f"/{name}/states")
+        peer.hear(JointTrajectory, f"/{name}/joint_trajectory_ff")
+        for topic in ("joint_torques", "torque_residual"):
+            peer.hear(JointState, f"/{name}/{topic}")
+        peer.hear(Float64MultiArray, f"/{name}/commands")
+        self._last = 0
+
+    def received(self, topic):
+        return self.peer.received(f"/{self.name}/{topic}")
+
+    def stamp(self):
+        """The present, and later than every stamp before."""
+        self._last = max(self.peer.now(), self._last + STEP)
+        return self._last
+
+    def ask(self, message):
+        """Send a trajectory and wait for its answer: all answers up to it."""
+        received = self.received("joint_trajectory_ff")
+        self.peer.send(f"/{self.name}/joint_trajectory", message)
+        self.peer.until(lambda: any(stamp_of(m) == stamp_of(message) for m in received))
+        answers = list(received)
+        received.clear()
+        return answers
+
+    def send_state(self, message):
+        self.peer.send(f"/{self.name}/states", message)
+
+    def ready(self):
+        """Wait until all topics are connected both ways."""
+
+        def repeat():
+            self.peer.send(f"/{self.name}/joint_trajectory", trajectory(stamp=self.stamp()))
+            self.send_state(state(stamp=self.stamp(), effort=(0.0, 0.0, 0.0)))
+
+        topics = ("joint_trajectory_ff", "joint_torques", "torque_residual", "commands")
+        self.peer.until(lambda: all(self.received(t) for t in topics), 90.0, repeat)
+        self.settle()
+        return self
+
+    def settle(self):
+        """Wait until a new trajectory is answered, and forget everything before."""
+        self.ask(trajectory(stamp=self.stamp()))
+        for topic in ("joint_torques", "torque_residual", "commands"):
+            self.received(topic).clear()
+
+    def stream(self, count, **fields):
+        """Send joint states: their stamps."""
+        stamps = [self.stamp() for _ in range(count)]
+        for stamp in stamps:
+            self.send_state(state(stamp, **fields))
+        return stamps
+
+    def since(self, stamps, topic="joint_torques"):
+        """The messages from the first of these stamps on, once that of the last has come."""
+        received = self.received(topic)
+        self.peer.until(lambda: any(stamp_of(m) == stamps[-1] for m in received))
+        return [m for m in received if stamp_of(m) >= stamps[0]]
+
+    def set(self, **values):
+        """Set parameters atomically; dots are written as two underscores."""
+        request = SetParametersAtomically.Request()
+        request.parameters = [
+            Parameter(key.replace("__", "."), value=value).to_parameter_msg()
+            for key, value in values.items()
+        ]
+        service = f"/{self.name}/set_parameters_atomically"
+        return self.peer.call(SetParametersAtomically, service, request).result
+
+    def effort(self, q=Q):
+        """What the node answers for holding still at q."""
+        rows = [tuple(q)]
+        zero = [(0.0, 0.0, 0.0)]
+        (answer,) = self.ask(MAKE.trajectory(NAMES, [SECOND], rows, zero, zero, self.stamp()))
+        return np.array(answer.points[0].effort)
+
+    def diagnostics(self, condition=lambda array: True):
+        return self.peer.diagnostics(f"/{self.name}", condition)
+
+
+def trajectory(count=5, order=(0, 1, 2), stamp=0, **changes):
+    times = np.arange(count) * 0.05
+    waves = np.outer(times, [3.0, -4.0, 5.0])
+    rows = {
+        "positions": 0.2 + 0.3 * np.sin(waves),
+        "velocities": 0.3 * np.cos(waves) * [3.0, -4.0, 5.0],
+        "accelerations": -0.3 * np.sin(waves) * [9.0, 16.0, 25.0],
+    }
+    order = list(order)
+    fields = {key: values[:, order].tolist() for key, values in rows.items()}
+    fields |= {"names": [NAMES[i] for i in order], "times": [round(t * SECOND) for t in times]}
+    return MAKE.trajectory(**(fields | {"stamp": stamp} | changes))
+
+
+def state(stamp, order=(0, 1, 2), position=Q, velocity=(0.1, -0.2, 0.3), effort=()):
+    def pick(values):
+        return [float(values[i]) for i in order] if len(values) else []
+
+    names = [NAMES[i] for i in order]
+    return MAKE.joint_state(names, pick(position), pick(velocity), pick(effort), stamp)
+
+
+def wave(index):
+    """A smooth motion at 1 kHz: position, velocity and measured effort of a sample."""
+    t = index * 1e-3
+    rates = np.array([6.0, -5.0, 4.0])
+    return (
+        0.2 + 0.2 * np.sin(rates * t),
+        0.2 * rates * np.cos(rates * t),
+        np.array([0.5, -0.25, 1.0]) * np.cos(t),
+    )
+
+
+@pytest.fixture(scope="module")
+def fleet(peer, launch):
+    """The node in three configurations, all started at once."""
+    peer.hear(DiagnosticArray, "/diagnostics")
+    options = {
+        "warning": ("stale_after:=5.0",),
+        "clamping": ("stale_after:=5.0", "limit_policy:=clamp", "acceleration:=differentiate"),
+        "rejecting": ("stale_after:=0.5", "limit_policy:=reject", "on_stop:=zeros"),
+    }
+    twins = {}
+    for name, parameters in options.items():
+        remap = ("-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states")
+        process = launch(MODULE, *COMMON, *parameters, arguments=remap)
+        twins[name] = Twin(peer, process, name)
+    for twin in twins.values():
+        twin.ready()
+    return twins
+
+
+@pytest.fixture
+def warning(fleet):
+    fleet["warning"].settle()
+    return fleet["warning"]
+
+
+@pytest.fixture
+def clamping(fleet):
+    fleet["clamping"].settle()
+    return fleet["clamping"]
+
+
+@pytest.fixture
+def rejecting(fleet):
+    fleet["rejecting"].settle()
+    return fleet["rejecting"]
+
+
+def test_the_start_line_names_robot_domain_and_range(warning, domain):
+    first = warning.process.output.splitlines()[0]
+    assert "robot delta_cu (delta), joints arm_1, arm_2, arm_3" in first
+    assert f"domain {domain.number}, discovery LOCALHOST" in first
+
+
+class TestTrajectories:
+    def test_a_trajectory_comes_back_with_effort_and_nothing_else_changed(self, warning):
+        sent = trajectory(stamp=warning.stamp())
+        (answer,) = warning.ask(sent)
+        rows = [(p.positions, p.velocities, p.accelerations) for p in sent.points]
+        q, qd, qdd = (np.array(values) for values in zip(*rows, strict=True))
+        efforts = np.array([p.effort for p in answer.points])
+        assert np.abs(efforts - inverse_dynamics(ROBOT, q, qd, qdd)).max() < 1e-12
+        for point in answer.points:
+            point.effort = []
+        assert answer == sent
+
+    def test_permuted_joints_have_bit_identical_efforts(self, warning):
+        (expected,) = warning.ask(trajectory(stamp=warning.stamp()))
+        expected = np.array([p.effort for p in expected.points])
+        for order in permutations(range(3)):
+            (answer,) = warning.ask(trajectory(order=order, stamp=warning.stamp()))
+            assert answer.joint_names == [NAMES[i] for i in order]
+            efforts = np.array([p.effort for p in answer.points])
+            assert (efforts == expected[:, list(order)]).all()
+
+    def test_each_bad_trajectory_is_counted_and_the_next_good_one_is_answered(self, warning):
+        good = [(0.1, 0.2, 0.3)] * 3
+        times = [0, STEP, 2 * STEP]
+        past = warning.peer.now() - 10 * SECOND
+        bad = [
+            ("not finite", {"positions": [(0.1, math.nan, 0.3)] * 3}),
+            ("not finite", {"velocities": [(math.inf, 0.2, 0.3)] * 3}),
+            ("not finite", {"accelerations": [(0.1, 0.2, -math.inf)] * 3}),
+            ("missing joint", {"names": NAMES[:2]}),
+            ("unknown joint", {"names": (*NAMES[:2], "wrist")}),
+            ("duplicated joint", {"names": (*NAMES, NAMES[0])}),
+            ("empty", {"names": ()}),
+            ("empty", {"times": [], "positions": [], "velocities": [], "accelerations": []}),
+            ("length", {"positions": [(0.1, 0.2)] * 3}),
+            ("length", {"velocities": [(0.1,), *good[1:]]}),
+            ("no velocities", {"velocities": None}),
+            ("no accelerations", {"accelerations": None}),
+            ("bounds", {"accelerations": [(1e300, 0.0, 0.0)] * 3}),
+            ("bounds", {"positions": [(5e-324, 0.0, 0.0)] * 3}),
+            ("limit", {"positions": [(1.4, 0.2, 0.3)] * 3}),
+            ("limit", {"velocities": [(0.0, 16.0, 0.0)] * 3}),
+            ("time", {"times": [0, STEP, STEP]}),
+            ("time", {"times": [0, 2 * STEP, STEP]}),
+            ("time", {"times": [-STEP, 0, STEP]}),
+            ("over", {"stamp": past}),
+        ]
+        expected = {}
+        for reason, changes in bad:
+            fields = {
+                "names": NAMES,
+                "times": times,
+                "positions": good,
+                "velocities": good,
+                "accelerations": good,
+            }
+            message = MAKE.trajectory(**(fields | changes))
+            warning.peer.send("/warning/joint_trajectory", message)
+            answers = warning.ask(trajectory(stamp=warning.stamp()))
+            assert len(answers) == 1, f"{reason}: the bad trajectory was answered"
+            expected[reason] = expected.get(reason, 0) + 1
+        array = warning.diagnostics(
+            lambda a: sum(counts_of(a, "trajectories rejected").values()) >= len(bad)
+        )
+        assert counts_of(array, "trajectories rejected") == expected
+        assert array.status[0].message.startswith("last reject: the trajectory ended 1")
+        assert array.status[0].level == b"\x01"
+
+    def test_derivatives_are_made_where_declared(self, clamping):
+        times = np.array([0.0, 0.1, 0.15, 0.3])
+        a, b = np.array([0.5, -0.5, 0.2]), np.array([1.0, 0.5, -0.5])
+        q = 0.1 + np.outer(times, a) + np.outer(times**2, b)
+        stamps = [round(t * SECOND) for t in times]
+        (answer,) = clamping.ask(MAKE.trajectory(NAMES, stamps, q.tolist(), stamp=clamping.stamp()))
+        exact = inverse_dynamics(ROBOT, q, a + 2 * np.outer(times, b), np.tile(2 * b, (4, 1)))
+        assert np.allclose([p.effort for p in answer.points], exact, atol=1e-9)
+        assert all(len(p.velocities) == 0 for p in answer.points)
+
+
+class TestStreams:
+    def compare(self, twin, differentiate):
+        """Every answer of a permuted stream is, to the bit, the core's for the ordered one."""
+        core = Feedforward(
+            ROBOT,
+            Settings(differentiate=differentiate, window=WINDOW, good_needed=1, stale_after=5.0),
+        )
+        begin = twin.stamp()
+        twin.peer.until(lambda: twin.peer.now() > begin + 31 * STEP)
+        orders = list(permutations(range(3)))
+        expected = []
+        for i in range(30):
+            q, qd, measured = wave(i)
+            stamp = begin + (i + 1) * STEP
+            twin._last = stamp
+            message = {"position": q, "velocity": () if differentiate else qd, "effort": measured}
+            twin.send_state(state(stamp, orders[i % 6], **message))
+            result = core.joint_state(state(stamp, **message), stamp)
+            if result is not None:
+                expected.append(result)
+                twin.since([stamp])  # In step: the queue holds only the newest ten.
+        stamps = [result.stamp for result in expected]
+        torques = twin.since(stamps)
+        residuals = twin.since(stamps, "torque_residual")
+        received = twin.received("commands")
+        last = expected[-1].effort.tobytes()
+        twin.peer.until(lambda: received and np.array(received[-1].data).tobytes() == last)
+        commands = received[-len(expected) :]
+        for result, torque, residual, command in zip(
+            expected, torques, residuals, commands, strict=True
+        ):
+            for message in (torque, residual):
+                assert stamp_of(message) == result.stamp
+                assert tuple(message.name) == NAMES
+                assert len(message.position) == len(message.velocity) == 0
+            assert np.array(torque.effort).tobytes() == result.effort.tobytes()
+            assert np.array(residual.effort).tobytes() == result.residual.tobytes()
+            assert np.array(command.data).tobytes() == result.effort.tobytes()
+            measured = np.array(residual.effort) + np.array(torque.effort)
+            i = round((result.stamp - begin) / STEP) - 1
+            assert np.allclose(measured, wave(i)[2], atol=1e-12)
+
+    def test_velocities_are_differentiated(self, warning):
+        self.compare(warning, False)
+
+    def test_positions_are_differentiated_where_declared(self, clamping):
+        self.compare(clamping, True)
+
+    def test_no_residual_without_a_measured_effort(self, warning):
+        stamps = warning.stream(WINDOW)
+        warning.since(stamps)
+        last = warning.stream(1, effort=(1.0, 2.0, 3.0))
+        assert [stamp_of(m) for m in warning.since(stamps[:1] + last, "torque_residual")] == last
+
+    def test_torques_are_reliable_and_volatile(self, warning):
+        for topic in ("joint_torques", "joint_trajectory_ff", "torque_residual", "commands"):
+            infos = warning.peer.node.get_publishers_info_by_topic(f"/warning/{topic}")
+            (profile,) = [info.qos_profile for info in infos]
+            assert profile.durability == DurabilityPolicy.VOLATILE
+            assert profile.reliability == ReliabilityPolicy.RELIABLE
+
+    def test_bad_samples_in_a_row_stop_and_good_ones_start_again(self, warning):
+        warning.since(warning.stream(WINDOW))
+        bad = warning.stream(5, position=(math.nan, 0.0, 0.0))
+        array = warning.diagnostics(lambda a: a.status[0].level == b"\x02")
+        assert array.status[0].message == "stopped: not finite: position of arm_1 is nan"
+        assert counts_of(array, "joint states rejected")["not finite"] == 5
+        assert counts_of(array, "stopped") == {"not finite": 1}
+        good = warning.stream(3)
+        # good_needed is 2.
+        assert [stamp_of(m) for m in warning.since(bad[:1] + good)] == good[1:]
+        assert warning.diagnostics().status[0].level == b"\x01"
+
+
+class TestStale:
+    def test_silence_stops_a_stream_and_good_samples_start_it_again(self, rejecting):
+        torques = rejecting.received("joint_torques")
+        rejecting.since(rejecting.stream(WINDOW + 3))
+        torques.clear()
+        # By the parameter on_stop, zeros are sent, once.
+        rejecting.peer.until(lambda: torques)
+        assert list(torques[0].effort) == [0.0, 0.0, 0.0]
+        array = rejecting.diagnostics(lambda a: a.status[0].level == b"\x02")
+        assert "no joint state for 0." in array.status[0].message
+        assert counts_of(array, "stopped")["stale input"] >= 1
+        assert len(torques) == 1
+        torques.clear()
+        # The window is filled anew, then good_needed answers are held back.
+        stamps = rejecting.stream(WINDOW + 3)
+        assert [stamp_of(m) for m in rejecting.since(stamps)] == stamps[WINDOW:]
+
+
+class TestLimits:
+    weak = (0.2, 20.0, 20.0)
+
+    @pytest.mark.parametrize("name", ["warning", "clamping", "rejecting"])
+    def test_a_passed_effort_limit_is_answered_by_the_policy(self, fleet, name):
+        twin = fleet[name]
+        twin.settle()
+        free = twin.effort()
+        assert abs(free[0]) > self.weak[0]
+        before = int(values_of(twin.diagnostics())["effort limit passed"])
+        assert twin.set(effort_limits=self.weak).successful
+        zero = [(0.0, 0.0, 0.0)]
+        message = MAKE.trajectory(NAMES, [SECOND], [tuple(Q)], zero, zero, twin.stamp())
+        try:
+            if name == "rejecting":
+                twin.peer.send(f"/{name}/joint_trajectory", message)
+                twin.diagnostics(lambda a: "effort limit" in counts_of(a, "trajectories rejected"))
+                assert "rejected, effort limit: effort of arm_1 is" in twin.process.output
+                assert twin.received("joint_trajectory_ff") == []
+                return
+            (answer,) = twin.ask(message)
+            effort = np.array(answer.points[0].effort)
+            clamped = np.clip(free, -np.array(self.weak), self.weak)
+            assert (effort == (free if name == "warning" else clamped)).all()
+            array = twin.diagnostics(
+                lambda a: int(values_of(a)["effort limit passed"]) == before + 1
+            )
+            assert array.status[0].level >= b"\x01"
+        finally:
+            assert twin.set(effort_limits=(20.0, 20.0, 20.0)).successful
+
+
+class TestParameters:
+    def test_a_payload_set_at_run_time_shows_in_the_torques(self, warning):
+        zero = np.zeros(3)
+        light = warning.effort()
+        assert np.abs(light - inverse_dynamics(ROBOT, Q, zero, zero)).max() < 1e-12
+        try:
+            result = warning.set(payload__mass=0.4, payload__com=(0.01, 0.0, -0.05))
+            assert result.successful
+            heavy = ROBOT.changed(payload={"mass": 0.4, "com": [0.01, 0.0, -0.05]})
+            exact = inverse_dynamics(heavy, Q, zero, zero)
+            assert np.abs(warning.effort() - exact).max() < 1e-12
+            assert np.abs(exact - light).max() > 0.1
+            assert values_of(warning.diagnostics())["payload mass"] == "0.4"
+        finally:
+            assert warning.set(payload__mass=0.0, payload__com=(0.0, 0.0, 0.0)).successful
+        assert (warning.effort() == light).all()
+
+    @pytest.mark.parametrize(
+        ("changes", "reason"),
+        [
+            ({"payload__mass": 0.4, "gravity": (0.0, 0.0, math.nan)}, "gravity[2]: nan"),
+            ({"payload__mass": 0.4, "payload__com": (0.0, 0.0)}, "payload.com"),
+            ({"payload__mass": 0.4, "friction__viscous": (-1.0, 0.0, 0.0)}, "friction.viscous[0]"),
+            ({"payload__mass": -0.4, "gravity": (0.0, 0.0, -1.62)}, "payload.mass"),
+            ({"gravity": (0.0, 0.0, -1.62), "payload__inertia": (1.0, 1.0, 3.0)}, "triangle"),
+            ({"payload__mass": 0.4, "mechanism": "delta"}, "mechanism"),
+            ({"payload__mass": 0.4, "stale_after": 0.1}, "stale_after"),
+            ({"payload__mass": "heavy", "gravity": (0.0, 0.0, -1.62)}, "expected 'Type.DOUBLE'"),
+            ({"payload__mass": math.inf}, "payload.mass"),
+        ],
+    )
+    def test_a_half_bad_set_changes_nothing(self, warning, changes, reason):
+        before = warning.effort()
+        result = warning.set(**changes)
+        assert not result.successful
+        assert reason in result.reason
+        assert (warning.effort() == before).all()
+        request = GetParameters.Request(names=["payload.mass", "gravity"])
+        values = warning.peer.call(GetParameters, "/warning/get_parameters", request).values
+        assert values[0].double_value == 0.0
+        assert list(values[1].double_array_value) == [0.0, 0.0, -9.81]
+
+    @pytest.mark.parametrize(
+        ("parameters", "named"),
+        [
+            (["payload.masss:=0.1"], "did you mean 'payload.mass'"),
+            (["mechanism:=delta_uc"], "did you mean 'delta_cu'"),
+            (["mechanism:=upr_rpu"], "mechanism: 'upr_rpu'"),
+            (["mechanism:=/nonexistent/robot.yaml"], "/nonexistent/robot.yaml"),
+            (["mechanism:=5"], "mechanism: 5"),
+            (["payload.mass:=.nan"], "payload.mass: nan"),
+            (["payload.mass:=heavy"], "payload.mass: 'heavy'"),
+            (["gravity:=[0.0, 0.0, .nan]"], "gravity[2]: nan"),
+            (["payload.inertia:=[1.0, 1.0, 2.5]"], "payload.inertia"),
+            (["stale_after:=.nan"], "stale_after: nan"),
+            (["limit_policy:=clip"], "did you mean 'clamp'"),
+            (["acceleration:=guess"], "acceleration: 'guess'"),
+            (["differentiator.window:=3"], "differentiator.window: 3"),
+            (["use_sim_time:=maybe"], "use_sim_time"),
+            (["qos_overrides./joint_states.subscription.reliability:=best"], "`reliability`"),
+        ],
+    )
+    def test_a_bad_configuration_is_refused_in_one_line(self, launch, parameters, named):
+        line = one_line_refusal(launch(MODULE, *parameters))
+        assert line.startswith("refused to start: ")
+        assert named in line
+
+
+class TestProcess:
+    def test_diagnostics_come_once_a_second(self, warning):
+        received = warning.peer.received("/diagnostics")
+        received.clear()
+
+        def own():
+            return [a for a in received if a.status[0].name == "/warning"]
+
+        warning.peer.until(lambda: len(own()) >= 4)
+        gaps = np.diff([stamp_of(array) for array in own()]) / SECOND
+        # Each gap may see the machine's other work; together they may not drift.
+        assert gaps.mean() == pytest.approx(1.0, abs=0.2)
+        status = own()[-1].status[0]
+        assert status.hardware_id == "delta_cu"
+        assert values_of(own()[-1])["exceptions"] == "0"
+
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGTERM])
+    def test_a_signal_in_the_middle_of_a_stream_ends_the_node(self, peer, launch, number):
+        name = f"ending_{number}"
+        remap = ("-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states")
+        twin = Twin(peer, launch(MODULE, *COMMON, arguments=remap), name)
+        twin.ready()
+        enough = threading.Event()
+
+        def stream():
+            # At some kHz, so that the signal comes while a callback publishes.
+            while not enough.wait(0.0002):
+                twin.send_state(state(peer.now(), effort=(1.0, 2.0, 3.0)))
+
+        thread = threading.Thread(target=stream)
+        thread.start()
+        try:
+            twin.peer.until(lambda: len(twin.received("joint_torques")) > 50)
+            code, took = twin.process.stop(number)
+        finally:
+            enough.set()
+            thread.join()
+        assert code == 0
+        assert took < 2.0
+        assert "Traceback" not in twin.process.output
+
+    def test_an_exception_in_a_callback_stops_the_stream_and_not_the_node(self, peer, launch):
+        code = """
+import delta_dynamics.node as node
+solve = node.Feedforward._joint_state
+def broken(self, message, now):
+    if message.position[0] == 0.125:
+        raise ZeroDivisionError("made for the test")
+    return solve(self, message, now)
+node.Feedforward._joint_state = broken
+node.main()
+"""
+        remap = ("-r", "__node:=broken", "-r", "joint_states:=/broken/states")
+        process = launch(None, *COMMON, "stale_after:=5.0", arguments=remap, code=code)
+        peer.hear(DiagnosticArray, "/diagnostics")
+        twin = Twin(peer, process, "broken").ready()
+        twin.stream(3, position=(0.125, 0.2, 0.3))
+        array = twin.diagnostics(lambda a: values_of(a)["exceptions"] == "3")
+        assert array.status[0].level == b"\x02"
+        assert counts_of(array, "stopped") == {"exception": 1}
+        assert process.output.count("Traceback") == 1
+        stamps = twin.stream(WINDOW + 3)
+        assert [stamp_of(m) for m in twin.since(stamps)] == stamps[WINDOW:]
+        assert process.alive()
+
+    def test_a_clock_that_never_comes_is_told(self, peer, launch):
+        peer.hear(DiagnosticArray, "/diagnostics")
+        remap = ("-r", "__node:=waiting")
+        process = launch(MODULE, "use_sim_time:=true", arguments=remap)
+        array = peer.diagnostics("/waiting")
+        assert array.status[0].message == "use_sim_time is set and no /clock arrives"
+        assert array.status[0].level == b"\x01"
+        assert process.stop()[0] == 0
+
+
+class TestLayers:
+    """The core knows nothing of ROS."""
+
+    core = (
+        "pkm_twin",
+        "pkm_twin.bags",
+        "pkm_twin.errors",
+        "pkm_twin.guard",
+        "pkm_twin.kernels",
+        "pkm_twin.mechanisms",
+        "pkm_twin.messages",
+        "pkm_twin.parameters",
+        "delta_dynamics",
+        "delta_dynamics.differentiator",
+        "delta_dynamics.feedforward",
+        "stiffness_monitor",
+        "stiffness_monitor.monitor",
+    )
+    # What runs nodes or talks to them; all else must run without ROS.
+    with_ros = ("node.py", "player.py", "health.py", "demo.py", "recorder.py")
+
+    def test_the_core_imports_no_rclpy(self, domain):
+        code = f"import sys, {', '.join(self.core)}; sys.exit('rclpy' in sys.modules)"
+        result = subprocess.run(
+            [sys.executable, "-c", code], env=domain.environment(), timeout=120, check=False
+        )
+        assert result.returncode == 0
+
+    def test_only_nodes_name_rclpy(self):
+        importers = set()
+        for package in ("pkm_twin", "delta_dynamics", "stiffness_monitor"):
+            for path in (REPOSITORY / package).rglob("*.py"):
+                for node in ast.walk(ast.parse(path.read_text())):
+                    if isinstance(node, ast.Import):
+                        modules = [alias.name for alias in node.names]
+                    elif isinstance(node, ast.ImportFrom):
+                        modules = [node.module or ""]
+                    else:
+                        continue
+                    if any(module.split(".")[0] == "rclpy" for module in modules):
+                        importers.add(path)
+        assert {"node.py", "health.py"} <= {path.name for path in importers}
+        assert [path for path in importers if path.name not in self.with_ros] == []

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stiffness core: a wrench and the pose beside it, to compliance and strain energy."""
+
+import math
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pkm_twin import load
+from pkm_twin.errors import MessageError, SingularityError
+from stiffness_monitor import compliance, monitor, strain_energy
+from stiffness_monitor.monitor import Monitor, Settings
+from test.nodes.harness import SECOND, Maker, Plain
+
+NOW = 1_000 * SECOND
+ROBOT = load("upr_rpu")
+NAMES = ROBOT.joint_names
+POSE = np.array([-0.7, 0.2, -0.15])
+Q = ROBOT.inverse(POSE)
+WRENCH = np.array([30.0, -20.0, -100.0, 3.0, -2.0, 1.0])
+DAMAGED = [math.nan, math.inf, -math.inf, 1e308, 5e-324]
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+def state(make, q=Q, stamp=NOW, names=NAMES):
+    return make.joint_state(names, q, stamp=stamp)
+
+
+def watching(make, **changes):
+    """A monitor that has seen one joint state."""
+    twin = Monitor(ROBOT, Settings(**changes))
+    twin.joint_state(state(make), NOW)
+    return twin
+
+
+def reject(call, *arguments):
+    with pytest.raises(MessageError) as caught:
+        call(*arguments)
+    return caught.value.reason, str(caught.value)
+
+
+class TestAnswers:
+    def test_compliance_and_energy_are_those_of_the_pose(self, make):
+        answer = watching(make, wrench_frame="base_link").wrench(
+            make.wrench(WRENCH, NOW, "base_link"), NOW
+        )
+        assert answer.stamp == NOW
+        assert np.allclose(answer.pose, POSE, atol=1e-12)
+        assert (answer.wrench == WRENCH).all()
+        assert (answer.compliance == compliance(ROBOT, answer.pose)).all()
+        expected = strain_energy(ROBOT, answer.pose, WRENCH)
+        assert (answer.energy.factors == expected.factors).all()
+        assert answer.energy.dominant == expected.dominant
+        assert np.allclose(answer.energy.deflection, answer.compliance @ WRENCH, rtol=1e-9)
+
+    @pytest.mark.parametrize("frame", ["platform", "tool0"])
+    def test_a_wrench_off_the_base_frame_has_the_platforms_axes(self, make, frame):
+        answer = watching(make, wrench_frame=frame).wrench(make.wrench(WRENCH, NOW, frame), NOW)
+        rotation = ROBOT.rotation(answer.pose)
+        fixed = np.concatenate((rotation @ WRENCH[:3], rotation @ WRENCH[3:]))
+        assert np.abs(fixed - WRENCH).max() > 1.0
+        assert np.allclose(answer.wrench, fixed, atol=1e-12)
+        twin = watching(make, wrench_frame="base_link")
+        same = twin.wrench(make.wrench(fixed, NOW, "base_link"), NOW)
+        assert np.allclose(answer.energy.deflection, same.energy.deflection, rtol=1e-12)
+
+    def test_the_base_frame_may_have_another_name(self, make):
+        options = {"wrench_frame": "world", "base_frame": "world"}
+        answer = watching(make, **options).wrench(make.wrench(WRENCH, NOW, "world"), NOW)
+        assert (answer.wrench == WRENCH).all()
+
+    def test_permuted_limbs_give_the_same_bits(self, make):
+        expected = watching(make).wrench(make.wrench(WRENCH, NOW), NOW)
+        for order in permutations(range(3)):
+            twin = Monitor(ROBOT)
+            twin.joint_state(state(make, Q[list(order)], NOW, [NAMES[i] for i in order]), NOW)
+            answer = twin.wrench(make.wrench(WRENCH, NOW), NOW)
+            assert (answer.compliance == expected.compliance).all()
+
+    def test_a_zero_wrench_has_no_dominant_element(self, make):
+        answer = watching(make).wrench(make.wrench([0.0] * 6, NOW), NOW)
+        assert answer.energy.dominant == "none"
+        assert answer.energy.total == 0.0
+        assert not np.isnan(answer.energy.factors).any()
+        assert np.isfinite(answer.compliance).all()
+
+    @pytest.mark.parametrize("size", [1e-300, 1e-200, 1e-100, 1e7])
+    def test_a_tiny_or_large_wrench_gives_no_nan(self, make, size):
+        answer = watching(make).wrench(make.wrench([size] * 6, NOW), NOW)
+        energy = answer.energy
+        assert np.isfinite([*energy.factors, energy.total, *energy.deflection]).all()
+        assert energy.dominant == "none" or sum(energy.factors) == pytest.approx(1.0)
+
+    def test_a_tie_is_reported_and_broken_by_order(self, make):
+        # Straight home pose, force along z: limbs 1 and 2 mirror each other.
+        twin = Monitor(ROBOT)
+        twin.joint_state(state(make, ROBOT.inverse([-0.7, 0.0, 0.0])), NOW)
+        tied = [
+            twin.wrench(make.wrench(wrench, NOW), NOW).energy
+            for wrench in ([0, 0, 0, 0, 100.0, 0], [100.0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 10.0])
+        ]
+        assert any(energy.tie for energy in tied)
+        for energy in tied:
+            best = [
+                name
+                for name, factor in zip(energy.elements, energy.factors, strict=True)
+                if factor >= max(energy.factors) - 1e-9
+            ]
+            assert energy.tie == (len(best) > 1)
+            assert energy.dominant == best[0]
+
+
+class TestPairing:
+    def test_no_pose_before_a_joint_state(self, make):
+        twin = Monitor(ROBOT)
+        reason, text = reject(twin.wrench, make.wrench(WRENCH, NOW), NOW)
+        assert (reason, "no pose" in text) == ("no pose", True)
+        assert twin.wrenches.rejected == {"no pose": 1}
+
+    @pytest.mark.parametrize(("apart", "good"), [(-1.0, False), (-0.1, True), (0.1, True)])
+    def test_stamps_too_far_apart_are_no_pose(self, make, apart, good):
+        twin = watching(make, max_state_age=0.1)
+        stamp = NOW + round(apart * SECOND)
+        message = make.wrench(WRENCH, stamp)
+        if good:
+            assert twin.wrench(message, max(NOW, stamp)).stamp == stamp
+        else:
+            reason, text = reject(twin.wrench, message, NOW)
+            assert reason == "no pose" and "1.000 s" in text and "0.1 s" in text
+
+    def test_the_nearest_of_many_states_is_used(self, make):
+        twin = Monitor(ROBOT)
+        poses = [POSE - [0.0001 * i, 0.0, 0.0] for i in range(400)]
+        for i, pose in enumerate(poses):
+            stamp = NOW + i * SECOND // 1000
+            twin.joint_state(state(make, ROBOT.inverse(pose), stamp), stamp)
+        arrival = NOW + SECOND // 2
+        for i in (399, 300, 250):
+            message = make.wrench(WRENCH, NOW + i * SECOND // 1000 + SECOND // 3000)
+            assert np.allclose(twin.wrench(message, arrival).pose, poses[i], atol=1e-12)
+
+    def test_an_older_state_is_dropped_and_counted(self, make):
+        twin = watching(make)
+        reason, _ = reject(twin.joint_state, state(make, stamp=NOW - 1), NOW)
+        assert (reason, twin.dropped) == ("stamp order", 1)
+        twin.joint_state(state(make, stamp=NOW), NOW)
+        assert twin.states.accepted == 2
+
+    def test_after_a_reset_there_is_no_pose(self, make):
+        twin = watching(make)
+        twin.reset()
+        assert reject(twin.wrench, make.wrench(WRENCH, NOW), NOW)[0] == "no pose"
+        twin.joint_state(state(make, stamp=NOW - SECOND), NOW - SECOND)
+
+    def test_zero_stamps_are_arrival_times_where_allowed(self, make):
+        assert reject(Monitor(ROBOT).joint_state, state(make, stamp=0), NOW)[0] == "zero stamp"
+        assert reject(watching(make).wrench, make.wrench(WRENCH, 0), NOW)[0] == "zero stamp"
+        twin = Monitor(ROBOT, Settings(accept_zero_stamp=True))
+        twin.joint_state(state(make, stamp=0), NOW)
+        assert twin.wrench(make.wrench(WRENCH, 0), NOW + 1).stamp == NOW + 1
+
+    def test_future_stamps_are_rejected(self, make):
+        twin = watching(make)
+        assert reject(twin.wrench, make.wrench(WRENCH, NOW + SECOND), NOW)[0] == "future stamp"
+        late = state(make, stamp=NOW + SECOND)
+        assert reject(twin.joint_state, late, NOW)[0] == "future stamp"
+
+
+class TestRejects:
+    @pytest.mark.parametrize("frame", ["", "tool0", "base_link"])
+    def test_an_empty_or_other_frame(self, make, frame):
+        twin = watching(make)
+        assert reject(twin.wrench, make.wrench(WRENCH, NOW, frame), NOW)[0] == "frame"
+        assert twin.wrenches.rejected == {"frame": 1}
+
+    def test_an_empty_frame_is_the_declared_one_where_allowed(self, make):
+        twin = watching(make, accept_empty_frame=True)
+        empty = twin.wrench(make.wrench(WRENCH, NOW, ""), NOW)
+        named = twin.wrench(make.wrench(WRENCH, NOW, "platform"), NOW)
+        assert (empty.wrench == named.wrench).all()
+        assert reject(twin.wrench, make.wrench(WRENCH, NOW, "tool0"), NOW)[0] == "frame"
+
+    @pytest.mark.parametrize("value", DAMAGED)
+    def test_damaged_values(self, make, value):
+        twin = watching(make)
+        assert reject(twin.wrench, make.wrench([0, 0, value, 0, 0, 0], NOW), NOW)
+        assert reject(twin.joint_state, state(make, [Q[0], value, Q[2]]), NOW)
+        assert twin.wrench(make.wrench(WRENCH, NOW), NOW)
+
+    @pytest.mark.parametrize("value", [0.29, 1.01, -0.5, 0.0])
+    def test_a_limb_length_off_its_limits(self, make, value):
+        reason, text = reject(Monitor(ROBOT).joint_state, state(make, [Q[0], Q[1], value]), NOW)
+        assert (reason, "limb_3" in text) == ("limit", True)
+
+    def test_lengths_without_an_assembly_name_the_limb(self, make):
+        twin = Monitor(ROBOT)
+        twin.joint_state(state(make, [0.3, 1.0, 0.5]), NOW)
+        reason, text = reject(twin.wrench, make.wrench(WRENCH, NOW), NOW)
+        assert reason == "unreachable"
+        assert "limb" in text
+
+    @pytest.mark.parametrize(
+        ("error", "reason"),
+        [
+            (SingularityError("pose", (), 1e-12, 1e-9), "singular"),
+            (ValueError("pose is not finite"), "non-finite result"),
+        ],
+    )
+    def test_a_model_that_fails(self, make, monkeypatch, error, reason):
+        def fail(*arguments):
+            raise error
+
+        twin = watching(make)
+        monkeypatch.setattr(monitor, "compliance", fail)
+        assert reject(twin.wrench, make.wrench(WRENCH, NOW), NOW)[0] == reason
+
+    def test_a_compliance_that_is_not_finite(self, make, monkeypatch):
+        twin = watching(make)
+        monkeypatch.setattr(monitor, "compliance", lambda *a: np.full((6, 6), np.nan))
+        assert reject(twin.wrench, make.wrench(WRENCH, NOW), NOW)[0] == "non-finite result"
+
+
+NUMBERS = st.one_of(st.floats(-1e3, 1e3), st.floats(), st.sampled_from([*DAMAGED, 0.0, 1e7]))
+LENGTHS = st.one_of(st.floats(0.3, 1.0), st.floats(0.3, 1.0), NUMBERS)
+
+
+@settings(max_examples=400, deadline=None)
+@given(q=st.tuples(LENGTHS, LENGTHS, LENGTHS), wrench=st.tuples(*[NUMBERS] * 6))
+def test_anything_is_rejected_or_answered_with_finite_numbers(q, wrench):
+    make = Maker(Plain())
+    twin = Monitor(ROBOT)
+    try:
+        twin.joint_state(state(make, q), NOW)
+        answer = twin.wrench(make.wrench(wrench, NOW), NOW)
+    except MessageError as error:
+        assert error.reason and str(error)
+        return
+    energy = answer.energy
+    assert np.isfinite(answer.compliance).all() and np.isfinite(answer.pose).all()
+    assert np.isfinite([*energy.factors, energy.total, *energy.deflection]).all()
+    assert energy.total >= 0.0
+    assert energy.dominant in (*energy.elements, "none")

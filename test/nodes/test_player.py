@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The player over the real middleware: a process of its own publishes, this one subscribes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from pkm_twin.bags import BagWriter
+from pkm_twin.errors import BagError, ParameterError
+from pkm_twin.player import play
+
+DOMAIN = 1 + os.getpid() % 100
+COUNT = 200
+PERIOD = 0.005
+FIRST = 1_700_000_000 * 10**9
+PROGRAM = (
+    "import sys; from pkm_twin.player import play; print(play(sys.argv[1], **eval(sys.argv[2])))"
+)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One second of joint states at 200 Hz, every tenth with a note, and a latched note."""
+    path = tmp_path_factory.mktemp("bags") / "second.mcap"
+    with BagWriter(path) as writer:
+        writer.add_topic("/joint_states", "sensor_msgs/msg/JointState")
+        writer.add_topic("/note", "std_msgs/msg/String", reliability="best_effort", depth=100)
+        writer.add_topic("/latched", "std_msgs/msg/String", durability="transient_local", depth=1)
+        writer.write("/latched", String(data="latched"), FIRST)
+        for index in range(COUNT):
+            now = FIRST + round(index * PERIOD * 1e9)
+            writer.write("/joint_states", JointState(name=["a"], position=[float(index)]), now)
+            if index % 10 == 0:
+                writer.write("/note", String(data=str(index)), now)
+    return path
+
+
+class Listener:
+    """Collects arrival time, topic and message in a ROS domain of this test's own."""
+
+    def __init__(self, node: Node, executor: SingleThreadedExecutor) -> None:
+        self.node = node
+        self.executor = executor
+        self.heard: list[tuple[float, str, Any]] = []
+
+    def listen(self, kind: Any, topic: str, qos: QoSProfile | int = 1000) -> None:
+        def take(message: Any) -> None:
+            self.heard.append((time.monotonic(), topic, message))
+
+        self.node.create_subscription(kind, topic, take, qos)
+
+    def of(self, topic: str) -> list[Any]:
+        return [message for _, name, message in self.heard if name == topic]
+
+    def spin(self, done: Callable[[], bool], seconds: float = 15.0) -> None:
+        """Take in messages until ``done``; then a little longer, for what should not come."""
+        give_up = time.monotonic() + seconds
+        while not done():
+            assert time.monotonic() < give_up, f"only {len(self.heard)} messages came"
+            self.executor.spin_once(timeout_sec=0.05)
+        give_up = time.monotonic() + 0.1
+        while time.monotonic() < give_up:
+            self.executor.spin_once(timeout_sec=0.01)
+
+
+@pytest.fixture
+def listener(monkeypatch: pytest.MonkeyPatch) -> Iterator[Listener]:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    node = Node("listener", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    yield Listener(node, executor)
+    executor.shutdown()
+    node.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.fixture
+def player() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start players; whatever still runs at the end of the test is killed."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(path: Path, **options: object) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", PROGRAM, str(path), repr(options)]
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("rate", [1.0, 4.0])
+def test_order_count_and_timing(
+    bag: Path, listener: Listener, player: Callable[..., Any], rate: float
+) -> None:
+    listener.listen(JointState, "joint_states")
+    listener.listen(
+        String, "note", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
+    topics = ["/joint_states", "/note"]
+    process = player(bag, rate=rate, wait_for_subscribers=10.0, topics=topics)
+    listener.spin(lambda: process.poll() is not None)
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    positions = [message.position[0] for message in listener.of("joint_states")]
+    assert positions == [float(index) for index in range(COUNT)]
+    assert [m.data for m in listener.of("note")] == [str(i) for i in range(0, COUNT, 10)]
+    arrivals = [at for at, topic, _ in listener.heard if topic == "joint_states"]
+    assert arrivals[-1] - arrivals[0] == pytest.approx((COUNT - 1) * PERIOD / rate, rel=0.1)
+    assert f"PlayResult(messages={COUNT + 20}, loops=1" in out
+
+
+def test_recorded_durability_is_offered(
+    bag: Path, listener: Listener, player: Callable[..., Any]
+) -> None:
+    """A subscriber that asks for latched messages matches, which a volatile offer would not."""
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    listener.listen(String, "elsewhere", latched)
+    process = player(
+        bag, remap={"/latched": "/elsewhere"}, topics=["/latched"], wait_for_subscribers=10.0
+    )
+    listener.spin(lambda: len(listener.of("elsewhere")) == 1)
+    assert process.wait(10) == 0
+
+
+def test_clock(bag: Path, listener: Listener, player: Callable[..., Any]) -> None:
+    """/clock runs at its rate in bag time and is there before the first message."""
+    listener.listen(Clock, "clock")
+    listener.listen(JointState, "joint_states")
+    process = player(bag, clock=50.0, rate=2.0, wait_for_subscribers=10.0, topics=["/joint_states"])
+    listener.spin(lambda: process.poll() is not None)
+    assert process.returncode == 0, process.communicate()[1]
+    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.of("clock")]
+    assert times[0] == FIRST
+    steps = [after - before for before, after in pairwise(times)]
+    assert all(abs(step - 40_000_000) <= 1 for step in steps)
+    assert len(times) == pytest.approx(25, abs=2)
+
+
+def test_loop_ends_by_sigint(bag: Path, listener: Listener, player: Callable[..., Any]) -> None:
+    listener.listen(JointState, "joint_states")
+    listener.listen(Clock, "clock")
+    process = player(
+        bag, loop=True, rate=4.0, clock=100.0, wait_for_subscribers=10.0, topics=["/joint_states"]
+    )
+    listener.spin(lambda: len(listener.of("joint_states")) > 2 * COUNT + 10)
+    asked = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=5)
+    assert time.monotonic() - asked < 2
+    assert (process.returncode, "Traceback" in err) == (0, False), err
+    assert "interrupted=True" in out and "loops=2" in out
+    positions = [message.position[0] for message in listener.of("joint_states")]
+    assert positions[: 2 * COUNT] == [float(index) for index in range(COUNT)] * 2
+    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.of("clock")]
+    assert times.count(FIRST) == 3
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_during_a_long_pause(
+    tmp_path: Path, listener: Listener, player: Callable[..., Any], number: signal.Signals
+) -> None:
+    path = tmp_path / "pause.mcap"
+    with BagWriter(path) as writer:
+        writer.add_topic("/note", "std_msgs/msg/String")
+        writer.write("/note", String(data="first"), FIRST)
+        writer.write("/note", String(data="an hour later"), FIRST + 3600 * 10**9)
+    listener.listen(String, "note")
+    process = player(path, wait_for_subscribers=10.0)
+    listener.spin(lambda: len(listener.heard) == 1)
+    asked = time.monotonic()
+    process.send_signal(number)
+    _, err = process.communicate(timeout=5)
+    assert time.monotonic() - asked < 2
+    assert (process.returncode, "Traceback" in err) == (0, False), err
+
+
+def test_missing_subscribers_are_named(bag: Path, player: Callable[..., Any]) -> None:
+    process = player(bag, rate=100.0, wait_for_subscribers=0.2, topics=["/note"], progress=False)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 0
+    assert err == "no subscriber after 0.2 s: /note\n" and "messages=20" in out
+
+
+def test_damaged_bag_is_not_played(
+    bag: Path, tmp_path: Path, listener: Listener, player: Callable[..., Any]
+) -> None:
+    path = tmp_path / "damaged.mcap"
+    data = bytearray(bag.read_bytes())
+    data[-200] ^= 1
+    path.write_bytes(data)
+    listener.listen(JointState, "joint_states")
+    process = player(path)
+    _, err = process.communicate(timeout=20)
+    assert "DamagedBagError" in err and process.returncode == 1
+    listener.spin(lambda: True)
+    assert listener.heard == []
+
+
+def test_refusals(bag: Path, tmp_path: Path) -> None:
+    for options in ({"rate": 0.0}, {"rate": float("nan")}, {"clock": -1.0}):
+        with pytest.raises(ParameterError):
+            play(bag, **options)  # type: ignore[arg-type]
+    with pytest.raises(BagError, match=r"no topic /x; topics: /joint_states"):
+        play(bag, topics=["/x"])
+    with pytest.raises(BagError, match="cannot remap /x"):
+        play(bag, remap={"/x": "/y"})
+
+
+@pytest.mark.parametrize(
+    ("kind", "definition", "text"),
+    [
+        ("std_msgs/msg/String", "string text", "recorded with other fields"),
+        ("nobody_msgs/msg/Nothing", "string data", "is not installed"),
+    ],
+)
+def test_types_that_do_not_fit(tmp_path: Path, kind: str, definition: str, text: str) -> None:
+    with BagWriter(tmp_path / "t.mcap") as writer:
+        writer.add_topic("/a", kind, definition=definition)
+    with pytest.raises(BagError, match=text) as caught:
+        play(tmp_path / "t.mcap")
+    assert caught.value.reason == "type"
