@@ -10,7 +10,6 @@ from delta_dynamics.isotropy import (
     joint_motion,
     max_driving_force,
     max_driving_force_range,
-    sphere_directions,
     spread,
     tilted_pose,
 )
@@ -23,6 +22,7 @@ from delta_dynamics.virtual_work import (
     inverse_dynamics,
     mass_matrix,
 )
+from pkm_twin.mechanisms.tracking import sphere_directions
 
 __all__ = [
     "Energy",

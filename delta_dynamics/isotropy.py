@@ -208,17 +208,6 @@ def max_driving_force_range(
     return Extremes(least, greatest, _directions(np.einsum("...ij,...kj->...ki", back, y)))
 
 
-def sphere_directions(count: int) -> Array:
-    """Unit vectors spread evenly over the sphere (Fibonacci lattice), shape (count, 3)."""
-    if count < 1:
-        raise ValueError(f"count has to be at least 1, not {count}")
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    turn = np.pi * (3 - np.sqrt(5)) * i
-    out = np.sqrt(1 - z * z)
-    return np.stack([out * np.cos(turn), out * np.sin(turn), z], -1)
-
-
 def spread(values: ArrayLike) -> Array:
     """Greatest less least over the last axis, shape (...): of an index on a sphere's directions."""
     return np.asarray(np.ptp(np.asarray(values, np.float64), axis=-1), np.float64)

@@ -45,6 +45,12 @@ def random_joints(robot, rng, count):
     return rng.uniform(middle - half, middle + half, (count, 3))
 
 
+def random_poses(robot, rng, count):
+    """Poses of random joint states that can be assembled, shape (count, 3)."""
+    poses, fault = robot.forward_kernel(robot.parameters, random_joints(robot, rng, 20 * count))
+    return poses[fault[:, 0] == 0][:count]
+
+
 def finite_difference(function, x, step=1e-6):
     """Central differences of function by the last axis of x: shape (..., outputs, inputs)."""
     columns = []

@@ -357,7 +357,7 @@ class TestFiles:
             "payload: \x00\n",
             "payload: {com: 2001-99-99}\n",
             "payload: {mass: 0x" + "f" * 3000 + "}\n",
-            "joints: 0x" + "f" * 5000 + "\n",
+            "payload: 0x" + "f" * 5000 + "\n",
             "payload: {mass: " + "9" * 5000 + "}\n",
         ],
     )

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Streams keep their assembly mode; the edge of the workspace is where it is."""
+
+import numpy as np
+import pytest
+
+from pkm_twin import load, robot_names
+from pkm_twin.errors import SingularityError
+from pkm_twin.mechanisms.tracking import boundary_distance, follow, track
+from test.conftest import random_poses
+
+every_robot = pytest.mark.parametrize("name", robot_names())
+
+
+def stream(robot, rng, count):
+    """A smooth path between two random joint states."""
+    a, b = robot.inverse(random_poses(robot, rng, 2))
+    s = np.sin(np.linspace(0, np.pi / 2, count))[:, None] ** 2
+    return a + s * (b - a)
+
+
+@every_robot
+def test_a_stream_agrees_with_the_closed_form(name, rng):
+    robot = load(name)
+    q = stream(robot, rng, 60)
+    np.testing.assert_allclose(track(robot, q), robot.forward(q), atol=1e-11)
+
+
+@every_robot
+def test_a_jump_is_refused(name, rng):
+    robot = load(name)
+    low, high = robot.limits.position.T
+    near = low + 0.15 * (high - low)
+    far = high - 0.15 * (high - low)
+    with pytest.raises(SingularityError):
+        follow(robot, far, robot.forward(near))
+
+
+def test_the_previous_pose_leads():
+    """A Delta whose platform was left above its elbows stays there, forward takes it below."""
+    robot = load("delta")
+    above = np.array([0.01, 0.005, 0.36])
+    q = robot.inverse(above)
+    beside = above + np.array([0.002, -0.001, 0.003])
+    np.testing.assert_allclose(follow(robot, robot.inverse(beside), above), beside, atol=1e-11)
+    assert robot.forward(q)[2] < 0
+
+
+def test_boundary_straight_below_is_the_stretched_limb(variant):
+    """Over a tall narrow reach the nearest edge of a low pose is straight down."""
+    robot, _ = variant("delta", limits={"position": [-3.1, 3.1]})
+    g = robot.geometry
+    lowest = -np.sqrt((g.arm_length + g.forearm_length) ** 2 - 0.036**2)
+    pose = [0.0, 0.0, lowest + 0.01]
+    distance = boundary_distance(robot, pose, singularity=0.0, directions=4000, farthest=0.3)
+    assert 0.005 < distance <= 0.0101
+
+
+@every_robot
+def test_boundary_distance_is_kept_inside_and_zero_outside(name, rng):
+    robot = load(name)
+    poses = random_poses(robot, rng, 5)
+    distances = boundary_distance(robot, poses)
+    assert (distances > 0).all()
+    radius = robot.geometry.platform_radius
+    scale = np.array([1.0 if unit == "m" else radius for unit in robot.pose_units])
+    for pose, distance in zip(poses, distances, strict=True):
+        for direction in rng.normal(size=(20, 3)):
+            moved = pose + 0.8 * distance * direction / np.linalg.norm(direction) / scale
+            q = robot.inverse(moved)
+            assert (q >= robot.limits.position[:, 0]).all()
+            assert (q <= robot.limits.position[:, 1]).all()
+    beyond = robot.limits.position[:, 1] + 0.05
+    assert boundary_distance(robot, robot.forward(beyond)) == 0.0
