@@ -51,6 +51,8 @@ class Torques:
     """Efforts for one joint state; ``residual`` is measured less predicted, None if unmeasured."""
 
     stamp: int
+    motion: tuple[Array, Array, Array]
+    """q, qd, qdd, shape (3,) each."""
     effort: Array
     residual: Array | None
     saturated: bool
@@ -174,10 +176,11 @@ class Feedforward:
         if rates is None:
             return None
         self._reader.check_derived(*rates)
-        effort, saturated = self._gate(self._solve(sample.q, *rates))
+        motion = (sample.q, *rates)
+        effort, saturated = self._gate(self._solve(*motion))
         self._last_good = sample.q
         residual = None if sample.effort is None else sample.effort - effort
-        return Torques(sample.stamp, effort, residual, saturated)
+        return Torques(sample.stamp, motion, effort, residual, saturated)
 
     def _solve(self, q: Array, qd: Array, qdd: Array) -> Array:
         try:

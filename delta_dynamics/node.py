@@ -8,13 +8,15 @@ from array import array
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import WrenchStamped
 from rclpy.parameter import Parameter
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from delta_dynamics.feedforward import Feedforward, Settings
+from delta_dynamics.feedforward import Feedforward, Settings, Torques
+from delta_dynamics.reactions import reactions
 from delta_dynamics.virtual_work import kernels
 from pkm_twin import health, load
 from pkm_twin.errors import MessageError, ParameterError, UnknownNameError
@@ -48,6 +50,7 @@ class DeltaDynamics(health.TwinNode):
         self._torques = self.speak(JointState, "~/joint_torques")
         self._residual = self.speak(JointState, "~/torque_residual")
         self._commands = self.speak(Float64MultiArray, "~/commands") if commands else None
+        self._reactions = self._speak_reactions(robot)
         self._pending: Robot | None = None
         self.listen(JointTrajectory, "~/joint_trajectory", self._on_trajectory)
         self.listen(JointState, "joint_states", self._on_joint_state)
@@ -96,6 +99,21 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
         return level, message, values
+
+    def _speak_reactions(self, robot: Robot) -> dict[str, Any]:
+        """A publisher for each joint's reaction, where the parameter asks for them."""
+        wanted = self.declare("publish_reactions", False, "publish ~/reactions/*", read_only=True)
+        rate = self.declare("reactions_rate", 50.0, "Hz of ~/reactions/*", read_only=True)
+        self._reactions_period = round(1e9 / _within("reactions_rate", rate, 1e-3, 1e4))
+        self._reactions_due = 0
+        frame = self.declare("base_frame", "base_link", "frame of the reactions", read_only=True)
+        self._base_frame = frame
+        if not wanted:
+            return {}
+        return {
+            name: self.speak(WrenchStamped, f"~/reactions/{name.replace(' ', '_')}")
+            for name in reactions(robot, robot.inverse(robot.home()), *np.zeros((2, 3))).names
+        }
 
     def _declare_changes(self, robot: Robot) -> dict[str, Any]:
         changes = {}
@@ -167,6 +185,23 @@ class DeltaDynamics(health.TwinNode):
             self._publish_effort(self._residual, stamp, torques.residual)
         if self._commands is not None:
             self._commands.publish(Float64MultiArray(data=array("d", torques.effort)))
+        # A dense solve a sample is too much for the stream's own rate.
+        if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
+            self._reactions_due = torques.stamp
+            self._publish_reactions(stamp, torques)
+
+    def _publish_reactions(self, stamp: Any, torques: Torques) -> None:
+        """Every joint's wrench that rigid bodies determine, world axes, at the joint's point."""
+        result = reactions(self._feedforward.robot, *torques.motion)
+        for k, name in enumerate(result.names):
+            if not result.determinate[k].all():
+                continue
+            message = WrenchStamped()
+            message.header.stamp = stamp
+            message.header.frame_id = self._base_frame
+            force, torque = message.wrench.force, message.wrench.torque
+            force.x, force.y, force.z, torque.x, torque.y, torque.z = result.wrenches[k].tolist()
+            self._reactions[name].publish(message)
 
     def _publish_effort(self, publisher: Any, stamp: Any, effort: np.ndarray[Any, Any]) -> None:
         message = JointState(name=list(self._feedforward.robot.joint_names))

@@ -108,10 +108,13 @@ def bodies(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[A
 
 
 def kernels(robot: Robot) -> tuple[Kernel, ...]:
-    """The kernels to warm up before live use."""
+    """What a live node calls, to warm up before the first sample.
+
+    :raises ParameterError: a mechanism without masses.
+    """
     if robot.dynamics_kernel is None:
         raise _no_masses(robot)
-    return robot.forward_kernel, robot.jacobian_kernel, robot.dynamics_kernel
+    return (robot.dynamics_kernel,)
 
 
 def _no_masses(robot: Robot) -> ParameterError:

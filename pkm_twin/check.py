@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.differentiator import Differentiator
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
-from pkm_twin.recorded import Recording, read_recording
+from pkm_twin.recorded import JOINT_STATE, WRENCH, Recording, read_recording
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,11 @@ class CheckReport:
     @property
     def good(self) -> bool:
         """No item is bad."""
-        return all(item.verdict is not Verdict.BAD for item in self.items)
+        return not self.named(Verdict.BAD)
+
+    def named(self, verdict: Verdict) -> list[str]:
+        """What got this verdict."""
+        return [item.what for item in self.items if item.verdict is verdict]
 
     def as_json(self) -> dict[str, Any]:
         """Plain data for a script."""
@@ -90,17 +94,16 @@ def check_bag(
 
 def _file(r: Recording, bounds: Bounds) -> list[Item]:
     report = r.bag.report
-    covered = "every byte whole, counts agree" if report.has_crc else "no CRC covers the messages"
     items = [
         Item(
             "file",
-            covered,
+            "; ".join(report.warnings) or "every byte whole, counts agree",
             "CRCs, counts and times agree",
-            Verdict.GOOD if report.has_crc else Verdict.UNKNOWN,
+            Verdict.UNKNOWN if report.warnings else Verdict.GOOD,
         )
     ]
     refused = sum(r.rejected.values())
-    total = refused + len(r.time)
+    total = sum(t.count for t in report.topics.values() if t.type in (JOINT_STATE, WRENCH))
     reasons = ", ".join(f"{k}: {v}" for k, v in r.rejected.items())
     value = f"{refused} of {total}" + (f" ({reasons}; first: {r.first_reject})" if refused else "")
     items.append(

@@ -12,6 +12,10 @@ from delta_dynamics import reactions
 from pkm_twin.mechanisms.robot import Robot
 
 UNITS = {
+    # Fractions of a length and plain numbers first: their names end as those of lengths do.
+    "arm_com": "of the arm, from its pivot",
+    "link_com": "of the link, from the slider's joint",
+    "shear_factor": "",
     "base_radius": "m",
     "platform_radius": "m",
     "arm_length": "m",
@@ -26,7 +30,15 @@ UNITS = {
     "shear_modulus": "Pa",
     "diameter": "m",
     "joint_angle": "rad",
+    "density": "kg/m3",
+    "width": "m",
 }
+
+
+def summary(robot: Robot) -> str:
+    """One line that tells a robot from its siblings."""
+    closures = getattr(getattr(robot, "geometry", None), "closures", None)
+    return robot.description + (f"; closures {', '.join(closures)}" if closures else "")
 
 
 def describe(robot: Robot) -> dict[str, Any]:
@@ -36,7 +48,7 @@ def describe(robot: Robot) -> dict[str, Any]:
     return {
         "name": robot.name,
         "mechanism": robot.mechanism,
-        "description": robot.description,
+        "description": summary(robot),
         "joints": list(robot.joint_names),
         "joint_unit": robot.joint_unit,
         "effort_unit": robot.effort_unit if robot.dynamics_kernel is not None else None,
@@ -61,25 +73,54 @@ def overconstraint(robot: Robot) -> list[str]:
 def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
     """The same as pairs of words for a table."""
     pose = ", ".join(f"{name} ({unit})" for name, unit in data["pose"].items())
+    joint_units = dict.fromkeys(data["joints"], data["joint_unit"])
     rows = [
         ("robot", f"{data['name']}: {data['description']}"),
         ("mobility", data["mobility"]),
         ("pose", pose),
         ("actuated joints", f"{', '.join(data['joints'])} ({data['joint_unit']})"),
-        ("home pose", _pairs(data["home_pose"])),
-        ("home joints", _pairs(data["home_joints"])),
+        ("home pose", _pairs(data["home_pose"], data["pose"])),
+        ("home joints", _pairs(data["home_joints"], joint_units)),
         ("distance to singularity at home", f"{data['singularity_at_home']:.3f} (1 is best)"),
         (
             "overconstrained",
             "; ".join(data["overconstrained"]) or "no: rigid bodies determine every reaction",
         ),
     ]
-    for section, values in data["parameters"].items():
-        if isinstance(values, dict):
-            rows += [(f"{section}: {key}", _text(key, value)) for key, value in values.items()]
-        elif section not in ("mechanism", "joints"):
-            rows.append((section, _text(section, values)))
+    units = UNITS | _joint_units(data["joint_unit"], data["effort_unit"])
+    for section, value in data["parameters"].items():
+        if section not in ("mechanism", "joints"):
+            rows += _rows(section, value, units)
     return rows
+
+
+def _rows(name: str, value: Any, units: dict[str, str]) -> list[tuple[str, str]]:
+    """A parameter, or a section's parameters under its name."""
+    if isinstance(value, dict):
+        return [row for key, item in value.items() for row in _rows(f"{name}: {key}", item, units)]
+    section, _, key = name.rpartition(": ")
+    named = section if section == "joints_compliance" else key
+    return [(name, "none" if value is None else f"{_number(value)} {_unit(named, units)}".strip())]
+
+
+def _joint_units(joint: str, effort: str | None) -> dict[str, str]:
+    """Units that depend on whether the actuated joints turn or slide."""
+    rate = f"{joint}/s"
+    units = {
+        "position": joint,
+        "velocity": rate,
+        "limb_length": "m",
+        "joints_compliance": "m/N (3), rad/(N m) (3)",
+    }
+    if effort is not None:
+        units |= {"effort": effort, "coulomb": effort, "viscous": f"{effort} per {rate}"}
+    return units
+
+
+def _unit(key: str, units: dict[str, str]) -> str:
+    if key in units:
+        return units[key]
+    return next((unit for end, unit in units.items() if key.endswith(f"_{end}")), "")
 
 
 def _plain(value: Any) -> Any:
@@ -90,13 +131,6 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _text(key: str, value: Any) -> str:
-    unit = UNITS.get(key) or next((u for k, u in UNITS.items() if key.endswith(f"_{k}")), "")
-    if value is None:
-        return "none"
-    return f"{_number(value)} {unit}".strip()
-
-
 def _number(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
@@ -105,5 +139,6 @@ def _number(value: Any) -> str:
     return str(value)
 
 
-def _pairs(values: dict[str, float]) -> str:
-    return ", ".join(f"{name} {value:.4f}" for name, value in values.items())
+def _pairs(values: dict[str, float], units: dict[str, str]) -> str:
+    # Rounded first, so that nothing reads -0.0000.
+    return ", ".join(f"{k} {round(v, 4) + 0.0:.4f} {units[k]}" for k, v in values.items())

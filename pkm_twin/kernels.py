@@ -44,12 +44,13 @@ def _drop_stale_caches() -> None:
 
     numba looks at the outermost function's file only, and kernels call into others.
     """
-    folder = Path(__file__).parent / "mechanisms"
-    newest = max(path.stat().st_mtime for path in (*folder.glob("*.py"), Path(__file__)))
-    for index in (folder / "__pycache__").glob("*.nbi"):
-        with suppress(OSError):
-            if index.stat().st_mtime < newest:
-                index.unlink()
+    here = Path(__file__).parent
+    newest = max(path.stat().st_mtime for path in (*here.glob("mechanisms/*.py"), Path(__file__)))
+    for folder in (here, here / "mechanisms"):
+        for index in (folder / "__pycache__").glob("*.nbi"):
+            with suppress(OSError):
+                if index.stat().st_mtime < newest:
+                    index.unlink()
 
 
 if COMPILED:
@@ -72,10 +73,23 @@ def scalar(function: Callable[..., Any]) -> Callable[..., Any]:
     return compiled
 
 
-def _renamed(function: Callable[..., None], suffix: str) -> Callable[..., None]:
-    """The same function under a name, and so with a cache file, of its own."""
-    copy = types.FunctionType(function.__code__, function.__globals__, function.__name__ + suffix)
-    copy.__qualname__ = function.__qualname__ + suffix
+# What guvectorize wraps, by number of arrays; each kernel gets a copy with its own ``kernel``.
+_ROWS: Final[dict[int, Any]] = {
+    5: lambda a, b, c, d, e: kernel(a, b, c, d, e),  # type: ignore[name-defined]  # noqa: F821
+    6: lambda a, b, c, d, e, f: kernel(a, b, c, d, e, f),  # type: ignore[name-defined]  # noqa: F821
+    7: lambda a, b, c, d, e, f, g: kernel(a, b, c, d, e, f, g),  # type: ignore[name-defined]  # noqa: F821
+    8: lambda a, b, c, d, e, f, g, h: kernel(a, b, c, d, e, f, g, h),  # type: ignore[name-defined]  # noqa: F821
+    9: lambda a, b, c, d, e, f, g, h, i: kernel(a, b, c, d, e, f, g, h, i),  # type: ignore[name-defined]  # noqa: F821
+}
+
+
+def _copied(function: Any, suffix: str, names: dict[str, Any] | None = None) -> Callable[..., None]:
+    """The same function under a name of its own, and so with a cache file of its own."""
+    name = function.__name__ + suffix
+    copy = types.FunctionType(
+        function.__code__, function.__globals__ if names is None else names, name
+    )
+    copy.__qualname__ = name
     copy.__module__ = function.__module__
     return copy
 
@@ -122,19 +136,23 @@ class Kernel:
     def _many(self) -> Callable[..., None]:
         """The formula as a generalised ufunc; results and scratch are arguments, written in place.
 
-        numba wants the size of its one formal output, the fault, from an input: it takes that
-        of the first, which has three entries too (joints or pose).
+        Cached is the formula, not the ufunc around it: numba's cached wrapper looks for its formula
+        under a symbol that another process may have replaced, and ends in a crash. numba wants the
+        size of the one formal output, the fault, from an input: it takes that of the first, which
+        has three entries too (joints or pose).
         """
         n_in, n_out = 1 + len(self.inputs), len(self.outputs)
         sizes = [f"(n{i})" for i in range(n_in + n_out + 1)]
-        vector = numba.float64[:]
+        signature = numba.void(*[numba.float64[:]] * (n_in + n_out + 2))
+        formula = numba.njit(signature, cache=True, error_model="numpy")(
+            _copied(self.function, "_many")
+        )
         compiled: Callable[..., None] = numba.guvectorize(
-            [numba.void(*[vector] * (n_in + n_out + 2))],
+            [signature],
             f"{','.join(sizes)}->{sizes[1]}",
             nopython=True,
-            cache=True,
             writable_args=tuple(range(n_in, n_in + n_out)),
-        )(_renamed(self.function, "_many"))
+        )(_copied(_ROWS[n_in + n_out + 2], "", {"kernel": formula}))
         return compiled
 
     def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[Array, ...]:
@@ -147,9 +165,15 @@ class Kernel:
         """
         first = inputs[0]
         if COMPILED and type(first) is np.ndarray and first.ndim == 1:
-            one = self._single(p, inputs)
-            if one is not None:
-                return one
+            # One sample, the fast way.
+            try:
+                if tuple(map(len, inputs)) == self.inputs:  # type: ignore[arg-type]
+                    results = [np.empty(size) for size in self.outputs]
+                    fault = np.zeros(FAULT_SIZE)
+                    self._one(p, *inputs, *results, self._space, fault)
+                    return (*results, fault)
+            except TypeError:
+                pass  # a plain number, or another type of array
         arrays = [np.asarray(value, _F8) for value in inputs]
         for array, size in zip(arrays, self.inputs, strict=True):
             if array.ndim == 0 or array.shape[-1] != size:
@@ -164,19 +188,6 @@ class Kernel:
         else:
             self._interpret(p, arrays, results, batch)
         return tuple(results)
-
-    def _single(self, p: Array, inputs: tuple[ArrayLike, ...]) -> tuple[Array, ...] | None:
-        """One sample, the fast way; None where the inputs are not plain vectors of floats."""
-        try:
-            for value, size in zip(inputs, self.inputs, strict=True):
-                if len(value) != size:  # type: ignore[arg-type]
-                    return None
-            results = [np.empty(size) for size in self.outputs]
-            fault = np.zeros(FAULT_SIZE)
-            self._one(p, *inputs, *results, self._space, fault)
-        except TypeError:  # a plain number, or another type of array
-            return None
-        return (*results, fault)
 
     def _interpret(
         self, p: Array, arrays: list[Array], results: list[Array], batch: tuple[int, ...]

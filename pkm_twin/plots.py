@@ -129,7 +129,7 @@ def torques(motion: Any, table: Mapping[str, Any]) -> Any:
             ax.plot(table["time"], table[f"{joint}.measured"], color="0.7", lw=2, label="measured")
         ax.plot(table["time"], table[f"{joint}.effort"], color="black", lw=1, label="sum")
         for colour, term in zip(COLOURS, terms, strict=False):
-            values = table[f"{joint}.{term}"]
+            values = table[f"{joint}.effort_{term}"]
             if np.any(values != 0.0):
                 ax.plot(table["time"], values, color=colour, lw=0.8, label=term)
         ax.set_title(f"{robot.name}: effort of {joint}")

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 BASE_FRAME = "base_link"
+PLATFORM_FRAME = "platform"
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,9 @@ def read_recording(
 
 
 def _wrench(message: Any, now: int, rules: StampRules) -> tuple[int, str, Array]:
-    sample = read_wrench(message, now, rules, message.header.frame_id, accept_empty=False)
+    # Any frame that has a name: all but the base frame turn with the platform.
+    frame = message.header.frame_id or PLATFORM_FRAME
+    sample = read_wrench(message, now, rules, frame, accept_empty=False)
     return stamp_of(message.header), sample.frame, sample.wrench
 
 

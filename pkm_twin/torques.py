@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,13 +15,23 @@ from numpy.typing import NDArray
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions
 from pkm_twin import load
 from pkm_twin.check import motion
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import (
+    BagError,
+    ParameterError,
+    PkmTwinError,
+    SingularityError,
+    UnknownNameError,
+    UnreachableError,
+)
 from pkm_twin.mechanisms.robot import Robot
 from pkm_twin.recorded import read_recording
 
 Array = NDArray[np.float64]
 BLOCK = 4096
 """Samples computed at a time, so that memory stays flat."""
+ENDINGS = (".csv", ".parquet")
+WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
+INPUTS = ("position", "velocity", "acceleration")
 
 
 @dataclass(frozen=True)
@@ -37,9 +48,15 @@ class Motion:
 
 
 def motion_of_bag(path: Path, robot: str | None) -> Motion:
-    """The motion that a bag recorded, accelerations by the node's differentiator."""
+    """The motion that a bag recorded, accelerations by the node's differentiator.
+
+    :raises BagError: the bag is damaged, or has too few joint states in a row.
+    """
     r = read_recording(path, robot)
     qd, qdd, used = motion(r)
+    if not used.any():
+        text = f"too few joint states in a row to differentiate: {len(r.time)}"
+        raise BagError(text, path=path, reason="too short")
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
     return Motion(
         r.robot,
@@ -56,13 +73,21 @@ def motion_of_csv(path: Path, robot: str) -> Motion:
     """A motion from a CSV with a head line.
 
     Columns, in any order: ``time``; for every joint NAME ``NAME.position``, and optionally
-    ``NAME.velocity`` and ``NAME.acceleration`` (all of them or none); optionally the wrench
-    ``fx fy fz mx my mz``. What is absent is differentiated by second-order differences.
+    ``NAME.velocity`` and ``NAME.acceleration`` (of all joints or of none); optionally the wrench
+    ``fx fy fz mx my mz``. Absent rates are differentiated by second-order differences, absent
+    parts of the wrench are zero. Other columns are left alone, but not those that begin with a
+    joint's name and are none of these or of :func:`table`'s: they are misspelt.
 
-    :raises ParameterError: a column is missing, or a value is no finite number.
+    :raises ParameterError: a column is missing or misspelt, or a value is no finite number.
     """
     machine = load(robot)
     columns = _read_columns(path)
+    known = [f"{joint}.{what}" for joint in machine.joint_names for what in INPUTS]
+    for name in columns:
+        joint, dot, what = name.rpartition(".")
+        computed = what in ("effort", "measured") or what.startswith("effort_")
+        if dot and joint in machine.joint_names and name not in known and not computed:
+            raise UnknownNameError(f"{path}: column", name, known)
 
     def stack(what: str) -> Array | None:
         names = [f"{joint}.{what}" for joint in machine.joint_names]
@@ -85,8 +110,7 @@ def motion_of_csv(path: Path, robot: str) -> Motion:
     if (qd is None or qdd is None) and len(time) < 3:
         raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
     rates = np.gradient(q, time, axis=0, edge_order=2) if qd is None else qd
-    wrench = [columns.get(name, np.zeros(len(time))) for name in ("fx", "fy", "fz")]
-    wrench += [columns.get(name, np.zeros(len(time))) for name in ("mx", "my", "mz")]
+    wrench = [columns.get(name, np.zeros(len(time))) for name in WRENCH_AXES]
     return Motion(
         machine,
         time,
@@ -98,9 +122,14 @@ def motion_of_csv(path: Path, robot: str) -> Motion:
 
 
 def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str, Array]:
-    """Named columns: time, positions, torques, terms, and every joint's reaction.
+    """Named columns: time, the motion, efforts, their terms, and every joint's reaction.
 
-    A reaction that rigid bodies do not determine is left empty (NaN) in the table.
+    The terms ``NAME.effort_gravity``, ``NAME.effort_inertia`` ... sum to ``NAME.effort``. A
+    reaction that rigid bodies do not determine is left empty (NaN) in the table.
+
+    :raises UnreachableError: by the sample's index in the motion.
+    :raises SingularityError: likewise.
+    :raises PkmTwinError: values so large that the model's result is not finite.
     """
     columns: dict[str, list[Array]] = {}
 
@@ -110,7 +139,19 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
     for begin in range(0, len(m.time), BLOCK):
         part = slice(begin, begin + BLOCK)
         state = (m.robot, m.q[part], m.qd[part], m.qdd[part], m.wrench[part])
-        tau, terms, react = inverse_dynamics(*state), dynamics_terms(*state), reactions(*state)
+        try:
+            tau, terms, react = inverse_dynamics(*state), dynamics_terms(*state), reactions(*state)
+        except UnreachableError as e:
+            at = (begin + e.index[0],)
+            raise UnreachableError("joint state", e.limb, at, e.miss) from None
+        except SingularityError as e:
+            at = (begin + e.index[0],)
+            raise SingularityError("joint state", at, e.measure, e.bound) from None
+        except ParameterError:
+            raise
+        except ValueError as e:
+            seconds = f"{m.time[part][0]:g} to {m.time[part][-1]:g} s"
+            raise PkmTwinError(f"between {seconds}: {e}") from None
         put("time", m.time[part])
         for i, joint in enumerate(m.robot.joint_names):
             put(f"{joint}.position", m.q[part][:, i])
@@ -120,41 +161,62 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
             if m.measured is not None:
                 put(f"{joint}.measured", m.measured[part][:, i])
             for field in fields(terms):
-                put(f"{joint}.{field.name}", getattr(terms, field.name)[:, i])
+                put(f"{joint}.effort_{field.name}", getattr(terms, field.name)[:, i])
         for k, name in enumerate(react.names):
-            for i, axis in enumerate(("fx", "fy", "fz", "mx", "my", "mz")):
+            for i, axis in enumerate(WRENCH_AXES):
                 put(f"{name}.{axis}", react.wrenches[:, k, i])
         if progress is not None:
             progress(min(begin + BLOCK, len(m.time)))
     return {name: np.concatenate(parts) for name, parts in columns.items()}
 
 
+def check_target(path: Path) -> None:
+    """Refuse a table's name before the work, not after it.
+
+    :raises ParameterError: the ending is none of :data:`ENDINGS`.
+    """
+    if path.suffix not in ENDINGS:
+        raise ParameterError("out", str(path), f"a name that ends in {' or '.join(ENDINGS)}")
+
+
 def write_table(columns: dict[str, Array], path: Path) -> None:
     """Write CSV, or Parquet where the name ends so (needs pyarrow).
 
+    The file appears only once it is complete.
+
     :raises ParameterError: another ending, or pyarrow is missing.
     """
-    if path.suffix == ".csv":
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(columns)
-            for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-                # An undetermined reaction is an empty cell; repr keeps every digit.
-                writer.writerow(["" if value != value else repr(value) for value in row])
-    elif path.suffix == ".parquet":
-        try:
-            import pyarrow
-            from pyarrow import parquet
-        except ImportError as error:
-            raise ParameterError("out", str(path), "CSV; Parquet needs pyarrow") from error
-        parquet.write_table(pyarrow.table(columns), path)
-    else:
-        raise ParameterError("out", str(path), "a name that ends in .csv or .parquet")
+    check_target(path)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        (_write_csv if path.suffix == ".csv" else _write_parquet)(columns, part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _write_csv(columns: dict[str, Array], path: Path) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        for row in zip(*(values.tolist() for values in columns.values()), strict=True):
+            # An undetermined reaction is an empty cell; repr keeps every digit.
+            writer.writerow(["" if value != value else repr(value) for value in row])
+
+
+def _write_parquet(columns: dict[str, Array], path: Path) -> None:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ParameterError("out", str(path), "CSV; Parquet needs pyarrow") from error
+    parquet.write_table(pyarrow.table(columns), path)
 
 
 def _read_columns(path: Path) -> dict[str, Array]:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        # Spreadsheets put a byte order mark before the head line.
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ParameterError(str(path), str(error), "a readable CSV file") from None

@@ -26,12 +26,23 @@ from pkm_twin import parameters
 from pkm_twin.errors import ParameterError
 from pkm_twin.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
 from pkm_twin.mechanisms.bodies import (
+    COULOMB,
     HEAD,
     PAYLOAD_COM,
     PAYLOAD_MASS,
     ROW,
     TWIST,
-    virtual_work,
+    VISCOUS,
+)
+from pkm_twin.mechanisms.frame import (
+    RIGID,
+    Frame,
+    Member,
+    RigidBody,
+    Section,
+    Support,
+    Tube,
+    disc,
 )
 from pkm_twin.mechanisms.joints import GROUND, MOVING, Joint, PlatformMotion, joint
 from pkm_twin.mechanisms.robot import (
@@ -100,6 +111,27 @@ class Inertia:
 
 
 @dataclass(frozen=True, eq=False)
+class Members:
+    """Arms and forearms as tubes, whose masses stand in the inertia section; for modes only.
+
+    ``forearm``: each of a parallelogram's two rods, ``parallelogram_width`` apart (m), half of
+    the forearm's mass each. ``rcu_forearm``: the one rod of an rcu limb, required where there is
+    one. ``platform_inertia``: about the platform's origin, kg m2; default a thin disc of the
+    platform's radius. ``drive_compliance``: of a locked drive, rad/(N m); ``elbow_compliance`` and
+    ``platform_joint_compliance``: of each rod's end in all directions that it holds, m/N.
+    """
+
+    arm: Tube = parameters.section(Tube)
+    forearm: Tube = parameters.section(Tube)
+    parallelogram_width: float = length()
+    rcu_forearm: Tube | None = parameters.section(Tube, default=None)
+    platform_inertia: Array | None = parameters.inertia(positive=True, default=None)
+    drive_compliance: float = parameters.number(at_least=0.0, at_most=1.0, default=0.0)
+    elbow_compliance: float = parameters.number(at_least=0.0, at_most=1.0, default=0.0)
+    platform_joint_compliance: float = parameters.number(at_least=0.0, at_most=1.0, default=0.0)
+
+
+@dataclass(frozen=True, eq=False)
 class Delta(Robot):
     """A Delta robot, symmetric or with one R-C-U limb (Delta-CU)."""
 
@@ -111,6 +143,7 @@ class Delta(Robot):
     gravity: Array = parameters.vector(3, default=[0, 0, -9.81])
     joints: tuple[str, ...] = parameters.names(3, default=["joint_1", "joint_2", "joint_3"])
     limits: Limits = parameters.section(Limits, default={})
+    members: Members | None = parameters.section(Members, default=None)
 
     description: ClassVar[str] = "Delta robot, three arms with forearms, the platform translates"
     mobility: ClassVar[str] = "3: translations x, y, z"
@@ -124,6 +157,11 @@ class Delta(Robot):
         "platform",
         "payload",
     )
+
+    def verify(self, path: str) -> None:
+        """Tubes that hold their masses."""
+        if self.members is not None:
+            self._sections()
 
     def rotation(self, pose: ArrayLike) -> Array:
         """Always the identity, shape (..., 3, 3): the platform only translates."""
@@ -193,6 +231,96 @@ class Delta(Robot):
                 )
             joints += [inner, outer]
         return tuple(joints)
+
+    def frame(self, pose: Array) -> Frame:
+        """Arms clamped at their locked drives, rods between arms and platform.
+
+        The joints are those of :meth:`body_joints`: a parallelogram's rods stand on ball joints,
+        side by side along t, and an rcu's rod slides along t and turns about t at the elbow, turns
+        about t and r at the platform. A rod between two ball joints would spin idly, so the
+        elbow's holds that spin, which carries no load.
+
+        :param pose: shape (3,), m.
+        :raises ParameterError: the file has no members.
+        """
+        g, m, members = self.geometry, self.inertia, self.members
+        if members is None:
+            raise ParameterError(
+                "members", None, "a section that gives the sections of arms and forearms, for modes"
+            )
+        arm_section, sections = self._sections()
+        up = np.array([0.0, 0.0, 1.0])
+        beams: list[Member] = []
+        free = math.inf
+        drive = (*RIGID[:4], members.drive_compliance, 0.0)
+        inner, outer = members.elbow_compliance, members.platform_joint_compliance
+        for i, limb in enumerate(("I", "II", "III")):
+            angle = float(self.inverse(pose)[i])
+            r = np.array([math.cos(g.azimuths[i]), math.sin(g.azimuths[i]), 0.0])
+            t = np.cross(up, r)
+            pivot = g.base_radius * r
+            tip = pivot + g.arm_length * (math.cos(angle) * r - math.sin(angle) * up)
+            corner = pose + g.platform_radius * r
+            arm, forearm = f"arm {limb}", f"forearm {limb}"
+            fixed = np.column_stack((r, t, up))
+            base = Support(f"base joint {limb}", GROUND, fixed, drive)
+            beams.append(Member(arm, arm, arm_section, pivot, tip, base, None))
+            elbow, platform = f"elbow {limb}", f"platform joint {limb}"
+            if g.closures[i] == "rcu":
+                start = tip + ((corner - tip) @ t) * t
+                beams.append(
+                    Member(
+                        forearm,
+                        forearm,
+                        sections[i],
+                        start,
+                        corner,
+                        Support(elbow, arm, fixed, (inner, free, inner, 0.0, free, 0.0)),
+                        Support(platform, MOVING, fixed, (outer, outer, outer, free, free, 0.0)),
+                    )
+                )
+                continue
+            w = (corner - tip) / np.linalg.norm(corner - tip)
+            e = np.cross(t, w)
+            e /= np.linalg.norm(e)
+            axes = np.column_stack((w, e, np.cross(w, e)))
+            for side, name in ((-0.5, "a"), (0.5, "b")):
+                offset = side * members.parallelogram_width * t
+                beams.append(
+                    Member(
+                        f"{forearm} {name}",
+                        forearm,
+                        sections[i],
+                        tip + offset,
+                        corner + offset,
+                        Support(elbow, arm, axes, (inner, inner, inner, 0.0, free, free)),
+                        Support(platform, MOVING, axes, (outer, outer, outer, free, free, free)),
+                    )
+                )
+        inertia = members.platform_inertia
+        if inertia is None:
+            inertia = disc(m.platform_mass, g.platform_radius)
+        bodies = [RigidBody(MOVING, m.platform_mass, np.zeros(3), inertia)]
+        load = self.payload
+        if load.mass > 0.0:
+            bodies.append(RigidBody("payload", load.mass, load.com, load.inertia))
+        return Frame(np.array(pose), tuple(beams), tuple(bodies))
+
+    def _sections(self) -> tuple[Section, tuple[Section, ...]]:
+        """Sections of an arm and of each limb's rods."""
+        g, m, members = self.geometry, self.inertia, self.members
+        assert members is not None  # noqa: S101
+        arm = members.arm.section(m.arm_mass / g.arm_length, "members.arm")
+        spread = m.forearm_mass / g.forearm_length
+        rods: list[Section] = []
+        for closure in g.closures:
+            if closure == "rod":
+                rods.append(members.forearm.section(spread / 2, "members.forearm"))
+            elif members.rcu_forearm is None:
+                raise ParameterError("members.rcu_forearm", None, "required for the rcu limb")
+            else:
+                rods.append(members.rcu_forearm.section(spread, "members.rcu_forearm"))
+        return arm, tuple(rods)
 
     def _pack(self) -> list[float]:
         g, m = self.geometry, self.inertia
@@ -307,7 +435,8 @@ def _newton(p, c0, c1, c2, x, y, z):  # type: ignore[no-untyped-def]
         x -= sx
         y -= sy
         z -= sz
-        if abs(sx) + abs(sy) + abs(sz) < 1e-13 * size:
+        # Convergence is quadratic: the step after one so small is below rounding.
+        if abs(sx) + abs(sy) + abs(sz) < 1e-10 * size:
             return x, y, z, det, True
     return x, y, z, det, False
 
@@ -458,15 +587,21 @@ def _forward(p, q, pose, scratch, fault):  # type: ignore[no-untyped-def]
 
 
 @scalar
-def _motion(p, q, qd, qdd, s, fault):  # type: ignore[no-untyped-def]
-    """Rows of all bodies, see bodies.py; False where the state is faulty.
+def _kinematics(p, q, qd, qdd, s, t, fault):  # type: ignore[no-untyped-def]
+    """Assembly and accelerations; the platform's linear Jacobian goes to s from t on.
 
     Velocity: d_i . (v - L1 qd_i u'_i) = 0; acceleration: its derivative, d_i the forearm, u_i
     the arm's direction, u'_i its derivative by q_i.
+
+    Returns whether the state is good, platform position and acceleration, the forearms' vectors,
+    and the limbs' centres with cosine and sine of the arms' angles.
     """
+    zero = (0.0, 0.0, 0.0)
+    none = (0.0, 0.0, 0.0, 0.0, 0.0)
+    bad = (False, zero, zero, zero, zero, zero, none, none, none)
     if not math.isfinite(q[0] + q[1] + q[2] + qd[0] + qd[1] + qd[2] + qdd[0] + qdd[1] + qdd[2]):
         fault[0] = NOT_FINITE
-        return False
+        return bad
     c0 = _centre(p, q, 0)
     c1 = _centre(p, q, 1)
     c2 = _centre(p, q, 2)
@@ -475,24 +610,16 @@ def _motion(p, q, qd, qdd, s, fault):  # type: ignore[no-untyped-def]
     fault[1] = limb
     fault[2] = amount
     if code != 0.0:
-        return False
+        return bad
     a, b, c, n0, det, _ra, _rb, _rc = _residuals(p, c0, c1, c2, x, y, z)
-    # Locals: a store into s could be one into p for all the compiler knows.
     arm = p[ARM]
-    platform = p[PLATFORM]
-    m_arm = p[M_ARM]
-    lever = arm * p[ARM_COM]
-    arm_inertia = p[ARM_INERTIA]
-    m_forearm = p[M_FOREARM]
-    base = p[BASE]
     cube = p[FOREARM] * p[FOREARM] * p[FOREARM]
     if not abs(det) > SINGULARITY_BOUND * cube:
         fault[0] = SINGULAR
         fault[2] = abs(det) / cube
-        return False
+        return bad
     n1 = _cross(c[0], c[1], c[2], a[0], a[1], a[2])
     n2 = _cross(a[0], a[1], a[2], b[0], b[1], b[2])
-    t = ROW * BODIES
     vx = vy = vz = 0.0
     for i in range(3):
         d = a if i == 0 else (b if i == 1 else c)
@@ -507,8 +634,6 @@ def _motion(p, q, qd, qdd, s, fault):  # type: ignore[no-untyped-def]
         vx += f * n[0] * qd[i]
         vy += f * n[1] * qd[i]
         vz += f * n[2] * qd[i]
-    for k in range(9):
-        s[t + 9 + k] = 0.0
     ax = ay = az = 0.0
     for i in range(3):
         d = a if i == 0 else (b if i == 1 else c)
@@ -532,6 +657,28 @@ def _motion(p, q, qd, qdd, s, fault):  # type: ignore[no-untyped-def]
         ax += f * n[0]
         ay += f * n[1]
         az += f * n[2]
+    return True, (x, y, z), (ax, ay, az), a, b, c, c0, c1, c2
+
+
+@scalar
+def _motion(p, q, qd, qdd, s, fault):  # type: ignore[no-untyped-def]
+    """Rows of all bodies, see bodies.py; False where the state is faulty."""
+    t = ROW * BODIES
+    good, at, acceleration, a, b, c, c0, c1, c2 = _kinematics(p, q, qd, qdd, s, t, fault)
+    if not good:
+        return False
+    x, y, z = at
+    ax, ay, az = acceleration
+    # Locals: a store into s could be one into p for all the compiler knows.
+    arm = p[ARM]
+    platform = p[PLATFORM]
+    m_arm = p[M_ARM]
+    lever = arm * p[ARM_COM]
+    arm_inertia = p[ARM_INERTIA]
+    m_forearm = p[M_FOREARM]
+    base = p[BASE]
+    for k in range(9):
+        s[t + 9 + k] = 0.0
     twelfth = m_forearm / 12.0
     inverse = 1.0 / (p[FOREARM] * p[FOREARM])
     for i in range(3):
@@ -641,10 +788,62 @@ def _bodies(p, q, qd, qdd, rows, scratch, fault):  # type: ignore[no-untyped-def
 
 
 def _inverse_dynamics(p, q, qd, qdd, wrench, tau, scratch, fault):  # type: ignore[no-untyped-def]
-    """Arm torques by virtual work, N m."""
-    if _motion(p, q, qd, qdd, scratch, fault) and not virtual_work(
-        p, scratch, BODIES, qd, wrench, tau
-    ):
+    """Arm torques by virtual work, N m, from forces at the forearms' ends.
+
+    A thin rod's inertia forces are exactly m (2 a_B + a_C) / 6 at its end B and m (a_B + 2 a_C) / 6
+    at C: no rotation is needed. The law tests hold this against the rows of all bodies.
+    """
+    good, _, acceleration, _a, _b, _c, c0, c1, c2 = _kinematics(p, q, qd, qdd, scratch, 0, fault)
+    if not good:
+        return
+    ax, ay, az = acceleration
+    gx = p[0]
+    gy = p[1]
+    gz = p[2]
+    arm = p[ARM]
+    sixth = p[M_FOREARM] / 6.0
+    half = p[M_FOREARM] / 2.0
+    lever = p[M_ARM] * p[ARM_COM] * arm
+    about_pivot = p[ARM_INERTIA] + lever * p[ARM_COM] * arm
+    held = p[M_PLATFORM] + p[PAYLOAD_MASS]
+    fx = held * (ax - gx) - wrench[0]
+    fy = held * (ay - gy) - wrench[1]
+    fz = held * (az - gz) - wrench[2]
+    for i in range(3):
+        m = c0 if i == 0 else (c1 if i == 1 else c2)
+        cq = m[3]
+        sq = m[4]
+        co = p[COS + i]
+        si = p[SIN + i]
+        # u' = -sin q e - cos q z; the elbow's acceleration L1 (u' qdd - u qd^2).
+        dx = -sq * co
+        dy = -sq * si
+        square = qd[i] * qd[i]
+        slide = p[RCU + i] * (ay * co - ax * si)
+        bx = arm * (dx * qdd[i] - cq * co * square) - slide * si
+        by = arm * (dy * qdd[i] - cq * si * square) + slide * co
+        bz = arm * (sq * square - cq * qdd[i])
+        ex = sixth * (2.0 * bx + ax) - half * gx
+        ey = sixth * (2.0 * by + ay) - half * gy
+        ez = sixth * (2.0 * bz + az) - half * gz
+        # What slides along t at an rcu's elbow is carried by the platform.
+        slide = p[RCU + i] * (ey * co - ex * si)
+        fx += sixth * (bx + 2.0 * ax) - half * gx - slide * si
+        fy += sixth * (by + 2.0 * ay) - half * gy + slide * co
+        fz += sixth * (bz + 2.0 * az) - half * gz
+        effort = arm * (dx * ex + dy * ey - cq * ez) + about_pivot * qdd[i]
+        effort -= lever * (dx * gx + dy * gy - cq * gz)
+        tau[i] = effort + p[VISCOUS + i] * qd[i]
+        if qd[i] > 0.0:
+            tau[i] += p[COULOMB + i]
+        elif qd[i] < 0.0:
+            tau[i] -= p[COULOMB + i]
+    for i in range(3):
+        k = 3 * i
+        tau[i] += scratch[k] * fx + scratch[k + 1] * fy + scratch[k + 2] * fz
+    # The moment does no work on a platform that only translates, but has to be a number.
+    moment = wrench[3] + wrench[4] + wrench[5]
+    if not math.isfinite(tau[0] + tau[1] + tau[2] + moment):
         fault[0] = NOT_FINITE
 
 
@@ -652,4 +851,4 @@ Delta.inverse_kernel = Kernel(_inverse, (3,), (3,))
 Delta.forward_kernel = Kernel(_forward, (3,), (3,))
 Delta.jacobian_kernel = Kernel(_jacobian, (3,), (9, 18), SCRATCH)
 Delta.motion_kernel = Kernel(_bodies, (3, 3, 3), (SCRATCH,))
-Delta.dynamics_kernel = Kernel(_inverse_dynamics, (3, 3, 3, 6), (3,), SCRATCH)
+Delta.dynamics_kernel = Kernel(_inverse_dynamics, (3, 3, 3, 6), (3,), 9)

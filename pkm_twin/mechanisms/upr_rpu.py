@@ -36,7 +36,17 @@ from pkm_twin import parameters
 from pkm_twin.errors import ParameterError
 from pkm_twin.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
 from pkm_twin.mechanisms.elements import BLOCK, SCRATCH, divide, factorise, invert
-from pkm_twin.mechanisms.robot import SINGULARITY_BOUND, Robot, length
+from pkm_twin.mechanisms.frame import (
+    GROUND,
+    MOVING,
+    Frame,
+    Member,
+    RigidBody,
+    Section,
+    Support,
+    disc,
+)
+from pkm_twin.mechanisms.robot import SINGULARITY_BOUND, Robot, length, mass
 
 Array = NDArray[np.float64]
 
@@ -118,6 +128,20 @@ class JointsCompliance:
 
 
 @dataclass(frozen=True, eq=False)
+class Inertia:
+    """Masses for modes: density of the bars (kg/m3), and the platform with what it carries.
+
+    ``platform_com`` (m) and ``platform_inertia`` (about the com, kg m2) in platform axes; default
+    a thin disc of the platform's radius about its origin.
+    """
+
+    density: float = parameters.number(above=0.0, at_most=1e5)
+    platform_mass: float = mass()
+    platform_com: Array = parameters.vector(3, default=[0, 0, 0])
+    platform_inertia: Array | None = parameters.inertia(positive=False, default=None)
+
+
+@dataclass(frozen=True, eq=False)
 class Limits:
     """Limb lengths [min, max], one pair or three (m); bound of every passive joint's angle (rad).
 
@@ -153,6 +177,7 @@ class UprRpu(Robot):
     joints_compliance: JointsCompliance = parameters.section(JointsCompliance)
     limits: Limits = parameters.section(Limits, default={})
     joints: tuple[str, ...] = parameters.names(3, default=["limb_1", "limb_2", "limb_3"])
+    inertia: Inertia | None = parameters.section(Inertia, default=None)
 
     description: ClassVar[str] = "2UPR-RPU head, three actuated telescopic limbs"
     mobility: ClassVar[str] = "3: translation along Oo, rotations beta, gamma"
@@ -181,6 +206,64 @@ class UprRpu(Robot):
         zero = np.zeros_like(cb)
         rows = [[cg, zero, sg], [sb * sg, cb, -sb * cg], [-cb * sg, sb, cb * cg]]
         return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+    def frame(self, pose: Array) -> Frame:
+        """Bars between base and platform, joints elastic in their own axes, drives locked.
+
+        A bar reaches from B to A, as in the paper, and its mass with it: a telescope's tubes that
+        overlap are not told apart.
+
+        :param pose: shape (3,): z (m), beta, gamma (rad).
+        :raises ParameterError: the file has no inertia.
+        """
+        g, members, joints, inertia = (
+            self.geometry,
+            self.members,
+            self.joints_compliance,
+            self.inertia,
+        )
+        if inertia is None:
+            raise ParameterError(
+                "inertia", None, "a section with density, platform_mass and more, for modes"
+            )
+        turn = self.rotation(pose)
+        z, beta = float(pose[0]), float(pose[1])
+        origin = np.array([0.0, -z * math.tan(beta), z])
+        pattern = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        x, y = np.array([1.0, 0.0, 0.0]), turn[:, 1]
+        universal = np.column_stack((x, y, np.cross(x, y)))
+        bars: list[Member] = []
+        for i, limb in enumerate("123"):
+            d = float(members.diameter[i])
+            section = Section(
+                members.youngs_modulus,
+                members.shear_modulus,
+                d,
+                0.0,
+                inertia.density * math.pi / 4 * d * d,
+                members.shear_factor,
+            )
+            lower, upper = g.base_radius * pattern[i], origin + g.platform_radius * turn @ pattern[i]
+            w = (lower - upper) / np.linalg.norm(lower - upper)
+            if i == 2:
+                revolute = np.column_stack((x, np.cross(w, x), w))
+                feet = (f"{limb}R", revolute, joints.rpu_revolute)
+                heads = (f"{limb}U", universal, joints.rpu_universal)
+            else:
+                revolute = np.column_stack((np.cross(y, w), y, w))
+                feet = (f"{limb}U", universal, joints.upr_universal)
+                heads = (f"{limb}R", revolute, joints.upr_revolute)
+            bar = f"{limb}B"
+            inner = Support(feet[0], GROUND, feet[1], tuple(feet[2].tolist()))
+            outer = Support(heads[0], MOVING, heads[1], tuple(heads[2].tolist()))
+            bars.append(Member(bar, bar, section, lower, upper, inner, outer))
+        own = inertia.platform_inertia
+        if own is None:
+            own = disc(inertia.platform_mass, g.platform_radius)
+        platform = RigidBody(
+            MOVING, inertia.platform_mass, turn @ inertia.platform_com, turn @ own @ turn.T
+        )
+        return Frame(origin, tuple(bars), (platform,))
 
     def _pack(self) -> list[float]:
         m, j = self.members, self.joints_compliance

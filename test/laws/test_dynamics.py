@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import energy, forward_dynamics, inverse_dynamics, mass_matrix
+from delta_dynamics.virtual_work import bodies
 from pkm_twin import load, robot_names
 from pkm_twin.errors import SingularityError, UnreachableError
 from test.conftest import finite_difference, random_joints
@@ -65,6 +66,22 @@ def test_power_is_the_rate_of_energy(name, robot, rng):
     rate = (8 * (total(h) - total(-h)) - (total(2 * h) - total(-2 * h))) / (12 * h)
     power = np.sum(inverse_dynamics(robot, q, qd, qdd) * qd, -1)
     np.testing.assert_allclose(power, rate, rtol=1e-7, atol=1e-8 * np.abs(rate).max())
+
+
+def test_efforts_are_the_virtual_work_of_all_bodies(name, robot, rng):
+    """The kernel against the sum over the rows that reactions and energies are made of."""
+    q, qd, qdd = states(robot, rng, 100)
+    wrench = rng.normal(0.0, 10.0, (100, 6))
+    rows, twist = bodies(robot, q, qd, qdd)
+    force = rows[..., 0:1] * (rows[..., 4:7] - robot.gravity)
+    linear, angular = (rows[..., k : k + 9].reshape(*rows.shape[:-1], 3, 3) for k in (10, 19))
+    expected = np.einsum("nbjk,nbk->nj", linear, force)
+    expected += np.einsum("nbjk,nbk->nj", angular, rows[..., 7:10])
+    expected -= np.einsum("nkj,nk->nj", twist, wrench)
+    expected += robot.friction.viscous * qd + robot.friction.coulomb * np.sign(qd)
+    np.testing.assert_allclose(
+        inverse_dynamics(robot, q, qd, qdd, wrench), expected, rtol=1e-11, atol=1e-11
+    )
 
 
 def test_external_power_reaches_the_actuators(name, robot, rng):

@@ -75,6 +75,7 @@ class Monitor:
 
     def ready(self):
         def repeat():
+            assert self.process.alive(), self.process.output
             self.send_state()
             self.send_wrench()
 
@@ -278,9 +279,7 @@ class TestRejects:
         [
             (["wrench_fram:=tool0"], "did you mean 'wrench_frame'"),
             (["mechanism:=delta_cu"], "elastic members"),
-            (["mechanism:=upr_rpv"], "did you mean 'upr_rpu'"),
             (["max_state_age:=.nan"], "max_state_age: nan"),
-            (["max_state_age:=-0.1"], "max_state_age: -0.1"),
             (["wrench_frame:=''"], "wrench_frame: ''"),
             (["accept_empty_frame:=1"], "accept_empty_frame: 1"),
         ],

@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finite elements of a frame: Timoshenko beams with consistent mass, joints, a rigid platform.
+
+Every displacement of a member's ends is written as that of the body it stands on plus what its
+joint lets through: u_end = X u_body + A s. So releases and springs need no constraint equations:
+a free direction is a coordinate s, an elastic one a coordinate s with a spring, a rigid one none.
+
+Displacements of a node are in the order x y z rx ry rz (m, rad). SI units.
+
+May import: numpy, pkm_twin's core, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.mechanisms.frame import GROUND, MOVING, Frame, Member, RigidBody, Section, Support
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_AXIAL: Final = ((0, 6),)
+_TWIST: Final = ((3, 9),)
+_PLANES: Final = (((1, 5, 7, 11), 1.0), ((2, 4, 8, 10), -1.0))
+"""Deflection and slope at both ends; in the plane x z a positive turn lowers the slope."""
+
+
+@lru_cache(maxsize=64)
+def element_matrices(section: Section, length: float) -> tuple[Array, Array]:
+    """Stiffness and consistent mass of one beam element along its own x axis, shape (12, 12) each.
+
+    Shape functions are the exact static ones of a beam loaded at its ends, with the ratio of
+    bending to shear phi = 12 E I / (G A_shear L^2) (Friedman and Kosmatka 1993, equations 14, 22
+    and 23); mass of cross sections in translation and in rotation. Read-only.
+    """
+    s, l = section, length  # noqa: E741
+    bending = s.youngs_modulus * s.second_moment
+    phi = 12 * bending * s.shear_factor / (s.shear_modulus * s.area * l * l)
+    stiffness, mass = np.zeros((12, 12)), np.zeros((12, 12))
+    rod = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    spread = np.array([[2.0, 1.0], [1.0, 2.0]]) / 6
+    for dofs, rigidity, inertia in (
+        (_AXIAL, s.youngs_modulus * s.area, s.mass_per_length),
+        (_TWIST, s.shear_modulus * 2 * s.second_moment, 2 * s.rotary_inertia),
+    ):
+        at = np.ix_(dofs[0], dofs[0])
+        stiffness[at] = rigidity / l * rod
+        mass[at] = inertia * l * spread
+    bend = (
+        bending
+        / ((1 + phi) * l**3)
+        * np.array(
+            [
+                [12, 6 * l, -12, 6 * l],
+                [6 * l, (4 + phi) * l * l, -6 * l, (2 - phi) * l * l],
+                [-12, -6 * l, 12, -6 * l],
+                [6 * l, (2 - phi) * l * l, -6 * l, (4 + phi) * l * l],
+            ]
+        )
+    )
+    a, b = 70 * phi**2 + 147 * phi + 78, (35 * phi**2 + 77 * phi + 44) * l / 4
+    c, d = 35 * phi**2 + 63 * phi + 27, (35 * phi**2 + 63 * phi + 26) * l / 4
+    e, f = (7 * phi**2 + 14 * phi + 8) * l * l / 4, (7 * phi**2 + 14 * phi + 6) * l * l / 4
+    move = np.array([[a, b, c, -d], [b, e, d, -f], [c, d, a, -b], [-d, -f, -b, e]])
+    g, h = (15 * phi - 3) * l, (10 * phi**2 + 5 * phi + 4) * l * l
+    k = (5 * phi**2 - 5 * phi - 1) * l * l
+    turn = np.array([[36, -g, -36, -g], [-g, h, g, k], [-36, g, 36, g], [-g, k, g, h]])
+    consistent = (s.mass_per_length * l / 210 * move + s.rotary_inertia / (30 * l) * turn) / (
+        1 + phi
+    ) ** 2
+    for plane, sign in _PLANES:
+        at = np.ix_(plane, plane)
+        flip = np.array([1.0, sign, 1.0, sign])
+        stiffness[at] = flip[:, None] * bend * flip
+        mass[at] = flip[:, None] * consistent * flip
+    stiffness.setflags(write=False)
+    mass.setflags(write=False)
+    return stiffness, mass
+
+
+def member_matrices(section: Section, length: float, elements: int) -> tuple[Array, Array]:
+    """Stiffness and mass of a chain of equal elements, shape (6 (elements + 1),) * 2."""
+    one, weight = element_matrices(section, length / elements)
+    size = 6 * (elements + 1)
+    stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
+    for k in range(elements):
+        at = slice(6 * k, 6 * k + 12)
+        stiffness[at, at] += one
+        mass[at, at] += weight
+    return stiffness, mass
+
+
+def local_axes(along: Array) -> Array:
+    """Right-handed axes whose first is the unit vector ``along``; columns, shape (3, 3)."""
+    side = np.zeros(3)
+    side[int(np.argmin(np.abs(along)))] = 1.0
+    y = _cross(side, along)
+    y /= math.sqrt(float(y @ y))
+    return np.column_stack((along, y, _cross(along, y)))
+
+
+def rigid_offset(arm: Array) -> Array:
+    """Displacement of a point of a rigid body by that of another, ``arm`` away; shape (6, 6)."""
+    x, y, z = arm.tolist()
+    offset = np.eye(6)
+    offset[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    return offset
+
+
+def body_mass(body: RigidBody) -> Array:
+    """Mass matrix of a rigid body at the platform's origin, shape (6, 6)."""
+    about_com = np.zeros((6, 6))
+    about_com[:3, :3] = body.mass * np.eye(3)
+    about_com[3:, 3:] = body.inertia
+    offset = rigid_offset(body.com)
+    return np.asarray(offset.T @ about_com @ offset, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One element of the energy shares: matrices on its own displacements.
+
+    ``own`` (k,) of the system's coordinates move it, by ``map``, shape (rows, k).
+    """
+
+    name: str
+    own: Indices
+    map: Array
+    stiffness: Array
+    mass: Array
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """An assembled frame of n coordinates.
+
+    ``stiffness``, ``mass``: shape (n, n). The platform's six displacements are the first six
+    coordinates. ``nodes``: names; node k, at ``positions[k]`` (m), has the displacements
+    ``turns[k] @ (parts[node_parts[k]].map @ z)[rows]``, see :meth:`displacements`.
+    """
+
+    stiffness: Array
+    mass: Array
+    parts: tuple[Part, ...]
+    nodes: tuple[str, ...]
+    positions: Array
+    members: tuple[tuple[int, Array], ...]
+
+    def displacements(self, shape: Array) -> Array:
+        """World displacements of the named nodes, shape (nodes, 6), of coordinates (n,)."""
+        rows = [shape[None, :6]]
+        for index, axes in self.members:
+            part = self.parts[index]
+            own = (part.map @ shape[part.own]).reshape(-1, 2, 3)
+            rows.append((own @ axes.T).reshape(-1, 6))
+        return np.concatenate(rows)
+
+    def energies(self, shape: Array) -> tuple[tuple[str, ...], Array, Array]:
+        """Names, then twice the strain energy and twice the kinetic one at unit rate, by part.
+
+        Parts of one name are added up.
+        """
+        strain: dict[str, float] = {}
+        kinetic: dict[str, float] = {}
+        for part in self.parts:
+            own = part.map @ shape[part.own]
+            strain[part.name] = strain.get(part.name, 0.0) + float(own @ part.stiffness @ own)
+            kinetic[part.name] = kinetic.get(part.name, 0.0) + float(own @ part.mass @ own)
+        return tuple(strain), np.array(list(strain.values())), np.array(list(kinetic.values()))
+
+
+def assemble(frame: Frame, elements: int) -> System:
+    """Stiffness and mass of a frame, each member divided into ``elements`` beams.
+
+    :raises ValueError: a member stands on a body that no earlier member ends in, or has no length.
+    """
+    parts: list[Part] = []
+    names: list[str] = [MOVING]
+    positions: list[Array] = [frame.origin[None]]
+    members: list[tuple[int, Array]] = []
+    platform = np.arange(6)
+    bodies: dict[str, tuple[Indices, Array] | None] = {
+        GROUND: None,
+        MOVING: (platform, frame.origin),
+    }
+    size = 6
+    for body in frame.bodies:
+        parts.append(Part(body.name, platform, np.eye(6), np.zeros((6, 6)), body_mass(body)))
+    springs: list[Part] = []
+    for member in frame.members:
+        span = member.end - member.start
+        length = math.sqrt(float(span @ span))
+        if not length > 0.0:
+            raise ValueError(f"{member.name} has no length")
+        axes = local_axes(span / length)
+        stiffness, mass = member_matrices(member.section, length, elements)
+        rows = 6 * (elements + 1)
+        inside = np.arange(size, size + 6 * (elements - 1))
+        size += len(inside)
+        columns: list[Indices] = [inside]
+        # Inside, coordinates are along the member's own axes.
+        blocks: list[Array] = [np.eye(rows)[:, 6:-6]]
+        for support, point, first in (
+            (member.inner, member.start, 0),
+            (member.outer, member.end, rows - 6),
+        ):
+            own, block, spring, size = _end(support, point, bodies, size)
+            full = np.zeros((rows, block.shape[1]))
+            full[first : first + 6] = (axes.T @ block.reshape(2, 3, -1)).reshape(6, -1)
+            columns.append(own)
+            blocks.append(full)
+            if spring is not None:
+                springs.append(spring)
+        if member.outer is None:
+            bodies[member.name] = (columns[-1], member.end)
+        index = np.concatenate(columns)
+        members.append((len(parts), axes))
+        # A body that holds both ends appears once.
+        own, where = np.unique(index, return_inverse=True)
+        joined = np.zeros((rows, len(own)))
+        np.add.at(joined.T, where, np.hstack(blocks).T)
+        parts.append(Part(member.body, own, joined, stiffness, mass))
+        fractions = np.arange(elements + 1)[:, None] / elements
+        positions.append(member.start + fractions * span)
+        names += [f"{member.name} {k}/{elements}" for k in range(elements + 1)]
+    whole = (*parts, *springs)
+    stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
+    for part in whole:
+        at = np.ix_(part.own, part.own)
+        stiffness[at] += part.map.T @ part.stiffness @ part.map
+        mass[at] += part.map.T @ part.mass @ part.map
+    return System(stiffness, mass, whole, tuple(names), np.concatenate(positions), tuple(members))
+
+
+def _end(
+    support: Support | None,
+    point: Array,
+    bodies: dict[str, tuple[Indices, Array] | None],
+    size: int,
+) -> tuple[Indices, Array, Part | None, int]:
+    """Coordinates of a member's end, its displacement by them (6, k), springs, and the new size."""
+    if support is None:
+        return np.arange(size, size + 6), np.eye(6), None, size + 6
+    if support.body not in bodies:
+        raise ValueError(f"{support.joint} stands on {support.body}, which no earlier member has")
+    body = bodies[support.body]
+    compliance = np.array(support.compliance)
+    loose = np.flatnonzero(compliance)
+    travel = np.zeros((6, len(loose)))
+    for column, k in enumerate(loose.tolist()):
+        travel[3 * (k // 3) : 3 * (k // 3) + 3, column] = support.axes[:, k % 3]
+    own = np.arange(size, size + len(loose))
+    rigidity = 1.0 / compliance[loose]
+    spring = None
+    if rigidity.any():
+        count = len(loose)
+        spring = Part(
+            support.joint, own, np.eye(count), np.diag(rigidity), np.zeros((count, count))
+        )
+    if body is None:
+        return own, travel, spring, size + len(loose)
+    moved, at = body
+    return (
+        np.concatenate((moved, own)),
+        np.hstack((rigid_offset(point - at), travel)),
+        spring,
+        size + len(loose),
+    )
+
+
+def _cross(a: Array, b: Array) -> Array:
+    ax, ay, az = a.tolist()
+    bx, by, bz = b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
