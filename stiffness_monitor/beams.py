@@ -5,6 +5,9 @@ Every displacement of a member's ends is written as that of the body it stands o
 joint lets through: u_end = X u_body + A s. So releases and springs need no constraint equations:
 a free direction is a coordinate s, an elastic one a coordinate s with a spring, a rigid one none.
 
+A member's inner nodes can be replaced by its lowest modes with held ends, beside the static shapes
+of its ends (Craig and Bampton 1968): statics stay exact, and a pose costs much less.
+
 Displacements of a node are in the order x y z rx ry rz (m, rad). SI units.
 
 May import: numpy, pkm_twin's core, the standard library; never rclpy.
@@ -20,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.mechanisms.frame import GROUND, MOVING, Frame, Member, RigidBody, Section, Support
+from pkm_twin.mechanisms.frame import GROUND, MOVING, Frame, RigidBody, Section, Support
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -96,6 +99,40 @@ def member_matrices(section: Section, length: float, elements: int) -> tuple[Arr
     return stiffness, mass
 
 
+@lru_cache(maxsize=64)
+def _member(
+    section: Section, length: float, elements: int, kept: int | None
+) -> tuple[Array, Array, Array]:
+    """Basis, stiffness and mass of a member on its own coordinates.
+
+    Coordinates: six displacements of the start, six of the end, then those inside. ``basis``,
+    shape (6 (elements + 1), coordinates), gives the nodes' displacements.
+    """
+    stiffness, mass = member_matrices(section, length, elements)
+    size = len(mass)
+    ends, inside = np.r_[0:6, size - 6 : size], np.arange(6, size - 6)
+    basis = np.zeros((size, 12))
+    basis[ends] = np.eye(12)
+    own = np.eye(len(inside))
+    if kept is not None and kept < len(inside):
+        held = stiffness[np.ix_(inside, inside)]
+        # The static shapes take no share of the modes' stiffness.
+        basis[inside] = -np.linalg.solve(held, stiffness[np.ix_(inside, ends)])
+        root = np.linalg.inv(np.linalg.cholesky(mass[np.ix_(inside, inside)]))
+        values, vectors = np.linalg.eigh(root @ held @ root.T)
+        # Equal ones stay together: one of a pair would make a round bar uneven.
+        while kept < len(values) and values[kept] < values[kept - 1] * (1 + 1e-6):
+            kept += 1
+        own = root.T @ vectors[:, :kept]
+    modal = np.zeros((size, own.shape[1]))
+    modal[inside] = own
+    basis = np.hstack((basis, modal))
+    result = basis, basis.T @ stiffness @ basis, basis.T @ mass @ basis
+    for array in result:
+        array.setflags(write=False)
+    return result
+
+
 def local_axes(along: Array) -> Array:
     """Right-handed axes whose first is the unit vector ``along``; columns, shape (3, 3)."""
     side = np.zeros(3)
@@ -141,8 +178,8 @@ class System:
     """An assembled frame of n coordinates.
 
     ``stiffness``, ``mass``: shape (n, n). The platform's six displacements are the first six
-    coordinates. ``nodes``: names; node k, at ``positions[k]`` (m), has the displacements
-    ``turns[k] @ (parts[node_parts[k]].map @ z)[rows]``, see :meth:`displacements`.
+    coordinates. ``nodes``: names, at ``positions``, shape (nodes, 3), m: the platform, then
+    members' nodes in order. ``members``: index of the part, its basis, and its axes.
     """
 
     stiffness: Array
@@ -150,14 +187,14 @@ class System:
     parts: tuple[Part, ...]
     nodes: tuple[str, ...]
     positions: Array
-    members: tuple[tuple[int, Array], ...]
+    members: tuple[tuple[int, Array, Array], ...]
 
     def displacements(self, shape: Array) -> Array:
         """World displacements of the named nodes, shape (nodes, 6), of coordinates (n,)."""
         rows = [shape[None, :6]]
-        for index, axes in self.members:
+        for index, basis, axes in self.members:
             part = self.parts[index]
-            own = (part.map @ shape[part.own]).reshape(-1, 2, 3)
+            own = (basis @ (part.map @ shape[part.own])).reshape(-1, 2, 3)
             rows.append((own @ axes.T).reshape(-1, 6))
         return np.concatenate(rows)
 
@@ -175,15 +212,17 @@ class System:
         return tuple(strain), np.array(list(strain.values())), np.array(list(kinetic.values()))
 
 
-def assemble(frame: Frame, elements: int) -> System:
+def assemble(frame: Frame, elements: int, kept: int | None = None) -> System:
     """Stiffness and mass of a frame, each member divided into ``elements`` beams.
+
+    :param kept: modes with held ends that a member keeps; None keeps all its nodes.
 
     :raises ValueError: a member stands on a body that no earlier member ends in, or has no length.
     """
     parts: list[Part] = []
     names: list[str] = [MOVING]
     positions: list[Array] = [frame.origin[None]]
-    members: list[tuple[int, Array]] = []
+    members: list[tuple[int, Array, Array]] = []
     platform = np.arange(6)
     bodies: dict[str, tuple[Indices, Array] | None] = {
         GROUND: None,
@@ -199,16 +238,17 @@ def assemble(frame: Frame, elements: int) -> System:
         if not length > 0.0:
             raise ValueError(f"{member.name} has no length")
         axes = local_axes(span / length)
-        stiffness, mass = member_matrices(member.section, length, elements)
-        rows = 6 * (elements + 1)
-        inside = np.arange(size, size + 6 * (elements - 1))
-        size += len(inside)
+        # Rounded: poses of one robot differ by less in a member that keeps its length.
+        basis, stiffness, mass = _member(member.section, round(length, 12), elements, kept)
+        rows = len(mass)
+        inside = np.arange(size, size + rows - 12)
+        size += rows - 12
         columns: list[Indices] = [inside]
         # Inside, coordinates are along the member's own axes.
-        blocks: list[Array] = [np.eye(rows)[:, 6:-6]]
+        blocks: list[Array] = [np.eye(rows)[:, 12:]]
         for support, point, first in (
             (member.inner, member.start, 0),
-            (member.outer, member.end, rows - 6),
+            (member.outer, member.end, 6),
         ):
             own, block, spring, size = _end(support, point, bodies, size)
             full = np.zeros((rows, block.shape[1]))
@@ -220,7 +260,7 @@ def assemble(frame: Frame, elements: int) -> System:
         if member.outer is None:
             bodies[member.name] = (columns[-1], member.end)
         index = np.concatenate(columns)
-        members.append((len(parts), axes))
+        members.append((len(parts), basis, axes))
         # A body that holds both ends appears once.
         own, where = np.unique(index, return_inverse=True)
         joined = np.zeros((rows, len(own)))

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cholesky, eigh, solve_triangular
+from scipy.linalg import cholesky, eigh, solve_triangular  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.mechanisms.frame import Framed, framed
@@ -23,8 +23,10 @@ from stiffness_monitor.beams import System, assemble
 
 Array = NDArray[np.float64]
 
-ELEMENTS: Final = 4
+ELEMENTS: Final = 8
 """Beam elements a member: the first six frequencies of the shipped robots to 0.1 %."""
+KEPT: Final = 8
+"""Modes with held ends that a member keeps, of more: the same frequencies to 0.01 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,7 @@ def natural_frequencies(
     :raises ParameterError: a robot whose file has no data for modes, by the missing section.
     :raises UnreachableError: a pose that is none of the mechanism's.
     :raises SingularityError: a pose in which the frame is a mechanism, with locked actuators.
-    :raises ValueError: a wrong last axis, a value that is not finite, more modes than the frame has.
+    :raises ValueError: a wrong last axis, a value that is not finite, too many modes.
     """
     frame, poses = _checked(robot, pose)
     result = np.empty((*poses.shape[:-1], count))
@@ -142,6 +144,15 @@ def frame_compliance(robot: Robot, pose: ArrayLike, *, elements: int = 1) -> Arr
     return result
 
 
+def has_modes(robot: Robot) -> bool:
+    """Whether the robot's file has what natural frequencies need."""
+    try:
+        framed(robot).frame(robot.home())
+    except ParameterError:
+        return False
+    return True
+
+
 def _checked(robot: Robot, pose: ArrayLike) -> tuple[Framed, Array]:
     frame = framed(robot)
     poses = np.asarray(pose, np.float64)
@@ -155,7 +166,7 @@ def _checked(robot: Robot, pose: ArrayLike) -> tuple[Framed, Array]:
 def _system(frame: Framed, pose: Array, elements: int) -> System:
     if elements < 1:
         raise ParameterError("elements", elements, "1 or more")
-    return assemble(frame.frame(pose), elements)
+    return assemble(frame.frame(pose), elements, KEPT)
 
 
 def _root(system: System, index: tuple[int, ...]) -> Array:

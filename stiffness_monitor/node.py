@@ -16,8 +16,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
 from pkm_twin import health, load
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from stiffness_monitor.compliance import kernels
+from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings
 
 
@@ -34,6 +35,11 @@ class StiffnessMonitor(health.TwinNode):
         self._energy = self.speak(DiagnosticArray, "~/strain_energy")
         self._dominant = self.speak(String, "~/dominant_element")
         self._deflection = self.speak(TransformStamped, "~/deflection")
+        self._pose: NDArray[np.float64] | None = None
+        rate = self._declare_frequencies_rate()
+        if rate > 0.0 and has_modes(robot):
+            self._frequencies = self.speak(Float64MultiArray, "~/natural_frequencies")
+            self.every(1.0 / rate, self._publish_frequencies)
         self.listen(JointState, "joint_states", self._on_joint_state)
         self.listen(WrenchStamped, "wrench", self._on_wrench)
         self.start()
@@ -49,6 +55,7 @@ class StiffnessMonitor(health.TwinNode):
     def clock_jumped(self) -> None:
         """No pose across the seam."""
         self._monitor.reset()
+        self._pose = None
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
@@ -88,6 +95,15 @@ class StiffnessMonitor(health.TwinNode):
                 raise ParameterError(name, value, "a frame's name")
         return Settings(frame, base, empty, age, tolerance, zero)
 
+    def _declare_frequencies_rate(self) -> float:
+        rate: float = self.declare(
+            "frequencies_rate", 10.0, "natural frequencies a second at most, 0: none; Hz",
+            read_only=True,
+        )  # fmt: skip
+        if not 0.0 <= rate <= 1000.0:
+            raise ParameterError("frequencies_rate", rate, "0 to 1000 Hz")
+        return rate
+
     def _on_joint_state(self, message: JointState) -> None:
         self._monitor.joint_state(message, self.now())
 
@@ -105,6 +121,23 @@ class StiffnessMonitor(health.TwinNode):
         deflection.header.frame_id = "platform"
         deflection.child_frame_id = "platform_deflected"
         self._deflection.publish(deflection)
+        self._pose = answer.pose
+
+    def _publish_frequencies(self) -> None:
+        """Of the latest pose, each pose once: they take milliseconds, so not with every wrench."""
+        pose, self._pose = self._pose, None
+        if pose is None:
+            return
+        try:
+            values = natural_frequencies(self._monitor.robot, pose)
+        except (SingularityError, UnreachableError) as error:
+            self.log_throttled("natural frequencies", f"no natural frequencies: {error}")
+            return
+        message = Float64MultiArray(data=array("d", values))
+        message.layout.dim = [
+            MultiArrayDimension(label="frequency", size=len(values), stride=len(values))
+        ]
+        self._frequencies.publish(message)
 
     def _status(self, answer: Answer) -> DiagnosticStatus:
         """Factors, energy, pose and frame; factors are absent where no load makes energy."""

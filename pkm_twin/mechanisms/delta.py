@@ -158,11 +158,6 @@ class Delta(Robot):
         "payload",
     )
 
-    def verify(self, path: str) -> None:
-        """Tubes that hold their masses."""
-        if self.members is not None:
-            self._sections()
-
     def rotation(self, pose: ArrayLike) -> Array:
         """Always the identity, shape (..., 3, 3): the platform only translates."""
         return np.broadcast_to(np.eye(3), (*np.shape(pose)[:-1], 3, 3)).copy()

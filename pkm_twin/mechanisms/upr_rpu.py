@@ -243,7 +243,8 @@ class UprRpu(Robot):
                 inertia.density * math.pi / 4 * d * d,
                 members.shear_factor,
             )
-            lower, upper = g.base_radius * pattern[i], origin + g.platform_radius * turn @ pattern[i]
+            lower = g.base_radius * pattern[i]
+            upper = origin + g.platform_radius * turn @ pattern[i]
             w = (lower - upper) / np.linalg.norm(lower - upper)
             if i == 2:
                 revolute = np.column_stack((x, np.cross(w, x), w))

@@ -3,12 +3,13 @@
 
 import os
 
+import numpy as np
 import pytest
 import yaml
 
-from delta_dynamics.virtual_work import kernels as dynamics_kernels
+from delta_dynamics import inverse_dynamics
 from pkm_twin import load
-from stiffness_monitor.compliance import kernels as stiffness_kernels
+from stiffness_monitor import compliance, strain_energy
 from test.conftest import parameters_of
 from test.nodes.harness import Domain, Maker, NodeProcess, Peer, Plain, Ros
 
@@ -56,8 +57,13 @@ def peer(domain):
 def launch(domain):
     """Start node processes that end with the module: launch(module, *parameters)."""
     # Compiled here once: two processes that find no compiled kernels would both take their time.
-    for kernel in (*dynamics_kernels(load("delta_cu")), *stiffness_kernels(load("upr_rpu"))):
-        kernel.warm_up()
+    delta, head = load("delta_cu"), load("upr_rpu")
+    for batch in ((), (1,)):
+        zero = np.zeros((*batch, 3))
+        inverse_dynamics(delta, zero, zero, zero)
+        pose = head.forward(np.full((*batch, 3), 0.7))
+        strain_energy(head, pose, np.ones(6))
+        compliance(head, pose)
     processes = []
 
     def start(module, *parameters, **options):
