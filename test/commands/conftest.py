@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run `pkm-twin` in this process or in one of its own, and cut or spoil recorded bags."""
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pkm_twin import cli
+from pkm_twin.bags import BagWriter, open_bag
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DELTA = REPOSITORY / "bags/delta_cu_pick_and_place.mcap"
+MILLING = REPOSITORY / "bags/prru_milling.mcap"
+STIFFNESS = REPOSITORY / "bags/upr_rpu_milling.mcap"
+
+
+@dataclass(frozen=True)
+class Result:
+    code: int
+    out: str
+    err: str
+
+    def one_line_error(self):
+        """The error, which has to be one line without a traceback."""
+        lines = self.err.strip().splitlines()
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("pkm-twin: ")
+        return lines[0]
+
+
+@pytest.fixture
+def twin(capsys):
+    """Run a command in this process: twin("info", "delta_cu")."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Result(end.value.code or 0, captured.out, captured.err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def process():
+    """Run a command as a process, as a script does."""
+
+    def run(*arguments, folder=None):
+        done = subprocess.run(
+            [sys.executable, "-m", "pkm_twin.cli", *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            cwd=folder,
+            env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        )
+        return Result(done.returncode, done.stdout, done.stderr)
+
+    return run
+
+
+def rewrite(source, target, change=None, begin=0.0, seconds=2.0, metadata=None, topics=None):
+    """Copy a part of a bag, each decoded message through ``change``: None leaves it out.
+
+    ``change(topic, message, time)`` gets the time since the bag's first message, s.
+    """
+    bag = open_bag(source)
+    kept = dict(bag.report.metadata) if metadata is None else metadata
+    names = [name for name in bag.report.topics if topics is None or name in topics]
+    first = bag.report.start_time
+    with BagWriter(target, metadata=kept, flush_period=None) as writer:
+        for name in names:
+            info = bag.report.topics[name]
+            writer.add_topic(name, info.type, definition=info.definition)
+        for m in bag.messages(names):
+            time = (m.log_time - first) * 1e-9
+            if time >= begin + seconds:
+                break
+            if time < begin:
+                continue
+            message = m.data if change is None else change(m.topic, m.message, time)
+            if message is not None:
+                writer.write(m.topic, message, m.log_time)
+    return target
+
+
+@pytest.fixture(scope="session")
+def sample(tmp_path_factory):
+    """Two seconds of the Delta's recording, before the payload; not to be changed."""
+    return rewrite(DELTA, tmp_path_factory.mktemp("sample") / "sample.mcap")
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory):
+    """Sixty joint states of it, to be damaged many times."""
+    path = tmp_path_factory.mktemp("tiny") / "tiny.mcap"
+    return rewrite(DELTA, path, seconds=0.06, topics=["/joint_states"])

@@ -1,0 +1,354 @@
+# SPDX-License-Identifier: Apache-2.0
+"""check and recover: no bag that is damaged or that the model contradicts passes."""
+
+import json
+import random
+
+import pytest
+from mcap.writer import CompressionType, Writer
+
+from pkm_twin.bags import inspect, read_messages
+from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
+
+JOINTS = "/joint_states"
+
+
+def scaled_efforts(topic, message, time):
+    if topic == JOINTS:
+        message.effort = [1.2 * value for value in message.effort]
+    return message
+
+
+def one_effort_reversed(topic, message, time):
+    if topic == JOINTS:
+        message.effort = [message.effort[0], -message.effort[1], message.effort[2]]
+    return message
+
+
+def hole(topic, message, time):
+    return None if topic == JOINTS and 1.0005 < time < 1.0195 else message
+
+
+def stamps_backwards(topic, message, time):
+    if topic == JOINTS and 1.0005 < time < 1.0025:
+        message.header.stamp.sec -= 1
+    return message
+
+
+def not_a_number(topic, message, time):
+    if topic == JOINTS and 0.9995 < time < 1.0005:
+        message.position = [float("nan"), *message.position[1:]]
+    return message
+
+
+def beyond_a_limit(topic, message, time):
+    if topic == JOINTS and 0.9995 < time < 1.0005:
+        message.position = [1.31, *message.position[1:]]
+    return message
+
+
+def beyond_an_effort_limit(topic, message, time):
+    if topic == JOINTS and 0.9995 < time < 1.0005:
+        message.effort = [*message.effort[:2], -20.5]
+    return message
+
+
+def doubled_joint(topic, message, time):
+    if topic == JOINTS and 0.9995 < time < 1.0005:
+        message.name = [message.name[0], *message.name[:2]]
+    return message
+
+
+def items_of(result):
+    data = json.loads(result.out)
+    return {item["what"]: item for item in data["items"]}
+
+
+@pytest.mark.parametrize("bag", [DELTA, MILLING, STIFFNESS], ids=lambda path: path.stem)
+def test_recordings_are_good(process, bag):
+    result = process("check", bag)
+    assert (result.code, result.err) == (0, "")
+    assert result.out.splitlines()[-1].startswith("good")
+    assert ("not judged: torque residual" in result.out) == (bag == STIFFNESS)
+
+
+def test_a_cut_out_part_is_good(twin, sample):
+    result = twin("check", sample, "--json")
+    assert (result.code, result.err) == (0, "")
+    data = json.loads(result.out)
+    assert data["good"]
+    assert data["robot"] == "delta_cu"
+    assert {item["verdict"] for item in data["items"]} == {"good"}
+    assert sum(item["what"].startswith("torque residual of arm_") for item in data["items"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "what", "value"),
+    [
+        (scaled_efforts, "torque residual of arm_1", "% of"),
+        (one_effort_reversed, "torque residual of arm_2", "N m"),
+        (hole, "longest gap", " ms at 1.0"),
+        (stamps_backwards, "messages that a node refuses", "stamp order"),
+        (not_a_number, "messages that a node refuses", "position of arm_1 is nan"),
+        (beyond_a_limit, "messages that a node refuses", "allowed -0.9 to 1.3"),
+        (beyond_an_effort_limit, "effort limits", "-0.5 N m"),
+        (doubled_joint, "messages that a node refuses", "arm_1"),
+    ],
+)
+def test_a_fault_is_bad_and_named(twin, tmp_path, change, what, value):
+    bag = rewrite(DELTA, tmp_path / "bad.mcap", change)
+    result = twin("check", bag, "--json")
+    assert (result.code, result.err) == (1, "")
+    item = items_of(result)[what]
+    assert item["verdict"] == "bad"
+    assert value in item["value"]
+    shown = twin("check", bag)
+    assert shown.code == 1
+    assert what in shown.out.splitlines()[-1]
+
+
+def test_only_the_contradicted_joint_is_bad(twin, tmp_path):
+    items = items_of(
+        twin("check", rewrite(DELTA, tmp_path / "b.mcap", one_effort_reversed), "--json")
+    )
+    assert [what for what, item in items.items() if item["verdict"] == "bad"] == [
+        "torque residual of arm_2"
+    ]
+
+
+def test_a_bad_wrench_is_bad(twin, tmp_path):
+    def nameless(topic, message, time):
+        if topic == "/wrench":
+            message.header.frame_id = ""
+        return message
+
+    bag = rewrite(STIFFNESS, tmp_path / "w.mcap", nameless, seconds=0.2)
+    item = items_of(twin("check", bag, "--json"))["messages that a node refuses"]
+    assert item["verdict"] == "bad"
+    assert item["value"].startswith("100 of 200 ")
+    assert "frame" in item["value"]
+
+
+def test_the_payload_is_part_of_the_model_only_where_the_bag_tells_of_it(twin, tmp_path):
+    held = {"begin": 9.0, "seconds": 2.0}
+    facts = inspect(DELTA).metadata["pkm_twin"]
+    untold = {k: v for k, v in facts.items() if not k.startswith("payload")}
+    silent = rewrite(DELTA, tmp_path / "silent.mcap", metadata={"pkm_twin": untold}, **held)
+    assert twin("check", silent).code == 1
+    # Times count from the bag's beginning, and this one begins 9 s later.
+    told = facts | {"payload_picked_s": "-1.0", "payload_released_s": "5.0"}
+    loaded = rewrite(DELTA, tmp_path / "loaded.mcap", metadata={"pkm_twin": told}, **held)
+    assert twin("check", loaded).code == 0
+
+
+def test_the_allowed_residual_is_an_option(twin, tmp_path, sample):
+    assert twin("check", sample, "--residual", "0.001").code == 1
+    scaled = rewrite(DELTA, tmp_path / "scaled.mcap", scaled_efforts)
+    assert twin("check", scaled, "--residual", "0.5").code == 0
+    assert twin("check", sample, "--residual", "-1").code == 2
+
+
+class TestRobot:
+    def test_a_bag_without_a_name_needs_the_option(self, twin, tmp_path):
+        bag = rewrite(DELTA, tmp_path / "nameless.mcap", metadata={}, seconds=0.5)
+        result = twin("check", bag)
+        assert (result.code, result.out) == (1, "")
+        assert "--robot" in result.one_line_error()
+        assert twin("check", bag, "--robot", "delta_cu").code == 0
+
+    def test_another_robot_is_refused_with_the_joint(self, twin, sample):
+        result = twin("check", sample, "--robot", "prru")
+        assert result.code == 1
+        assert "'slider_1' is missing" in result.one_line_error()
+
+    def test_another_robot_of_the_same_joints_is_bad(self, twin, sample, variant):
+        heavy, _ = variant("delta_cu", inertia={"platform_mass": 0.5})
+        file = heavy.__dict__["_name"]
+        assert file == "delta_cu_variant"
+        path = next(p for p in sample.parent.parent.rglob("delta_cu_variant.yaml"))
+        result = twin("check", sample, "--robot", path)
+        assert result.code == 1
+        assert "torque residual of arm_1" in result.out.splitlines()[-1]
+
+    def test_a_wrong_name_tells_the_closest(self, twin, sample):
+        result = twin("check", sample, "--robot", "delta_kuh")
+        assert result.code == 1
+        assert "did you mean 'delta_cu'" in result.one_line_error()
+
+
+class TestNoEvidence:
+    """What cannot be judged is neither good nor bad."""
+
+    def test_no_efforts(self, twin, tmp_path):
+        def mute(topic, message, time):
+            if topic == JOINTS:
+                message.effort = []
+            return message
+
+        result = twin("check", rewrite(DELTA, tmp_path / "m.mcap", mute, seconds=0.5), "--json")
+        assert result.code == 0
+        items = items_of(result)
+        assert items["torque residual"]["verdict"] == "unknown"
+        assert "no efforts" in items["torque residual"]["value"]
+        assert "effort limits" not in items
+
+    def test_no_masses(self, twin, tmp_path):
+        bag = rewrite(STIFFNESS, tmp_path / "s.mcap", seconds=0.2)
+        item = items_of(twin("check", bag, "--json"))["torque residual"]
+        assert (item["verdict"], "no masses" in item["value"]) == ("unknown", True)
+
+    def test_too_short(self, twin, tmp_path):
+        bag = rewrite(DELTA, tmp_path / "s.mcap", seconds=0.002, topics=[JOINTS])
+        result = twin("check", bag, "--json")
+        items = items_of(result)
+        assert result.code == 0
+        assert items["rate"]["verdict"] == items["torque residual"]["verdict"] == "unknown"
+        assert twin("check", bag).out.splitlines()[-1] == "good; not judged: rate, torque residual"
+
+    def test_no_crc(self, twin, tmp_path, sample):
+        bag = without_crcs(sample, tmp_path / "plain.mcap")
+        result = twin("check", bag, "--robot", "delta_cu", "--json")
+        item = items_of(result)["file"]
+        assert (result.code, item["verdict"]) == (0, "unknown")
+        assert "no CRC" in item["value"]
+
+    @pytest.mark.parametrize("topics", [["/delta_dynamics/joint_trajectory"], []])
+    def test_no_joint_states_at_all_is_refused(self, twin, tmp_path, topics):
+        bag = rewrite(DELTA, tmp_path / "t.mcap", topics=topics)
+        assert "joint state" in twin("check", bag).one_line_error()
+
+
+def without_crcs(source, target):
+    """The same messages as rosbag2's default storage settings write them."""
+    with target.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD, enable_crcs=False)
+        writer.start(profile="ros2", library="test")
+        channels = {}
+        for topic, info in inspect(source).topics.items():
+            schema = writer.register_schema(info.type, "ros2msg", info.definition.encode())
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        for m in read_messages(source):
+            writer.add_message(channels[m.topic], m.log_time, m.data, m.publish_time)
+        writer.finish()
+    return target
+
+
+class TestDamage:
+    def test_flips_never_pass(self, twin, tiny, tmp_path):
+        whole = tiny.read_bytes()
+        assert twin("check", tiny).code == 0
+        draw = random.Random(20240229)
+        path = tmp_path / "flipped.mcap"
+        codes = []
+        for _ in range(200):
+            data = bytearray(whole)
+            bit = draw.randrange(8 * len(data))
+            data[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(data)
+            result = twin("check", path, "--json")
+            assert not json.loads(result.out)["good"]
+            result.one_line_error()
+            codes.append(result.code)
+        assert set(codes) <= {1, 3}
+        assert codes.count(3) > 50
+
+    def test_cuts_never_pass(self, twin, tiny, tmp_path):
+        whole = tiny.read_bytes()
+        path = tmp_path / "cut.mcap"
+        codes = set()
+        for size in [*range(0, len(whole), 37), len(whole) - 1]:
+            path.write_bytes(whole[:size])
+            result = twin("check", path)
+            assert result.out == ""
+            result.one_line_error()
+            codes.add(result.code)
+        assert codes == {1, 3}
+
+    @pytest.mark.parametrize("content", [b"", b"no bag at all", b"\x89MCAP0\r\n"])
+    def test_what_is_no_bag(self, twin, tmp_path, content):
+        path = tmp_path / "bad.mcap"
+        path.write_bytes(content)
+        result = twin("check", path, "--json")
+        data = json.loads(result.out)
+        assert result.code == 1
+        assert (data["good"], data["salvageable"]) == (False, 0)
+        assert data["error"] in result.one_line_error()
+
+    def test_missing_file(self, twin, tmp_path):
+        assert "does not exist" in twin("check", tmp_path / "absent.mcap").one_line_error()
+        assert twin("check").code == 2
+
+
+class TestRecover:
+    def test_then_check(self, process, twin, sample, tmp_path):
+        whole = sample.read_bytes()
+        cut, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
+        cut.write_bytes(whole[: len(whole) * 3 // 4])
+        refused = process("check", cut)
+        assert refused.code == 3
+        promised = int(refused.one_line_error().split(" whole messages")[0].split()[-1])
+        done = process("recover", cut, saved, "--json")
+        assert (done.code, done.err) == (3, "")
+        facts = json.loads(done.out)
+        assert not facts["lossless"]
+        assert facts["messages"] == promised == inspect(saved).message_count
+        assert promised > 1000
+        assert cut.read_bytes() == whole[: len(whole) * 3 // 4]
+        assert twin("check", saved).code == 0
+
+    def test_a_sound_bag_loses_nothing(self, twin, tiny, tmp_path):
+        result = twin("recover", tiny, tmp_path / "copy.mcap")
+        assert (result.code, result.err) == (0, "")
+        assert "60 messages saved, nothing lost" in result.out
+        assert twin("check", tmp_path / "copy.mcap").code == 0
+
+    def test_loss_is_told_in_words(self, twin, tiny, tmp_path):
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(tiny.read_bytes()[:-10])
+        result = twin("recover", cut, tmp_path / "saved.mcap")
+        assert result.code == 3
+        assert "messages saved, " in result.out
+        assert "lost" in result.out
+
+    def test_refusals(self, twin, tiny, tmp_path):
+        target = tmp_path / "target.mcap"
+        target.write_text("mine")
+        assert "exists" in twin("recover", tiny, target).one_line_error()
+        assert target.read_text() == "mine"
+        assert twin("recover", tiny, target, "--overwrite").code == 0
+        assert inspect(target).message_count == 60
+        (tmp_path / "text").write_text("no bag")
+        for source in (tmp_path / "text", tmp_path / "absent"):
+            assert twin("recover", source, tmp_path / "new.mcap").code == 1
+            assert not (tmp_path / "new.mcap").exists()
+        assert twin("recover", tiny).code == 2
+
+
+class TestPlay:
+    """The player itself is tested over the middleware; here only what the command refuses."""
+
+    def test_process_help(self, process):
+        result = process("play", "--help")
+        assert (result.code, result.err) == (0, "")
+        assert "--clock" in result.out
+
+    @pytest.mark.parametrize(
+        ("arguments", "code", "text"),
+        [
+            (("--remap", "no pair"), 2, "FROM:=TO"),
+            (("--rate", "fast"), 2, "rate"),
+            (("--rate", "0"), 1, "rate"),
+            (("--rate", "nan"), 1, "rate"),
+            (("--topic", "/absent"), 1, "/absent"),
+        ],
+    )
+    def test_refusals(self, twin, tiny, arguments, code, text):
+        result = twin("play", tiny, *arguments)
+        assert (result.code, result.out) == (code, "")
+        assert text in result.err
+        assert "Traceback" not in result.err
+
+    def test_a_damaged_bag_is_not_played(self, twin, tiny, tmp_path):
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(tiny.read_bytes()[:-10])
+        assert "recovered" in twin("play", cut).one_line_error()

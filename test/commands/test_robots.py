@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""robots, info and compliance: what they print for people and for scripts."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pkm_twin import load, robot_names
+from stiffness_monitor import compliance, strain_energy
+
+POSE = (-0.6, 0.1, -0.05)
+WRENCH = (30.0, -50.0, -40.0, 10.0, -20.0, 50.0)
+COMMANDS = ("play", "robots", "info", "torques", "compliance", "check", "recover")
+
+
+def parse(text):
+    """JSON proper: NaN and Infinity are refused."""
+
+    def refuse(token):
+        raise AssertionError(f"{token} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_processes(process):
+    listed = process("robots")
+    assert (listed.code, listed.err) == (0, "")
+    assert [line.split()[0] for line in listed.out.splitlines()] == robot_names()
+    shown = process("info", "upr_rpu", "--json")
+    assert (shown.code, shown.err) == (0, "")
+    assert parse(shown.out)["name"] == "upr_rpu"
+    solved = process("compliance", "upr_rpu", *POSE, "--json")
+    assert (solved.code, solved.err) == (0, "")
+    assert parse(solved.out)["dominant"]
+    unknown = process("info", "delta_kuh")
+    assert unknown.code == 1
+    assert "did you mean 'delta_cu'" in unknown.one_line_error()
+
+
+def test_siblings_are_told_apart(twin):
+    described = [line.split(maxsplit=1)[1] for line in twin("robots").out.splitlines()]
+    assert len(set(described)) == len(described)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_names_what_it_takes(twin, command):
+    result = twin(command, "--help")
+    assert (result.code, result.err) == (0, "")
+    assert f"Usage: pkm-twin {command}" in result.out
+    # The list of commands shows each one's first sentence whole.
+    first = result.out.split("\n\n")[1].strip().splitlines()[0]
+    assert first in twin("--help").out
+
+
+def test_bare_command_and_unknown_one(twin):
+    assert twin().code == 2
+    result = twin("torks")
+    assert (result.code, result.out) == (2, "")
+    assert "torks" in result.err
+
+
+@pytest.mark.parametrize("name", robot_names())
+class TestInfo:
+    def test_json_has_all_and_nothing_else_is_on_stdout(self, twin, name):
+        result = twin("info", name, "--json")
+        assert (result.code, result.err) == (0, "")
+        data = parse(result.out)
+        robot = load(name)
+        assert list(data["home_pose"]) == list(robot.pose_names)
+        assert data["joints"] == list(robot.joint_names)
+        pose = list(data["home_pose"].values())
+        assert np.allclose(robot.inverse(pose), list(data["home_joints"].values()))
+
+    def test_table_shows_every_parameter_with_its_unit(self, twin, name):
+        result = twin("info", name)
+        assert (result.code, result.err) == (0, "")
+        rows = dict(
+            [cell.strip() for cell in line.strip("│").split("│")]
+            for line in result.out.splitlines()
+            if line.startswith("│")
+        )
+        assert "-0.0000" not in result.out
+        robot = load(name)
+        for section in ("geometry", "limits"):
+            for field in vars(getattr(robot, section)):
+                assert rows[f"{section}: {field}"], field
+        assert rows["geometry: base_radius"].endswith(" m")
+        if robot.dynamics_kernel is not None:
+            assert rows["inertia: platform_mass"].endswith(" kg")
+            assert rows["limits: effort"].endswith(f" {robot.effort_unit}")
+            # A fraction of a length, not a length.
+            com = rows.get("inertia: arm_com") or rows["inertia: link_com"]
+            assert " of the " in com
+
+
+def test_overconstraint_is_named(twin):
+    assert "constraint couples" in twin("info", "upr_rpu").out
+    assert "│ no:" in twin("info", "delta_cu").out
+
+
+class TestCompliance:
+    def test_json_is_what_the_library_says(self, twin):
+        result = twin(
+            "compliance", "upr_rpu", *POSE, "--json", "--wrench", ",".join(map(str, WRENCH))
+        )
+        assert (result.code, result.err) == (0, "")
+        data = parse(result.out)
+        robot = load("upr_rpu")
+        energy = strain_energy(robot, POSE, WRENCH)
+        assert np.array_equal(data["compliance"], compliance(robot, POSE))
+        assert np.array_equal(data["deflection"], energy.deflection)
+        assert data["factors"] == dict(zip(energy.elements, energy.factors, strict=True))
+        assert (data["dominant"], data["total_energy"]) == (energy.dominant, energy.total)
+        assert (list(data["pose"].values()), data["wrench"]) == (list(POSE), list(WRENCH))
+
+    def test_the_text_has_units_and_names_the_dominant_element_first(self, twin):
+        result = twin("compliance", "upr_rpu", *POSE)
+        assert (result.code, result.err) == (0, "")
+        assert "m and rad, per N and N m" in result.out
+        assert "deflection (um, urad)" in result.out
+        dominant = result.out.split("dominant element ")[1].split()[0]
+        assert f"shares: {dominant} " in result.out
+
+    def test_two_dashes_before_a_negative_number_are_allowed_not_needed(self, twin):
+        plain = twin("compliance", "upr_rpu", "-0.6", "-1e-3", "0")
+        dashed = twin("compliance", "upr_rpu", "--", "-0.6", "-1e-3", "0")
+        assert plain.code == 0
+        assert plain.out == dashed.out
+
+    def test_no_load_has_no_dominant_element(self, twin):
+        assert parse(twin("compliance", "upr_rpu", *POSE, "--json", "--wrench", "0,0,0,0,0,0").out)[
+            "dominant"
+        ] == ("none")
+
+    @pytest.mark.parametrize(
+        ("arguments", "code", "text"),
+        [
+            (("upr_rpo", -0.6, 0, 0), 1, "did you mean 'upr_rpu'"),
+            (("delta_cu", 0, 0, -0.4), 1, "elastic members"),
+            (("upr_rpu", 0.6, 0, 0), 1, "unreachable: limb"),
+            (("upr_rpu", -1e300, 0, 0), 1, ""),
+            (("upr_rpu", -0.6, 0, 0, "--wrench", "1e300,0,0,0,0,0"), 1, "finite"),
+            (("upr_rpu", -0.6, 0), 2, "z (m), beta (rad), gamma (rad)"),
+            (("upr_rpu", "nan", 0, 0), 2, "z (m), beta (rad), gamma (rad)"),
+            (("upr_rpu", "z", 0, 0), 2, "pose"),
+            (("upr_rpu", -0.6, 0, 0, "--jsn"), 2, ""),
+            (("upr_rpu", -0.6, 0, 0, "--wrench", "1,2,3"), 2, "6 numbers"),
+            (("upr_rpu", -0.6, 0, 0, "--wrench", "nan,0,0,0,0,0"), 2, "6 numbers"),
+        ],
+    )
+    def test_refusals(self, twin, arguments, code, text):
+        result = twin("compliance", *arguments)
+        assert (result.code, result.out) == (code, "")
+        assert text in result.err
+        if code == 1:
+            result.one_line_error()
+
+    def test_a_bad_robot_file_is_one_line(self, twin, tmp_path):
+        path = tmp_path / "bad.yaml"
+        path.write_text("mechanism: delta\ngeometry: {base_radius: -1}\n")
+        assert "geometry" in twin("info", path).one_line_error()
+        assert twin("info", tmp_path / "absent.yaml").code == 1

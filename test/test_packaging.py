@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The package as colcon and pip build it from a clean copy of the tree."""
+
+import ast
+import configparser
+import os
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+import pkm_twin
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+EXECUTABLES = {"delta_dynamics", "stiffness_monitor", "pkm-twin"}
+COLCON = Path(sys.executable).with_name("colcon")
+needs_colcon = pytest.mark.skipif(
+    not COLCON.exists(), reason="colcon is not installed beside this Python"
+)
+
+
+@cache
+def tracked():
+    """Files that a clone has, and those that are about to be committed."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    try:
+        listed = subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a git checkout")
+    names = [Path(name) for name in listed.decode().split("\0") if name]
+    return [name for name in names if (REPOSITORY / name).is_file()]
+
+
+def run(*command, cwd, **environment):
+    done = subprocess.run(
+        [str(word) for word in command],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory):
+    """A clean copy of the tree, without recordings and tests."""
+    target = tmp_path_factory.mktemp("workspace") / "src/pkm_twin"
+    for name in tracked():
+        if name.parts[0] not in ("bags", "test", "docs"):
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(REPOSITORY / name, target / name)
+    return target
+
+
+def modules():
+    """Every Python file that belongs to the installed packages."""
+    tops = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
+    return {str(name) for name in tracked() if name.parts[0] in tops and name.suffix == ".py"}
+
+
+def robots():
+    return {name.stem for name in tracked() if name.parts[0] == "config" and name.suffix == ".yaml"}
+
+
+def check_installation(site, folder):
+    """Load every robot from an unpacked installation, away from the tree."""
+    for name in modules():
+        assert (site / name).is_file(), f"{name} is not installed: is its package in setup.py?"
+    for typed in ("pkm_twin", "delta_dynamics", "stiffness_monitor"):
+        assert (site / typed / "py.typed").is_file()
+    code = (
+        "import pkm_twin; from pkm_twin import load, robot_names;"
+        "print(pkm_twin.__file__); print(*[load(name).name for name in robot_names()])"
+    )
+    place, names = run(sys.executable, "-c", code, cwd=folder, PYTHONPATH=str(site)).splitlines()
+    assert Path(place) == site / "pkm_twin/__init__.py"
+    assert set(names.split()) == robots()
+
+
+@pytest.fixture(scope="module")
+def wheel(copy, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    # Without the wheel package, pip has to fetch it into an isolated build.
+    isolation = [] if find_spec("wheel") is None else ["--no-build-isolation"]
+    command = ["-m", "pip", "wheel", "--quiet", "--no-deps", *isolation, "--wheel-dir", folder]
+    run(sys.executable, *command, copy, cwd=folder)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+class TestWheel:
+    def test_holds_all_modules_and_robots(self, wheel, tmp_path):
+        with zipfile.ZipFile(wheel) as archive:
+            archive.extractall(tmp_path / "site")
+        check_installation(tmp_path / "site", tmp_path)
+
+    def test_metadata(self, wheel):
+        with zipfile.ZipFile(wheel) as archive:
+            names = archive.namelist()
+            folder = next(name.split("/")[0] for name in names if ".dist-info/" in name)
+            metadata = archive.read(f"{folder}/METADATA").decode()
+            points = configparser.ConfigParser()
+            points.read_string(archive.read(f"{folder}/entry_points.txt").decode())
+            tops = set(archive.read(f"{folder}/top_level.txt").decode().split())
+        assert f"\nVersion: {pkm_twin.__version__}\n" in metadata
+        assert set(points["console_scripts"]) == EXECUTABLES
+        # Tests and recorders are not for installing.
+        assert tops == {"pkm_twin", "delta_dynamics", "stiffness_monitor"}
+        # A machine with ROS 2 must not get a second one.
+        required = re.findall(r"^Requires-Dist: (.*)$", metadata, re.MULTILINE)
+        assert all("extra ==" in line for line in required if line.startswith("ros-"))
+
+
+@needs_colcon
+class TestColcon:
+    def test_list(self, copy):
+        workspace = copy.parents[1]
+        listed = run(COLCON, "list", cwd=workspace).split()
+        assert listed == ["pkm_twin", "src/pkm_twin", "(ros.ament_python)"]
+
+    def test_build(self, copy, tmp_path):
+        workspace = copy.parents[1]
+        # The build's Python is this one, as an unactivated venv needs to be told.
+        path = os.pathsep.join((str(COLCON.parent), os.environ["PATH"]))
+        run(COLCON, "build", cwd=workspace, PATH=path)
+        prefix = workspace / "install/pkm_twin"
+        assert {file.name for file in (prefix / "lib/pkm_twin").iterdir()} == EXECUTABLES
+        share = prefix / "share/pkm_twin"
+        assert (share / "package.xml").is_file()
+        assert (share / "launch/twin.launch.py").is_file()
+        assert {file.stem for file in (share / "config").glob("*.yaml")} == robots()
+        marker = prefix / "share/ament_index/resource_index/packages/pkm_twin"
+        assert marker.is_file()
+        (site,) = prefix.glob("lib/python*/site-packages")
+        check_installation(site, tmp_path)
+
+        start = sys.executable, prefix / "lib/pkm_twin/pkm-twin"
+        listed = run(*start, "robots", cwd=tmp_path, PYTHONPATH=str(site))
+        assert {line.split()[0] for line in listed.splitlines()} == robots()
+        assert "Usage: pkm-twin" in run(*start, "--help", cwd=tmp_path, PYTHONPATH=str(site))
+        arguments = "--ros-args", "-p", "mechanism:=no_such_robot"
+        for node in EXECUTABLES - {"pkm-twin"} if find_spec("rclpy") else ():
+            refused = subprocess.run(
+                [*start[:1], start[1].with_name(node), *arguments],
+                cwd=tmp_path,
+                env={**os.environ, "PYTHONPATH": str(site)}
+                | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "87"},
+                capture_output=True,
+                text=True,
+                timeout=60,
+            )
+            assert refused.returncode == 1, refused.stderr
+            assert "no_such_robot" in refused.stderr
+
+
+@pytest.fixture(scope="module")
+def manifest():
+    package = pytest.importorskip("catkin_pkg.package", reason="catkin_pkg is not installed")
+    # Reading validates too.
+    return package.parse_package(str(REPOSITORY / "package.xml"))
+
+
+class TestManifest:
+    def test_is_of_this_package(self, manifest):
+        assert manifest.package_format == 3
+        assert manifest.name == "pkm_twin"
+        assert manifest.licenses == ["Apache-2.0"]
+        assert manifest.get_build_type() == "ament_python"
+        assert (REPOSITORY / "resource" / manifest.name).is_file()
+
+    def test_names_every_message_package_that_is_imported(self, manifest):
+        depends = {depend.name for depend in manifest.exec_depends}
+        imported = set()
+        for name in modules():
+            for node in ast.walk(ast.parse((REPOSITORY / name).read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ImportFrom) and not node.level:
+                    imported.add(node.module.split(".")[0])
+                elif isinstance(node, ast.Import):
+                    imported |= {alias.name.split(".")[0] for alias in node.names}
+        ros = {
+            name for name in imported if name == "rclpy" or name.endswith(("_msgs", "_interfaces"))
+        }
+        assert ros
+        assert ros <= depends
+
+    def test_one_version_everywhere(self):
+        found = {"pkm_twin": pkm_twin.__version__}
+        found["package.xml"] = ElementTree.parse(REPOSITORY / "package.xml").findtext("version")
+        setup = ast.parse((REPOSITORY / "setup.py").read_text(encoding="utf-8"))
+        found["setup.py"] = next(
+            word.value.value
+            for node in ast.walk(setup)
+            if isinstance(node, ast.Call)
+            for word in node.keywords
+            if word.arg == "version"
+        )
+        changes = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
+        found["CHANGELOG.md"] = re.search(r"^## \[?v?(\d+\.\d+\.\d+)", changes, re.MULTILINE)[1]
+        assert len(set(found.values())) == 1, found
+
+
+@pytest.fixture(scope="module")
+def tree():
+    path = REPOSITORY / "launch/twin.launch.py"
+    text = path.read_text(encoding="utf-8")
+    compile(text, str(path), "exec")
+    return ast.parse(text)
+
+
+class TestLaunchFile:
+    """launch is not among the wheels, so the file is read, not run."""
+
+    def nodes(self, tree):
+        """Keyword arguments of every Node(...)."""
+        return [
+            {word.arg: word.value for word in call.keywords}
+            for call in ast.walk(tree)
+            if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "Node"
+        ]
+
+    def strings(self, name):
+        source = (REPOSITORY / name).read_text(encoding="utf-8")
+        return {n.value for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Constant)}
+
+    def test_executables_parameters_and_topics_exist(self, tree):
+        nodes = self.nodes(tree)
+        assert {node["executable"].value for node in nodes} == EXECUTABLES - {"pkm-twin"}
+        for node in nodes:
+            assert node["package"].value == "pkm_twin"
+            known = self.strings(f"{node['executable'].value}/node.py") | {"use_sim_time"}
+            (parameters,) = node["parameters"].elts
+            assert {key.value for key in parameters.keys} <= known
+            topics = {pair.elts[0].value for pair in node["remappings"].elts}
+            assert topics
+            assert topics <= known
+
+    def test_every_configuration_is_a_declared_argument(self, tree):
+        function = next(node for node in tree.body if isinstance(node, ast.FunctionDef))
+        declared = {key.value for key in function.body[0].value.keys}
+        used = {
+            call.args[0].value
+            for call in ast.walk(tree)
+            if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "LaunchConfiguration"
+        }
+        assert used == declared
