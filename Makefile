@@ -11,6 +11,7 @@ help:
 	@echo "make test         lint, types and tests"
 	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
+	@echo "make certificate  torques against three other engines, into docs/certificate.md"
 	@echo "make fuzz         damage every kind of byte of a bag, at length"
 	@echo "make clean        remove .venv, out and caches"
 
@@ -46,6 +47,9 @@ bench: $(VENV)/bench.stamp
 	mkdir -p out
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest test/benchmarks -m benchmark_run --benchmark-disable-gc --benchmark-json=out/benchmarks.json
 	$(BIN)/python -m test.benchmarks.report out/benchmarks.json docs/benchmarks.md
+
+certificate: $(VENV)/certificate.stamp
+	$(BIN)/python -m test.certificate
 
 fuzz: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m long test/bags

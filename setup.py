@@ -15,6 +15,7 @@ setup(
     python_requires=">=3.11",
     packages=[
         "pkm_twin",
+        "pkm_twin.atlas",
         "pkm_twin.config",
         "pkm_twin.mechanisms",
         "delta_dynamics",
@@ -71,7 +72,10 @@ setup(
             "types-PyYAML",
             "wheel",
         ],
-        "bags": ["pin", "PyNiteFEA", "scipy"],
+        "atlas": ["h5netcdf", "netCDF4", "plotly", "xarray"],
+        "cluster": ["dask[distributed]"],
+        "bags": ["pin", "PyNiteFEA"],
+        "certificate": ["mpmath", "mujoco", "pin"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },
     entry_points={

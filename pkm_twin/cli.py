@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.atlas import commands as atlases
 from pkm_twin.errors import PkmTwinError
 
 app = typer.Typer(
@@ -325,6 +326,10 @@ def recover(
         typer.echo(f"{out}: {result.messages} messages saved, {lost}")
     if not result.lossless:
         raise typer.Exit(SALVAGED)
+
+
+app.command()(atlases.atlas)
+app.command()(atlases.show)
 
 
 @contextmanager

@@ -115,8 +115,8 @@ class Members:
     """Arms and forearms as tubes, whose masses stand in the inertia section; for modes only.
 
     ``forearm``: each of a parallelogram's two rods, ``parallelogram_width`` apart (m), half of
-    the forearm's mass each. ``rcu_forearm``: the one rod of an rcu limb, required where there is
-    one. ``platform_inertia``: about the platform's origin, kg m2; default a thin disc of the
+    the forearm's mass each. ``rcu_forearm``: the one rod of an rcu limb, for modes of a robot that
+    has one. ``platform_inertia``: about the platform's origin, kg m2; default a thin disc of the
     platform's radius. ``drive_compliance``: of a locked drive, rad/(N m); ``elbow_compliance`` and
     ``platform_joint_compliance``: of each rod's end in all directions that it holds, m/N.
     """
@@ -302,7 +302,11 @@ class Delta(Robot):
         return Frame(np.array(pose), tuple(beams), tuple(bodies))
 
     def _sections(self) -> tuple[Section, tuple[Section, ...]]:
-        """Sections of an arm and of each limb's rods."""
+        """Sections of an arm and of each limb's rods.
+
+        Checked here and not at loading: dynamics of a robot whose masses or closures were changed
+        need no sections.
+        """
         g, m, members = self.geometry, self.inertia, self.members
         assert members is not None  # noqa: S101
         arm = members.arm.section(m.arm_mass / g.arm_length, "members.arm")

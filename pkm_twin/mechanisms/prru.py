@@ -53,7 +53,15 @@ from pkm_twin.mechanisms.bodies import (
     TWIST,
     virtual_work,
 )
-from pkm_twin.mechanisms.joints import GROUND, MOVING, Joint, PlatformMotion, joint
+from pkm_twin.mechanisms.frame import Frame, Member, RigidBody, Support, Tube, disc
+from pkm_twin.mechanisms.joints import (
+    GROUND,
+    MOVING,
+    Joint,
+    PlatformMotion,
+    joint,
+    platform_motion,
+)
 from pkm_twin.mechanisms.robot import (
     SINGULARITY_BOUND,
     Friction,
@@ -160,6 +168,13 @@ class Inertia:
 
 
 @dataclass(frozen=True, eq=False)
+class Members:
+    """A limb's two links as one tube with the masses of both; for modes only."""
+
+    limb: Tube = parameters.section(Tube)
+
+
+@dataclass(frozen=True, eq=False)
 class Prru(Robot):
     """A 3-PRRU head with three vertical sliders."""
 
@@ -171,6 +186,7 @@ class Prru(Robot):
     gravity: Array = parameters.vector(3, default=[0, 0, -9.81])
     joints: tuple[str, ...] = parameters.names(3, default=["slider_1", "slider_2", "slider_3"])
     limits: Limits = parameters.section(Limits, default={})
+    members: Members | None = parameters.section(Members, default=None)
 
     description: ClassVar[str] = "3-PRRU head, three vertical sliders and two links a limb"
     mobility: ClassVar[str] = "3: translation z, rotations alpha, beta (x, y, gamma follow)"
@@ -262,6 +278,52 @@ class Prru(Robot):
                 joint(f"platform joint {limb}", (upper, MOVING), corner, along, {"n": n}),
             ]
         return tuple(joints)
+
+    def frame(self, pose: Array) -> Frame:
+        """Limbs between locked sliders and the platform.
+
+        The joints are those of :meth:`body_joints`: a limb turns about t and about itself at its
+        slider, about h and d x h at the platform. The sliders stand still.
+
+        :param pose: shape (3,): z (m), alpha, beta (rad).
+        :raises ParameterError: the file has no members.
+        """
+        g, m = self.geometry, self.inertia
+        if self.members is None:
+            raise ParameterError(
+                "members", None, "a section that gives the limbs' section, for modes"
+            )
+        spread = (m.lower_link_mass + m.upper_link_mass) / g.limb_length
+        section = self.members.limb.section(spread, "members.limb")
+        q = self.inverse(pose)
+        platform = platform_motion(self, q)
+        turn, up, free = platform.axes, np.array([0.0, 0.0, 1.0]), math.inf
+        beams: list[Member] = []
+        for i, limb in enumerate(("I", "II", "III")):
+            e = np.array([math.cos(g.azimuths[i]), math.sin(g.azimuths[i]), 0.0])
+            t = np.cross(up, e)
+            start = q[i] * up - g.base_radius * e
+            end = platform.position - g.platform_radius * (turn @ e)
+            d = (end - start) / np.linalg.norm(end - start)
+            h = turn @ t
+            across = np.cross(d, h)
+            across /= np.linalg.norm(across)
+            foot = np.column_stack((d, t, np.cross(d, t)))
+            head = np.column_stack((h, across, np.cross(h, across)))
+            inner = Support(f"slider joint {limb}", GROUND, foot, (0.0, 0.0, 0.0, free, free, 0.0))
+            outer = Support(
+                f"platform joint {limb}", MOVING, head, (0.0, 0.0, 0.0, free, free, 0.0)
+            )
+            beams.append(Member(f"limb {limb}", f"limb {limb}", section, start, end, inner, outer))
+        own = m.platform_inertia
+        if own is None:
+            own = disc(m.platform_mass, g.platform_radius)
+        bodies = [RigidBody(MOVING, m.platform_mass, turn @ m.platform_com, turn @ own @ turn.T)]
+        load = self.payload
+        if load.mass > 0.0:
+            inertia = turn @ load.inertia @ turn.T
+            bodies.append(RigidBody("payload", load.mass, turn @ load.com, inertia))
+        return Frame(platform.position, tuple(beams), tuple(bodies))
 
     def _pack(self) -> list[float]:
         g, m = self.geometry, self.inertia

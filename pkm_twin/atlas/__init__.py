@@ -1,0 +1,7 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Atlases: one quantity over a whole grid of poses, swept in chunks, stored as NetCDF, drawn.
+
+A kind of atlas is a :class:`~pkm_twin.atlas.sweep.Sweep`; ``run.py`` computes its chunks on this
+machine or on a Dask cluster, ``store.py`` keeps them and joins them into one file, ``figures.py``
+and ``html.py`` draw the file. xarray, h5netcdf, plotly and dask are extras, imported on first use.
+"""

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Computing a sweep: here in one process or on all cores, or on a Dask cluster.
+
+Chunks are independent, so the results are the same bit for bit wherever and in whatever order they
+are computed. Few chunks are in flight at a time, and each goes to disk when it is done: memory
+does not grow with the sweep.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any, Final
+
+import pkm_twin
+from pkm_twin.atlas.extras import require
+from pkm_twin.atlas.store import AtlasError, Parts, join, save_part
+from pkm_twin.atlas.sweep import Chunk, Sweep, Values
+from pkm_twin.errors import PkmTwinError
+
+Progress = Callable[[int], None]
+Work = Sequence[tuple[int, Chunk]]
+
+ATTEMPTS: Final = 3
+"""How often workers may die at one chunk before the sweep is given up."""
+FEW: Final = 3
+"""Chunks that are not worth starting processes for."""
+CONNECT: Final = "10s"
+"""How long a scheduler may take to answer."""
+IN_FLIGHT: Final = 2
+"""Chunks a worker that are handed out at a time."""
+
+
+class ClusterError(PkmTwinError):
+    """A Dask scheduler that does not answer, or a cluster that keeps losing its workers."""
+
+
+def run(
+    sweep: Sweep,
+    out: Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Compute a sweep into a NetCDF file; chunks that an earlier, stopped run finished are kept.
+
+    :param workers: processes on this machine; default one a core, 1 is this process alone.
+    :param scheduler: address of a Dask scheduler, which then does the work.
+    :param overwrite: replace the target, and chunks of another sweep.
+    :param progress: called with the number of points done.
+    :raises AtlasError: the target exists, or the kept chunks belong to another sweep.
+    :raises ClusterError: no scheduler, or workers that keep dying.
+    :raises MissingExtraError: a package that is not installed.
+    """
+    # Before hours of work.
+    require("h5netcdf", "atlas")
+    if workers is not None and workers < 1:
+        raise PkmTwinError(f"workers is {workers}; it has to be 1 or more")
+    if out.exists() and not overwrite:
+        raise AtlasError(out, "exists; give --overwrite to replace it")
+    parts = Parts(out, sweep)
+    parts.open(overwrite)
+    chunks = sweep.chunks()
+    pending = set(parts.pending())
+    done = sum(sweep.count(chunk) for i, chunk in enumerate(chunks) if i not in pending)
+    tell = progress or (lambda _: None)
+    tell(done)
+    work = [(i, chunks[i]) for i in sorted(pending)]
+    results: Iterator[tuple[int, Values | None]]
+    if scheduler is not None:
+        results = on_cluster(sweep, work, scheduler)
+    else:
+        count = workers or os.cpu_count() or 1
+        alone = count == 1 or len(work) <= FEW
+        results = here(sweep, work) if alone else on_cores(sweep, work, count, parts.folder)
+    for index, values in results:
+        if values is not None:
+            parts.save(index, values)
+        done += sweep.count(chunks[index])
+        tell(done)
+    join(sweep, parts, out)
+    parts.drop()
+    return out
+
+
+def here(sweep: Sweep, work: Work) -> Iterator[tuple[int, Values]]:
+    """Chunks one after the other in this process."""
+    for index, chunk in work:
+        yield index, sweep.evaluate(chunk)
+
+
+def on_cores(
+    sweep: Sweep, work: Work, workers: int, folder: Path
+) -> Iterator[tuple[int, Values | None]]:
+    """Chunks on processes of this machine, in the order in which they are done.
+
+    The processes keep their chunks in the folder themselves (None here): only a number goes
+    through the pipe, which a process that is killed in the middle of a long message would block.
+    A killed process costs its chunk's time.
+    """
+    # The first chunk compiles what the others load; processes that all compile would waste it.
+    first = next((k for k, (_, chunk) in enumerate(work) if sweep.count(chunk)), 0)
+    yield from here(sweep, [work[first]])
+    rest = dict([*work[:first], *work[first + 1 :]])
+    broken = 0
+    while rest:
+        try:
+            for index in _pool(sweep, list(rest.items()), min(workers, len(rest)), folder):
+                del rest[index]
+                yield index, None
+        except BrokenProcessPool:
+            broken += 1
+            if broken == ATTEMPTS:
+                raise ClusterError(f"processes died {ATTEMPTS} times in this sweep") from None
+
+
+def _pool(sweep: Sweep, work: Work, workers: int, folder: Path) -> Iterator[int]:
+    # Not forked: the parent has threads (the progress bar's, numba's).
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_interrupts)
+    queue = iter(work)
+    flying: set[Future[int]] = set()
+    try:
+        while True:
+            for index, chunk in queue:
+                flying.add(pool.submit(_keep, sweep, chunk, folder, index))
+                if len(flying) >= IN_FLIGHT * workers:
+                    break
+            if not flying:
+                break
+            finished, flying = wait(flying, return_when=FIRST_COMPLETED)
+            for future in finished:
+                yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def on_cluster(sweep: Sweep, work: Work, scheduler: str) -> Iterator[tuple[int, Values]]:
+    """Chunks on a Dask cluster, in the order in which they are done.
+
+    The scheduler gives the chunks of a lost worker to another one.
+
+    :raises ClusterError: no scheduler answers, it has no workers, or chunks keep losing theirs.
+    """
+    distributed = require("distributed", "cluster")
+    try:
+        client = distributed.Client(scheduler, timeout=CONNECT, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ClusterError(f"no Dask scheduler answers at {scheduler}: {error}") from None
+    with client:
+        threads = sum(client.nthreads().values())
+        if not threads:
+            raise ClusterError(f"the Dask scheduler at {scheduler} has no workers")
+        queue = iter(work)
+
+        def submit() -> list[Any]:
+            return [
+                client.submit(
+                    compute,
+                    sweep,
+                    chunk,
+                    pkm_twin.__version__,
+                    key=f"atlas-{sweep.fingerprint[:16]}-{index}",
+                    pure=False,
+                )
+                for index, chunk in _some(queue, 1)
+            ]
+
+        flying: list[Any] = []
+        for _ in range(IN_FLIGHT * threads):
+            flying += submit()
+        finished = distributed.as_completed(flying, loop=client.loop)
+        del flying
+        for future in finished:
+            try:
+                values = future.result()
+            except distributed.KilledWorker as error:
+                raise ClusterError(f"workers kept dying: {error}") from None
+            index = int(future.key.rpartition("-")[2])
+            del future
+            yield index, values
+            for following in submit():
+                finished.add(following)
+
+
+def compute(sweep: Sweep, chunk: Chunk, version: str) -> Values:
+    """One chunk, in a worker.
+
+    :raises PkmTwinError: what the chunk raises, in a form that passes between processes; or a
+        worker with another version of this package.
+    """
+    if pkm_twin.__version__ != version:
+        raise PkmTwinError(f"a worker has pkm_twin {pkm_twin.__version__}, not {version}")
+    try:
+        return sweep.evaluate(chunk)
+    except PkmTwinError as error:
+        raise PkmTwinError(str(error)) from None
+
+
+def _keep(sweep: Sweep, chunk: Chunk, folder: Path, index: int) -> int:
+    save_part(folder, index, compute(sweep, chunk, pkm_twin.__version__))
+    return index
+
+
+def _some(queue: Iterator[tuple[int, Chunk]], count: int) -> Iterator[tuple[int, Chunk]]:
+    for _, item in zip(range(count), queue, strict=False):
+        yield item
+
+
+def _leave_interrupts() -> None:
+    """Ctrl-C goes to all processes of a terminal; the parent decides what it means."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The comparison with other engines at length: ``make certificate``."""

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the twin with other engines at length and write docs/certificate.md.
+
+Fails where a bound is exceeded; the document is written all the same and says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from test.certificate.compare import Figures, compare
+from test.certificate.machines import ROBOTS
+from test.certificate.report import document
+from test.certificate.swing import Swing, run, starts
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m test.certificate", description=__doc__)
+    parser.add_argument("--machines", type=int, default=50, help="random machines a robot")
+    parser.add_argument("--states", type=int, default=20, help="random states a machine")
+    parser.add_argument("--exact", type=int, default=10, help="of these by the Lagrange route")
+    parser.add_argument("--seed", type=int, default=20261121)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--no-swing", action="store_true", help="leave the free swings out")
+    parser.add_argument("--output", type=Path, default=Path("docs/certificate.md"))
+    options = parser.parse_args()
+    exact = min(options.exact, options.states)
+
+    figures = {name: Figures() for name in ROBOTS}
+    results: dict[tuple[int, int], Figures] = {}
+    swings: dict[int, list[Swing]] = {}
+    begun = [] if options.no_swing else starts()
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    context = multiprocessing.get_context("spawn")
+    with (
+        Progress(*columns, TimeElapsedColumn(), console=console) as progress,
+        ProcessPoolExecutor(options.jobs, mp_context=context) as pool,
+    ):
+        machines = progress.add_task("random machines", total=len(ROBOTS) * options.machines)
+        swinging = progress.add_task("free swings", total=len(begun))
+        # The long ones first.
+        work = {pool.submit(run, start): ("swing", k, 0) for k, start in enumerate(begun)}
+        for number in range(options.machines):
+            for k, name in enumerate(ROBOTS):
+                seed = options.seed, k, number
+                job = pool.submit(compare, name, seed, options.states, exact)
+                work[job] = ("machine", k, number)
+        for job in as_completed(work):
+            kind, k, number = work[job]
+            if job.exception() is not None:
+                pool.shutdown(wait=False, cancel_futures=True)
+            if kind == "swing":
+                swings[k] = job.result()
+                progress.advance(swinging)
+            else:
+                results[k, number] = job.result()
+                progress.advance(machines)
+    for (k, _), found in sorted(results.items()):
+        figures[ROBOTS[k]].add(found)
+    runs = [swing for k in sorted(swings) for swing in swings[k]]
+    text, failures = document(figures, runs, "python -m test.certificate", options.seed)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.write_text(text)
+    console.print(f"{options.output} written")
+    for line in failures:
+        console.print(line, style="red")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One random machine through all routes, and the collected figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.reactions import reactions
+from delta_dynamics.virtual_work import energy
+from pkm_twin.mechanisms.joints import platform_motion
+from test.certificate.lagrange import energies
+from test.certificate.machines import Case, friction, random_case
+from test.certificate.mujoco_models import tree
+from test.certificate.swing import engine_of
+
+ROUTES = ("Pinocchio", "MuJoCo", "Lagrange")
+BOUNDS = {"Pinocchio": 1e-9, "MuJoCo": 1e-6, "Lagrange": 1e-9}
+"""Greatest relative difference of the torques that passes."""
+PLACE_BOUND = 1e-9
+"""Greatest difference of the platform's centre that passes, m."""
+BALANCE_BOUNDS = {"residual": 1e-10, "efforts": 1e-9, "power": 1e-9, "energy": 1e-9}
+
+
+@dataclass
+class Figures:
+    """What was found; lists with one number a state."""
+
+    machines: int = 0
+    efforts: dict[str, list[float]] = field(default_factory=lambda: {r: [] for r in ROUTES})
+    places: dict[str, list[float]] = field(default_factory=lambda: {r: [] for r in ROUTES})
+    balances: dict[str, list[float]] = field(
+        default_factory=lambda: {name: [] for name in BALANCE_BOUNDS}
+    )
+
+    def add(self, other: Figures) -> None:
+        """Take in the figures of another machine."""
+        self.machines += other.machines
+        for mine, theirs in (
+            (self.efforts, other.efforts),
+            (self.places, other.places),
+            (self.balances, other.balances),
+        ):
+            for key, values in theirs.items():
+                mine[key] += values
+
+
+def difference(got: np.ndarray, expected: np.ndarray) -> float:
+    """Greatest difference over the greatest expected amount."""
+    return float(np.abs(got - expected).max() / np.abs(expected).max())
+
+
+def compare(name: str, seed: tuple[int, ...], states: int, exact: int) -> Figures:
+    """All routes over one random machine; the first ``exact`` states by the Lagrange route."""
+    return compare_case(random_case(name, np.random.default_rng(seed), states), exact)
+
+
+def compare_case(case: Case, exact: int) -> Figures:
+    """As :func:`compare`, for a machine that is there."""
+    figures = Figures(machines=1)
+    robot, data = case.robot, case.data
+    got = inverse_dynamics(robot, case.q, case.qd, case.qdd, case.wrench)
+    platform = platform_motion(robot, case.q)
+    motion = platform_motion(robot, case.q, case.qd)
+    joint = reactions(robot, case.q, case.qd, case.qdd, case.wrench)
+    drag = friction(data, case.qd)
+    figures.balances["residual"] = joint.residual.tolist()
+    figures.balances["efforts"] = [
+        difference(one, other) for one, other in zip(joint.efforts, got - drag, strict=True)
+    ]
+
+    engine, mechanics, source = engine_of(data), tree(data), energies(data)
+    stored = energy(robot, case.q, case.qd).total
+    spin = _spin(motion.axes, motion.axes_rate)
+    for k in range(len(case.q)):
+        state = case.q[k], case.qd[k], case.qdd[k]
+        full = engine.state(*state)
+        effort = engine.actuator_effort(full, case.wrench[k])[0] + engine.friction(case.qd[k])
+        place = engine.platform_placement(full.q).translation
+        _note(figures, "Pinocchio", got[k], effort, platform.position[k], place)
+
+        effort = mechanics.inverse_dynamics(*state, case.wrench[k]) + drag[k]
+        _note(figures, "MuJoCo", got[k], effort, platform.position[k], mechanics.platform()[0])
+
+        if k >= exact:
+            continue
+        result = source.solve(*state, case.wrench[k])
+        effort = result.effort + drag[k]
+        _note(figures, "Lagrange", got[k], effort, platform.position[k], result.platform)
+        # The twin's efforts and velocities against the rate of the other route's energy.
+        shares = (got[k] - drag[k]) * case.qd[k]
+        load = case.wrench[k, :3] @ motion.velocity[k] + case.wrench[k, 3:] @ spin[k]
+        scale = np.abs(shares).sum() + abs(load)
+        figures.balances["power"].append(
+            float(abs(shares.sum() + load - result.energy_rate) / scale)
+        )
+        size = abs(result.energy) + abs(result.kinetic)
+        figures.balances["energy"].append(float(abs(stored[k] - result.energy) / size))
+    return figures
+
+
+def _note(
+    figures: Figures,
+    route: str,
+    got: np.ndarray,
+    effort: np.ndarray,
+    mine: np.ndarray,
+    place: np.ndarray,
+) -> None:
+    figures.efforts[route].append(difference(got, effort))
+    figures.places[route].append(float(np.abs(mine - place).max()))
+
+
+def _spin(axes: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Angular velocity from the axes and their rates: half the sum of axis x rate."""
+    return 0.5 * np.cross(axes, rates, axis=-2).sum(-1)

@@ -1,0 +1,506 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Actuator efforts from energies alone, in 50 digits.
+
+A machine here is points and directions: where the bodies' points are for given actuator positions,
+found by Newton's method on lengths and planes, and the kinetic and potential energy as functions
+of those points and of their velocities. Everything else is differentiation. All derivatives,
+the velocities too, are central differences at steps of 1e-14, which in 50 digits leaves more
+than 20 good ones:
+
+    T(q, q') from the points' velocities, (X(q + h q') - X(q - h q')) / 2 h
+    tau_j = d/dt (dT/dq'_j) - dT/dq_j + dV/dq_j - F . do/dq_j - M . turn_j
+
+May import: mpmath, numpy (for the start of Newton's method), the standard library; nothing of the
+twin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import mpmath
+import numpy as np
+
+DIGITS = 50
+STEP = mpmath.mpf(10) ** -14
+WAY = 12
+"""Steps from the symmetric assembly to the wanted one."""
+
+Vector = list[Any]
+
+
+class Result(NamedTuple):
+    """What Euler and Lagrange's equations give for one state."""
+
+    effort: np.ndarray
+    """Efforts without friction, shape (3,), N m or N."""
+    platform: np.ndarray
+    """The platform's centre, shape (3,), m."""
+    energy: float
+    """Kinetic and potential energy, J."""
+    kinetic: float
+    """The kinetic part, J."""
+    energy_rate: float
+    """Its derivative in time, W."""
+    wrench_power: float
+    """Power of the wrench, W."""
+
+
+class Shape(NamedTuple):
+    """All that the energies need of one assembled configuration."""
+
+    points: list[Vector]
+    """Points and directions whose velocities the kinetic energy is made of."""
+    centre: Vector
+    axes: list[Vector]
+    """The platform's axes x, y, z in the world."""
+
+
+def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Sequence[Any], b: Sequence[Any]) -> Vector:
+    return [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
+
+
+def plus(a: Sequence[Any], b: Sequence[Any], factor: Any = 1) -> Vector:
+    return [a[k] + factor * b[k] for k in range(3)]
+
+
+def axes_of(alpha: Any, beta: Any, gamma: Any, m: Any) -> list[Vector]:
+    """Columns of Rx(alpha) Ry(beta) Rz(gamma)."""
+    ca, sa, cb, sb = m.cos(alpha), m.sin(alpha), m.cos(beta), m.sin(beta)
+    cg, sg = m.cos(gamma), m.sin(gamma)
+    return [
+        [cb * cg, ca * sg + sa * sb * cg, sa * sg - ca * sb * cg],
+        [-cb * sg, ca * cg - sa * sb * sg, sa * cg + ca * sb * sg],
+        [sb, -sa * cb, ca * cb],
+    ]
+
+
+class Solid(NamedTuple):
+    """A body fixed to the platform: its kinetic energy needs its com and the turning axes."""
+
+    mass: Any
+    com: Vector
+    planar: list[Vector]
+    """Second moments of mass about the com, P = trace(I) / 2 - I, kg m2."""
+
+    @classmethod
+    def of(cls, mass: Any, com: Any, inertia: Any) -> Solid:
+        full = np.asarray(inertia, dtype=float)
+        full = np.diag(full) if full.shape == (3,) else full
+        exact = [[mpmath.mpf(float(v)) for v in row] for row in full]
+        half = (exact[0][0] + exact[1][1] + exact[2][2]) / 2
+        planar = [[(half if i == j else 0) - exact[i][j] for j in range(3)] for i in range(3)]
+        return cls(mpmath.mpf(float(mass)), [mpmath.mpf(float(c)) for c in com], planar)
+
+    def place(self, centre: Vector, axes: list[Vector]) -> Vector:
+        point = centre
+        for k in range(3):
+            point = plus(point, axes[k], self.com[k])
+        return point
+
+    def turning(self, rates: list[Vector]) -> Any:
+        """Kinetic energy of rotation from the velocities of the axes, half trace R' P R'T."""
+        total = mpmath.mpf(0)
+        for i in range(3):
+            for j in range(3):
+                if self.planar[i][j]:
+                    total += self.planar[i][j] * dot(rates[i], rates[j])
+        return total / 2
+
+
+class Energies:
+    """The common part: assembly, energies and their differences."""
+
+    unknowns: int
+
+    def __init__(self, params: Mapping[str, Any]) -> None:
+        exact = mpmath.mpf
+        gravity = params.get("gravity", (0.0, 0.0, -9.81))
+        self.gravity = [exact(float(v)) for v in gravity]
+        g = params["geometry"]
+        self.lengths = {k: exact(float(v)) for k, v in g.items() if isinstance(v, float)}
+        self.azimuths = [exact(float(a)) for a in g["azimuths"]]
+        with mpmath.workdps(DIGITS):
+            self.out = [[mpmath.cos(a), mpmath.sin(a), exact(0)] for a in self.azimuths]
+        self.solids: list[Solid] = []
+        payload = params.get("payload") or {}
+        if payload.get("mass"):
+            self.solids.append(
+                Solid.of(
+                    payload["mass"], payload.get("com", (0, 0, 0)), payload.get("inertia", (0,) * 3)
+                )
+            )
+        self._base: Vector = []
+        self._slope: Any = None
+
+    # What a machine has to say
+
+    def gaps(self, q: Sequence[Any], u: Sequence[Any], m: Any) -> Vector:
+        """Errors of the closure, zero in an assembled configuration; m is math or mpmath."""
+        raise NotImplementedError
+
+    def start(self, middle: float) -> list[float]:
+        """Unknowns of the symmetric assembly with all actuators at ``middle``."""
+        raise NotImplementedError
+
+    def middles(self, q: np.ndarray) -> list[float]:
+        """Where the symmetric assemblies are that a walk to ``q`` may begin from."""
+        return [float(np.mean(q))]
+
+    def shape(self, q: Vector, u: Vector) -> Shape:
+        raise NotImplementedError
+
+    def kinetic_of(self, rates: list[Vector], axes: list[Vector]) -> Any:
+        """Kinetic energy from the velocities of the points and of the platform's axes."""
+        raise NotImplementedError
+
+    def potential_of(self, shape: Shape) -> Any:
+        raise NotImplementedError
+
+    # Assembly
+
+    def _rough(self, q: np.ndarray) -> np.ndarray:
+        """Walk from a symmetric assembly, in floating point."""
+        for middle in self.middles(q):
+            try:
+                u = self._walk(q, middle)
+            except (np.linalg.LinAlgError, OverflowError):
+                continue
+            left = np.abs(np.array(self.gaps(q.tolist(), u.tolist(), math), dtype=float)).max()
+            if left < 1e-12:
+                return u
+        raise ValueError(f"no way to the assembly at {q}")
+
+    def _walk(self, q: np.ndarray, middle: float) -> np.ndarray:
+        u = np.array(self.start(middle))
+        for k in range(1, WAY + 1):
+            at = (middle + k / WAY * (q - middle)).tolist()
+            for _ in range(8):
+                error = np.array(self.gaps(at, u.tolist(), math), dtype=float)
+                slope = np.empty((self.unknowns, self.unknowns))
+                for j in range(self.unknowns):
+                    shift = 1e-7 * np.eye(self.unknowns)[j]
+                    high = np.array(self.gaps(at, (u + shift).tolist(), math), dtype=float)
+                    low = np.array(self.gaps(at, (u - shift).tolist(), math), dtype=float)
+                    slope[:, j] = (high - low) / 2e-7
+                step = np.linalg.solve(slope, error)
+                u = u - step
+                if np.abs(step).max() < 1e-10:
+                    break
+        return u
+
+    def _settle(self, q: np.ndarray) -> None:
+        """Newton's method in all digits, and its matrix for the neighbours of ``q``."""
+        at = [mpmath.mpf(float(v)) for v in q]
+        u = [mpmath.mpf(float(v)) for v in self._rough(q)]
+        tiny = mpmath.mpf(10) ** -25
+        n = self.unknowns
+        for _ in range(6):
+            slope = mpmath.matrix(n, n)
+            for j in range(n):
+                high = self.gaps(at, [v + tiny * (k == j) for k, v in enumerate(u)], mpmath)
+                low = self.gaps(at, [v - tiny * (k == j) for k, v in enumerate(u)], mpmath)
+                for i in range(n):
+                    slope[i, j] = (high[i] - low[i]) / (2 * tiny)
+            self._slope = (slope**-1).tolist()
+            change = self._correct(at, u)
+            if change < mpmath.mpf(10) ** -24:
+                break
+        self._base = u
+        self._at = at
+
+    def _correct(self, q: Vector, u: Vector) -> Any:
+        error = self.gaps(q, u, mpmath)
+        largest = mpmath.mpf(0)
+        for i, row in enumerate(self._slope):
+            step = sum(a * b for a, b in zip(row, error, strict=True))
+            u[i] -= step
+            largest = max(largest, abs(step))
+        return largest
+
+    def assemble(self, q: Vector) -> Shape:
+        """The configuration at actuator positions near those settled at."""
+        u = list(self._base)
+        for _ in range(8):
+            if self._correct(q, u) < mpmath.mpf(10) ** -(DIGITS - 14):
+                break
+        else:
+            raise ValueError("the assembly did not converge")
+        return self.shape(q, u)
+
+    # Energies
+
+    def kinetic(self, q: Vector, qd: Vector) -> Any:
+        """Kinetic energy of a state."""
+        high = self.assemble(plus(q, qd, STEP))
+        low = self.assemble(plus(q, qd, -STEP))
+        rates = [_rate(a, b) for a, b in zip(high.points, low.points, strict=True)]
+        axes = [_rate(a, b) for a, b in zip(high.axes, low.axes, strict=True)]
+        return self.kinetic_of(rates, axes)
+
+    def total(self, q: Vector, qd: Vector) -> Any:
+        """Kinetic and potential energy of a state."""
+        return self.kinetic(q, qd) + self.potential_of(self.assemble(q))
+
+    def _momentum(self, q: Vector, qd: Vector) -> Vector:
+        """Derivative of the kinetic energy by the rates; exact for a quadratic form."""
+        result = []
+        for j in range(3):
+            high = self.kinetic(q, plus(qd, _unit(j)))
+            low = self.kinetic(q, plus(qd, _unit(j), -1))
+            result.append((high - low) / 2)
+        return result
+
+    def solve(self, q: Any, qd: Any, qdd: Any, wrench: Any) -> Result:
+        """Euler and Lagrange's equations for one state, all arguments floats."""
+        with mpmath.workdps(DIGITS):
+            self._settle(np.asarray(q, dtype=float))
+            at = self._at
+            rate, change, load = (
+                [mpmath.mpf(float(v)) for v in values] for values in (qd, qdd, wrench)
+            )
+            later = plus(at, rate, STEP), plus(rate, change, STEP)
+            earlier = plus(at, rate, -STEP), plus(rate, change, -STEP)
+            gained = _rate(self._momentum(*later), self._momentum(*earlier))
+            here = self.assemble(at)
+            effort = []
+            power = mpmath.mpf(0)
+            for j in range(3):
+                high, low = plus(at, _unit(j), STEP), plus(at, _unit(j), -STEP)
+                steep = (self.kinetic(high, rate) - self.kinetic(low, rate)) / (2 * STEP)
+                up, down = self.assemble(high), self.assemble(low)
+                weight = (self.potential_of(up) - self.potential_of(down)) / (2 * STEP)
+                turned = [mpmath.mpf(0)] * 3
+                for k in range(3):
+                    moved = _rate(up.axes[k], down.axes[k])
+                    turned = plus(turned, cross(here.axes[k], moved), mpmath.mpf(1) / 2)
+                work = dot(load[:3], _rate(up.centre, down.centre)) + dot(load[3:], turned)
+                effort.append(gained[j] - steep + weight - work)
+                power += work * rate[j]
+            energy_rate = (self.total(*later) - self.total(*earlier)) / (2 * STEP)
+            return Result(
+                np.array([float(v) for v in effort]),
+                np.array([float(v) for v in here.centre]),
+                float(self.total(at, rate)),
+                float(self.kinetic(at, rate)),
+                float(energy_rate),
+                float(power),
+            )
+
+    def state_energy(self, q: Any, qd: Any) -> float:
+        """Kinetic and potential energy of a state of floats, J."""
+        with mpmath.workdps(DIGITS):
+            self._settle(np.asarray(q, dtype=float))
+            return float(self.total(self._at, [mpmath.mpf(float(v)) for v in qd]))
+
+
+class DeltaEnergies(Energies):
+    """A Delta: pivots, elbows and platform joints. The unknowns are the platform's centre."""
+
+    unknowns = 3
+
+    def __init__(self, params: Mapping[str, Any]) -> None:
+        super().__init__(params)
+        m = params["inertia"]
+        self.sliding = [c == "rcu" for c in params["geometry"].get("closures", ("rod",) * 3)]
+        exact = mpmath.mpf
+        self.platform_mass = exact(float(m["platform_mass"]))
+        self.arm_mass = exact(float(m["arm_mass"]))
+        self.forearm_mass = exact(float(m["forearm_mass"]))
+        self.arm_com = exact(float(m.get("arm_com", 0.5)))
+        with mpmath.workdps(DIGITS):
+            given = m.get("arm_inertia")
+            thin = self.arm_mass * self.lengths["arm_length"] ** 2 / 12
+            about = thin if given is None else exact(float(given))
+            self.arm_inertia = about + exact(float(m.get("rotor_inertia", 0.0)))
+
+    def middles(self, q: np.ndarray) -> list[float]:
+        """The mean angle and others where three forearms meet."""
+        size = {k: float(v) for k, v in self.lengths.items()}
+        angles = [float(np.mean(q)) + shift for shift in (0.0, 0.2, 0.4, 0.7, 1.0)]
+        reach = size["base_radius"] - size["platform_radius"]
+        return [
+            angle
+            for angle in angles
+            if abs(reach + size["arm_length"] * math.cos(angle)) < 0.99 * size["forearm_length"]
+        ]
+
+    def start(self, middle: float) -> list[float]:
+        size = {k: float(v) for k, v in self.lengths.items()}
+        out = size["base_radius"] - size["platform_radius"] + size["arm_length"] * math.cos(middle)
+        drop = math.sqrt(size["forearm_length"] ** 2 - out**2)
+        return [0.0, 0.0, -size["arm_length"] * math.sin(middle) - drop]
+
+    def _limb(self, i: int, q: Any, u: Sequence[Any], m: Any) -> tuple[Vector, Vector, Vector]:
+        """The arm's direction, the forearm's end at the elbow and at the platform."""
+        size: Callable[[Any], Any] = float if m is math else mpmath.mpf
+        r = [size(v) for v in self.out[i]]
+        base, platform, arm = (
+            size(self.lengths[k]) for k in ("base_radius", "platform_radius", "arm_length")
+        )
+        direction = [m.cos(q) * r[0], m.cos(q) * r[1], -m.sin(q)]
+        elbow = [base * r[k] + arm * direction[k] for k in range(3)]
+        corner = [u[k] + platform * r[k] for k in range(3)]
+        if self.sliding[i]:
+            axis = [-r[1], r[0], 0]
+            elbow = plus(elbow, axis, dot(plus(corner, elbow, -1), axis))
+        return direction, elbow, corner
+
+    def gaps(self, q: Sequence[Any], u: Sequence[Any], m: Any) -> Vector:
+        result = []
+        for i in range(3):
+            _, elbow, corner = self._limb(i, q[i], u, m)
+            rod = plus(corner, elbow, -1)
+            size = self.lengths["forearm_length"]
+            long = float(size) if m is math else size
+            result.append(dot(rod, rod) - long * long)
+        return result
+
+    def shape(self, q: Vector, u: Vector) -> Shape:
+        points = [p for i in range(3) for p in self._limb(i, q[i], u, mpmath)]
+        axes = [_unit(k) for k in range(3)]
+        return Shape([*points, *(s.place(u, axes) for s in self.solids), u], u, axes)
+
+    def kinetic_of(self, rates: list[Vector], axes: list[Vector]) -> Any:
+        lever = self.arm_com * self.lengths["arm_length"]
+        arm = self.arm_inertia + self.arm_mass * lever**2
+        total = self.platform_mass * dot(rates[-1], rates[-1]) / 2
+        for i in range(3):
+            turn, one, end = rates[3 * i : 3 * i + 3]
+            total += arm * dot(turn, turn) / 2
+            # A thin rod whose points move in proportion between its ends.
+            total += self.forearm_mass / 6 * (dot(one, one) + dot(one, end) + dot(end, end))
+        for solid, rate in zip(self.solids, rates[9:-1], strict=True):
+            total += solid.mass * dot(rate, rate) / 2 + solid.turning(axes)
+        return total
+
+    def potential_of(self, shape: Shape) -> Any:
+        points = shape.points
+        lever = self.arm_com * self.lengths["arm_length"]
+        total = self.platform_mass * dot(self.gravity, points[-1])
+        for i in range(3):
+            direction, one, end = points[3 * i : 3 * i + 3]
+            place = [self.lengths["base_radius"] * v for v in self.out[i]]
+            total += self.arm_mass * dot(self.gravity, plus(place, direction, lever))
+            total += self.forearm_mass * dot(self.gravity, plus(one, end)) / 2
+        for solid, place in zip(self.solids, points[9:-1], strict=True):
+            total += solid.mass * dot(self.gravity, place)
+        return -total
+
+
+class PrruEnergies(Energies):
+    """A 3-PRRU head. The unknowns are the platform's centre and its three angles.
+
+    Every platform joint stays in its limb's vertical plane at the limb's length from the slider.
+    The upper link's x axis is at a right angle to the limb and to the platform's tangent.
+    """
+
+    unknowns = 6
+
+    def __init__(self, params: Mapping[str, Any]) -> None:
+        super().__init__(params)
+        m, exact = params["inertia"], mpmath.mpf
+        self.rise = 1 if params["geometry"].get("branch", "below") == "below" else -1
+        self.slider_mass = exact(float(m["slider_mass"]))
+        self.link_com = exact(float(m.get("link_com", 0.5)))
+        self.links = []
+        with mpmath.workdps(DIGITS):
+            for name in ("lower", "upper"):
+                mass = exact(float(m[f"{name}_link_mass"]))
+                given = m.get(f"{name}_link_inertia")
+                thin = (mass * self.lengths["limb_length"] ** 2 / 12, exact(0))
+                across, about = thin if given is None else (exact(float(v)) for v in given)
+                self.links.append((mass, across, about))
+            com = m.get("platform_com", (0, 0, 0))
+            self.solids.append(Solid.of(m["platform_mass"], com, m["platform_inertia"]))
+
+    def start(self, middle: float) -> list[float]:
+        size = {k: float(v) for k, v in self.lengths.items()}
+        reach = size["base_radius"] - size["platform_radius"]
+        height = math.sqrt(size["limb_length"] ** 2 - reach**2)
+        return [0.0, 0.0, middle + self.rise * height, 0.0, 0.0, 0.0]
+
+    def _corner(self, i: int, u: Sequence[Any], axes: list[Vector], m: Any) -> Vector:
+        size: Callable[[Any], Any] = float if m is math else mpmath.mpf
+        radius = size(self.lengths["platform_radius"])
+        r = [size(v) for v in self.out[i]]
+        return plus(plus(u[:3], axes[0], -radius * r[0]), axes[1], -radius * r[1])
+
+    def gaps(self, q: Sequence[Any], u: Sequence[Any], m: Any) -> Vector:
+        size: Callable[[Any], Any] = float if m is math else mpmath.mpf
+        axes = axes_of(u[3], u[4], u[5], m)
+        base, limb = size(self.lengths["base_radius"]), size(self.lengths["limb_length"])
+        result = []
+        for i in range(3):
+            r = [size(v) for v in self.out[i]]
+            corner = self._corner(i, u, axes, m)
+            way = [corner[0] + base * r[0], corner[1] + base * r[1], corner[2] - q[i]]
+            result += [dot(way, way) - limb * limb, way[1] * r[0] - way[0] * r[1]]
+        return result
+
+    def shape(self, q: Vector, u: Vector) -> Shape:
+        axes = axes_of(u[3], u[4], u[5], mpmath)
+        base, limb = self.lengths["base_radius"], self.lengths["limb_length"]
+        points: list[Vector] = []
+        for i in range(3):
+            r = self.out[i]
+            corner = self._corner(i, u, axes, mpmath)
+            slider = [-base * r[0], -base * r[1], q[i]]
+            along = [v / limb for v in plus(corner, slider, -1)]
+            tangent = plus([-r[1] * v for v in axes[0]], axes[1], r[0])
+            x = cross(tangent, along)
+            long = mpmath.sqrt(dot(x, x))
+            x = [v / long for v in x]
+            com = plus(slider, along, self.link_com * limb)
+            points += [slider, com, along, x, cross(along, x)]
+        points += [s.place(u[:3], axes) for s in self.solids]
+        return Shape(points, u[:3], axes)
+
+    def kinetic_of(self, rates: list[Vector], axes: list[Vector]) -> Any:
+        (m_lower, i_lower, _), (m_upper, across, about) = self.links
+        total = mpmath.mpf(0)
+        for i in range(3):
+            slider, com, along, x, y = rates[5 * i : 5 * i + 5]
+            total += self.slider_mass * dot(slider, slider) / 2
+            total += (m_lower + m_upper) * dot(com, com) / 2
+            # The lower link turns in its plane only.
+            total += i_lower * dot(along, along) / 2
+            # Second moments of a round body: about / 2 sideways, across - about / 2 along.
+            total += about / 4 * (dot(x, x) + dot(y, y))
+            total += (across - about / 2) * dot(along, along) / 2
+        for solid, rate in zip(self.solids, rates[15:], strict=True):
+            total += solid.mass * dot(rate, rate) / 2 + solid.turning(axes)
+        return total
+
+    def potential_of(self, shape: Shape) -> Any:
+        total = mpmath.mpf(0)
+        for i in range(3):
+            slider, com = shape.points[5 * i : 5 * i + 2]
+            total += self.slider_mass * dot(self.gravity, slider)
+            total += (self.links[0][0] + self.links[1][0]) * dot(self.gravity, com)
+        for solid, place in zip(self.solids, shape.points[15:], strict=True):
+            total += solid.mass * dot(self.gravity, place)
+        return -total
+
+
+def energies(params: Mapping[str, Any]) -> Energies:
+    """The energies of a parameter mapping."""
+    return PrruEnergies(params) if params["mechanism"] == "prru" else DeltaEnergies(params)
+
+
+def _rate(high: Sequence[Any], low: Sequence[Any]) -> Vector:
+    return [(a - b) / (2 * STEP) for a, b in zip(high, low, strict=True)]
+
+
+def _unit(k: int) -> Vector:
+    return [mpmath.mpf(int(j == k)) for j in range(3)]

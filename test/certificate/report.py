@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures as a document."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+from importlib.metadata import version
+
+import numpy as np
+
+from test.certificate.compare import BALANCE_BOUNDS, BOUNDS, PLACE_BOUND, ROUTES, Figures
+from test.certificate.lagrange import DIGITS
+from test.certificate.machines import AZIMUTH_ERROR, LEAST_MEASURE, THIN
+from test.certificate.mujoco_models import SPECK
+from test.certificate.swing import (
+    DELTA_DEVIATION,
+    DELTA_REST,
+    DURATION,
+    PRRU_RATES,
+    SAMPLES,
+    STEP,
+    TOLERANCE,
+    TOOL,
+    Swing,
+)
+
+SWING_BOUNDS = {"drift": 1e-9, "closure": 1e-10, "DOP853": 1e-9, "its own step": 1e-7}
+"""Greatest energy drift (relative), opening of a loop (m), and differences of the end states."""
+
+BALANCES = {"residual": "bodies", "efforts": "efforts", "power": "power", "energy": "energy"}
+
+TITLES = {
+    "delta": "Delta, three rods",
+    "delta_cu": "Delta, two rods and an R-C-U",
+    "prru": "3-PRRU",
+}
+
+PACKAGES = ("numpy", "numba", "scipy", "pin", "mujoco", "mpmath")
+
+
+class Judge:
+    """Formats a figure with its verdict and counts what goes beyond its bound."""
+
+    def __init__(self) -> None:
+        self.failures: list[str] = []
+
+    def __call__(self, value: float, bound: float, what: str) -> str:
+        """The figure as text, bold and counted where it is above ``bound`` or not a number."""
+        if value <= bound:
+            return f"{value:.1e}"
+        self.failures.append(f"{what}: {value:.3g} is above {bound:.0e}")
+        return f"**{value:.1e}**"
+
+
+def document(
+    figures: dict[str, Figures], swings: list[Swing], command: str, seed: int
+) -> tuple[str, list[str]]:
+    """The certificate in Markdown, and one line for every bound that is exceeded."""
+    judge = Judge()
+    parts = [_head(command, seed)]
+    parts.append(_torques(figures, judge))
+    parts.append(_balances(figures, judge))
+    if swings:
+        parts.append(_swings(swings, judge))
+    verdict = "All figures are within their bounds."
+    if judge.failures:
+        verdict = "**Bounds exceeded:**\n\n" + "\n".join(f"- {line}" for line in judge.failures)
+    parts.insert(1, verdict + "\n")
+    return "\n".join(parts), judge.failures
+
+
+def _head(command: str, seed: int) -> str:
+    today = datetime.datetime.now(datetime.UTC).date()
+    versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
+    return f"""# Certificate of the rigid-body dynamics
+
+The twin's torques, reactions, energies and free motion, beside three other routes to the same
+numbers. This page is written by a program; every number in the tables comes from its run of
+{today}. Make it again with
+
+    make certificate
+
+which runs `{command}`; it takes some minutes and fails where a bound is
+exceeded. The random numbers start from {seed}. Made with Python {platform.python_version()},
+{versions}.
+"""
+
+
+def _torques(figures: dict[str, Figures], judge: Judge) -> str:
+    rows = []
+    for name, found in figures.items():
+        for route in ROUTES:
+            values, places = np.array(found.efforts[route]), np.array(found.places[route])
+            if not len(values):
+                continue
+            what = f"{TITLES[name]}, {route}"
+            worst = judge(float(values.max()), BOUNDS[route], f"{what}, torque")
+            place = judge(float(places.max()), PLACE_BOUND, f"{what}, place")
+            rows.append(
+                f"| {TITLES[name]} | {route} | {found.machines} | {len(values)} | {worst} "
+                f"| {np.median(values):.1e} | {BOUNDS[route]:.0e} | {place} |"
+            )
+    table = "\n".join(rows)
+    return f"""## Torques
+
+Each machine has random dimensions, limb azimuths up to {AZIMUTH_ERROR} rad off, masses and
+inertias, a payload with its own centre of mass and full inertia matrix, gravity in any direction,
+friction; each state random positions, rates, accelerations and a wrench on the platform. The R-C-U
+is on any of the limbs; the 3-PRRU's sliders are above or below, and {THIN:.0%} of its machines have
+rods without inertia about themselves for links. States whose Jacobian, by the twin, is worse
+conditioned than 1 : {1 / LEAST_MEASURE:.0f} are not drawn.
+
+- **Pinocchio**: an open tree of bodies and loop constraints; tree motion by Newton's method and
+  the constraints' Jacobian, efforts from recursive Newton-Euler sweeps and the multipliers.
+- **MuJoCo**: another tree, an MJCF made of the same parameter mapping; loops closed by Newton's
+  method on MuJoCo's kinematics, rates and accelerations by its Jacobians and their derivatives,
+  `mj_inverse` on the tree, projected on the actuators. Rods have {SPECK:.0e} kg m2 about
+  themselves, because MuJoCo wants more than nothing.
+- **Lagrange**: kinetic and potential energy as functions of points and their velocities, all
+  derivatives by central differences in {DIGITS} digits, the loops closed by Newton's method in as
+  many. What is left is the twin's rounding.
+
+A difference is the greatest one of the three efforts over the greatest effort of the other route.
+The last column is the greatest difference of the platform's place by forward kinematics.
+
+| robot | route | machines | states | worst | median | bound | place, m (bound {PLACE_BOUND:.0e}) |
+|---|---|---|---|---|---|---|---|
+{table}
+"""
+
+
+def _balances(figures: dict[str, Figures], judge: Judge) -> str:
+    rows = []
+    for key, title in BALANCES.items():
+        for name, found in figures.items():
+            values = np.array(found.balances[key])
+            if not len(values):
+                continue
+            worst = judge(
+                float(values.max()), BALANCE_BOUNDS[key], f"{TITLES[name]}, balance of {title}"
+            )
+            rows.append(
+                f"| {title} | {TITLES[name]} | {len(values)} | {worst} "
+                f"| {np.median(values):.1e} | {BALANCE_BOUNDS[key]:.0e} |"
+            )
+    table = "\n".join(rows)
+    return f"""## Balances
+
+Over the same states; the last two where the Lagrange route was taken.
+
+- Bodies: force and moment balance of every body with the joints' reactions, the worst imbalance
+  over the greatest load.
+- Efforts: the actuators' efforts that come out of these balances, against those by virtual work.
+- Power: the twin's efforts and platform twist against the rate of the Lagrange route's energy,
+  over the sum of the powers' amounts.
+- Energy: the twin's kinetic and potential energy against the Lagrange route's.
+
+The first two weigh reactions against the twin's own inertia forces. A couple that does no work in
+any motion of the machine, such as the gyroscopic one of a 3-PRRU's upper link, is in the reactions
+but not in torques or energies, so nothing on this page judges it.
+
+| balance | robot | states | worst | median | bound |
+|---|---|---|---|---|---|
+{table}
+"""
+
+
+def _swings(swings: list[Swing], judge: Judge) -> str:
+    rows = []
+    twin = {swing.machine: swing for swing in swings if swing.route.startswith("twin")}
+    for swing in swings:
+        what = f"swing of {swing.machine}, {swing.route}"
+        drift = judge(swing.drift, SWING_BOUNDS["drift"], f"{what}, energy")
+        closure = judge(swing.closure, SWING_BOUNDS["closure"], f"{what}, closure")
+        ends = ["", ""]
+        other = twin[swing.machine]
+        if swing is not other:
+            bound = SWING_BOUNDS[swing.route.split(", ")[1]]
+            for k, (one, two) in enumerate(((swing.q, other.q), (swing.qd, other.qd))):
+                apart = float(np.abs(one[-1] - two[-1]).max())
+                ends[k] = judge(apart, bound, f"{what}, {('position', 'rate')[k]} at the end")
+        travel = float(np.ptp(swing.q, axis=0).max())
+        rows.append(
+            f"| {TITLES[swing.machine]} | {swing.route} | {travel:.2f} | {swing.kinetic:.3f} "
+            f"| {drift} | {closure} | {ends[0]} | {ends[1]} |"
+        )
+    table = "\n".join(rows)
+    return f"""## Free swing of {DURATION:.0f} s
+
+The shipped parameter files, without friction. The actuators hold constant efforts, those that
+balance the weight at a stable equilibrium. Both Deltas: arms at {DELTA_REST} rad, let go at rest
+{_list(DELTA_DEVIATION)} rad beside that. (Without efforts a Delta of these dimensions swings about
+stretched limbs, and most starts reach the edge of its workspace.) The sliders of the 3-PRRU are
+vertical, so without efforts it would fall: it hangs from its sliders (`branch: above`) with a
+tool of {TOOL["mass"]:.0f} kg, {-TOOL["com"][2]} m below the platform, which makes the tilt stable,
+and begins with slider rates of {_list(PRRU_RATES)} m/s; their mean is zero because its height
+is free.
+
+The twin's `forward_dynamics` and Pinocchio's are both integrated by DOP853 with tolerances of
+{TOLERANCE:.0e}, Pinocchio's whole tree without closing the loops again; the engine's own step is
+RK4 at {1e3 * STEP:.0f} ms with the loops closed after each step. Energy: the Lagrange route's
+function at {SAMPLES} instants, less the constant efforts' work; its greatest change over the
+greatest kinetic energy. Closure: the limbs' lengths and planes between actuators and platform; the
+twin's loops are solved anew for each state. Travel of one actuator and differences from the twin
+at the end in rad, rad/s (Delta) and m, m/s (3-PRRU). Bounds: energy {SWING_BOUNDS["drift"]:.0e},
+closure {SWING_BOUNDS["closure"]:.0e} m, end states {SWING_BOUNDS["DOP853"]:.0e} with DOP853 and
+{SWING_BOUNDS["its own step"]:.0e} with the step.
+
+| robot | engine | travel | kinetic energy, J | energy drift | closure, m | q apart | q' apart |
+|---|---|---|---|---|---|---|---|
+{table}
+"""
+
+
+def _list(values: tuple[float, ...]) -> str:
+    return ", ".join(str(v) for v in values[:-1]) + f" and {values[-1]}"

@@ -1,0 +1,494 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of natural frequencies and shapes, over all robots that have data for them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import load
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from stiffness_monitor import compliance
+from stiffness_monitor.beams import assemble
+from stiffness_monitor.modes import frame_compliance, has_modes, modes, natural_frequencies
+from test.conftest import parameters_of, random_joints
+
+ROBOTS = ("delta", "delta_cu", "prru", "upr_rpu")
+DELTAS = ("delta", "delta_cu")
+NAMES = pytest.mark.parametrize("name", ROBOTS)
+
+
+def random_poses(robot, rng, count):
+    if robot.mechanism == "upr_rpu":
+        return rng.uniform([-0.8, -0.35, -0.35], [-0.45, 0.35, 0.35], (count, 3))
+    return robot.forward(random_joints(robot, rng, count))
+
+
+def tubes(name, **changes):
+    """The members section of a delta with every tube changed."""
+    members = parameters_of(name)["members"]
+    for key in ("arm", "forearm", "rcu_forearm"):
+        if key in members:
+            members[key] |= changes
+    return members
+
+
+# ------------------------------------------------------------------ against other models
+
+
+def test_static_compliance_is_that_of_the_strain_energy_method(variant, rng):
+    """Displacement method against screws and Castigliano: other bars and joints each time."""
+    for _ in range(8):
+        joints = {}
+        for key, values in parameters_of("upr_rpu")["joints_compliance"].items():
+            joints[key] = [v * float(10 ** rng.uniform(-1, 3)) for v in values]
+        robot, _ = variant(
+            "upr_rpu",
+            members={"diameter": rng.uniform(0.03, 0.2, 3).tolist(), "shear_factor": 1.2},
+            joints_compliance=joints,
+        )
+        poses = random_poses(robot, rng, 4)
+        for elements in (1, 3):
+            found = frame_compliance(robot, poses, elements=elements)
+            expected = compliance(robot, poses)
+            scale = np.sqrt(np.einsum("...ii->...i", expected))
+            difference = (found - expected) / (scale[..., None] * scale[..., None, :])
+            assert np.abs(difference).max() < 1e-9
+
+
+@pytest.fixture
+def with_members(tmp_path):
+    """A shipped robot whose members section is replaced."""
+
+    def make(name, members):
+        data = parameters_of(name) | {"members": members}
+        path = tmp_path / "robot.yaml"
+        path.write_text(yaml.safe_dump(data))
+        return load(path)
+
+    return make
+
+
+@pytest.fixture
+def on_springs(with_members):
+    """A delta of stiff members whose drives have a compliance, rad/(N m)."""
+
+    def make(name, value):
+        slim = {"youngs_modulus": 1e14, "shear_modulus": 1e14, "outer_diameter": 0.004}
+        members = tubes(name, **slim, inner_diameter=0.0)
+        for key in ("arm", "forearm", "rcu_forearm"):
+            members.get(key, {}).pop("density", None)
+        return with_members(name, members | {"drive_compliance": value})
+
+    return make
+
+
+@pytest.mark.parametrize("name", DELTAS)
+def test_stiff_members_on_soft_drives_are_the_rigid_body_model_on_springs(name, on_springs, rng):
+    """J c J' for the compliance, and M(q) of the virtual work for the frequencies."""
+    drive = 1.0
+    robot = on_springs(name, drive)
+    q = random_joints(robot, rng, 6)
+    poses = robot.forward(q)
+    jacobian = robot.jacobian(q)
+    soft = frame_compliance(robot, poses)[:, :3, :3]
+    expected = drive * jacobian @ jacobian.swapaxes(-1, -2)
+    size = np.linalg.norm(expected, axis=(-2, -1))[:, None, None]
+    assert np.abs((soft - expected) / size).max() < 1e-3
+    weightless = robot.changed(gravity=[0.0, 0.0, 0.0])
+    inertia = inverse_dynamics(weightless, q[:, None], np.zeros(3), np.eye(3))
+    rigid = np.sqrt(1 / (drive * np.linalg.eigvalsh(inertia)[:, ::-1])) / (2 * np.pi)
+    assert natural_frequencies(robot, poses, 3) == pytest.approx(rigid, rel=1e-3)
+
+
+@NAMES
+def test_locked_drives_carry_what_virtual_work_says(name, rng):
+    """Their efforts under a wrench on the platform: end forces of beams against J' P."""
+    robot = load(name)
+    for pose in random_poses(robot, rng, 4):
+        wrench = rng.normal(size=6)
+        frame = robot.frame(pose)
+        system = assemble(frame, 2)
+        load_vector = np.zeros(len(system.mass))
+        load_vector[:6] = wrench
+        shape = np.linalg.solve(system.stiffness, load_vector)
+        q = robot.inverse(pose)
+        expected = -robot.platform_jacobian(q).T @ wrench
+        driven = [
+            k for k, member in enumerate(frame.members)
+            if name == "upr_rpu" or member.inner.body == "base"
+        ]  # fmt: skip
+        for i, k in enumerate(driven):
+            index, _, axes = system.members[k]
+            part = system.parts[index]
+            # What the drive does to the member's start.
+            effort = (part.stiffness @ part.map @ shape[part.own])[:6]
+            force, moment = axes @ effort[:3], axes @ effort[3:]
+            if name == "prru":
+                found = force[2]
+            elif name == "upr_rpu":
+                # Along the limb, from B to A.
+                found = force @ axes[:, 0]
+            else:
+                angle = robot.geometry.azimuths[i]
+                found = moment @ np.array([-math.sin(angle), math.cos(angle), 0.0])
+            assert found == pytest.approx(expected[i], rel=1e-6, abs=1e-6)
+
+
+def at_point(matrix, lever):
+    """Translations per force of a point of the platform, shape (..., 3, 3)."""
+    carried = np.zeros((*lever.shape[:-1], 3, 6))
+    carried[..., :3] = np.eye(3)
+    for k in range(3):
+        carried[..., 3 + k] = np.cross(np.eye(3)[k], lever)
+    return carried @ matrix @ carried.swapaxes(-1, -2)
+
+
+@NAMES
+def test_a_heavy_point_load_has_the_frequencies_of_the_static_compliance(name, variant, rng):
+    mass, com = 5e4, [0.02, -0.03, -0.08]
+    if name == "upr_rpu":
+        point = {"platform_mass": mass, "platform_com": com, "platform_inertia": [1e-6] * 3}
+        robot, _ = variant(name, inertia=point)
+    else:
+        robot, _ = variant(name, payload={"mass": mass, "com": com})
+    poses = random_poses(robot, rng, 3)
+    lever = robot.rotation(poses) @ np.array(com)
+    soft = np.linalg.eigvalsh(at_point(frame_compliance(robot, poses), lever))[:, ::-1]
+    expected = 1 / (2 * np.pi * np.sqrt(mass * soft))
+    assert natural_frequencies(robot, poses, 3) == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_heavy_flywheel_turns_with_the_platform(variant, rng):
+    """Its principal axes are the platform's."""
+    wheel = np.array([4e4, 5e4, 8e4])
+    robot, _ = variant(
+        "upr_rpu",
+        inertia={
+            "platform_mass": 1.0,
+            "platform_com": [0, 0, 0],
+            "platform_inertia": wheel.tolist(),
+        },
+    )
+    poses = random_poses(robot, rng, 3)
+    turn = robot.rotation(poses)
+    soft = frame_compliance(robot, poses)[:, 3:, 3:]
+    product = (turn * wheel) @ turn.swapaxes(-1, -2) @ soft
+    expected = 1 / (2 * np.pi * np.sqrt(np.sort(np.linalg.eigvals(product).real)[:, ::-1]))
+    assert natural_frequencies(robot, poses, 3) == pytest.approx(expected, rel=1e-3)
+
+
+# ------------------------------------------------------------------ symmetry and scale
+
+
+@pytest.mark.parametrize("name", DELTAS)
+def test_frequencies_go_with_the_root_of_stiffness_over_mass(name, variant, rng):
+    robot = load(name)
+    poses = random_poses(robot, rng, 3)
+    expected = natural_frequencies(robot, poses)
+    members = tubes(name)
+    for key in ("arm", "forearm", "rcu_forearm"):
+        for modulus in ("youngs_modulus", "shear_modulus"):
+            if key in members:
+                members[key][modulus] *= 4
+    assert natural_frequencies(variant(name, members=members)[0], poses) == pytest.approx(
+        2 * expected, rel=1e-8
+    )
+    members = tubes(name)
+    for key in ("arm", "forearm", "rcu_forearm"):
+        if key in members:
+            members[key]["density"] *= 4
+    inertia = {
+        key: 4 * parameters_of(name)["inertia"][key]
+        for key in ("platform_mass", "arm_mass", "forearm_mass")
+    }
+    heavy = variant(name, members=members, inertia=inertia)[0]
+    assert natural_frequencies(heavy, poses) == pytest.approx(expected / 2, rel=1e-8)
+
+
+def test_frequencies_of_the_limbs_head_scale_too(variant, rng):
+    data = parameters_of("upr_rpu")
+    robot = load("upr_rpu")
+    poses = random_poses(robot, rng, 3)
+    members = {k: 4 * data["members"][k] for k in ("youngs_modulus", "shear_modulus")}
+    joints = {k: [v / 4 for v in values] for k, values in data["joints_compliance"].items()}
+    firm = variant("upr_rpu", members=members, joints_compliance=joints)[0]
+    assert natural_frequencies(firm, poses) == pytest.approx(
+        2 * natural_frequencies(robot, poses), rel=1e-8
+    )
+
+
+def test_a_symmetric_delta_has_pairs_of_lateral_modes(rng):
+    robot = load("delta")
+    for angle in (-0.3, 0.22, 0.8):
+        pose = robot.forward([angle] * 3)
+        found = modes(robot, pose, 6)
+        f = found.frequencies
+        assert f[0] == pytest.approx(f[1], rel=1e-9)
+        # Three limbs in a ring: a mode is alone or one of two, never of three.
+        assert f[2] > f[1] * (1 + 1e-3)
+        # The two lateral ones move the platform sideways, the same energy altogether.
+        platform = found.shapes[:2, 0, :3]
+        assert np.abs(platform[:, 2]).max() < 1e-9 * np.abs(platform).max()
+
+
+def turned(pose, angle):
+    c, s = math.cos(angle), math.sin(angle)
+    return pose @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_a_third_of_a_turn_changes_nothing_of_a_symmetric_delta(rng):
+    robot = load("delta")
+    poses = random_poses(robot, rng, 3)
+    expected = natural_frequencies(robot, poses)
+    for k in (1, 2):
+        found = natural_frequencies(robot, turned(poses, k * 2 * math.pi / 3))
+        assert found == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("order", [(1, 2, 0), (0, 2, 1)])
+def test_the_order_of_the_limbs_does_not_matter(order, variant, rng):
+    robot = load("delta_cu")
+    poses = random_poses(robot, rng, 3)
+    geometry = parameters_of("delta_cu")["geometry"]
+    changed = {key: [geometry[key][i] for i in order] for key in ("azimuths", "closures")}
+    other = variant("delta_cu", geometry=changed)[0]
+    assert natural_frequencies(other, poses) == pytest.approx(
+        natural_frequencies(robot, poses), rel=1e-8
+    )
+
+
+def test_the_head_is_the_same_on_both_sides(rng):
+    robot = load("upr_rpu")
+    poses = random_poses(robot, rng, 4)
+    assert natural_frequencies(robot, poses * [1, 1, -1]) == pytest.approx(
+        natural_frequencies(robot, poses), rel=1e-8
+    )
+
+
+# ------------------------------------------------------------------ modes
+
+
+@NAMES
+def test_locked_drives_leave_no_mechanism(name, rng):
+    robot = load(name)
+    found = natural_frequencies(robot, random_poses(robot, rng, 20), 1, elements=2)
+    assert found.min() > 5.0
+
+
+def test_rods_that_touch_hold_no_rotation(variant):
+    robot = variant("delta", members={"parallelogram_width": 1e-9})[0]
+    with pytest.raises(SingularityError, match="elastic frame") as caught:
+        natural_frequencies(robot, robot.home()[None])
+    assert caught.value.index == (0,)
+
+
+@NAMES
+def test_shares_sum_to_one_and_the_platforms_is_that_of_its_shape(name, rng):
+    robot = load(name)
+    poses = random_poses(robot, rng, 3)
+    found = modes(robot, poses)
+    shares = found.energies
+    assert shares.strain.shape == shares.kinetic.shape == (3, 6, len(shares.elements))
+    for part in (shares.strain, shares.kinetic):
+        assert part.sum(-1) == pytest.approx(np.ones((3, 6)))
+        assert part.min() > -1e-12
+    index = shares.elements.index("platform")
+    assert np.abs(shares.strain[..., index]).max() == 0.0
+    for k, pose in enumerate(poses):
+        body = robot.frame(pose).bodies[0]
+        moved = found.shapes[k, :, found.nodes.index("platform")]
+        spin = moved[:, 3:]
+        velocity = moved[:, :3] + np.cross(spin, body.com)
+        energy = body.mass * (velocity**2).sum(-1) + np.einsum(
+            "ki,ij,kj->k", spin, body.inertia, spin
+        )
+        # Shapes have unit generalised mass.
+        assert energy == pytest.approx(shares.kinetic[k, :, index], rel=1e-9, abs=1e-12)
+
+
+def test_joints_with_elasticity_are_elements_of_the_shares():
+    robot = load("upr_rpu")
+    found = modes(robot, robot.home())
+    assert set(found.energies.elements) == {"platform", *robot.element_names}
+    static = {e[1] for e, s in zip(found.energies.elements, found.energies.kinetic[0], strict=True)
+              if s == 0.0}  # fmt: skip
+    assert static == {"R", "U"}
+
+
+def test_shapes_keep_what_joints_hold(rng):
+    """At a ball joint the rod's end moves with the platform's point; at the base nothing moves."""
+    robot = load("delta_cu")
+    pose = random_poses(robot, rng, 1)[0]
+    found = modes(robot, pose, elements=3)
+    at = {node: k for k, node in enumerate(found.nodes)}
+    platform = found.shapes[:, 0]
+    for rod in ("forearm I a", "forearm I b", "forearm II a", "forearm II b", "forearm III"):
+        lever = found.positions[at[f"{rod} 3/3"]] - pose
+        expected = platform[:, :3] + np.cross(platform[:, 3:], lever)
+        assert found.shapes[:, at[f"{rod} 3/3"], :3] == pytest.approx(expected, abs=1e-9)
+    for limb in ("I", "II", "III"):
+        assert not found.shapes[:, at[f"arm {limb} 0/3"]].any()
+    # The cylindrical joint of limb III lets its rod slide along t, and not across.
+    start, tip = at["forearm III 0/3"], at["arm III 3/3"]
+    angle = robot.geometry.azimuths[2]
+    r, t = np.array([[math.cos(angle), math.sin(angle), 0], [-math.sin(angle), math.cos(angle), 0]])
+    lever = found.positions[start] - found.positions[tip]
+    carried = found.shapes[:, tip, :3] + np.cross(found.shapes[:, tip, 3:], lever)
+    gap = found.shapes[:, start, :3] - carried
+    assert np.abs(gap @ r).max() < 1e-9
+    assert np.abs(gap[:, 2]).max() < 1e-9
+    assert np.abs(gap @ t).max() > 0.1
+
+
+def test_first_three_shapes_of_the_delta_cu_live_in_the_platform():
+    """The paper's finding; in 4 to 6 the forearms swing between elbow and platform."""
+    robot = load("delta_cu")
+    found = modes(robot, robot.forward([0.22] * 3))
+    names, kinetic = found.energies.elements, found.energies.kinetic
+    platform = kinetic[:, names.index("platform")]
+    forearms = kinetic[:, [k for k, name in enumerate(names) if name.startswith("forearm")]].sum(1)
+    assert (platform[:3] > 0.3).all()
+    assert (platform[3:] < 0.1).all()
+    assert (forearms[3:] > 0.85).all()
+
+
+@NAMES
+def test_the_shipped_number_of_elements_is_enough(name):
+    robot = load(name)
+    fine = natural_frequencies(robot, robot.home(), elements=16)
+    assert natural_frequencies(robot, robot.home()) == pytest.approx(fine, rel=1.5e-3)
+
+
+def test_a_payload_slows_the_platform_down():
+    robot = load("delta")
+    pose = robot.home()
+    loaded = robot.changed(payload={"mass": 0.5, "com": [0.0, 0.0, -0.02]})
+    assert (natural_frequencies(loaded, pose, 2) < natural_frequencies(robot, pose, 2)).all()
+    assert "payload" in modes(loaded, pose).energies.elements
+
+
+# ------------------------------------------------------------------ interface
+
+
+@NAMES
+def test_batches_are_loops(name, rng):
+    robot = load(name)
+    poses = random_poses(robot, rng, 6).reshape(2, 3, 3)
+    found = modes(robot, poses, 4)
+    assert natural_frequencies(robot, poses, 4).shape == (2, 3, 4)
+    size = len(found.nodes)
+    assert found.frequencies.shape == (2, 3, 4)
+    assert found.shapes.shape == (2, 3, 4, size, 6)
+    assert found.positions.shape == (2, 3, size, 3)
+    for index in np.ndindex(2, 3):
+        one = modes(robot, poses[index], 4)
+        assert np.array_equal(one.frequencies, found.frequencies[index])
+        assert np.array_equal(one.shapes, found.shapes[index])
+        alone = natural_frequencies(robot, poses[index], 4)
+        assert alone == pytest.approx(found.frequencies[index], rel=1e-10)
+    assert (np.diff(found.frequencies) >= 0.0).all()
+    for array in (found.frequencies, found.shapes, found.energies.strain):
+        assert not array.flags.writeable
+
+
+def test_no_pose_has_no_frequencies():
+    assert natural_frequencies(load("delta"), np.empty((0, 3))).shape == (0, 6)
+
+
+@pytest.mark.parametrize(
+    ("name", "section"), [("delta", "members"), ("prru", "members"), ("upr_rpu", "inertia")]
+)
+def test_a_file_without_the_section_loads_and_is_refused_by_name(name, section, tmp_path):
+    data = parameters_of(name)
+    del data[section]
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump(data))
+    robot = load(path)
+    with pytest.raises(ParameterError) as caught:
+        natural_frequencies(robot, robot.home())
+    assert caught.value.field == section
+
+
+def test_bad_arguments_are_refused():
+    robot = load("delta")
+    home = robot.home()
+    with pytest.raises(UnreachableError):
+        natural_frequencies(robot, [[0.0, 0.0, -0.4], [0.0, 0.0, -2.0]])
+    for pose in ([0.0, 0.0], 1.0, [math.nan, 0.0, -0.4]):
+        with pytest.raises(ValueError, match=r"pose|finite|shape"):
+            natural_frequencies(robot, pose)
+    for count in (0, 10_000):
+        with pytest.raises(ValueError, match="count"):
+            natural_frequencies(robot, home, count)
+    with pytest.raises(ParameterError, match="elements"):
+        natural_frequencies(robot, home, elements=0)
+    with pytest.raises(ValueError, match="no pose"):
+        modes(robot, np.empty((0, 3)))
+
+
+def test_the_wall_of_a_tube_follows_from_its_mass():
+    members = load("delta_cu").frame(load("delta_cu").home()).members
+    inner = {m.name: m.section.inner_diameter for m in members}
+    assert inner["arm I"] == pytest.approx(0.03110, abs=1e-5)
+    assert inner["forearm I a"] == pytest.approx(0.01389, abs=1e-5)
+    assert inner["forearm III"] == pytest.approx(0.01752, abs=1e-5)
+    masses = [m.section.mass_per_length * np.linalg.norm(m.end - m.start) for m in members]
+    assert sum(masses) == pytest.approx(3 * (0.2548 + 0.0771))
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"inner_diameter": 0.01}, "members.arm"),
+        ({"density": 0.0}, "members.arm.density"),
+        ({"outer_diameter": 0.0}, "members.arm.outer_diameter"),
+        ({"youngs_modulus": 10.0}, "members.arm.youngs_modulus"),
+        ({"wall": 0.01}, "members.arm.wall"),
+    ],
+)
+def test_tubes_that_cannot_be_are_refused(changes, field, variant):
+    members = parameters_of("delta")["members"]
+    members["arm"] |= changes
+    with pytest.raises(ParameterError) as caught:
+        variant("delta", members=members)
+    assert caught.value.field == field
+
+
+def test_an_inner_diameter_can_stand_for_the_density(with_members):
+    robot = load("delta")
+    members = parameters_of("delta")["members"]
+    del members["arm"]["density"]
+    members["arm"]["inner_diameter"] = robot.frame(robot.home()).members[0].section.inner_diameter
+    other = with_members("delta", members)
+    assert natural_frequencies(other, robot.home()) == pytest.approx(
+        natural_frequencies(robot, robot.home())
+    )
+    members["arm"]["inner_diameter"] = 0.04
+    with pytest.raises(ParameterError) as caught:
+        with_members("delta", members)
+    assert caught.value.field == "members.arm.inner_diameter"
+    del members["arm"]["inner_diameter"]
+    with pytest.raises(ParameterError) as caught:
+        with_members("delta", members)
+    assert caught.value.value == "neither"
+
+
+def test_a_robot_whose_sections_do_not_fit_still_loads_and_has_no_modes(variant):
+    """Its dynamics need none of them."""
+    for name, changes, field in (
+        ("delta", {"geometry": {"closures": ["rod", "rod", "rcu"]}}, "members.rcu_forearm"),
+        ("delta", {"inertia": {"arm_mass": 3.0}}, "members.arm.density"),
+        ("delta", {"inertia": {"forearm_mass": 0.0}}, "members.forearm"),
+    ):
+        robot, _ = variant(name, **changes)
+        assert np.isfinite(inverse_dynamics(robot, np.zeros(3), np.zeros(3), np.ones(3))).all()
+        assert not has_modes(robot)
+        with pytest.raises(ParameterError) as caught:
+            natural_frequencies(robot, robot.home())
+        assert caught.value.field == field
+    assert all(has_modes(load(name)) for name in ROBOTS)

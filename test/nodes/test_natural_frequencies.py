@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Natural frequencies from the node stiffness_monitor, over the real middleware."""
+
+import numpy as np
+import pytest
+import yaml
+
+from pkm_twin import load
+from stiffness_monitor.modes import natural_frequencies
+from test.conftest import parameters_of
+from test.nodes.harness import SECOND, Maker, Ros, one_line_refusal
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from geometry_msgs.msg import TransformStamped, WrenchStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+MODULE = "stiffness_monitor.node"
+ROBOT = load("upr_rpu")
+POSE = np.array([-0.7, 0.2, -0.15])
+Q = ROBOT.inverse(POSE)
+RATE = 5.0
+
+
+@pytest.fixture(scope="module")
+def massless(tmp_path_factory):
+    """The same machine from a file without inertia."""
+    data = parameters_of("upr_rpu")
+    del data["inertia"]
+    path = tmp_path_factory.mktemp("massless") / "massless.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+class Talk:
+    """A running node, and states and wrenches for it."""
+
+    def __init__(self, peer, launch, name, *parameters):
+        self.peer, self.name, self.make = peer, name, Maker(Ros())
+        peer.talk(JointState, f"/{name}/states")
+        peer.talk(WrenchStamped, f"/{name}/wrench")
+        peer.hear(TransformStamped, f"/{name}/deflection")
+        peer.hear(Float64MultiArray, f"/{name}/natural_frequencies")
+        pairs = {"__node": name, "joint_states": f"/{name}/states", "wrench": f"/{name}/wrench"}
+        remap = [part for pair in pairs.items() for part in ("-r", ":=".join(pair))]
+        launch(MODULE, "max_state_age:=1.0", *parameters, arguments=remap)
+
+    def received(self, topic):
+        return self.peer.received(f"/{self.name}/{topic}")
+
+    def send(self):
+        stamp = self.peer.now()
+        self.peer.send(
+            f"/{self.name}/states",
+            self.make.joint_state(ROBOT.joint_names, Q.tolist(), stamp=stamp),
+        )
+        self.peer.send(f"/{self.name}/wrench", self.make.wrench((1.0, 0.0, -50.0, 0, 0, 0), stamp))
+
+    def run(self, seconds, send=True):
+        end = self.peer.now() + round(seconds * SECOND)
+        repeat = self.send if send else None
+        self.peer.until(lambda: self.peer.now() > end, seconds + 30.0, repeat)
+
+
+def test_frequencies_of_the_latest_pose_at_most_at_their_rate(peer, launch):
+    talk = Talk(peer, launch, "modal", f"frequencies_rate:={RATE}")
+    peer.until(lambda: talk.received("natural_frequencies"), 90.0, talk.send)
+    message = talk.received("natural_frequencies")[-1]
+    (dim,) = message.layout.dim
+    assert (dim.label, dim.size, dim.stride) == ("frequency", 6, 6)
+    assert np.allclose(message.data, natural_frequencies(ROBOT, POSE), rtol=1e-9)
+    for topic in ("natural_frequencies", "deflection"):
+        talk.received(topic).clear()
+    talk.run(2.0)
+    found, answers = (len(talk.received(t)) for t in ("natural_frequencies", "deflection"))
+    assert 2 <= found <= 2.0 * RATE + 2
+    # Never more often than there are new poses.
+    assert found <= answers
+    # No new pose, no new frequencies.
+    talk.run(1.0, send=False)
+    talk.received("natural_frequencies").clear()
+    talk.run(1.0, send=False)
+    assert not talk.received("natural_frequencies")
+
+
+@pytest.mark.parametrize("case", ["off", "massless"])
+def test_no_frequencies_when_off_or_without_masses(case, peer, launch, massless):
+    choice = "frequencies_rate:=0.0" if case == "off" else f"mechanism:={massless}"
+    talk = Talk(peer, launch, f"still_{case}", choice)
+    peer.until(lambda: len(talk.received("deflection")) > 20, 90.0, talk.send)
+    talk.run(0.5)
+    assert not talk.received("natural_frequencies")
+
+
+def test_a_rate_out_of_bounds_is_refused(launch):
+    process = launch(MODULE, "frequencies_rate:=-1.0")
+    assert "frequencies_rate" in one_line_refusal(process)
