@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bags bench certificate fuzz clean help
+.PHONY: demo test lint types unit bags bench certificate fuzz soak clean help
 
 help:
 	@echo "make demo         set up .venv, run both nodes on the recorded bags, table and picture in out/"
@@ -13,6 +13,7 @@ help:
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
 	@echo "make certificate  torques against three other engines, into docs/certificate.md"
 	@echo "make fuzz         damage every kind of byte of a bag, at length"
+	@echo "make soak         ten million poses in flat memory"
 	@echo "make clean        remove .venv, out and caches"
 
 # One stamp a set of extras, made anew when the requirements change.
@@ -53,6 +54,9 @@ certificate: $(VENV)/certificate.stamp
 
 fuzz: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m long test/bags
+
+soak: $(VENV)/test.stamp
+	$(BIN)/python -m pytest -m long test/atlas
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks
