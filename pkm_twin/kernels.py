@@ -168,7 +168,7 @@ class Kernel:
             # One sample, the fast way.
             try:
                 if tuple(map(len, inputs)) == self.inputs:  # type: ignore[arg-type]
-                    results = [np.empty(size) for size in self.outputs]
+                    results = list(map(np.empty, self.outputs))
                     fault = np.zeros(FAULT_SIZE)
                     self._one(p, *inputs, *results, self._space, fault)
                     return (*results, fault)
