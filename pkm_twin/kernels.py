@@ -83,15 +83,10 @@ _ROWS: Final[dict[int, Any]] = {
 }
 
 
-def _copied(function: Any, suffix: str, names: dict[str, Any] | None = None) -> Callable[..., None]:
-    """The same function under a name of its own, and so with a cache file of its own."""
-    name = function.__name__ + suffix
-    copy = types.FunctionType(
-        function.__code__, function.__globals__ if names is None else names, name
-    )
-    copy.__qualname__ = name
-    copy.__module__ = function.__module__
-    return copy
+def _row_of(kernel: Callable[..., None], arrays: int) -> Callable[..., None]:
+    """What guvectorize wraps to run ``kernel``; a copy of the row with its own globals."""
+    row = _ROWS[arrays]
+    return types.FunctionType(row.__code__, {"kernel": kernel}, kernel.__name__)
 
 
 class Kernel:
@@ -121,9 +116,12 @@ class Kernel:
 
     @cached_property
     def _one(self) -> Callable[..., None]:
-        """The formula for one sample, compiled for exactly one array type."""
+        """The formula for one sample, compiled for exactly one array type.
+
+        One signature a function: two processes that fill the cache at once write the same.
+        """
         read = numba.types.Array(numba.float64, 1, "A", readonly=True)
-        write = numba.types.Array(numba.float64, 1, "C")
+        write = numba.types.Array(numba.float64, 1, "A")
         n_in = 1 + len(self.inputs)
         n_out = len(self.outputs) + 2
         signature = numba.void(*[read] * n_in, *[write] * n_out)
@@ -144,15 +142,12 @@ class Kernel:
         n_in, n_out = 1 + len(self.inputs), len(self.outputs)
         sizes = [f"(n{i})" for i in range(n_in + n_out + 1)]
         signature = numba.void(*[numba.float64[:]] * (n_in + n_out + 2))
-        formula = numba.njit(signature, cache=True, error_model="numpy")(
-            _copied(self.function, "_many")
-        )
         compiled: Callable[..., None] = numba.guvectorize(
             [signature],
             f"{','.join(sizes)}->{sizes[1]}",
             nopython=True,
             writable_args=tuple(range(n_in, n_in + n_out)),
-        )(_copied(_ROWS[n_in + n_out + 2], "", {"kernel": formula}))
+        )(_row_of(self._one, n_in + n_out + 2))
         return compiled
 
     def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[Array, ...]:
