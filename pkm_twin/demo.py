@@ -210,6 +210,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     recording = options.out / "demo.mcap"
     context = Context()
+    # A context of its own has no handlers: SIGTERM has to end the children too.
+    signal.signal(signal.SIGTERM, _interrupt)
     try:
         rclpy.init(context=context)
         executor = SingleThreadedExecutor(context=context)
@@ -237,6 +239,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print_findings(console, findings)
     console.print(f"picture {picture}, recording {recording}")
     return 0 if all(finding.good for finding in findings) else 1
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
 
 
 def _message_class(kind: str) -> Any:
