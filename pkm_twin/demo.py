@@ -50,6 +50,8 @@ class Stage:
     outputs: dict[str, str]
 
 
+# A shared machine may leave the node waiting for a while: here nobody is pushed by a late torque.
+PATIENT = ("stale_after:=1.0", "qos_overrides./joint_states.subscription.depth:=1000")
 DYNAMICS_OUTPUTS = {
     "/delta_dynamics/joint_torques": STATE,
     "/delta_dynamics/torque_residual": STATE,
@@ -59,14 +61,14 @@ STAGES = (
     Stage(
         "delta_cu_pick_and_place",
         "delta_dynamics.node",
-        ("mechanism:=delta_cu", "qos_overrides./joint_states.subscription.depth:=1000"),
+        ("mechanism:=delta_cu", *PATIENT),
         ("/joint_states", "/delta_dynamics/joint_trajectory"),
         DYNAMICS_OUTPUTS,
     ),
     Stage(
         "prru_milling",
         "delta_dynamics.node",
-        ("mechanism:=prru", "qos_overrides./joint_states.subscription.depth:=1000"),
+        ("mechanism:=prru", *PATIENT),
         ("/joint_states", "/delta_dynamics/joint_trajectory"),
         DYNAMICS_OUTPUTS,
     ),
