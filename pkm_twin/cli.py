@@ -191,8 +191,9 @@ def compliance(
 
     For example `pkm-twin compliance upr_rpu -0.6 0 0 --wrench 30,-50,-40,10,-20,50`.
 
-    The elements of the strain energy are the limb's number and R (revolute joint), B (bar) or U
-    (universal joint); the dominant one is where stiffening pays.
+    The elements of the strain energy are, of upr_rpu, the limb's number and R (revolute joint), B
+    (bar) or U (universal joint), of the others the members and elastic joints of their frame; the
+    dominant one is where stiffening pays.
     """
     from pkm_twin import load
     from stiffness_monitor import compliance as matrix

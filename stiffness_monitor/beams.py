@@ -189,6 +189,11 @@ class System:
     positions: Array
     members: tuple[tuple[int, Array, Array], ...]
 
+    @property
+    def elastic(self) -> tuple[str, ...]:
+        """Names of the parts that have stiffness, each once, as :meth:`energies` orders them."""
+        return tuple(dict.fromkeys(part.name for part in self.parts if part.stiffness.any()))
+
     def displacements(self, shape: Array) -> Array:
         """World displacements of the named nodes, shape (nodes, 6), of coordinates (n,)."""
         rows = [shape[None, :6]]

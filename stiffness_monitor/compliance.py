@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compliance and strain energy by the strain-energy method, for every robot with elastic members.
+"""Compliance and strain energy of every robot with elastic members.
+
+A mechanism with kernels of its own (upr_rpu) is solved by the strain-energy method in closed form,
+any other that declares its elastic frame by finite elements (:mod:`stiffness_monitor.statics`),
+actuators locked: the same numbers where a mechanism has both, but in a millisecond a pose.
 
 May import: numpy, pkm_twin's core, the standard library; never rclpy.
 """
@@ -12,10 +16,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.errors import ParameterError
 from pkm_twin.kernels import NOT_FINITE, Kernel
-from pkm_twin.mechanisms.elements import WRENCH
+from pkm_twin.mechanisms.elements import TIE, WRENCH
+from pkm_twin.mechanisms.frame import framed
 from pkm_twin.mechanisms.robot import Robot
+from stiffness_monitor.statics import frame_compliance, frame_energies
 
 Array = NDArray[np.float64]
 
@@ -36,7 +41,7 @@ def compliance(robot: Robot, pose: ArrayLike) -> Array:
     """
     kernel = robot.elastic_kernel
     if kernel is None:
-        raise _no_members(robot)
+        return frame_compliance(robot, pose)
     flat, fault = kernel(robot.parameters, pose)
     if fault.ndim > 1 or fault.item(0) != 0.0:
         robot.raise_fault(fault, "pose")
@@ -56,9 +61,10 @@ def stiffness(robot: Robot, pose: ArrayLike) -> Array:
 class StrainEnergy:
     """What a wrench does to the platform, and where its energy goes.
 
-    ``elements``: names of the nine elements, limb number and R joint, bar or U joint.
-    ``factors``: part of the total in each element, shape (..., 9), sum 1; all zero, which says
-    absent, where the wrench is zero. ``energies``: shape (..., 9), J. ``total``: P' C P / 2,
+    ``elements``: of upr_rpu nine names, limb number and R joint, bar or U joint; of other machines
+    the frame's members and elastic joints. ``factors``: part of the total in each element, shape
+    (..., elements), sum 1; all zero, which says absent, where the wrench is zero. ``energies``:
+    shape (..., elements), J. ``total``: P' C P / 2,
     shape (...), J. ``deflection``: C P at the platform's origin, fixed axes, shape (..., 6), m and
     rad. ``dominant``: name of the element with the largest factor, ``"none"`` for a zero wrench;
     a string for one sample, an array of strings for a batch. ``tie``: whether the largest two
@@ -84,7 +90,7 @@ def strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> StrainEne
     """
     kernel = robot.energy_kernel
     if kernel is None:
-        raise _no_members(robot)
+        return _frame_strain_energy(robot, pose, wrench)
     deflection, energies, factors, summary, fault = kernel(robot.parameters, pose, wrench)
     for array in (deflection, energies, factors):
         array.setflags(write=False)
@@ -110,10 +116,40 @@ def strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> StrainEne
 
 
 def kernels(robot: Robot) -> tuple[Kernel, ...]:
-    """The kernels to warm up before live use."""
+    """The kernels to warm up before live use.
+
+    :raises ParameterError: a robot without elastic members.
+    """
     if robot.elastic_kernel is None or robot.energy_kernel is None:
-        raise _no_members(robot)
-    return robot.forward_kernel, robot.elastic_kernel, robot.energy_kernel
+        framed(robot).frame(robot.home())
+        return robot.forward_kernel, robot.inverse_kernel
+    return robot.forward_kernel, robot.inverse_kernel, robot.elastic_kernel, robot.energy_kernel
+
+
+def _frame_strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> StrainEnergy:
+    """The same of a frame. Solved for a wrench of size 1, so that no square leaves the numbers."""
+    loads = np.asarray(wrench, np.float64)
+    size = np.abs(loads).max(-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        unit = loads / np.where(size == 0.0, 1.0, size)
+    names, deflection, energies = frame_energies(robot, pose, unit)
+    whole = energies.sum(-1, keepdims=True)
+    factors = energies / np.where(whole == 0.0, 1.0, whole)
+    largest = factors.max(-1, keepdims=True)
+    close = (factors > largest * (1.0 - TIE)) & (largest > 0.0)
+    first = np.where(close.any(-1), close.argmax(-1), -1)
+    tie = close.sum(-1) > 1
+    with np.errstate(over="ignore"):
+        deflection, energies, whole = deflection * size, energies * size**2, whole * size**2
+    if not (np.isfinite(deflection).all() and np.isfinite(whole).all()):
+        raise ValueError("wrench, or its energy, is not finite, or leads to a result that is not")
+    for array in (deflection, energies, factors):
+        array.setflags(write=False)
+    total = whole[..., 0].copy()
+    if total.ndim == 0:
+        dominant = names[int(first)] if first >= 0 else "none"
+        return StrainEnergy(names, factors, energies, float(total), deflection, dominant, bool(tie))
+    return StrainEnergy(names, factors, energies, total, deflection, _choices(names)[first], tie)
 
 
 @lru_cache(maxsize=8)
@@ -126,9 +162,3 @@ def _raise_fault(robot: Robot, fault: Array) -> None:
     code, source, _ = first[np.flatnonzero(first[:, 0])[0]].tolist()
     wrong_wrench = code == NOT_FINITE and source == WRENCH
     robot.raise_fault(fault, "wrench, or its energy," if wrong_wrench else "pose")
-
-
-def _no_members(robot: Robot) -> ParameterError:
-    return ParameterError(
-        "mechanism", robot.mechanism, "a mechanism with elastic members (upr_rpu)"
-    )

@@ -14,12 +14,13 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cholesky, eigh, solve_triangular  # type: ignore[import-untyped]
+from scipy.linalg import eigh, solve_triangular  # type: ignore[import-untyped]
 
-from pkm_twin.errors import ParameterError, SingularityError
+from pkm_twin.errors import ParameterError
 from pkm_twin.mechanisms.frame import Framed, framed
-from pkm_twin.mechanisms.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.mechanisms.robot import Robot
 from stiffness_monitor.beams import System, assemble
+from stiffness_monitor.statics import checked_frame, stiffness_root
 
 Array = NDArray[np.float64]
 
@@ -72,7 +73,7 @@ def natural_frequencies(
     :raises SingularityError: a pose in which the frame is a mechanism, with locked actuators.
     :raises ValueError: a wrong last axis, a value that is not finite, too many modes.
     """
-    frame, poses = _checked(robot, pose)
+    frame, poses = checked_frame(robot, pose)
     result = np.empty((*poses.shape[:-1], count))
     for index in np.ndindex(*poses.shape[:-1]):
         system = _system(frame, poses[index], elements)
@@ -88,7 +89,7 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     :param pose: shape (..., 3), the mechanism's pose parameters, m and rad.
     :param elements: beam elements a member.
     """
-    frame, poses = _checked(robot, pose)
+    frame, poses = checked_frame(robot, pose)
     batch = poses.shape[:-1]
     frequencies: list[Array] = []
     positions: list[Array] = []
@@ -125,25 +126,6 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     )
 
 
-def frame_compliance(robot: Robot, pose: ArrayLike, *, elements: int = 1) -> Array:
-    """Static compliance of the platform at its origin by the same elements, shape (..., 6, 6).
-
-    Locked actuators; order x y z rx ry rz in fixed axes, as :func:`stiffness_monitor.compliance`,
-    and for a frame without inertia, too. One element a member is exact: loads are at its ends.
-    Errors as :func:`natural_frequencies`.
-    """
-    frame, poses = _checked(robot, pose)
-    result = np.empty((*poses.shape[:-1], 6, 6))
-    unit = np.eye(6)
-    for index in np.ndindex(*poses.shape[:-1]):
-        root = _root(_system(frame, poses[index], elements), index)
-        load = np.zeros((len(root), 6))
-        load[:6] = unit
-        half = solve_triangular(root, load, lower=True, check_finite=False)
-        result[index] = half.T @ half
-    return result
-
-
 def has_modes(robot: Robot) -> bool:
     """Whether the robot's file has what natural frequencies need."""
     try:
@@ -153,33 +135,10 @@ def has_modes(robot: Robot) -> bool:
     return True
 
 
-def _checked(robot: Robot, pose: ArrayLike) -> tuple[Framed, Array]:
-    frame = framed(robot)
-    poses = np.asarray(pose, np.float64)
-    if poses.ndim == 0 or poses.shape[-1] != 3:
-        raise ValueError(f"a pose has 3 parameters; the shape is {poses.shape}")
-    # Refuses what is no pose, by its sample.
-    robot.inverse(poses)
-    return frame, poses
-
-
 def _system(frame: Framed, pose: Array, elements: int) -> System:
     if elements < 1:
         raise ParameterError("elements", elements, "1 or more")
     return assemble(frame.frame(pose), elements, KEPT)
-
-
-def _root(system: System, index: tuple[int, ...]) -> Array:
-    """Lower Cholesky factor of the stiffness; not positive definite is a mechanism."""
-    measure = 0.0
-    try:
-        root: Array = cholesky(system.stiffness, lower=True, check_finite=False)
-        measure = float((np.diag(root) ** 2 / np.diag(system.stiffness)).min())
-    except np.linalg.LinAlgError:
-        pass
-    if not measure > SINGULARITY_BOUND:
-        raise SingularityError("the elastic frame of the pose", index, measure, SINGULARITY_BOUND)
-    return root
 
 
 def _solve(
@@ -193,7 +152,7 @@ def _solve(
     size = len(system.mass)
     if not 1 <= count <= size:
         raise ValueError(f"count is {count}; the frame has {size} modes")
-    root = _root(system, index)
+    root = stiffness_root(system, index)
     half = solve_triangular(root, system.mass, lower=True, check_finite=False)
     matrix = solve_triangular(root, half.T, lower=True, check_finite=False)
     chosen = (size - count, size - 1)

@@ -67,6 +67,11 @@ class Monitor:
         self._reader = JointReader(self.robot)
         self._recent: deque[tuple[int, Array]] = deque(maxlen=256)
 
+    @property
+    def latest(self) -> tuple[int, Array] | None:
+        """Stamp and joint positions of the newest state, None before the first."""
+        return self._recent[-1] if self._recent else None
+
     def reset(self) -> None:
         """Forget all joint states, as when the clock jumps."""
         self._recent.clear()

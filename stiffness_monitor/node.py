@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node ``stiffness_monitor``: wrenches in, compliance and dominant element out."""
+"""The node ``stiffness_monitor``: wrenches in, compliance and dominant element out.
+
+Beside them the natural frequencies of the pose, which need joint states alone.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
 from pkm_twin import health, load
-from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.errors import ParameterError, PkmTwinError
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings
@@ -35,7 +38,8 @@ class StiffnessMonitor(health.TwinNode):
         self._energy = self.speak(DiagnosticArray, "~/strain_energy")
         self._dominant = self.speak(String, "~/dominant_element")
         self._deflection = self.speak(TransformStamped, "~/deflection")
-        self._pose: NDArray[np.float64] | None = None
+        self._known = 0
+        """Stamp of the joint state whose frequencies were published last."""
         rate = self._declare_frequencies_rate()
         if rate > 0.0 and has_modes(robot):
             self._frequencies = self.speak(Float64MultiArray, "~/natural_frequencies")
@@ -55,7 +59,7 @@ class StiffnessMonitor(health.TwinNode):
     def clock_jumped(self) -> None:
         """No pose across the seam."""
         self._monitor.reset()
-        self._pose = None
+        self._known = 0
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
@@ -121,16 +125,17 @@ class StiffnessMonitor(health.TwinNode):
         deflection.header.frame_id = "platform"
         deflection.child_frame_id = "platform_deflected"
         self._deflection.publish(deflection)
-        self._pose = answer.pose
 
     def _publish_frequencies(self) -> None:
-        """Of the latest pose, each pose once: they take milliseconds, so not with every wrench."""
-        pose, self._pose = self._pose, None
-        if pose is None:
+        """Of the latest joint state: a pose costs milliseconds, so not of every one."""
+        latest = self._monitor.latest
+        if latest is None or latest[0] == self._known:
             return
+        self._known, q = latest
+        robot = self._monitor.robot
         try:
-            values = natural_frequencies(self._monitor.robot, pose)
-        except (SingularityError, UnreachableError) as error:
+            values = natural_frequencies(robot, robot.forward(q))
+        except (PkmTwinError, ValueError) as error:
             self.log_throttled("natural frequencies", f"no natural frequencies: {error}")
             return
         message = Float64MultiArray(data=array("d", values))

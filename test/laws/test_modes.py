@@ -14,7 +14,8 @@ from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from stiffness_monitor import compliance
 from stiffness_monitor.beams import assemble
-from stiffness_monitor.modes import frame_compliance, has_modes, modes, natural_frequencies
+from stiffness_monitor.modes import has_modes, modes, natural_frequencies
+from stiffness_monitor.statics import frame_compliance
 from test.conftest import parameters_of, random_joints
 
 ROBOTS = ("delta", "delta_cu", "prru", "upr_rpu")

@@ -278,7 +278,6 @@ class TestRejects:
         ("parameters", "named"),
         [
             (["wrench_fram:=tool0"], "did you mean 'wrench_frame'"),
-            (["mechanism:=delta_cu"], "elastic members"),
             (["max_state_age:=.nan"], "max_state_age: nan"),
             (["wrench_frame:=''"], "wrench_frame: ''"),
             (["accept_empty_frame:=1"], "accept_empty_frame: 1"),

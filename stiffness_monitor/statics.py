@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compliance and strain energy of a robot's elastic frame by finite elements, actuators locked.
+
+For every robot that declares its members as a frame (:class:`~pkm_twin.mechanisms.frame.Framed`).
+One beam element a member is exact, because loads act at members' ends.
+
+May import: numpy, scipy, pkm_twin's core, this package, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import cholesky, solve_triangular  # type: ignore[import-untyped]
+
+from pkm_twin.errors import SingularityError
+from pkm_twin.mechanisms.frame import Framed, framed
+from pkm_twin.mechanisms.robot import SINGULARITY_BOUND, Robot
+from stiffness_monitor.beams import System, assemble
+
+Array = NDArray[np.float64]
+
+
+def frame_compliance(robot: Robot, pose: ArrayLike, *, elements: int = 1) -> Array:
+    """Static compliance of the platform at its origin, shape (..., 6, 6).
+
+    Order x y z rx ry rz in fixed axes, as :func:`stiffness_monitor.compliance`.
+
+    :param pose: shape (..., 3), the mechanism's pose parameters, m and rad.
+    :param elements: beam elements a member.
+    :raises ParameterError: a robot whose file has no elastic members, by the missing section.
+    :raises UnreachableError: a pose that is none of the mechanism's.
+    :raises SingularityError: a pose in which the frame is a mechanism, with locked actuators.
+    :raises ValueError: a wrong last axis, a value that is not finite.
+    """
+    frame, poses = checked_frame(robot, pose)
+    result = np.empty((*poses.shape[:-1], 6, 6))
+    for index in np.ndindex(*poses.shape[:-1]):
+        root = stiffness_root(assemble(frame.frame(poses[index]), elements), index)
+        half = _platform_columns(root)
+        result[index] = half.T @ half
+    return result
+
+
+def frame_energies(
+    robot: Robot, pose: ArrayLike, wrench: ArrayLike
+) -> tuple[tuple[str, ...], Array, Array]:
+    """Deflection under a wrench, and the strain energy of every elastic element.
+
+    :param pose: shape (..., 3); errors as :func:`frame_compliance`.
+    :param wrench: force and moment on the platform at its origin, fixed axes, shape (..., 6), N
+        and N m, broadcast against the pose.
+    :returns: names of the elements (members, and joints that have elasticity), deflection
+        (..., 6), m and rad, energies (..., elements), J.
+    """
+    frame, poses = checked_frame(robot, pose)
+    loads = np.asarray(wrench, np.float64)
+    if loads.ndim == 0 or loads.shape[-1] != 6:
+        raise ValueError(f"a wrench has 6 entries; the shape is {loads.shape}")
+    if not np.isfinite(loads).all():
+        raise ValueError("wrench is not finite")
+    batch = np.broadcast_shapes(poses.shape[:-1], loads.shape[:-1])
+    poses, loads = np.broadcast_to(poses, (*batch, 3)), np.broadcast_to(loads, (*batch, 6))
+    names: tuple[str, ...] = ()
+    deflections, energies = np.empty((*batch, 6)), []
+    for index in np.ndindex(*batch):
+        system = assemble(frame.frame(poses[index]), 1)
+        root = stiffness_root(system, index)
+        shape = solve_triangular(
+            root, _platform_columns(root) @ loads[index], lower=True, trans=1, check_finite=False
+        )
+        every, strain, _ = system.energies(shape)
+        elastic = [every.index(name) for name in system.elastic]
+        names = system.elastic
+        deflections[index] = shape[:6]
+        # What carries no load can round to just below zero.
+        energies.append(np.maximum(strain[elastic] / 2, 0.0))
+    return names, deflections, np.array(energies).reshape(*batch, len(names))
+
+
+def checked_frame(robot: Robot, pose: ArrayLike) -> tuple[Framed, Array]:
+    """The robot as one with a frame, and its poses, refused by sample where they are none."""
+    frame = framed(robot)
+    poses = np.asarray(pose, np.float64)
+    if poses.ndim == 0 or poses.shape[-1] != 3:
+        raise ValueError(f"a pose has 3 parameters; the shape is {poses.shape}")
+    robot.inverse(poses)
+    return frame, poses
+
+
+def stiffness_root(system: System, index: tuple[int, ...]) -> Array:
+    """Lower Cholesky factor of the stiffness; not positive definite is a mechanism.
+
+    :raises SingularityError: by the sample's index.
+    """
+    measure = 0.0
+    try:
+        root: Array = cholesky(system.stiffness, lower=True, check_finite=False)
+        measure = float((np.diag(root) ** 2 / np.diag(system.stiffness)).min())
+    except np.linalg.LinAlgError:
+        pass
+    if not measure > SINGULARITY_BOUND:
+        raise SingularityError("the elastic frame of the pose", index, measure, SINGULARITY_BOUND)
+    return root
+
+
+def _platform_columns(root: Array) -> Array:
+    """L^-1 E for the unit wrenches E of the platform, whose six coordinates come first."""
+    load = np.zeros((len(root), 6))
+    load[:6] = np.eye(6)
+    return np.asarray(solve_triangular(root, load, lower=True, check_finite=False), np.float64)

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of compliance and strain energy by finite elements, over all robots with elastic members."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from pkm_twin import load
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from stiffness_monitor import compliance, stiffness, strain_energy
+from stiffness_monitor.compliance import kernels
+from stiffness_monitor.statics import frame_energies
+from test.conftest import parameters_of, random_joints
+
+ROBOTS = ("delta", "delta_cu", "prru")
+NAMES = pytest.mark.parametrize("name", ROBOTS)
+
+
+def random_wrenches(rng, *shape):
+    return rng.normal(size=(*shape, 6)) * [50, 50, 50, 5, 5, 5]
+
+
+def random_poses(robot, rng, count):
+    return robot.forward(random_joints(robot, rng, count))
+
+
+def test_energies_are_those_of_the_strain_energy_method(variant, rng):
+    """Finite elements and closed form: the nine elements of the 2UPR-RPU, one by one."""
+    joints = {}
+    for key, values in parameters_of("upr_rpu")["joints_compliance"].items():
+        joints[key] = [v * float(10 ** rng.uniform(0, 3)) for v in values]
+    robot, _ = variant("upr_rpu", joints_compliance=joints)
+    poses = rng.uniform([-0.8, -0.35, -0.35], [-0.45, 0.35, 0.35], (12, 3))
+    wrench = random_wrenches(rng, 12)
+    names, deflection, energies = frame_energies(robot, poses, wrench)
+    expected = strain_energy(robot, poses, wrench)
+    assert deflection == pytest.approx(expected.deflection, rel=1e-8, abs=1e-18)
+    assert sorted(names) == sorted(expected.elements)
+    ours = energies[:, [names.index(name) for name in expected.elements]]
+    assert ours == pytest.approx(expected.energies, rel=1e-7, abs=1e-12 * expected.total.max())
+
+
+@NAMES
+class TestEveryRobot:
+    def test_compliance_is_symmetric_positive_definite_and_the_deflection_of_unit_wrenches(
+        self, name, rng
+    ):
+        robot = load(name)
+        poses = random_poses(robot, rng, 6)
+        matrix = compliance(robot, poses)
+        assert matrix.shape == (6, 6, 6)
+        assert (matrix == matrix.swapaxes(-1, -2)).all()
+        assert (np.linalg.eigvalsh(matrix) > 0.0).all()
+        wrench = random_wrenches(rng, 6)
+        found = strain_energy(robot, poses, wrench)
+        expected = np.einsum("nij,nj->ni", matrix, wrench)
+        assert found.deflection == pytest.approx(expected, rel=1e-8, abs=1e-15)
+        assert np.eye(6) == pytest.approx(stiffness(robot, poses[0]) @ matrix[0], abs=1e-6)
+
+    def test_energy_is_half_the_wrench_s_work_and_the_factors_share_it(self, name, rng):
+        robot = load(name)
+        poses, wrench = random_poses(robot, rng, 6), random_wrenches(rng, 6)
+        found = strain_energy(robot, poses, wrench)
+        work = np.einsum("ni,nij,nj->n", wrench, compliance(robot, poses), wrench) / 2
+        assert found.total == pytest.approx(work, rel=1e-8)
+        assert found.energies.sum(-1) == pytest.approx(found.total, rel=1e-12)
+        assert found.factors.sum(-1) == pytest.approx(1.0, rel=1e-12)
+        assert (found.factors >= 0.0).all()
+        assert found.factors.shape == (6, len(found.elements))
+        best = found.factors.argmax(-1)
+        alone = ~found.tie
+        assert [found.elements[k] for k in best[alone]] == found.dominant[alone].tolist()
+
+    def test_one_sample_is_the_batch_s(self, name, rng):
+        robot = load(name)
+        poses, wrench = random_poses(robot, rng, 4), random_wrenches(rng, 1)[0]
+        many = strain_energy(robot, poses.reshape(2, 2, 3), wrench)
+        for k, pose in enumerate(poses):
+            one = strain_energy(robot, pose, wrench)
+            at = divmod(k, 2)
+            assert (one.factors == many.factors[at]).all()
+            assert (one.deflection == many.deflection[at]).all()
+            assert (one.total, one.dominant, one.tie) == (
+                many.total[at],
+                many.dominant[at],
+                many.tie[at],
+            )
+            assert isinstance(one.total, float)
+            assert type(one.dominant) is str
+            assert (compliance(robot, poses)[k] == compliance(robot, pose)).all()
+
+    @pytest.mark.parametrize("size", [1e-160, 1e-30, 1e6])
+    def test_factors_do_not_hang_on_the_wrench_s_size(self, name, size, rng):
+        robot = load(name)
+        pose, wrench = robot.home(), random_wrenches(rng, 1)[0]
+        usual, other = (strain_energy(robot, pose, s * wrench) for s in (1.0, size))
+        assert other.factors == pytest.approx(usual.factors, rel=1e-9)
+        assert other.dominant == usual.dominant
+        assert other.deflection == pytest.approx(size * usual.deflection, rel=1e-9)
+
+    def test_no_load_has_no_dominant_element(self, name, rng):
+        robot = load(name)
+        found = strain_energy(robot, random_poses(robot, rng, 2), np.zeros((2, 6)))
+        assert found.dominant.tolist() == ["none", "none"]
+        assert not found.tie.any()
+        assert not found.factors.any()
+        assert not found.total.any()
+        one = strain_energy(robot, robot.home(), np.zeros(6))
+        assert (one.dominant, one.tie, one.total) == ("none", False, 0.0)
+
+    def test_a_stiffer_material_takes_less_energy_at_the_same_shares(self, name, tmp_path):
+        """All moduli doubled: half the compliance."""
+        data = parameters_of(name)
+        for section in (data["members"], *data["members"].values()):
+            if isinstance(section, dict):
+                for key in ("youngs_modulus", "shear_modulus"):
+                    if key in section:
+                        section[key] *= 2
+        path = tmp_path / "stiffer.yaml"
+        path.write_text(yaml.safe_dump(data))
+        robot, other = load(name), load(path)
+        pose, wrench = robot.home(), [3.0, -2.0, 5.0, 0.1, 0.2, -0.3]
+        usual, stiffer = (strain_energy(r, pose, wrench) for r in (robot, other))
+        assert stiffer.total == pytest.approx(usual.total / 2, rel=1e-9)
+        assert stiffer.factors == pytest.approx(usual.factors, rel=1e-7)
+
+    def test_refusals(self, name, rng):
+        robot = load(name)
+        home = robot.home()
+        for pose, wrench in (
+            ([np.nan, 0, 0], np.ones(6)),
+            (home, [np.inf, 0, 0, 0, 0, 0]),
+            (home, np.ones(5)),
+            (home[:2], np.ones(6)),
+            (home, [1e300, 0, 0, 0, 0, 0]),
+        ):
+            with pytest.raises(ValueError, match=r"finite|shape|broadcast|axis"):
+                strain_energy(robot, pose, wrench)
+        with pytest.raises((UnreachableError, SingularityError)):
+            compliance(robot, [50.0, 50.0, 50.0] if name != "prru" else [0.0, 3.0, 0.0])
+
+    def test_kernels_are_there_to_warm_up(self, name):
+        for kernel in kernels(load(name)):
+            kernel.warm_up()
+
+
+@NAMES
+def test_a_file_without_members_has_no_compliance(name, tmp_path):
+    data = parameters_of(name)
+    del data["members"]
+    path = tmp_path / "rigid.yaml"
+    path.write_text(yaml.safe_dump(data))
+    robot = load(path)
+    for ask in (
+        lambda: compliance(robot, robot.home()),
+        lambda: strain_energy(robot, robot.home(), np.ones(6)),
+        lambda: kernels(robot),
+    ):
+        with pytest.raises(ParameterError, match="members"):
+            ask()
+
+
+def test_equal_limbs_tie_under_an_axial_load():
+    robot = load("delta")
+    found = strain_energy(robot, robot.home(), [0, 0, -10.0, 0, 0, 0])
+    assert found.tie
+    limbs = [k for k, name in enumerate(found.elements) if name.startswith("arm ")]
+    assert found.factors[limbs] == pytest.approx(found.factors[limbs[0]], rel=1e-9)
