@@ -40,14 +40,14 @@ class TreeState(NamedTuple):
     a: Array
 
 
-class _PointLoop(NamedTuple):
+class PointLoop(NamedTuple):
     """Two frames whose origins coincide: three equations, m."""
 
     frame_a: int
     frame_b: int
 
 
-class _PerpendicularLoop(NamedTuple):
+class PerpendicularLoop(NamedTuple):
     """An axis of frame a stands at a right angle to an axis of frame b: one equation."""
 
     frame_a: int
@@ -74,8 +74,8 @@ class LoopEngine:
         """Coulomb friction of the actuated joints, N m or N."""
         self.friction_band = 0.0
         """Speed over which Coulomb friction turns over, rad/s or m/s; zero: a sharp sign."""
-        self._points: list[_PointLoop] = []
-        self._perpendiculars: list[_PerpendicularLoop] = []
+        self._points: list[PointLoop] = []
+        self._perpendiculars: list[PerpendicularLoop] = []
         self._actuated_joints: list[int] = []
         self._pose_joints: list[int] = []
         self._platform_joint = 0
@@ -318,6 +318,47 @@ class LoopEngine:
         effort = generalised[self.actuated] - jacobian[:, self.actuated].T @ multipliers
         return effort, multipliers
 
+    def transmitted(
+        self, tree: TreeState, wrench: ArrayLike | None = None
+    ) -> tuple[dict[str, Array], list[Array]]:
+        """What the joints transmit: the recursive sweep with the loops' multipliers as loads.
+
+        :returns: for every tree joint, by name, the wrench that its parent applies to its body, at
+            its origin, world axes, shape (6,), N and N m; for every point loop the wrench that its
+            second body applies to its first at that point, with the couples of perpendicular loops
+            between the same frames.
+        """
+        _, multipliers = self.actuator_effort(tree, wrench)
+        forces = self._external(tree.q, wrench)
+        pin.forwardKinematics(self.model, self.data, tree.q)
+        pin.updateFramePlacements(self.model, self.data)
+        count = len(self._points)
+        ends = {pair: k for k, pair in enumerate(self._points)}
+        loops = [
+            np.concatenate((part, np.zeros(3))) for part in multipliers[: 3 * count].reshape(-1, 3)
+        ]
+        for (a, x, b, y), couple in zip(
+            self._perpendiculars, multipliers[3 * count :].tolist(), strict=True
+        ):
+            normal = _cross(self.data.oMf[a].rotation @ x, self.data.oMf[b].rotation @ y)
+            loops[ends[PointLoop(a, b)]][3:] += couple * normal
+        for (a, b), load in zip(self._points, loops, strict=True):
+            for frame, sign in ((a, 1.0), (b, -1.0)):
+                joint = self.model.frames[frame].parentJoint
+                lever = self.data.oMf[frame].translation
+                about_origin = pin.Force(
+                    sign * load[:3], sign * (load[3:] + _cross(lever, load[:3]))
+                )
+                forces[joint] = forces[joint] + self.data.oMi[joint].actInv(about_origin)
+        pin.rnea(self.model, self.data, tree.q, tree.v, tree.a, forces)
+        found = {}
+        for joint in range(1, self.model.njoints):
+            turn, force = self.data.oMi[joint].rotation, self.data.f[joint]
+            found[self.model.names[joint]] = np.concatenate(
+                (turn @ force.linear, turn @ force.angular)
+            )
+        return found, loops
+
     def inverse_dynamics(
         self,
         q: ArrayLike,
@@ -512,7 +553,7 @@ class DeltaEngine(LoopEngine):
             end = self._frame(f"forearm_{limb}_end", forearm, (0.0, 0.0, -forearm_length))
             hold = turn @ np.array([float(geometry["platform_radius"]), 0.0, 0.0])
             corner = self._frame(f"platform_{limb}", self._platform_joint, hold)
-            self._points.append(_PointLoop(end, corner))
+            self._points.append(PointLoop(end, corner))
 
     def _guess(self, q: Array) -> Array:
         """Put the platform where three spheres about the elbows meet, below them."""
@@ -650,9 +691,9 @@ class PrruEngine(LoopEngine):
                 f"platform_{limb}", self._platform_joint, -self._platform_radius * inward
             )
             tangent = np.array([-inward[1], inward[0], 0.0])
-            self._points.append(_PointLoop(end, corner))
+            self._points.append(PointLoop(end, corner))
             self._perpendiculars.append(
-                _PerpendicularLoop(end, np.array([1.0, 0.0, 0.0]), corner, tangent)
+                PerpendicularLoop(end, np.array([1.0, 0.0, 0.0]), corner, tangent)
             )
 
     def _guess(self, q: Array) -> Array:
