@@ -16,9 +16,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from test.certificate.compare import Figures, compare
+from test.certificate.links import POSES, Links, compare_links, paper_rows
 from test.certificate.machines import ROBOTS
 from test.certificate.report import document
 from test.certificate.swing import Swing, run, starts
+from test.validation.calculix import CCX
 
 
 def main() -> int:
@@ -36,7 +38,10 @@ def main() -> int:
     figures = {name: Figures() for name in ROBOTS}
     results: dict[tuple[int, int], Figures] = {}
     swings: dict[int, list[Swing]] = {}
+    links: dict[str, Links] = {}
     begun = [] if options.no_swing else starts()
+    # Without CalculiX the document says so.
+    names = [] if CCX is None else list(POSES)
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     context = multiprocessing.get_context("spawn")
@@ -46,8 +51,11 @@ def main() -> int:
     ):
         machines = progress.add_task("random machines", total=len(ROBOTS) * options.machines)
         swinging = progress.add_task("free swings", total=len(begun))
+        bending = progress.add_task("platform compliance", total=len(names))
         # The long ones first.
         work = {pool.submit(run, start): ("swing", k, 0) for k, start in enumerate(begun)}
+        for k, name in enumerate(names):
+            work[pool.submit(compare_links, name)] = ("links", k, 0)
         for number in range(options.machines):
             for k, name in enumerate(ROBOTS):
                 seed = options.seed, k, number
@@ -60,13 +68,19 @@ def main() -> int:
             if kind == "swing":
                 swings[k] = job.result()
                 progress.advance(swinging)
+            elif kind == "links":
+                links[names[k]] = job.result()
+                progress.advance(bending)
             else:
                 results[k, number] = job.result()
                 progress.advance(machines)
     for (k, _), found in sorted(results.items()):
         figures[ROBOTS[k]].add(found)
     runs = [swing for k in sorted(swings) for swing in swings[k]]
-    text, failures = document(figures, runs, "python -m test.certificate", options.seed)
+    ordered = {name: links[name] for name in names}
+    text, failures = document(
+        figures, runs, ordered, paper_rows(), "python -m test.certificate", options.seed
+    )
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(text)
     console.print(f"{options.output} written")
