@@ -44,13 +44,12 @@ def _drop_stale_caches() -> None:
 
     numba looks at the outermost function's file only, and kernels call into others.
     """
-    here = Path(__file__).parent
-    newest = max(path.stat().st_mtime for path in (*here.glob("mechanisms/*.py"), Path(__file__)))
-    for folder in (here, here / "mechanisms"):
-        for index in (folder / "__pycache__").glob("*.nbi"):
-            with suppress(OSError):
-                if index.stat().st_mtime < newest:
-                    index.unlink()
+    formulas = Path(__file__).parent / "mechanisms"
+    newest = max(path.stat().st_mtime for path in (*formulas.glob("*.py"), Path(__file__)))
+    for index in (formulas / "__pycache__").glob("*.nbi"):
+        with suppress(OSError):
+            if index.stat().st_mtime < newest:
+                index.unlink()
 
 
 if COMPILED:

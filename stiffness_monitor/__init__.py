@@ -2,11 +2,17 @@
 """Elastostatics of parallel kinematic machines: compliance, strain energy, workspace."""
 
 from stiffness_monitor.compliance import StrainEnergy, compliance, stiffness, strain_energy
-from stiffness_monitor.workspace import RegularWorkspace, reachable, regular_workspace
+from stiffness_monitor.workspace import (
+    RegularWorkspace,
+    clearance,
+    reachable,
+    regular_workspace,
+)
 
 __all__ = [
     "RegularWorkspace",
     "StrainEnergy",
+    "clearance",
     "compliance",
     "reachable",
     "regular_workspace",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reachable and regular workspace of a machine whose pose is a height and two tilts.
+"""Reachable workspace of a machine, and the regular one of a height and two tilts.
 
 May import: numpy, pkm_twin's core, the standard library; never rclpy.
 """
@@ -14,20 +14,54 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.kernels import OK
+from pkm_twin.kernels import OK, Kernel
 from pkm_twin.mechanisms.robot import Robot
 
 Array = NDArray[np.float64]
 
 
-def reachable(robot: Robot, pose: ArrayLike) -> NDArray[np.bool_]:
-    """Whether poses keep the limits of limb lengths and passive joints, shape (...).
+def clearance(robot: Robot, pose: ArrayLike) -> Array:
+    """Least distance between the surfaces of members of different limbs, shape (...), m.
+
+    Members are round bars between their joints, of the outer diameters in the robot's file:
+    the bars of the 2UPR-RPU, the limbs of the 3-PRRU, arms and rods of a Delta. Zero where two
+    touch; below zero they are in each other, by the axes' distance less the radii. Of platform,
+    base, drives and joints the files tell no shape, so they are not counted.
+
+    :param pose: shape (..., 3), in the robot's pose parameters.
+    :raises ParameterError: the file does not tell the members' diameters.
+    :raises UnreachableError: a pose that is none of the mechanism's, by limb, sample and miss.
+    :raises SingularityError: a pose where the mechanism is singular.
+    :raises ValueError: a pose that is not finite.
+    """
+    kernel = _clearance_kernel(robot)
+    if kernel is None:
+        raise ParameterError("members", None, "a section that gives the members' outer diameters")
+    poses = np.asarray(pose, np.float64)
+    gap, fault = kernel(robot.parameters, poses, robot.inverse(poses))
+    robot.raise_fault(fault, "pose")
+    return np.asarray(gap[..., 0])
+
+
+def has_clearance(robot: Robot) -> bool:
+    """Whether :func:`clearance` is known: the robot's file tells the members' diameters."""
+    return _clearance_kernel(robot) is not None
+
+
+def _clearance_kernel(robot: Robot) -> Kernel | None:
+    return None if robot.radii is None else robot.clearance_kernel
+
+
+def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> NDArray[np.bool_]:
+    """Whether poses keep the limits of actuators and passive joints and limbs apart, shape (...).
 
     A passive joint's angle is that between its limb and the vertical, and between its limb and
     the platform's normal (2UPR-RPU paper, equation 40). A pose also has to be on the branch that
     ``forward`` gives. Limits that are absent hold everywhere; a pose that is not finite raises.
 
-    :param pose: shape (..., 3): z, and the two tilts, m and rad.
+    :param pose: shape (..., 3), in the robot's pose parameters, m and rad.
+    :param least_clearance: what :func:`clearance` has to be above, m; -inf lets limbs meet. It
+        bounds no robot whose clearance is not known.
     """
     poses = np.asarray(pose, np.float64)
     if not np.isfinite(poses).all():
@@ -51,6 +85,12 @@ def reachable(robot: Robot, pose: ArrayLike) -> NDArray[np.bool_]:
         inside &= (fault[..., 0] == OK) & (np.where(inside[..., None], angles, 0.0) <= bound).all(
             -1
         )
+    kernel = _clearance_kernel(robot)
+    if kernel is not None and least_clearance > -math.inf:
+        # The dearest test, so only where all others hold.
+        inside = np.asarray(inside)
+        gap, fault = kernel(p, poses[inside], q[inside])
+        inside[inside] = (fault[:, 0] == OK) & (gap[:, 0] > least_clearance)
     return np.asarray(inside)
 
 

@@ -55,6 +55,9 @@ def atlas(
     least_singularity: Annotated[
         float, typer.Option(help="workspace: distance to a singularity (0 to 1) that is too little")
     ] = 0.0,
+    least_clearance: Annotated[
+        float, typer.Option(help="workspace: distance between limbs (m) that is too little")
+    ] = 0.0,
     out: Annotated[
         _File, typer.Option(help="file to write; default ROBOT_KIND.nc", show_default=False)
     ] = None,
@@ -70,9 +73,9 @@ def atlas(
 ) -> None:
     """Compute a quantity over a robot's whole workspace: a NetCDF file and its pictures.
 
-    workspace: reach, singularities, regular part. strain-energy: where a wrench stores its energy
-    (upr_rpu). isotropy: kinetic energy and driving force over directions (prru, delta). modes:
-    the six lowest natural frequencies.
+    workspace: reach, singularities, limb interference, regular part. strain-energy: where a wrench
+    stores its energy (upr_rpu). isotropy: kinetic energy and driving force over directions (prru,
+    delta). modes: the six lowest natural frequencies.
 
     Ctrl-C stops it; finished parts stay in FILE.nc.parts, and the same command goes on from there,
     with the same result. Machines and memory: docs/scale.md.
@@ -88,6 +91,7 @@ def atlas(
         "height": height,
         "energy": energy,
         "least_singularity": least_singularity,
+        "least_clearance": least_clearance,
     }
     sweep = sweep_of(machine, kind, options)
     with _interruptible(), _progress(f"{kind} of {machine.name}", sweep.points) as update:
@@ -139,7 +143,12 @@ def sweep_of(machine: Any, kind: str, options: dict[str, Any]) -> Any:
     if kind == "workspace":
         from pkm_twin.atlas.workspace import workspace_sweep
 
-        return workspace_sweep(machine, points, least_singularity=options["least_singularity"])
+        return workspace_sweep(
+            machine,
+            points,
+            least_singularity=options["least_singularity"],
+            least_clearance=options["least_clearance"],
+        )
     if kind == "modes":
         from pkm_twin.atlas.modes import modes_sweep
 

@@ -125,12 +125,19 @@ class Reach:
     radius: Array
 
 
-def circles(robot: Robot, heights: ArrayLike, steps: int = 340, least: float = 0.0) -> Reach:
+def circles(
+    robot: Robot,
+    heights: ArrayLike,
+    steps: int = 340,
+    least: float = 0.0,
+    least_clearance: float = 0.0,
+) -> Reach:
     """The largest circle about the axis at each height that is reachable with all its inside.
 
     :param heights: shape (n,), m.
     :param steps: first search along each of 360 rays; a bisection refines it.
     :param least: singularity measure below which a pose counts as out of reach.
+    :param least_clearance: what the limbs' clearance has to be above, m.
     """
     z = np.atleast_1d(np.asarray(heights, np.float64))
     turn = turns(RAYS)
@@ -139,7 +146,7 @@ def circles(robot: Robot, heights: ArrayLike, steps: int = 340, least: float = 0
 
     def inside(height: float, distance: Array, azimuth: Array) -> NDArray[np.bool_]:
         poses = polar_pose(robot, height, distance, azimuth)
-        kept = reachable(robot, poses)
+        kept = reachable(robot, poses, least_clearance)
         if least > 0.0:
             kept &= singularity(robot, poses) >= least
         return kept

@@ -34,6 +34,7 @@ from pkm_twin.mechanisms.bodies import (
     TWIST,
     VISCOUS,
 )
+from pkm_twin.mechanisms.clearance import BAR, bar, least
 from pkm_twin.mechanisms.frame import (
     RIGID,
     Frame,
@@ -51,6 +52,8 @@ from pkm_twin.mechanisms.robot import (
     Limits,
     Payload,
     Robot,
+    check_azimuths,
+    dynamic_head,
     length,
     mass,
 )
@@ -69,10 +72,16 @@ M_ARM: Final = HEAD + 14
 ARM_COM: Final = HEAD + 15
 ARM_INERTIA: Final = HEAD + 16
 M_FOREARM: Final = HEAD + 17
+R_ARM: Final = HEAD + 18
+R_FOREARM: Final = HEAD + 19
+HALF_WIDTH: Final = HEAD + 22
+"""Half the distance of a parallelogram's rods, m."""
 
 BODIES: Final = 8
 SCRATCH: Final = ROW * BODIES + TWIST
 SEARCH_STEPS: Final = 256
+BARS: Final = 9
+"""Most members: an arm and two rods a limb."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +99,7 @@ class Geometry:
         """Limbs apart, and at most one of them an rcu."""
         if self.closures.count("rcu") > 1:
             raise ParameterError(f"{path}.closures", list(self.closures), "at most one rcu limb")
-        for i in range(3):
-            apart = self.azimuths[i] - self.azimuths[i - 1]
-            if abs(math.remainder(apart, 2 * math.pi)) < 1e-3:
-                raise ParameterError(
-                    f"{path}.azimuths", self.azimuths.tolist(), "limbs at least 0.001 rad apart"
-                )
+        check_azimuths(self.azimuths, f"{path}.azimuths")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +116,9 @@ class Inertia:
 
 @dataclass(frozen=True, eq=False)
 class Members:
-    """Arms and forearms as tubes, whose masses stand in the inertia section; for modes only.
+    """Arms and forearms as tubes, whose masses stand in the inertia section.
+
+    For elasticity, and by the outer diameters for limb interference; dynamics read none of it.
 
     ``forearm``: each of a parallelogram's two rods, ``parallelogram_width`` apart (m), half of
     the forearm's mass each. ``rcu_forearm``: the one rod of an rcu limb, for modes of a robot that
@@ -241,7 +247,7 @@ class Delta(Robot):
         g, m, members = self.geometry, self.inertia, self.members
         if members is None:
             raise ParameterError(
-                "members", None, "a section that gives the sections of arms and forearms, for modes"
+                "members", None, "a section with the elastic members, arms and forearms"
             )
         arm_section, sections = self._sections()
         up = np.array([0.0, 0.0, 1.0])
@@ -321,17 +327,26 @@ class Delta(Robot):
                 rods.append(members.rcu_forearm.section(spread, "members.rcu_forearm"))
         return arm, tuple(rods)
 
+    @property
+    def radii(self) -> tuple[float, ...] | None:
+        """Outer radii of an arm and of each limb's rods, m; None: the file lacks one."""
+        members = self.members
+        if members is None:
+            return None
+        tubes = [members.arm]
+        for closure in self.geometry.closures:
+            tube = members.forearm if closure == "rod" else members.rcu_forearm
+            if tube is None:
+                return None
+            tubes.append(tube)
+        return tuple(tube.outer_diameter / 2 for tube in tubes)
+
     def _pack(self) -> list[float]:
         g, m = self.geometry, self.inertia
         arm = m.arm_inertia
         about_com = m.arm_mass * g.arm_length**2 / 12 if arm is None else arm
         return [
-            *self.gravity,
-            *self.friction.viscous,
-            *self.friction.coulomb,
-            self.payload.mass,
-            *self.payload.com,
-            *self.payload.inertia.ravel(),
+            *dynamic_head(self),
             g.base_radius,
             g.platform_radius,
             g.arm_length,
@@ -344,6 +359,8 @@ class Delta(Robot):
             m.arm_com,
             about_com + m.rotor_inertia,
             m.forearm_mass,
+            *(self.radii or 4 * (math.nan,)),
+            math.nan if self.members is None else self.members.parallelogram_width / 2,
         ]
 
 
@@ -846,8 +863,32 @@ def _inverse_dynamics(p, q, qd, qdd, wrench, tau, scratch, fault):  # type: igno
         fault[0] = NOT_FINITE
 
 
+def _clearance(p, pose, q, clearance, scratch, fault):  # type: ignore[no-untyped-def]
+    """Clearance of arms and rods: the members of ``frame``, see clearance.py."""
+    count = 0
+    for i in range(3):
+        co = p[COS + i]
+        si = p[SIN + i]
+        base = p[BASE]
+        out = base + p[ARM] * math.cos(q[i])
+        tip = (out * co, out * si, -p[ARM] * math.sin(q[i]))
+        corner = (pose[0] + p[PLATFORM] * co, pose[1] + p[PLATFORM] * si, pose[2])
+        count = bar(scratch, count, i, p[R_ARM], (base * co, base * si, 0.0), tip)
+        # The rods stand off along t = (-si, co, 0): an rcu's by its slide, at the elbow only.
+        slide = (corner[1] - tip[1]) * co - (corner[0] - tip[0]) * si
+        rods = 1 if p[RCU + i] != 0.0 else 2
+        for rod in range(rods):
+            inner = slide if rods == 1 else (2 * rod - 1) * p[HALF_WIDTH]
+            outer = 0.0 if rods == 1 else inner
+            elbow = (tip[0] - inner * si, tip[1] + inner * co, tip[2])
+            joint = (corner[0] - outer * si, corner[1] + outer * co, corner[2])
+            count = bar(scratch, count, i, p[R_FOREARM + i], elbow, joint)
+    clearance[0] = least(scratch, count)
+
+
 Delta.inverse_kernel = Kernel(_inverse, (3,), (3,))
 Delta.forward_kernel = Kernel(_forward, (3,), (3,))
 Delta.jacobian_kernel = Kernel(_jacobian, (3,), (9, 18), SCRATCH)
 Delta.motion_kernel = Kernel(_bodies, (3, 3, 3), (SCRATCH,))
 Delta.dynamics_kernel = Kernel(_inverse_dynamics, (3, 3, 3, 6), (3,), 9)
+Delta.clearance_kernel = Kernel(_clearance, (3, 3), (1,), BAR * BARS)

@@ -53,6 +53,7 @@ from pkm_twin.mechanisms.bodies import (
     TWIST,
     virtual_work,
 )
+from pkm_twin.mechanisms.clearance import BAR, bar, least
 from pkm_twin.mechanisms.frame import Frame, Member, RigidBody, Support, Tube, disc
 from pkm_twin.mechanisms.joints import (
     GROUND,
@@ -68,6 +69,8 @@ from pkm_twin.mechanisms.robot import (
     Limits,
     Payload,
     Robot,
+    check_azimuths,
+    dynamic_head,
     length,
     mass,
 )
@@ -98,6 +101,7 @@ SPIN_UPPER: Final = HEAD + 35
 M_PLATFORM: Final = HEAD + 36
 PLATFORM_COM: Final = HEAD + 37
 PLATFORM_INERTIA: Final = HEAD + 40
+R_LIMB: Final = HEAD + 49
 
 BODIES: Final = 11
 SCRATCH: Final = ROW * BODIES + TWIST
@@ -122,12 +126,7 @@ class Geometry:
 
     def verify(self, path: str) -> None:
         """Limbs apart, and long enough for the level platform."""
-        for i in range(3):
-            apart = self.azimuths[i] - self.azimuths[i - 1]
-            if abs(math.remainder(apart, 2 * math.pi)) < 1e-3:
-                raise ParameterError(
-                    f"{path}.azimuths", self.azimuths.tolist(), "limbs at least 0.001 rad apart"
-                )
+        check_azimuths(self.azimuths, f"{path}.azimuths")
         out = abs(self.base_radius - self.platform_radius)
         if not self.limb_length > out * (1 + 1e-6):
             raise ParameterError(
@@ -169,7 +168,7 @@ class Inertia:
 
 @dataclass(frozen=True, eq=False)
 class Members:
-    """A limb's two links as one tube with the masses of both; for modes only."""
+    """A limb's two links as one tube with the masses of both, for elasticity and interference."""
 
     limb: Tube = parameters.section(Tube)
 
@@ -290,9 +289,7 @@ class Prru(Robot):
         """
         g, m = self.geometry, self.inertia
         if self.members is None:
-            raise ParameterError(
-                "members", None, "a section that gives the limbs' section, for modes"
-            )
+            raise ParameterError("members", None, "a section with the elastic members, the limbs")
         spread = (m.lower_link_mass + m.upper_link_mass) / g.limb_length
         section = self.members.limb.section(spread, "members.limb")
         q = self.inverse(pose)
@@ -325,6 +322,11 @@ class Prru(Robot):
             bodies.append(RigidBody("payload", load.mass, turn @ load.com, inertia))
         return Frame(platform.position, tuple(beams), tuple(bodies))
 
+    @property
+    def radii(self) -> tuple[float, ...] | None:
+        """Outer radius of a limb, m; None: the file has no members."""
+        return None if self.members is None else (self.members.limb.outer_diameter / 2,)
+
     def _pack(self) -> list[float]:
         g, m = self.geometry, self.inertia
         cosines, sines = np.cos(g.azimuths), np.sin(g.azimuths)
@@ -343,12 +345,7 @@ class Prru(Robot):
         disc = m.platform_mass * g.platform_radius**2 / 4 * np.diag([1.0, 1.0, 2.0])
         platform = disc if m.platform_inertia is None else m.platform_inertia
         return [
-            *self.gravity,
-            *self.friction.viscous,
-            *self.friction.coulomb,
-            self.payload.mass,
-            *self.payload.com,
-            *self.payload.inertia.ravel(),
+            *dynamic_head(self),
             g.base_radius,
             g.platform_radius,
             g.limb_length,
@@ -373,6 +370,7 @@ class Prru(Robot):
             m.platform_mass,
             *m.platform_com,
             *platform.ravel(),
+            *(self.radii or (math.nan,)),
         ]
 
 
@@ -463,18 +461,10 @@ def _rotation(p, pose, rotation, scratch, fault):  # type: ignore[no-untyped-def
     rotation[8] = math.cos(pose[1]) * math.cos(pose[2])
 
 
-def _inverse(p, pose, q, scratch, fault):  # type: ignore[no-untyped-def]
-    """Slider heights of a pose (equation 9)."""
-    if not math.isfinite(pose[0] + pose[1] + pose[2]):
-        fault[0] = NOT_FINITE
-        return
-    row1, row2, row3, norm = _turned(p, pose)
-    if not norm > SINGULARITY_BOUND:
-        fault[0] = SINGULAR
-        fault[2] = norm
-        return
+@scalar
+def _middle(p, row1, row2):  # type: ignore[no-untyped-def]
+    """Platform's centre, x and y: least squares of the three planes, which agree."""
     r = p[PLATFORM]
-    # The platform's centre: least squares of the three planes, which agree.
     xx = yy = xy = bx = by = 0.0
     for i in range(3):
         c = p[COS + i]
@@ -486,8 +476,21 @@ def _inverse(p, pose, q, scratch, fault):  # type: ignore[no-untyped-def]
         bx -= s * off
         by += c * off
     det = xx * yy - xy * xy
-    x = (yy * bx - xy * by) / det
-    y = (xx * by - xy * bx) / det
+    return (yy * bx - xy * by) / det, (xx * by - xy * bx) / det
+
+
+def _inverse(p, pose, q, scratch, fault):  # type: ignore[no-untyped-def]
+    """Slider heights of a pose (equation 9)."""
+    if not math.isfinite(pose[0] + pose[1] + pose[2]):
+        fault[0] = NOT_FINITE
+        return
+    row1, row2, row3, norm = _turned(p, pose)
+    if not norm > SINGULARITY_BOUND:
+        fault[0] = SINGULAR
+        fault[2] = norm
+        return
+    r = p[PLATFORM]
+    x, y = _middle(p, row1, row2)
     l = p[LIMB]  # noqa: E741
     for i in range(3):
         c = p[COS + i]
@@ -918,9 +921,32 @@ def _inverse_dynamics(p, q, qd, qdd, wrench, tau, scratch, fault):  # type: igno
         fault[0] = NOT_FINITE
 
 
+def _clearance(p, pose, q, clearance, scratch, fault):  # type: ignore[no-untyped-def]
+    """Clearance of the limbs between slider and platform joints, see clearance.py."""
+    row1, row2, row3, norm = _turned(p, pose)
+    if not norm > SINGULARITY_BOUND:
+        fault[0] = SINGULAR
+        fault[2] = norm
+        return
+    x, y = _middle(p, row1, row2)
+    r = p[PLATFORM]
+    for i in range(3):
+        c = p[COS + i]
+        s = p[SIN + i]
+        slider = (-p[BASE] * c, -p[BASE] * s, q[i])
+        corner = (
+            x - r * (row1[0] * c + row1[1] * s),
+            y - r * (row2[0] * c + row2[1] * s),
+            pose[0] - r * (row3[0] * c + row3[1] * s),
+        )
+        bar(scratch, i, i, p[R_LIMB], slider, corner)
+    clearance[0] = least(scratch, 3)
+
+
 Prru.rotation_kernel = Kernel(_rotation, (3,), (9,))
 Prru.inverse_kernel = Kernel(_inverse, (3,), (3,), 6)
 Prru.forward_kernel = Kernel(_forward, (3,), (3,))
 Prru.jacobian_kernel = Kernel(_jacobian, (3,), (9, 18), SCRATCH)
 Prru.motion_kernel = Kernel(_bodies, (3, 3, 3), (SCRATCH,))
 Prru.dynamics_kernel = Kernel(_inverse_dynamics, (3, 3, 3, 6), (3,), SCRATCH)
+Prru.clearance_kernel = Kernel(_clearance, (3, 3), (1,), 3 * BAR)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin import kernels, parameters
-from pkm_twin.errors import SingularityError, UnknownNameError, UnreachableError
+from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.kernels import Kernel
 
 Array = NDArray[np.float64]
@@ -35,6 +36,14 @@ def mass(**options: Any) -> Any:
     return parameters.number(at_least=0.0, at_most=MAX_MASS, **options)
 
 
+def check_azimuths(azimuths: Array, path: str) -> None:
+    """Refuse limbs that stand in one place."""
+    for i in range(3):
+        apart = math.remainder(float(azimuths[i] - azimuths[i - 1]), 2 * math.pi)
+        if abs(apart) < 1e-3:
+            raise ParameterError(path, azimuths.tolist(), "limbs at least 0.001 rad apart")
+
+
 @dataclass(frozen=True, eq=False)
 class Payload:
     """A body fixed to the platform: com from the platform's origin, inertia about the com."""
@@ -50,6 +59,18 @@ class Friction:
 
     viscous: Array = parameters.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
     coulomb: Array = parameters.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
+
+
+def dynamic_head(robot: Any) -> list[float]:
+    """The head of the flat parameters of a robot with masses, as bodies.py numbers it."""
+    return [
+        *robot.gravity,
+        *robot.friction.viscous,
+        *robot.friction.coulomb,
+        robot.payload.mass,
+        *robot.payload.com,
+        *robot.payload.inertia.ravel(),
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +107,8 @@ class Robot:
     dynamics_kernel: ClassVar[Kernel | None] = None
     body_names: ClassVar[tuple[str, ...]] = ()
     angles_kernel: ClassVar[Kernel | None] = None
+    clearance_kernel: ClassVar[Kernel | None] = None
+    """Least distance (m) of different limbs' members, of a pose and its q; needs ``radii``."""
     elastic_kernel: ClassVar[Kernel | None] = None
     energy_kernel: ClassVar[Kernel | None] = None
     element_names: ClassVar[tuple[str, ...]] = ()
@@ -95,6 +118,11 @@ class Robot:
     def name(self) -> str:
         """The name that the robot was loaded by."""
         return str(self.__dict__.get("_name", self.mechanism))
+
+    @property
+    def radii(self) -> tuple[float, ...] | None:
+        """Outer radii of the members that limb interference is about, m; None: not known."""
+        return None
 
     @cached_property
     def parameters(self) -> Array:

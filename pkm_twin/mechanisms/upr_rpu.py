@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from pkm_twin import parameters
 from pkm_twin.errors import ParameterError
 from pkm_twin.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
+from pkm_twin.mechanisms.clearance import BAR, bar, least
 from pkm_twin.mechanisms.elements import BLOCK, SCRATCH, divide, factorise, invert
 from pkm_twin.mechanisms.frame import (
     GROUND,
@@ -64,6 +65,7 @@ UPR_R: Final = 14
 UPR_U: Final = 20
 RPU_U: Final = 26
 RPU_R: Final = 32
+RADIUS: Final = 38
 
 FAR: Final = 1e5
 """Longest limb over the machine's size; beyond, rounding would lose the pose, or overflow."""
@@ -266,6 +268,11 @@ class UprRpu(Robot):
         )
         return Frame(origin, tuple(bars), (platform,))
 
+    @property
+    def radii(self) -> tuple[float, ...] | None:
+        """Radii of the three bars, m."""
+        return tuple((self.members.diameter / 2).tolist())
+
     def _pack(self) -> list[float]:
         m, j = self.members, self.joints_compliance
         area = np.pi * m.diameter**2 / 4
@@ -280,6 +287,7 @@ class UprRpu(Robot):
             *(1 / (m.shear_modulus * 2 * second)),
             # Free axes carry no load; their entries are never read.
             *np.where(np.isinf(joints), 0.0, joints),
+            *(m.diameter / 2),
         ]
 
 
@@ -542,6 +550,22 @@ def _angles(p, pose, angles, scratch, fault):  # type: ignore[no-untyped-def]
         angles[2 * i + 1] = math.acos(max(-1.0, min(1.0, along / size))) if size > 0.0 else 0.0
 
 
+def _clearance(p, pose, q, clearance, scratch, fault):  # type: ignore[no-untyped-def]
+    """Clearance of the bars from B to A, see clearance.py."""
+    good, rho, cb, sb, cg, sg = _place(p, pose, fault)
+    if not good:
+        return
+    a = p[PLATFORM]
+    b = p[BASE]
+    # o = rho tau, y = (0, cb, sb), tau = (0, -sb, cb).
+    for i in range(2):
+        side = -1.0 if i == 0 else 1.0
+        up = rho - side * a * sg
+        bar(scratch, i, i, p[RADIUS + i], (side * b, 0.0, 0.0), (side * a * cg, -sb * up, cb * up))
+    bar(scratch, 2, 2, p[RADIUS + 2], (0.0, b, 0.0), (0.0, a * cb - rho * sb, a * sb + rho * cb))
+    clearance[0] = least(scratch, 3)
+
+
 @scalar
 def _element(s, o, c11, c22, c23, c33):  # type: ignore[no-untyped-def]
     """Write one element's compliance on (f1, f2, m)."""
@@ -658,5 +682,6 @@ UprRpu.inverse_kernel = Kernel(_inverse, (3,), (3,))
 UprRpu.forward_kernel = Kernel(_forward, (3,), (3,))
 UprRpu.jacobian_kernel = Kernel(_jacobian, (3,), (9, 18))
 UprRpu.angles_kernel = Kernel(_angles, (3,), (6,))
+UprRpu.clearance_kernel = Kernel(_clearance, (3, 3), (1,), 3 * BAR)
 UprRpu.elastic_kernel = Kernel(_elastic, (3,), (36,), SCRATCH)
 UprRpu.energy_kernel = Kernel(_energy, (3, 6), (6, 9, 9, 3), SCRATCH)

@@ -8,12 +8,15 @@ import pytest
 
 from pkm_twin import load
 from pkm_twin.atlas import workspace
+from pkm_twin.atlas.commands import sweep_of
 from pkm_twin.atlas.grids import circles, largest_cylinder, nice, polar_pose, singularity
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace import workspace_sweep
 from pkm_twin.errors import ParameterError
 from stiffness_monitor import reachable, regular_workspace
+from stiffness_monitor.workspace import clearance
+from test.conftest import parameters_of
 
 ROBOTS = ("prru", "delta_cu", "upr_rpu")
 TURN = np.linspace(0, 2 * np.pi, 1001)
@@ -37,6 +40,18 @@ def test_reach_and_singularity_are_those_of_the_library(reach_atlas):
     low, high = robot.limits.position.T
     assert (q >= low).all()
     assert (q <= high).all()
+
+
+def test_clearance_is_that_of_the_library(reach_atlas):
+    """It is there wherever the other limits hold."""
+    robot, data = reach_atlas
+    grid = np.stack(np.meshgrid(*(data[n] for n in robot.pose_names), indexing="ij"), -1)
+    otherwise = reachable(robot, grid, -np.inf)
+    assert (np.isfinite(data.clearance.values) == otherwise).all()
+    expected = clearance(robot, grid[otherwise])
+    assert data.clearance.values[otherwise] == pytest.approx(expected, abs=1e-12)
+    assert data.clearance.attrs["units"] == "m"
+    assert float(data.interference) == 0.0
 
 
 def test_the_box_holds_all_that_is_reachable(reach_atlas):
@@ -102,6 +117,110 @@ def test_a_bound_on_singularity_takes_away(tmp_path, monkeypatch):
         assert float(narrow.singularity.min()) >= 0.3
 
 
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_bound_on_clearance_takes_away(name, tmp_path, monkeypatch):
+    """Volume, circles and cylinder are those of what is left; the rest is in the file."""
+    monkeypatch.setattr(workspace, "LAYERS", 15)
+    robot = load(name)
+    wide = run(workspace_sweep(robot, 4000), tmp_path / "wide.nc", workers=1)
+    with open_atlas(wide) as data:
+        data.load()
+    gaps = data.clearance.values
+    bound = float(np.nanquantile(gaps, 0.1))
+    sweep = workspace_sweep(robot, 4000, least_clearance=bound)
+    with open_atlas(run(sweep, tmp_path / "narrow.nc", workers=1)) as left:
+        left.load()
+    assert (left.clearance.values[np.isfinite(gaps)] == gaps[np.isfinite(gaps)]).all()
+    kept = np.nan_to_num(gaps, nan=-np.inf) > bound
+    assert (left.reachable.values == kept).all()
+    assert (np.isfinite(left.singularity.values) == kept).all()
+    lost = float(left.interference)
+    assert 0 < lost < 0.2
+    assert float(left.volume) == pytest.approx((1 - lost) * float(data.volume))
+    assert (left.circle.values <= data.circle.values).all()
+    assert left.circle.values == pytest.approx(
+        circles(robot, left.height.values, least_clearance=bound).radius
+    )
+    assert not left.equals(data)
+
+
+def test_the_box_holds_what_interference_takes_away(variant):
+    """Limbs so thick that they meet wherever the head tilts far."""
+    thin = load("prru")
+    limb = parameters_of("prru")["members"]["limb"] | {"outer_diameter": 0.40}
+    thick, _ = variant("prru", members={"limb": limb})
+    poses = np.stack(np.meshgrid(*workspace_sweep(thin, 4000).axes, indexing="ij"), -1)
+    tilt = np.abs(poses[..., 1:]).max((0, 1, 2))
+    assert (np.abs(poses[reachable(thick, poses)])[:, 1:].max(0) < 0.9 * tilt).all()
+    for one, other in zip(
+        workspace_sweep(thick, 4000).axes, workspace_sweep(thin, 4000).axes, strict=True
+    ):
+        assert (one == other).all()
+
+
+def test_the_command_line_gives_both_bounds():
+    options = {"points": 4000, "least_singularity": 0.2, "least_clearance": 0.03}
+    sweep = sweep_of(load("delta"), "workspace", options)
+    assert (sweep.least, sweep.least_clearance) == (0.2, 0.03)
+    assert sweep.settings["least_clearance"] == 0.03
+
+
+def test_pictures_show_what_interference_takes_away(tmp_path, monkeypatch):
+    """A name for the hatching, in words that say why."""
+    from matplotlib import pyplot
+
+    from pkm_twin.atlas import figures
+
+    monkeypatch.setattr(workspace, "LAYERS", 15)
+    for least, words in ((0.0, "limbs meet nowhere"), (0.03, "limbs are within 30 mm in ")):
+        sweep = workspace_sweep(load("delta"), 30000, least_clearance=least)
+        with open_atlas(run(sweep, tmp_path / f"{least}.nc", workers=1)) as data:
+            figure = figures.draw(data)["sections"]
+        assert words in figure.get_suptitle()
+        legends = [ax.get_legend() for ax in figure.axes if ax.get_legend()]
+        texts = {text.get_text() for legend in legends for text in legend.get_texts()}
+        hatched = {"lost: limbs are within 30 mm", "for some z limbs are within 30 mm"}
+        assert (texts & hatched) == (hatched if least else set())
+        pyplot.close(figure)
+
+
+def test_all_taken_away_is_still_an_atlas(tmp_path, monkeypatch):
+    from matplotlib import pyplot
+
+    from pkm_twin.atlas import figures
+
+    monkeypatch.setattr(workspace, "LAYERS", 15)
+    sweep = workspace_sweep(load("delta"), 4000, least_clearance=0.05)
+    with open_atlas(run(sweep, tmp_path / "none.nc", workers=1)) as data:
+        assert float(data.volume) == 0.0
+        assert float(data.interference) == 1.0
+        assert float(data.cylinder_radius) == 0.0
+        pyplot.close(figures.draw(data)["sections"])
+
+
+def test_without_members_there_is_no_clearance(tmp_path, monkeypatch):
+    from matplotlib import pyplot
+
+    from pkm_twin.atlas import figures
+
+    monkeypatch.setattr(workspace, "LAYERS", 15)
+    robot = load("delta")
+    whole = run(workspace_sweep(robot, 4000), tmp_path / "whole.nc", workers=1)
+    monkeypatch.setattr(type(robot), "radii", None)
+    bare = run(workspace_sweep(load("delta"), 4000), tmp_path / "bare.nc", workers=1)
+    with open_atlas(whole) as one, open_atlas(bare) as other:
+        assert set(one.variables) - set(other.variables) == {"clearance", "interference"}
+        for variable in other.variables:
+            assert one[variable].equals(other[variable])
+        figure = figures.draw(other)["sections"]
+        assert "limbs" not in figure.get_suptitle()
+        pyplot.close(figure)
+    options = {"points": 4000, "least_singularity": 0.0, "least_clearance": 0.01}
+    with pytest.raises(ParameterError) as caught:
+        sweep_of(load("delta"), "workspace", options)
+    assert caught.value.field == "least_clearance"
+
+
 def test_nice():
     assert [nice(v) for v in (0.07, 0.05, 0.0499, 1.0, 19.0)] == [0.05, 0.05, 0.02, 1.0, 10.0]
 
@@ -111,3 +230,6 @@ def test_refusals():
         workspace_sweep(load("delta"), 10)
     with pytest.raises(ParameterError):
         workspace_sweep(load("delta"), least_singularity=1.0)
+    for bad in (-0.01, np.inf, np.nan):
+        with pytest.raises(ParameterError):
+            workspace_sweep(load("delta"), least_clearance=bad)

@@ -1,0 +1,398 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of limb interference: distances of bars, and which poses they leave."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+from scipy.optimize import lsq_linear
+
+from delta_dynamics.isotropy import tilted_pose
+from pkm_twin import load, robot_names
+from pkm_twin.atlas.workspace import workspace_sweep
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.mechanisms.clearance import BAR, bar, distance, least
+from stiffness_monitor.workspace import clearance, has_clearance, reachable, regular_workspace
+from test.conftest import parameters_of, random_poses
+
+ROBOTS = robot_names()
+
+
+def segments(a, b, c, d):
+    """Distance of the segments a to b and c to d."""
+    a, b, c, d = (np.asarray(v, float) for v in (a, b, c, d))
+    return float(distance(*a, *(b - a), *c, *(d - c)))
+
+
+def bounded(a, b, c, d):
+    """The same as bounded least squares over the two places along the segments."""
+    found = lsq_linear(np.column_stack((b - a, c - d)), c - a, bounds=(0, 1), method="bvls")
+    return math.sqrt(2 * found.cost)
+
+
+def pairs(rng, count):
+    """Segments of every kind: skew, parallel, crossing, touching, and points; (count, 4, 3)."""
+    for k in range(count):
+        a, b, c, d = rng.normal(size=(4, 3))
+        kind = k % 7
+        if kind == 1:
+            d = c + rng.normal() * (b - a)
+        elif kind == 2:
+            # Collinear: apart, one in the other, or overlapping.
+            c, d = (a + s * (b - a) for s in rng.uniform(-2, 3, 2))
+        elif kind == 3:
+            middle = a + rng.uniform() * (b - a)
+            d = middle + rng.uniform() * (middle - c)
+        elif kind == 4:
+            d = c
+        elif kind == 5:
+            b, d = a, c
+        elif kind == 6:
+            c = (a, b)[rng.integers(2)]
+        yield np.array([a, b, c, d])
+
+
+def test_distance_is_the_least_over_both_segments(rng):
+    for k, points in enumerate(pairs(rng, 2100)):
+        assert segments(*points) == pytest.approx(bounded(*points), abs=1e-9), k % 7
+
+
+def test_no_two_points_are_nearer(rng):
+    along = np.linspace(0, 1, 201)
+    for a, b, c, d in pairs(rng, 70):
+        one, other = (p + along[:, None] * (q - p) for p, q in ((a, b), (c, d)))
+        sampled = np.linalg.norm(one[:, None] - other, axis=-1).min()
+        step = (np.linalg.norm(b - a) + np.linalg.norm(d - c)) / 400
+        assert sampled - step - 1e-12 <= segments(a, b, c, d) <= sampled + 1e-12
+
+
+def test_distances_that_are_known():
+    o, x, y, z = np.zeros(3), *np.eye(3)
+    known = [
+        ((-x, x, -y, y), 0.0),  # crossing
+        ((-x, x, z - y, z + y), 1.0),  # crossing above
+        ((o, x, x, x + y), 0.0),  # a common end
+        ((o, x, o, x), 0.0),  # the same
+        ((o, x, 3 * x, 2 * x), 1.0),  # on one line, apart
+        ((o, 2 * x, x, 3 * x), 0.0),  # on one line, overlapping
+        ((o, 2 * x, x + y, 3 * x + y), 1.0),  # parallel, side by side
+        ((o, x, 4 * x + 4 * y, 5 * x + 4 * y), 5.0),  # parallel, one after the other
+        ((o, x, 2 * x + y, 2 * x + 3 * y), math.sqrt(2)),
+        ((o, o, 3 * x, 3 * x), 3.0),  # points
+        ((o, o, y - x, y + x), 1.0),
+        ((y - x, y + x, o, o), 1.0),
+    ]
+    for points, expected in known:
+        assert segments(*points) == pytest.approx(expected, abs=1e-15)
+
+
+@pytest.mark.parametrize("angle", [1e-2, 1e-5, 1e-8, 1e-11])
+def test_nearly_parallel_segments_that_cross(angle):
+    """They cross at a third of both, so their distance is their offset."""
+    u, v = np.array([1.0, 0, 0]), np.array([math.cos(angle), math.sin(angle), 0])
+    for offset in (0.0, 0.3):
+        up = np.array([0, 0, offset])
+        assert segments(-u / 3, 2 * u / 3, up - v / 3, up + 2 * v / 3) == pytest.approx(
+            offset, abs=1e-15
+        )
+
+
+def test_motions_and_names_change_no_distance(rng):
+    for points in pairs(rng, 140):
+        expected = segments(*points)
+        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        a, b, c, d = points @ turn + rng.normal(size=3)
+        for order in ((a, b, c, d), (c, d, a, b), (b, a, c, d), (a, b, d, c), (d, c, b, a)):
+            assert segments(*order) == pytest.approx(expected, abs=1e-12)
+        assert segments(*(3 * points)) == pytest.approx(3 * expected, abs=1e-12)
+
+
+def test_least_is_that_of_the_nearest_pair_of_different_limbs(rng):
+    """Whatever pairs it does not look at."""
+    for _ in range(200):
+        count = int(rng.integers(2, 10))
+        limbs = np.sort(rng.integers(0, 3, count))
+        radii = rng.uniform(0, 0.6, count)
+        ends = rng.normal(size=(count, 2, 3)) * rng.choice([0.3, 1, 3])
+        rows = np.zeros(BAR * count)
+        for k in range(count):
+            assert bar(rows, k, limbs[k], radii[k], ends[k, 0], ends[k, 1]) == k + 1
+        gaps = [
+            segments(*ends[i], *ends[j]) - radii[i] - radii[j]
+            for i in range(count)
+            for j in range(i)
+            if limbs[i] != limbs[j]
+        ]
+        assert least(rows, count) == pytest.approx(min(gaps, default=math.inf), abs=1e-12)
+
+
+def tube(diameter):
+    """A member of another diameter whose wall is no matter of its mass."""
+    return {
+        "youngs_modulus": 70e9,
+        "shear_modulus": 26e9,
+        "outer_diameter": diameter,
+        "inner_diameter": 0.5 * diameter,
+    }
+
+
+FAT = {
+    "delta": {"members": {"forearm": tube(0.046)}},
+    "delta_cu": {"members": {"forearm": tube(0.046), "rcu_forearm": tube(0.060)}},
+    "prru": {"members": {"limb": tube(0.40)}},
+    "upr_rpu": {"members": {"diameter": 0.345}},
+}
+"""Members so thick that limbs meet in some poses."""
+VARIANTS = [
+    *((name, {}) for name in ROBOTS),
+    *FAT.items(),
+    # Where arms, or rods at the elbows, or far from their ends are nearest.
+    ("delta", {"members": {"arm": tube(0.140)}}),
+    ("delta", {"geometry": {"base_radius": 0.03, "platform_radius": 0.15}}),
+    ("delta_cu", {"geometry": {"base_radius": 0.02, "platform_radius": 0.12}}),
+    ("delta_cu", {"members": {"parallelogram_width": 0.16}}),
+    ("delta_cu", {"members": {"rcu_forearm": tube(0.12)}}),
+    (
+        "delta_cu",
+        {
+            "geometry": {"closures": ["rcu", "rod", "rod"]},
+            "members": {"rcu_forearm": tube(0.12), "arm": tube(0.02)},
+        },
+    ),
+    ("prru", {"geometry": {"base_radius": 0.15}}),
+    ("upr_rpu", {"geometry": {"base_radius": 0.2}, "members": {"diameter": [0.02, 0.3, 0.1]}}),
+]
+
+
+@pytest.mark.parametrize(("name", "sections"), VARIANTS)
+def test_members_are_those_of_the_frame(name, sections, variant, rng):
+    """The elastic frame declares the same bars, each on its own."""
+    robot, _ = variant(name, **sections)
+    assert has_clearance(robot)
+    poses = random_poses(robot, rng, 25)
+    assert len(poses) == 25
+    for pose in poses:
+        members = robot.frame(pose).members
+        bars = [(m.start, m.end, m.section.outer_diameter / 2) for m in members]
+        # "arm II", "forearm II a", "limb II", "2B"
+        limbs = [m.name.split()[1] if " " in m.name else m.name[0] for m in members]
+        assert len(set(limbs)) == 3
+        gaps = [
+            bounded(*bars[i][:2], *bars[j][:2]) - bars[i][2] - bars[j][2]
+            for i in range(len(bars))
+            for j in range(i)
+            if limbs[i] != limbs[j]
+        ]
+        assert float(clearance(robot, pose)) == pytest.approx(min(gaps), abs=1e-9)
+
+
+def test_machines_have_the_symmetry_of_their_limbs(rng):
+    third = 2 * np.pi / 3
+    turn, shift = rng.uniform(0, 2 * np.pi, 200), third * np.arange(3)[:, None]
+
+    delta = load("delta")
+    out, z = rng.uniform(0, 0.25, 200), rng.uniform(-0.5, -0.3, 200)
+    around = np.stack(
+        np.broadcast_arrays(out * np.cos(turn + shift), out * np.sin(turn + shift), z), -1
+    )
+    gaps = clearance(delta, around)
+    assert np.ptp(gaps[0]) > 1e-4
+    assert gaps[1:] == pytest.approx(np.broadcast_to(gaps[0], (2, 200)), abs=1e-12)
+
+    prru = load("prru")
+    gaps = clearance(prru, tilted_pose(0.83, turn + shift, rng.uniform(0, 0.4, 200)))
+    assert np.ptp(gaps[0]) > 1e-2
+    assert gaps[1:] == pytest.approx(np.broadcast_to(gaps[0], (2, 200)), abs=1e-12)
+
+    # Two limbs alike, on either side of a plane.
+    upr_rpu = load("upr_rpu")
+    poses = random_poses(upr_rpu, rng, 200)
+    gaps = clearance(upr_rpu, poses)
+    assert np.ptp(gaps) > 1e-3
+    assert clearance(upr_rpu, poses * (1, 1, -1)) == pytest.approx(gaps, abs=1e-12)
+
+    delta_cu = load("delta_cu")
+    c, s = np.cos(2 * delta_cu.geometry.azimuths[2]), np.sin(2 * delta_cu.geometry.azimuths[2])
+    mirror = np.array([[c, s, 0], [s, -c, 0], [0, 0, 1]])
+    assert clearance(delta_cu, around @ mirror) == pytest.approx(
+        clearance(delta_cu, around), abs=1e-12
+    )
+
+
+def test_thicker_members_leave_that_much_less(variant, rng):
+    for name, times in (("prru", 2), ("upr_rpu", 3)):
+        thin = load(name)
+        poses = random_poses(thin, rng, 50)
+        diameter = 2 * max(thin.radii)
+        section = (
+            {"limb": tube(times * diameter)} if name == "prru" else {"diameter": times * diameter}
+        )
+        thick, _ = variant(name, members=section)
+        assert clearance(thick, poses) == pytest.approx(
+            clearance(thin, poses) - (times - 1) * diameter, abs=1e-12
+        )
+
+
+def box(robot, count=25):
+    """Poses around all that a robot reaches, shape (count, count, count, 3)."""
+    axes = workspace_sweep(robot).axes
+    ticks = [np.linspace(a[0], a[-1], count) for a in axes]
+    return np.stack(np.meshgrid(*ticks, indexing="ij"), -1)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_poses_where_limbs_meet_are_refused(name, variant):
+    robot, _ = variant(name, **FAT[name])
+    poses = box(robot)
+    otherwise = reachable(robot, poses, -math.inf)
+    # A shipped robot's limbs are thinner, its limits the same.
+    assert (reachable(load(name), poses, -math.inf) == otherwise).all()
+    gaps = np.full(otherwise.shape, np.nan)
+    gaps[otherwise] = clearance(robot, poses[otherwise])
+    assert 0 < (gaps <= 0).sum() < otherwise.sum()
+    assert (reachable(robot, poses) == (gaps > 0)).all()
+    bound = float(np.nanmedian(gaps))
+    kept = reachable(robot, poses, bound)
+    assert (kept == (gaps > bound)).all()
+    assert 0 < kept.sum() < otherwise.sum()
+    worst = poses[np.unravel_index(np.nanargmin(gaps), gaps.shape)]
+    assert not reachable(robot, worst)
+    assert reachable(robot, worst, -math.inf)
+    assert reachable(load(name), worst)
+    assert reachable(robot, worst).shape == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "at_least"), [("delta", 0.026), ("delta_cu", 0.026), ("prru", 0.26), ("upr_rpu", 0.23)]
+)
+def test_limbs_of_the_shipped_robots_never_meet(name, at_least):
+    """In no pose that the other limits allow; the least is at the edge of these."""
+    robot = load(name)
+    poses = box(robot, 41)
+    otherwise = reachable(robot, poses, -math.inf)
+    assert otherwise.sum() > 1000
+    assert at_least < clearance(robot, poses[otherwise]).min() < 1.1 * at_least
+    assert (reachable(robot, poses) == otherwise).all()
+
+
+def test_the_regular_workspace_is_that_without_interference(monkeypatch):
+    robot = load("upr_rpu")
+    z = np.arange(-0.90, -0.34, 0.05)
+    found = regular_workspace(robot, z, directions=90)
+    monkeypatch.setattr(type(robot), "radii", None)
+    without = regular_workspace(robot, z, directions=90)
+    assert (found.z == without.z).all()
+    assert (found.radius == without.radius).all()
+
+
+def test_the_regular_workspace_ends_where_limbs_meet(variant):
+    """Bars so thick that they meet first: its circles are smaller, and limbs touch on them."""
+    z = np.arange(-0.90, -0.34, 0.05)
+    robot, _ = variant("upr_rpu", members={"diameter": 0.36})
+    wide = regular_workspace(load("upr_rpu"), z, least_radius=0.0)
+    narrow = regular_workspace(robot, z, least_radius=0.0)
+    assert (narrow.z == wide.z).all()
+    assert (narrow.radius <= wide.radius).all()
+    touched = narrow.radius < wide.radius - 1e-6
+    assert touched.sum() >= 3
+    turn = np.arange(360) * (2 * np.pi / 360)
+    for height, radius in zip(narrow.z[touched], narrow.radius[touched], strict=True):
+        poses = np.column_stack(
+            (np.full(360, height), radius * np.cos(turn), radius * np.sin(turn))
+        )
+        assert clearance(robot, poses).min() == pytest.approx(0.0, abs=1e-7)
+
+
+@pytest.mark.parametrize("name", ["delta", "delta_cu", "prru"])
+def test_without_members_nothing_is_known_and_all_else_holds(name, tmp_path):
+    data = parameters_of(name)
+    del data["members"]
+    path = tmp_path / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(data))
+    robot = load(path)
+    assert robot.radii is None
+    assert not has_clearance(robot)
+    poses = box(robot)
+    expected = reachable(load(name), poses, -math.inf)
+    for bound in (0.0, 1e3):
+        assert (reachable(robot, poses, bound) == expected).all()
+    with pytest.raises(ParameterError) as caught:
+        clearance(robot, robot.home())
+    assert caught.value.field == "members"
+
+
+def test_an_rcu_limb_without_its_rod_is_not_known(variant):
+    robot, _ = variant("delta", geometry={"closures": ["rod", "rod", "rcu"]})
+    assert not has_clearance(robot)
+    assert reachable(robot, robot.home(), 1e3)
+    assert has_clearance(load("delta"))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_batches_are_their_samples(name, rng):
+    robot = load(name)
+    poses = random_poses(robot, rng, 24).reshape(4, 2, 3, 3)
+    gaps = clearance(robot, poses)
+    assert gaps.shape == (4, 2, 3)
+    for index in np.ndindex(4, 2, 3):
+        one = clearance(robot, poses[index].copy())
+        assert one.shape == ()
+        assert float(one) == pytest.approx(gaps[index], rel=1e-14)
+        assert float(clearance(robot, poses[index].tolist())) == float(one)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_refused_poses_are_named(name):
+    robot = load(name)
+    far = [0.0, 0.0, -5.0] if robot.mechanism == "delta" else [9.0, 2.0, 2.0]
+    with pytest.raises((UnreachableError, SingularityError)) as caught:
+        clearance(robot, [robot.home(), far])
+    assert caught.value.index == (1,)
+    with pytest.raises(ValueError, match="not finite"):
+        clearance(robot, [math.nan, 0, 0])
+
+
+PROGRAM = """
+import json, sys
+import numpy as np
+from pkm_twin import load, kernels
+from stiffness_monitor.workspace import clearance, reachable
+given = json.loads(sys.stdin.read())
+result = {"compiled": kernels.COMPILED}
+for name, poses in given.items():
+    result[name] = clearance(load(name), poses).tolist()
+    result["one " + name] = float(clearance(load(name), poses[0]))
+    result["kept " + name] = reachable(load(name), poses, float(np.median(result[name]))).tolist()
+print(json.dumps(result))
+"""
+
+
+def test_with_and_without_numba(rng):
+    pytest.importorskip("numba")
+    given = json.dumps({name: random_poses(load(name), rng, 21).tolist() for name in ROBOTS})
+    results = []
+    for off in ("0", "1"):
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM],
+            input=given,
+            capture_output=True,
+            text=True,
+            check=True,
+            env=os.environ | {"PKM_TWIN_NO_NUMBA": off, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        results.append(json.loads(done.stdout))
+    fast, slow = results
+    assert (fast.pop("compiled"), slow.pop("compiled")) == (True, False)
+    for name, values in fast.items():
+        if name.startswith("kept"):
+            assert values == slow[name]
+            assert 0 < sum(values) < len(values)
+        else:
+            assert values == pytest.approx(slow[name], rel=1e-12)
