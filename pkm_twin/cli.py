@@ -19,6 +19,7 @@ from rich.text import Text
 
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.interrupts import INTERRUPTED, first_signal, ignore_signals
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -81,7 +82,7 @@ def play(
     from pkm_twin.player import play as play_bag
 
     pairs = dict(_pair(text) for text in remap)
-    play_bag(
+    result = play_bag(
         bag,
         rate=rate,
         loop=loop,
@@ -91,6 +92,8 @@ def play(
         remap=pairs,
         progress=not quiet,
     )
+    if result.interrupted:
+        ignore_signals()
 
 
 @app.command()
@@ -398,9 +401,10 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point: typed errors are one line on stderr and exit code 1."""
+    """Entry point: typed errors are one line on stderr and exit code 1, Ctrl-C is code 130."""
     try:
-        app(arguments, prog_name="pkm-twin")
+        with first_signal(lambda: SystemExit(INTERRUPTED)):
+            app(arguments, prog_name="pkm-twin")
     except PkmTwinError as error:
         print(f"pkm-twin: {error}", file=sys.stderr)
         sys.exit(REFUSED)

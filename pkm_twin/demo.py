@@ -31,6 +31,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pkm_twin.bags import BagWriter, inspect
 from pkm_twin.demo_report import REPORTS, Finding, draw, print_findings
 from pkm_twin.errors import BagError, PkmTwinError
+from pkm_twin.interrupts import INTERRUPTED, first_signal
 
 MATCH_SECONDS = 60.0
 """How long a node may take to come up: the first start compiles the kernels."""
@@ -210,41 +211,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not console.is_terminal:
         console = Console(width=120)
     options.out.mkdir(parents=True, exist_ok=True)
-    recording = options.out / "demo.mcap"
-    context = Context()
-    # A context of its own has no handlers: SIGTERM has to end the children too.
-    signal.signal(signal.SIGTERM, _interrupt)
     try:
-        rclpy.init(context=context)
-        executor = SingleThreadedExecutor(context=context)
-        node = rclpy.create_node("demo_recorder", context=context)
-        executor.add_node(node)
-        with BagWriter(recording, overwrite=True) as writer:
-            recorder = Recorder(node, writer)
-            for stage in STAGES:
-                run_stage(stage, options.bags / f"{stage.bag}.mcap", recorder, executor, console)
-        findings: list[Finding] = []
-        series = {}
-        for stage in STAGES:
-            found, series[stage.bag] = REPORTS[stage.bag](
-                options.bags / f"{stage.bag}.mcap", recording, stage.bag
-            )
-            findings += found
-        picture = draw(series, options.out / "demo.png")
+        # The children too have to end with this process.
+        with first_signal(KeyboardInterrupt):
+            findings = run(options.bags, options.out, console)
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
     except PkmTwinError as error:
         console.print(f"[red]demo failed:[/red] {error}")
         return 1
-    finally:
-        rclpy.try_shutdown(context=context)
-    print_findings(console, findings)
-    console.print(f"picture {picture}, recording {recording}")
     return 0 if all(finding.good for finding in findings) else 1
 
 
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
+def run(bags: Path, out: Path, console: Console) -> list[Finding]:
+    """Replay every bag through its node, and print and draw what came back."""
+    recording = out / "demo.mcap"
+    context = Context()
+    rclpy.init(context=context)
+    try:
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(rclpy.create_node("demo_recorder", context=context))
+        with BagWriter(recording, overwrite=True) as writer:
+            recorder = Recorder(executor.get_nodes()[0], writer)
+            for stage in STAGES:
+                run_stage(stage, bags / f"{stage.bag}.mcap", recorder, executor, console)
+    finally:
+        rclpy.try_shutdown(context=context)
+    findings: list[Finding] = []
+    series = {}
+    for stage in STAGES:
+        found, series[stage.bag] = REPORTS[stage.bag](
+            bags / f"{stage.bag}.mcap", recording, stage.bag
+        )
+        findings += found
+    picture = draw(series, out / "demo.png")
+    print_findings(console, findings)
+    console.print(f"picture {picture}, recording {recording}")
+    return findings
 
 
 def _message_class(kind: str) -> Any:

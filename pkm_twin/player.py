@@ -29,9 +29,22 @@ _DELIVERY_TIME = 1.0
 # A wait of the operating system overshoots by less than this, s; the rest is short sleeps.
 _COARSE = 0.002
 _FINE = 0.0001
+# How often a long wait looks for a signal, s.
+_LOOK = 0.02
 
 _RELIABILITIES = {"1": "reliable", "2": "best_effort"}
 _DURABILITIES = {"1": "transient_local", "2": "volatile"}
+
+
+@dataclass
+class _Stop:
+    """Set by signals. Not an event: its lock would stop a handler that interrupts a handler."""
+
+    asked: bool = False
+
+    def wait(self, seconds: float) -> None:
+        """Sleep, but no longer than until the next look."""
+        time.sleep(min(seconds, _LOOK))
 
 
 @dataclass(frozen=True)
@@ -84,7 +97,7 @@ def play(
     bag = open_bag(path)
     names = _selected(bag, topics, bool(clock))
     targets = _targets(bag, names, remap or {})
-    stop = threading.Event()
+    stop = _Stop()
     with _signals(stop), _publishers(bag, targets, bool(clock)) as (publishers, clock_publisher):
         awaited = {**publishers, CLOCK_TOPIC: clock_publisher} if clock else publishers
         _await_subscribers(awaited, wait_for_subscribers, stop)
@@ -155,13 +168,17 @@ def _targets(bag: Bag, names: list[str], remap: Mapping[str, str]) -> dict[str, 
 
 
 @contextmanager
-def _signals(stop: threading.Event) -> Iterator[None]:
-    """Let SIGINT and SIGTERM set ``stop``; only the main thread can have it so."""
+def _signals(stop: _Stop) -> Iterator[None]:
+    """Let SIGINT and SIGTERM ask to stop; only the main thread can have it so."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
+
+    def ask(*_: object) -> None:
+        stop.asked = True
+
+    before = [signal.signal(number, ask) for number in numbers]
     try:
         yield
     finally:
@@ -233,12 +250,10 @@ def _qos(text: str) -> Any:
     )
 
 
-def _await_subscribers(
-    publishers: Mapping[str, Any], seconds: float, stop: threading.Event
-) -> None:
+def _await_subscribers(publishers: Mapping[str, Any], seconds: float, stop: _Stop) -> None:
     give_up = time.monotonic() + seconds
     missing = list(publishers) if seconds else []
-    while missing and not stop.is_set():
+    while missing and not stop.asked:
         missing = [name for name in missing if not publishers[name].get_subscription_count()]
         if missing and time.monotonic() >= give_up:
             topics = ", ".join(publishers[name].topic_name for name in missing)
@@ -288,9 +303,7 @@ def _bar(bag: Bag, shown: bool) -> Iterator[Callable[[float, int], None]]:
 class _Replay:
     """Passes through a bag on an absolute schedule."""
 
-    def __init__(
-        self, bag: Bag, publishers: Mapping[str, Any], rate: float, stop: threading.Event
-    ) -> None:
+    def __init__(self, bag: Bag, publishers: Mapping[str, Any], rate: float, stop: _Stop) -> None:
         self._bag = bag
         self._publishers = publishers
         self._rate = rate
@@ -315,9 +328,9 @@ class _Replay:
     def run(self, *, loop: bool, update: Callable[[float, int], None]) -> PlayResult:
         begin = time.monotonic()
         loops = 0
-        while not self._stop.is_set():
+        while not self._stop.asked:
             self._pass(update)
-            loops += not self._stop.is_set()
+            loops += not self._stop.asked
             if not loop or not self._publishers:
                 break
         return PlayResult(
@@ -325,7 +338,7 @@ class _Replay:
             loops=loops,
             duration=time.monotonic() - begin,
             late_max=self._late,
-            interrupted=self._stop.is_set(),
+            interrupted=self._stop.asked,
         )
 
     def _pass(self, update: Callable[[float, int], None]) -> None:
@@ -355,10 +368,10 @@ class _Replay:
     def _sleep_until(self, due: float) -> bool:
         """Wait; return whether to go on."""
         while (left := due - time.monotonic()) > 0:
-            if self._stop.is_set():
+            if self._stop.asked:
                 return False
             if left > _COARSE:
                 self._stop.wait(left - _COARSE / 2)
             else:
                 time.sleep(min(left, _FINE))
-        return not self._stop.is_set()
+        return not self._stop.asked

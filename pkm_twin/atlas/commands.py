@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,8 +21,8 @@ from rich.progress import (
 from rich.table import Table
 
 from pkm_twin.errors import PkmTwinError, UnknownNameError
+from pkm_twin.interrupts import INTERRUPTED, first_signal
 
-INTERRUPTED = 130
 KINDS = ("workspace", "strain-energy", "isotropy", "modes")
 
 # typer of Ubuntu 24.04 reads no unions.
@@ -94,7 +93,10 @@ def atlas(
         "least_clearance": least_clearance,
     }
     sweep = sweep_of(machine, kind, options)
-    with _interruptible(), _progress(f"{kind} of {machine.name}", sweep.points) as update:
+    with (
+        first_signal(KeyboardInterrupt),
+        _progress(f"{kind} of {machine.name}", sweep.points) as update,
+    ):
         try:
             run(
                 sweep,
@@ -201,21 +203,6 @@ def _numbers(text: str) -> list[float]:
     if len(values) != 6:
         raise typer.BadParameter(f"{text!r} is not P1, P2, P3 or six numbers with commas between")
     return values
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Let a plain kill stop as Ctrl-C does, and Ctrl-C where a shell has switched it off."""
-
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

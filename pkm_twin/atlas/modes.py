@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Modes atlas: the lowest natural frequencies over the regular workspace, actuators locked.
 
-The grid: heights, distances from the axis (tilts, for a machine that tilts) and azimuths. Places
-beyond a height's circle are left out (NaN).
+The grid: heights, distances from the axis (tilts, for a machine that tilts) and azimuths.
+
+The file also has the shapes of the modes at one pose, on the axis at the middle height, and the
+lines of the frame to draw them on: a stored atlas is drawn without the robot.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -26,8 +29,9 @@ from pkm_twin.atlas.grids import (
 )
 from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
+from pkm_twin.mechanisms.frame import GROUND, MOVING, Frame, framed
 from pkm_twin.mechanisms.robot import Robot
-from stiffness_monitor.modes import has_modes, natural_frequencies
+from stiffness_monitor.modes import has_modes, modes, natural_frequencies
 
 Array = NDArray[np.float64]
 
@@ -38,11 +42,19 @@ _GRID: Final = ("z", "distance", "azimuth")
 
 @dataclass(frozen=True, eq=False)
 class ModesSweep(Sweep):
-    """Frequencies at ``heights`` (n,), m, ``distances`` (m,), m or rad, and ``azimuths``."""
+    """Frequencies at ``heights`` (n,), m, ``distances`` (m,), m or rad, and ``azimuths``.
+
+    ``nodes``: names of the points whose motion in a mode is stored, and ``elements`` of the parts
+    whose energy is, as :func:`stiffness_monitor.modes.modes` has them. ``edges``: pairs of nodes
+    between which a line is drawn, shape (edges, 2).
+    """
 
     heights: Array
     distances: Array
     azimuths: int
+    nodes: tuple[str, ...]
+    elements: tuple[str, ...]
+    edges: NDArray[np.int64]
 
     kind: ClassVar[str] = "modes"
     fields: ClassVar[Mapping[str, Field]] = {
@@ -53,7 +65,7 @@ class ModesSweep(Sweep):
 
     @property
     def coordinates(self) -> dict[str, Variable]:
-        """Height, distance from the axis, azimuth, and the number of the mode."""
+        """Height, distance from the axis, azimuth, number of the mode; names for the shapes."""
         what = "tilt" if distance_unit(self.robot) == "rad" else "distance from the axis"
         return {
             "z": Variable(("z",), self.heights, {"units": "m", "long_name": "height"}),
@@ -64,7 +76,19 @@ class ModesSweep(Sweep):
             ),
             "azimuth": Variable(("azimuth",), turns(self.azimuths), {"units": "rad"}),
             "mode": Variable(("mode",), np.arange(1, COUNT + 1), {"long_name": "lowest first"}),
+            "node": _names("node", self.nodes, "the platform's origin, then points of the members"),
+            "axis": _names("axis", ("x", "y", "z"), "fixed axes"),
+            "element": _names("element", self.elements, "bodies, and joints with elasticity"),
+            "parameter": _names("parameter", self.robot.pose_names, "parameters of a pose"),
+            "line": Variable(
+                ("edge", "end"), self.edges, {"long_name": "indices of the nodes that it joins"}
+            ),
         }
+
+    @property
+    def middle(self) -> Array:
+        """The pose whose shapes are stored: on the axis at the middle height, shape (3,)."""
+        return polar_pose(self.robot, self.heights[len(self.heights) // 2], 0.0, 0.0)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -85,6 +109,84 @@ class ModesSweep(Sweep):
         distance = self.distances[chunk.start : chunk.stop, None]
         poses = polar_pose(self.robot, self.heights[chunk.first], distance, turns(self.azimuths))
         return {"frequency": natural_frequencies(self.robot, poses, COUNT)}
+
+    def summaries(self, partial: Iterable[Values]) -> dict[str, Variable]:
+        """The shapes of the modes in the middle pose, and where their energy is."""
+        found = modes(self.robot, self.middle, COUNT)
+        units = ", ".join(self.robot.pose_units)
+        moved, turned = found.shapes[..., :3], found.shapes[..., 3:]
+        node, part = ("mode", "node", "axis"), ("mode", "element")
+        what = "of the nodes in a mode of unit generalised mass"
+        return {
+            **super().summaries(partial),
+            "shape_pose": Variable(
+                ("parameter",), self.middle, {"units": units, "long_name": "pose of the shapes"}
+            ),
+            "shape_frequency": Variable(
+                ("mode",), found.frequencies, {"units": "Hz", "long_name": "frequency of the shape"}
+            ),
+            "position": Variable(
+                ("node", "axis"), found.positions, {"units": "m", "long_name": "node at rest"}
+            ),
+            "displacement": Variable(
+                node, moved, {"units": "1/sqrt(kg)", "long_name": f"displacements {what}"}
+            ),
+            "rotation": Variable(
+                node, turned, {"units": "rad/(m sqrt(kg))", "long_name": f"rotations {what}"}
+            ),
+            "strain_share": Variable(
+                part,
+                found.energies.strain,
+                {"units": "1", "long_name": "part of the mode's strain energy"},
+            ),
+            "kinetic_share": Variable(
+                part,
+                found.energies.kinetic,
+                {"units": "1", "long_name": "part of the mode's kinetic energy"},
+            ),
+        }
+
+
+def frame_edges(frame: Frame, nodes: tuple[str, ...]) -> NDArray[np.int64]:
+    """Pairs of nodes to draw lines between, shape (edges, 2).
+
+    Along the members; from a member's end to those that stand on it; the platform as spokes from
+    its origin and the outline of the points where members meet it.
+
+    :param nodes: names as :func:`stiffness_monitor.modes.modes` gives them: the platform's origin,
+        then ``<member> <k>/<elements>``.
+    """
+    of: dict[str, list[int]] = {member.name: [] for member in frame.members}
+    for index, name in enumerate(nodes[1:], start=1):
+        of[name.rpartition(" ")[0]].append(index)
+    lines: list[tuple[int, int]] = []
+    corners: list[tuple[int, Array]] = []
+    for member in frame.members:
+        own = of[member.name]
+        lines += pairwise(own)
+        for support, node, point in (
+            (member.inner, own[0], member.start),
+            (member.outer, own[-1], member.end),
+        ):
+            if support is None or support.body == GROUND:
+                continue
+            if support.body == MOVING:
+                corners.append((node, point))
+            else:
+                lines.append((of[support.body][-1], node))
+    # Around the platform by angle, in the plane of its points.
+    arms = np.array([point - frame.origin for _, point in corners])
+    across = np.linalg.svd(arms - arms.mean(0))[2][:2]
+    turn = np.arctan2(*((arms - arms.mean(0)) @ across.T).T)
+    around = [corners[k][0] for k in np.argsort(turn)]
+    lines += [(0, node) for node in around]
+    if len(around) > 2:
+        lines += pairwise([*around, around[0]])
+    return np.array(lines, np.int64)
+
+
+def _names(dim: str, names: Iterable[str], what: str) -> Variable:
+    return Variable((dim,), np.array(list(names)), {"long_name": what})
 
 
 def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:
@@ -110,4 +212,16 @@ def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:
     if not math.isfinite(step):
         raise ParameterError("points", total, "enough for three rings")
     heights = np.linspace(best.low, best.high, layers)
-    return ModesSweep(robot, heights, ladder(step, rungs), azimuths)
+    # Names and lines are the same in every pose: members keep their divisions.
+    pose = polar_pose(robot, heights[layers // 2], 0.0, 0.0)
+    found = modes(robot, pose, COUNT)
+    edges = frame_edges(framed(robot).frame(pose), found.nodes)
+    return ModesSweep(
+        robot,
+        heights,
+        ladder(step, rungs),
+        azimuths,
+        found.nodes,
+        found.energies.elements,
+        edges,
+    )

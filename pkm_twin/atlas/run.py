@@ -14,6 +14,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -124,13 +125,14 @@ def on_cores(
 def _pool(sweep: Sweep, work: Work, workers: int, folder: Path) -> Iterator[int]:
     # Not forked: the parent has threads (the progress bar's, numba's).
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_interrupts)
+    pool = ProcessPoolExecutor(workers, mp_context=context)
     queue = iter(work)
     flying: set[Future[int]] = set()
     try:
         while True:
             for index, chunk in queue:
-                flying.add(pool.submit(_keep, sweep, chunk, folder, index))
+                with _without_interrupts():
+                    flying.add(pool.submit(_keep, sweep, chunk, folder, index))
                 if len(flying) >= IN_FLIGHT * workers:
                     break
             if not flying:
@@ -214,6 +216,14 @@ def _some(queue: Iterator[tuple[int, Chunk]], count: int) -> Iterator[tuple[int,
         yield item
 
 
-def _leave_interrupts() -> None:
-    """Ctrl-C goes to all processes of a terminal; the parent decides what it means."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """A process started here never sees Ctrl-C: the parent decides what it means.
+
+    A terminal sends it to all its processes; one that had to be told would be hit at its imports.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals end a process once and for all."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from test.commands.conftest import REPOSITORY
+
+SCRIPT = """
+import signal, sys, time
+from pkm_twin.interrupts import first_signal
+before = [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
+with first_signal(KeyboardInterrupt):
+    pass
+assert before == [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
+try:
+    with first_signal(lambda: SystemExit(7)), first_signal(KeyboardInterrupt):
+        print("ready", flush=True)
+        time.sleep(60)
+except KeyboardInterrupt:
+    print("caught", flush=True)
+    # A clean-up, in which further signals come.
+    time.sleep(0.5)
+    print("cleaned up", flush=True)
+"""
+
+
+def environment():
+    return {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_only_the_first_signal_counts(number):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+    )
+    assert process.stdout.readline() == "ready\n"
+    for _ in range(3):
+        process.send_signal(number)
+    assert process.stdout.readline() == "caught\n"
+    while process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.001)
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, out, err) == (0, "cleaned up\n", "")
+
+
+def test_an_interrupted_command_has_its_own_exit_code(tmp_path):
+    """Neither good nor bad: a script has to tell them apart."""
+    path = tmp_path / "motion.csv"
+    os.mkfifo(path)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "pkm_twin.cli", "torques", "delta_cu", str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+    )
+    # Opens when the command reads, and never sends anything.
+    with path.open("w"):
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=20)
+    assert (process.returncode, out) == (130, "")
+    assert "Traceback" not in err
