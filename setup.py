@@ -70,6 +70,7 @@ setup(
             "mypy",
             "pin",
             "plotly",
+            "psutil",
             "pytest",
             "pytest-timeout",
             "ruff",

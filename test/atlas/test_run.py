@@ -7,8 +7,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
-import time
 
 import pytest
 
@@ -21,6 +19,7 @@ from pkm_twin.atlas.store import AtlasError, Parts, open_atlas
 from pkm_twin.atlas.strain_energy import strain_energy_sweep
 from pkm_twin.errors import PkmTwinError
 from test.atlas.conftest import same
+from test.atlas.scale import command
 
 
 class Stop(Exception):
@@ -181,39 +180,12 @@ def test_typed_errors(tmp_path, strain, monkeypatch):
         run(sweep, tmp_path / "c.nc")
 
 
-def peak_of(work):
-    """Largest resident memory of this process while work runs, bytes."""
-    from pathlib import Path
-
-    page = os.sysconf("SC_PAGE_SIZE")
-    peak, done = 0, threading.Event()
-
-    def watch():
-        nonlocal peak
-        while not done.is_set():
-            peak = max(peak, int(Path("/proc/self/statm").read_text().split()[1]) * page)
-            time.sleep(0.01)
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
-        work()
-    finally:
-        done.set()
-        thread.join()
-    return peak
-
-
 @pytest.mark.long
 def test_memory_is_flat(tmp_path):
-    """docs/scale.md: from a million poses to ten."""
-    robot = load("upr_rpu")
-    peaks = []
-    for points in (10**6, 10**7):
-        sweep = strain_energy_sweep(robot, "P1", points)
-        start = time.monotonic()
-        peaks.append(peak_of(lambda s=sweep: run(s, tmp_path / "a.nc", overwrite=True)))
-        if points == 10**6:
-            assert time.monotonic() - start < 30.0
-    assert peaks[1] < 1.2 * peaks[0]
-    assert peaks[1] < 2e9
+    """docs/scale.md: from a million poses to ten, all processes together."""
+    (seconds, small), (_, large) = (
+        command(points, 2, tmp_path / "a.nc") for points in (10**6, 10**7)
+    )
+    assert seconds < 30.0
+    assert large < 1.2 * small
+    assert large < 2e9
