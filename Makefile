@@ -4,16 +4,17 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bags bench certificate fuzz soak clean help
+.PHONY: demo test lint types unit bags bench certificate fuzz soak scale clean help
 
 help:
 	@echo "make demo         set up .venv, run both nodes on the recorded bags, table and picture in out/"
 	@echo "make test         lint, types and tests"
 	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
-	@echo "make certificate  torques against three other engines, into docs/certificate.md"
+	@echo "make certificate  torques and compliance against other engines, into docs/certificate.md"
 	@echo "make fuzz         damage every kind of byte of a bag, at length"
-	@echo "make soak         ten million poses in flat memory"
+	@echo "make soak         ten million poses, and minutes of both nodes, in flat memory"
+	@echo "make scale        what sweeps cost, into docs/scale.md"
 	@echo "make clean        remove .venv, out and caches"
 
 # One stamp a set of extras, made anew when the requirements change.
@@ -56,7 +57,10 @@ fuzz: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m long test/bags
 
 soak: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -m long test/atlas
+	$(BIN)/python -m pytest -m long test/atlas test/nodes
+
+scale: $(VENV)/test.stamp
+	$(BIN)/python -m test.atlas.scale docs/scale.md
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import sys
 from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from delta_dynamics.feedforward import Feedforward, Settings, Torques
 from delta_dynamics.reactions import reactions
 from delta_dynamics.virtual_work import kernels
 from pkm_twin import health, load
-from pkm_twin.errors import MessageError, ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.mechanisms.robot import Robot
 
 CHANGES = {
@@ -41,25 +43,29 @@ class DeltaDynamics(health.TwinNode):
         super().__init__("delta_dynamics")
         robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
         # Before there is a topic to be found by: the first start compiles for many seconds.
-        for kernel in kernels(robot):
+        for kernel in (*kernels(robot), robot.forward_kernel, robot.jacobian_kernel):
             kernel.warm_up()
         robot = _changed(robot, self._declare_changes(robot))
         self._feedforward = Feedforward(robot, self._declare_settings())
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
         self._trajectory = self.speak(JointTrajectory, "~/joint_trajectory_ff")
-        self._torques = self.speak(JointState, "~/joint_torques")
+        # A torque is worth nothing once the stream that it answers would be stale.
+        stale_after = self._feedforward.settings.stale_after
+        self._torques = self.speak(JointState, "~/joint_torques", stale_after)
         self._residual = self.speak(JointState, "~/torque_residual")
-        self._commands = self.speak(Float64MultiArray, "~/commands") if commands else None
+        self._commands = (
+            self.speak(Float64MultiArray, "~/commands", stale_after) if commands else None
+        )
         self._reactions = self._speak_reactions(robot)
         self._pending: Robot | None = None
         self.listen(JointTrajectory, "~/joint_trajectory", self._on_trajectory)
         self.listen(JointState, "joint_states", self._on_joint_state)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
-        period = min(0.25 * self._feedforward.settings.stale_after, 0.1)
         self._last_heard = 0
-        self.every(period, self._watch)
-        self.start()
+        self.every(min(0.25 * stale_after, 0.1), self._watch)
+        # A step after which no stamp that was good before is good now.
+        self.start(leap=stale_after + self._feedforward.settings.future_tolerance)
 
     def summary(self) -> str:
         """One line that says what the node runs."""
@@ -70,20 +76,27 @@ class DeltaDynamics(health.TwinNode):
         """No torque across the seam: the stream starts anew."""
         self._feedforward.reset()
 
+    def clock_leapt(self) -> None:
+        """What was fresh is stale now: a running stream stops."""
+        with self._telling_stop():
+            self._feedforward.clock_leapt()
+
     def stream_broken(self, where: str) -> None:
-        """A stream whose callback failed is stopped."""
-        if where == "joint_states":
-            self._stop("exception", "a callback raised an exception")
+        """Whatever failed: the stream is stopped."""
+        self._stop("exception", f"{where} raised an exception")
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
         core = self._feedforward
         level, message = health.OK, "running"
-        if core.last_reject or core.saturations:
+        measure = core.singularity()
+        if core.last_reject or core.saturations or core.near_singular:
             level = health.WARN
             message = "an effort limit was passed"
         if core.last_reject:
             message = f"last reject: {core.last_reject}"
+        if core.near_singular:
+            message = f"close to a singularity or the edge of reach: measure {measure:.3g}"
         if core.stream.stopped:
             level, message = health.ERROR, f"stopped: {core.stream.reason}: {core.stream.text}"
         values: dict[str, object] = {
@@ -93,6 +106,8 @@ class DeltaDynamics(health.TwinNode):
             "trajectories answered": core.trajectories.accepted,
             "effort limit passed": core.saturations,
             "older stamps dropped": core.dropped,
+            "close to a singularity": core.near_singularities,
+            "distance to singularity": "" if measure is None else f"{measure:.4f}",
             "acceleration delay (samples)": core.differentiator_delay,
         }
         values |= {f"joint states rejected: {k}": v for k, v in core.stream.rejected.items()}
@@ -136,6 +151,9 @@ class DeltaDynamics(health.TwinNode):
         def fixed(name: str, default: Any, text: str) -> Any:
             return self.declare(name, default, text, read_only=True)
 
+        def fraction(name: str, default: float, text: str) -> Any:
+            return _within(name, fixed(name, default, text), 0.0, 1.0)
+
         policy = fixed("limit_policy", "warn", "warn | reject | clamp")
         if policy not in ("warn", "reject", "clamp"):
             raise UnknownNameError("limit_policy", policy, ("warn", "reject", "clamp"))
@@ -157,10 +175,24 @@ class DeltaDynamics(health.TwinNode):
             bad_limit=_within("bad_limit", fixed("bad_limit", 5, "rejects to stop"), 1, 10**6),
             good_needed=_within("good_needed", fixed("good_needed", 5, "to go on"), 1, 10**6),
             on_stop=on_stop,
+            singularity_warn=fraction("singularity_warn", 0.05, "measure below which to warn"),
+            singularity_stop=fraction("singularity_stop", 0.01, "measure below which to stop"),
         )
 
+    @contextmanager
+    def _telling_stop(self) -> Iterator[None]:
+        """Where the core stops the stream in here: log it, and send what ``on_stop`` says."""
+        stream = self._feedforward.stream
+        running = not stream.stopped
+        try:
+            yield
+        finally:
+            if running and stream.stopped:
+                self._send_stop()
+
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        efforts = self._feedforward.trajectory(message, self.now())
+        with self._telling_stop():
+            efforts = self._feedforward.trajectory(message, self.now())
         for point, effort in zip(message.points, efforts.tolist(), strict=True):
             point.effort = effort
         self._trajectory.publish(message)
@@ -168,13 +200,8 @@ class DeltaDynamics(health.TwinNode):
     def _on_joint_state(self, message: JointState) -> None:
         core = self._feedforward
         self._last_heard = self.steady.now().nanoseconds
-        running = not core.stream.stopped
-        try:
+        with self._telling_stop():
             torques = core.joint_state(message, self.now())
-        except MessageError:
-            if running and core.stream.stopped:
-                self._send_stop()
-            raise
         if torques is None:
             return
         stamp = message.header.stamp
@@ -217,9 +244,9 @@ class DeltaDynamics(health.TwinNode):
             self._stop("stale input", f"no joint state for {silent:.3f} s")
 
     def _stop(self, reason: str, text: str) -> None:
-        if self._feedforward.stream.stop(reason, text):
-            self._feedforward.reset()
-            self._send_stop()
+        with self._telling_stop():
+            if self._feedforward.stream.stop(reason, text):
+                self._feedforward.reset()
 
     def _send_stop(self) -> None:
         core = self._feedforward

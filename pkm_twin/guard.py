@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Counts what is rejected and latches the stop of a stream. Pure: time is an argument.
+"""Counts what is rejected, lost or late and latches the stop of a stream. Pure: no clock here.
 
 May import: the standard library.
 """
@@ -8,6 +8,10 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from typing import Final
+
+SMOOTHING: Final = 0.1
+"""Weight of the newest period in the mean."""
 
 
 @dataclass
@@ -57,3 +61,48 @@ class Guard:
             self.stopped = False
         self.accepted += 1
         return True
+
+
+@dataclass
+class Pace:
+    """Whether a topic's messages come whole, and whether they are answered at their pace.
+
+    ``lost``: messages between two that came, by the middleware's own numbers. ``overruns``:
+    answers that took longer than the mean time between messages.
+    """
+
+    lost: int = 0
+    overruns: int = 0
+    longest: float = 0.0
+    _number: int = 0
+    _sent: int = 0
+    _period: float = 0.0
+    _periods: int = 0
+    _missing: int = 0
+
+    def arrived(self, number: int | None, sent: int) -> bool:
+        """Take the number that the publisher gave (None: it gives none) and its time, ns.
+
+        :returns: True where messages are missing before this one. They are counted by
+            :meth:`confirm`: two publishers on one topic look the same.
+        """
+        period = (sent - self._sent) / 1e9
+        if self._sent and period > 0.0:
+            self._periods += 1
+            # A silence is no period, but a slower stream has to be learned.
+            longest = 2.0 * self._period if self._periods > 1 else period
+            weight = max(SMOOTHING, 1.0 / self._periods)
+            self._period += (min(period, longest) - self._period) * weight
+        self._sent = sent
+        last, self._number = self._number, number or 0
+        self._missing = self._number - last - 1 if last else 0
+        return self._missing > 0
+
+    def confirm(self) -> None:
+        """Count what is missing before the newest message."""
+        self.lost += self._missing
+
+    def answered(self, took: float) -> None:
+        """The newest message took so long to answer, s."""
+        self.longest = max(self.longest, took)
+        self.overruns += 0.0 < self._period < took

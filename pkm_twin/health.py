@@ -13,20 +13,35 @@ from typing import Any, Final, TypeVar
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
-from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import (
+    QoSCompatibility,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+    qos_policy_name_from_kind,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.guard import Pace
 
 OK: Final = DiagnosticStatus.OK
 WARN: Final = DiagnosticStatus.WARN
 ERROR: Final = DiagnosticStatus.ERROR
+
+OVERRIDES: Final = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+EXPIRY: Final = (QoSPolicyKind.LIFESPAN, QoSPolicyKind.DEADLINE)
+"""QoS policies that parameters may override; the second ones of topics that expire."""
+OVERRUN_SHARE: Final = 100
+"""One callback in so many may take longer than its period before the diagnostics warn."""
 
 M = TypeVar("M")
 
@@ -49,17 +64,29 @@ class TwinNode(Node):
         self._logged: dict[str, float] = {}
         self._seen = dict.fromkeys(("messages", "exceptions"), 0)
         self._last_exception = ""
+        self._last_kind = ""
+        self._paces: dict[str, Pace] = {}
+        self._reported = (0, 0, 0)
+        self._unfit: dict[str, str] = {}
+        self._incompatible = 0
+        self._last_clock = 0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", output_qos())
         # The diagnostics run on the steady clock: they have to tell that the ROS clock stands.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
 
-    def start(self) -> None:
-        """Refuse unknown parameters, begin the diagnostics, and say where the node listens."""
+    def start(self, leap: float | None = None) -> None:
+        """Refuse unknown parameters, begin the diagnostics, and say where the node listens.
+
+        :param leap: how far the ROS clock has to go forward at once for :meth:`clock_leapt`, s.
+        """
         self.refuse_unknown_parameters()
         self.every(1.0, self._publish_diagnostics)
-        self.get_clock().create_jump_callback(
+        # Kept: the middleware calls the handle without holding it.
+        self._jump_handle = self.get_clock().create_jump_callback(
             JumpThreshold(
-                min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
+                min_forward=None if leap is None else Duration(seconds=leap),
+                min_backward=Duration(nanoseconds=-1),
+                on_clock_change=True,
             ),
             post_callback=self._jumped,
         )
@@ -77,6 +104,10 @@ class TwinNode(Node):
 
     def clock_jumped(self) -> None:
         """The ROS clock went back or changed: forget everything that depends on time."""
+
+    def clock_leapt(self) -> None:
+        """The ROS clock went forward by more than a stream's messages may be apart."""
+        self.clock_jumped()
 
     def now(self) -> int:
         """The ROS clock, ns."""
@@ -105,31 +136,53 @@ class TwinNode(Node):
 
     def listen(self, kind: type[M], topic: str, callback: Callable[[M], None]) -> None:
         """Subscribe, with QoS overrides by parameter and a callback that cannot end the node."""
+        pace = self._paces[topic] = Pace()
+        name = self.resolve_topic_name(topic)
 
-        def guarded(message: M) -> None:
+        def guarded(message: M, info: Any) -> None:
             self._seen["messages"] += 1
+            began = time.perf_counter()
             try:
+                number, sent = info["publication_sequence_number"], info["source_timestamp"]
+                # Two publishers number their messages each: then nothing can be said.
+                if pace.arrived(number, sent) and self.count_publishers(name) == 1:
+                    pace.confirm()
                 callback(message)
             except MessageError as error:
                 self.log_throttled(error.reason, f"{topic}: rejected, {error.reason}: {error}")
             except Exception as error:
                 self.caught(topic, error)
+            pace.answered(time.perf_counter() - began)
 
         self.create_subscription(
             kind,
             topic,
             guarded,
             input_qos(),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            qos_overriding_options=QoSOverridingOptions(OVERRIDES),
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=lambda event: self._misfit(topic, event)
+            ),
         )
 
-    def speak(self, kind: type[M], topic: str) -> Any:
-        """A publisher with QoS overrides by parameter."""
+    def speak(self, kind: type[M], topic: str, expiry: float | None = None) -> Any:
+        """A publisher with QoS overrides by parameter.
+
+        :param expiry: lifespan and deadline that the topic offers, s; None is none.
+        """
+        qos = output_qos()
+        overrides: tuple[Any, ...] = OVERRIDES
+        if expiry is not None:
+            qos.lifespan = qos.deadline = Duration(seconds=expiry)
+            overrides = (*overrides, *EXPIRY)
         return self.create_publisher(
             kind,
             topic,
-            output_qos(),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            qos,
+            qos_overriding_options=QoSOverridingOptions(overrides),
+            event_callbacks=PublisherEventCallbacks(
+                incompatible_qos=lambda event: self._misfit(topic, event)
+            ),
         )
 
     def every(self, period: float, callback: Callable[[], None]) -> None:
@@ -151,6 +204,7 @@ class TwinNode(Node):
         if not self.context.ok():
             raise ExternalShutdownException from error
         self._seen["exceptions"] += 1
+        self._last_kind = f"{where}: {type(error).__name__}: {error}"
         text = traceback.format_exc()
         if text != self._last_exception:
             self._last_exception = text
@@ -167,29 +221,87 @@ class TwinNode(Node):
             self._logged[reason] = now
             self.get_logger().warning(text)
 
-    def _jumped(self, jump: object) -> None:
-        self.clock_jumped()
+    def _jumped(self, jump: Any) -> None:
+        # One is an enumeration of Python, the other may be the binding's.
+        same_clock = int(jump.clock_change) == int(ClockChange.ROS_TIME_NO_CHANGE)
+        if same_clock and jump.delta.nanoseconds > 0:
+            self.clock_leapt()
+        else:
+            self.clock_jumped()
+
+    def _misfit(self, topic: str, event: Any) -> None:
+        """Another node's QoS on a topic does not fit: nothing comes through between the two."""
+        policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
+        self._incompatible += event.total_count_change
+        self._unfit[topic] = policy
+        self.log_throttled(f"qos {topic}", f"{topic}: incompatible QoS of another node: {policy}")
+
+    def _is_unfit(self, topic: str) -> bool:
+        """Whether the misfit is still there."""
+        name = self.resolve_topic_name(topic)
+        speakers = self.get_publishers_info_by_topic(name)
+        listeners = self.get_subscriptions_info_by_topic(name)
+        return any(
+            qos_check_compatible(a.qos_profile, b.qos_profile)[0] == QoSCompatibility.ERROR
+            for a in speakers
+            for b in listeners
+        )
+
+    def _troubles(self) -> list[tuple[bytes, str]]:
+        """What is wrong with the node's surroundings, worst first."""
+        found: list[tuple[bytes, str]] = []
+        if self._seen["exceptions"]:
+            found.append((ERROR, f"a callback raised an exception: {self._last_kind}"))
+        self._unfit = {topic: p for topic, p in self._unfit.items() if self._is_unfit(topic)}
+        found += [
+            (WARN, f"incompatible QoS of another node on {topic}: {policy}")
+            for topic, policy in self._unfit.items()
+        ]
+        if self.get_parameter("use_sim_time").value:
+            now = self.now()
+            if now == 0:
+                found.append((WARN, "use_sim_time is set and no /clock arrives"))
+            elif now == self._last_clock:
+                found.append((WARN, "use_sim_time is set and /clock stands still"))
+            self._last_clock = now
+        own = (self.get_name(), self.get_namespace())
+        namesakes = self.get_node_names_and_namespaces().count(own)
+        if namesakes > 1:
+            found.append((WARN, f"{namesakes} nodes have this name"))
+        taken = self._seen["messages"]
+        lost = sum(pace.lost for pace in self._paces.values())
+        overruns = sum(pace.overruns for pace in self._paces.values())
+        before, self._reported = self._reported, (taken, lost, overruns)
+        taken, lost, overruns = (a - b for a, b in zip(self._reported, before, strict=True))
+        if lost:
+            found.append((WARN, f"{lost} messages lost in the last second"))
+        # A single late one on a machine that also does other things is no trouble.
+        if overruns > taken / OVERRUN_SHARE:
+            found.append((WARN, f"{overruns} of {taken} callbacks took longer than their period"))
+        return found
 
     def _publish_diagnostics(self) -> None:
         level, message, values = self.diagnose()
-        if self.get_parameter("use_sim_time").value and self.now() == 0:
-            level, message = max(level, WARN), "use_sim_time is set and no /clock arrives"
-        if self._seen["exceptions"]:
-            level, message = ERROR, "a callback raised an exception"
-        namesakes = [
-            1
-            for name, space in self.get_node_names_and_namespaces()
-            if (name, space) == (self.get_name(), self.get_namespace())
-        ]
-        if len(namesakes) > 1:
-            level, message = max(level, WARN), f"{len(namesakes)} nodes have this name"
+        troubles = self._troubles()
+        if level == ERROR:
+            troubles.insert(0, (level, message))
+        elif level != OK or not troubles:
+            troubles.append((level, message))
         status = DiagnosticStatus(
-            level=level, name=self.get_fully_qualified_name(), message=message
+            level=max(level for level, _ in troubles),
+            name=self.get_fully_qualified_name(),
+            message=troubles[0][1],
         )
         status.hardware_id = str(values.pop("robot", ""))
-        status.values = [
-            KeyValue(key=key, value=str(value)) for key, value in {**values, **self._seen}.items()
-        ]
+        values |= self._seen
+        # The message is the worst; what else there is stands here.
+        values["also"] = "; ".join(text for _, text in troubles[1:])
+        values["incompatible QoS"] = self._incompatible
+        for topic, pace in self._paces.items():
+            values[f"lost: {topic}"] = pace.lost
+            values[f"overruns: {topic}"] = pace.overruns
+            values[f"longest callback (ms): {topic}"] = f"{1e3 * pace.longest:.3f}"
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)

@@ -108,6 +108,7 @@ class JointReader:
         self._position = [(-reach, reach)] * 3 if position is None else position.tolist()
         rates = [MAX_RATE] * 3 if velocity is None else velocity.tolist()
         self._velocity = [(-rate, rate) for rate in rates]
+        self.highest_velocity: tuple[float, ...] = tuple(rates)
         self._highest_velocity = np.array(rates)
         self._acceleration = [(-MAX_ACCELERATION, MAX_ACCELERATION)] * 3
         self._effort = [(-MAX_EFFORT, MAX_EFFORT)] * 3
@@ -127,7 +128,7 @@ class JointReader:
         effort = self._take("effort", message.effort, count, index, self._effort)
         return JointSample(stamp, q, qd, effort)
 
-    def trajectory(self, message: Any, now: int, rules: StampRules) -> Trajectory:
+    def trajectory(self, message: Any, now: int) -> Trajectory:
         """A trajectory_msgs/JointTrajectory with exactly the robot's joints, in any order.
 
         A zero stamp means that it starts on receipt, as in ros2_controllers; a later start is

@@ -61,6 +61,8 @@ def launch(domain):
     for batch in ((), (1,)):
         zero = np.zeros((*batch, 3))
         inverse_dynamics(delta, zero, zero, zero)
+        delta.forward(zero)
+        delta.singularity(zero)
         pose = head.forward(np.full((*batch, 3), 0.7))
         strain_energy(head, pose, np.ones(6))
         compliance(head, pose)

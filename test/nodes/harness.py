@@ -257,6 +257,10 @@ class Peer:
                 due = now + 0.05
             self._executor.spin_once(timeout_sec=0.01)
 
+    def spin(self):
+        """Take one message, if one comes within a millisecond."""
+        self._executor.spin_once(timeout_sec=0.001)
+
     def call(self, kind, service, request):
         client = self.node.create_client(kind, service)
         self.until(client.service_is_ready)

@@ -14,144 +14,27 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward, Settings
-from pkm_twin import load
-from test.nodes.harness import (
-    REPOSITORY,
-    SECOND,
-    Maker,
-    Ros,
-    counts_of,
-    one_line_refusal,
-    stamp_of,
-    values_of,
-)
+from test.nodes.harness import REPOSITORY, SECOND, counts_of, one_line_refusal, stamp_of, values_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
-from rclpy.parameter import Parameter
+from rcl_interfaces.srv import GetParameters
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
-from trajectory_msgs.msg import JointTrajectory
 
-MODULE = "delta_dynamics.node"
-ROBOT = load("delta_cu")
-NAMES = ROBOT.joint_names
-STEP = SECOND // 1000
-WINDOW = 4
-MAKE = Maker(Ros())
-COMMON = (f"differentiator.window:={WINDOW}", "good_needed:=2", "publish_commands:=true")
-Q = np.array([0.1, 0.2, 0.3])
-
-
-class Twin:
-    """A running node and its topics, seen from this side."""
-
-    def __init__(self, peer, process, name):
-        self.peer, self.process, self.name = peer, process, name
-        peer.talk(JointTrajectory, f"/{name}/joint_trajectory")
-        peer.talk(JointState, f"/{name}/states")
-        peer.hear(JointTrajectory, f"/{name}/joint_trajectory_ff")
-        for topic in ("joint_torques", "torque_residual"):
-            peer.hear(JointState, f"/{name}/{topic}")
-        peer.hear(Float64MultiArray, f"/{name}/commands")
-        self._last = 0
-
-    def received(self, topic):
-        return self.peer.received(f"/{self.name}/{topic}")
-
-    def stamp(self):
-        """The present, and later than every stamp before."""
-        self._last = max(self.peer.now(), self._last + STEP)
-        return self._last
-
-    def ask(self, message):
-        """Send a trajectory and wait for its answer: all answers up to it."""
-        received = self.received("joint_trajectory_ff")
-        self.peer.send(f"/{self.name}/joint_trajectory", message)
-        self.peer.until(lambda: any(stamp_of(m) == stamp_of(message) for m in received))
-        answers = list(received)
-        received.clear()
-        return answers
-
-    def send_state(self, message):
-        self.peer.send(f"/{self.name}/states", message)
-
-    def ready(self):
-        """Wait until all topics are connected both ways."""
-
-        def repeat():
-            assert self.process.alive(), self.process.output
-            self.peer.send(f"/{self.name}/joint_trajectory", trajectory(stamp=self.stamp()))
-            self.send_state(state(stamp=self.stamp(), effort=(0.0, 0.0, 0.0)))
-
-        topics = ("joint_trajectory_ff", "joint_torques", "torque_residual", "commands")
-        self.peer.until(lambda: all(self.received(t) for t in topics), 90.0, repeat)
-        self.settle()
-        return self
-
-    def settle(self):
-        """Wait until a new trajectory is answered, and forget everything before."""
-        self.ask(trajectory(stamp=self.stamp()))
-        for topic in ("joint_torques", "torque_residual", "commands"):
-            self.received(topic).clear()
-
-    def stream(self, count, **fields):
-        """Send joint states: their stamps."""
-        stamps = [self.stamp() for _ in range(count)]
-        for stamp in stamps:
-            self.send_state(state(stamp, **fields))
-        return stamps
-
-    def since(self, stamps, topic="joint_torques"):
-        """The messages from the first of these stamps on, once that of the last has come."""
-        received = self.received(topic)
-        self.peer.until(lambda: any(stamp_of(m) == stamps[-1] for m in received))
-        return [m for m in received if stamp_of(m) >= stamps[0]]
-
-    def set(self, **values):
-        """Set parameters atomically; dots are written as two underscores."""
-        request = SetParametersAtomically.Request()
-        request.parameters = [
-            Parameter(key.replace("__", "."), value=value).to_parameter_msg()
-            for key, value in values.items()
-        ]
-        service = f"/{self.name}/set_parameters_atomically"
-        return self.peer.call(SetParametersAtomically, service, request).result
-
-    def effort(self, q=Q):
-        """What the node answers for holding still at q."""
-        rows = [tuple(q)]
-        zero = [(0.0, 0.0, 0.0)]
-        (answer,) = self.ask(MAKE.trajectory(NAMES, [SECOND], rows, zero, zero, self.stamp()))
-        return np.array(answer.points[0].effort)
-
-    def diagnostics(self, condition=lambda array: True):
-        return self.peer.diagnostics(f"/{self.name}", condition)
-
-
-def trajectory(count=5, order=(0, 1, 2), stamp=0, **changes):
-    times = np.arange(count) * 0.05
-    waves = np.outer(times, [3.0, -4.0, 5.0])
-    rows = {
-        "positions": 0.2 + 0.3 * np.sin(waves),
-        "velocities": 0.3 * np.cos(waves) * [3.0, -4.0, 5.0],
-        "accelerations": -0.3 * np.sin(waves) * [9.0, 16.0, 25.0],
-    }
-    order = list(order)
-    fields = {key: values[:, order].tolist() for key, values in rows.items()}
-    fields |= {"names": [NAMES[i] for i in order], "times": [round(t * SECOND) for t in times]}
-    return MAKE.trajectory(**(fields | {"stamp": stamp} | changes))
-
-
-def state(stamp, order=(0, 1, 2), position=Q, velocity=(0.1, -0.2, 0.3), effort=()):
-    def pick(values):
-        return [float(values[i]) for i in order] if len(values) else []
-
-    names = [NAMES[i] for i in order]
-    return MAKE.joint_state(names, pick(position), pick(velocity), pick(effort), stamp)
+from test.nodes.twin import (
+    COMMON,
+    MAKE,
+    MODULE,
+    NAMES,
+    ROBOT,
+    STEP,
+    WINDOW,
+    Q,
+    Twin,
+    state,
+    trajectory,
+)
 
 
 def wave(index):
@@ -474,6 +357,8 @@ class TestParameters:
             (["payload.mass:=heavy"], "payload.mass: 'heavy'"),
             (["gravity:=[0.0, 0.0, .nan]"], "gravity[2]: nan"),
             (["stale_after:=.nan"], "stale_after: nan"),
+            (["singularity_warn:=.nan"], "singularity_warn: nan"),
+            (["singularity_stop:=0.2"], "at least singularity_stop, 0.2"),
             (["limit_policy:=clip"], "did you mean 'clamp'"),
             (["acceleration:=guess"], "acceleration: 'guess'"),
             (["use_sim_time:=maybe"], "use_sim_time"),

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The feedforward core: torques of trajectories and streams, rejects, stops and limits."""
 
+import contextlib
 import math
 from itertools import permutations
 
@@ -242,16 +243,19 @@ class TestStreams:
         exact = inverse_dynamics(ROBOT, *motion((WINDOW - 1) / 1000))
         assert np.allclose(results[-1].effort, exact, atol=1e-9)
 
-    def test_a_gap_longer_than_stale_after_fills_the_window_anew(self, make):
+    def test_a_gap_longer_than_stale_after_stops_and_fills_the_window_anew(self, make):
         twin = running(make)
-        results = answers(twin, make, range(10 + 101, 10 + 101 + WINDOW))
-        assert [result is None for result in results] == [True] * (WINDOW - 1) + [False]
+        results = answers(twin, make, range(10 + 101, 10 + 101 + WINDOW + 2))
+        # The window is filled, then good_needed is 3.
+        assert [result is None for result in results] == [True] * (WINDOW + 1) + [False]
+        assert twin.stream.stops == {"stale input": 1}
         assert running(make).joint_state(*sample(make, 10 + 99)) is not None
 
     def test_differentiated_rates_keep_the_velocity_limit(self, make):
         twin = core(differentiate=True)
         answers(twin, make, range(WINDOW - 1), rates=False)
-        leap = sample(make, WINDOW - 1, rates=False, position=(1.2, 1.2, 1.2))
+        q = motion((WINDOW - 2) / 1000)[0]
+        leap = sample(make, WINDOW - 1, rates=False, position=q + 0.09)
         assert reject(twin.joint_state, *leap)[0] == "limit"
 
     def test_an_unreachable_state_names_the_limb(self, make, limitless):
@@ -261,13 +265,14 @@ class TestStreams:
         reason, text = reject(twin.joint_state, *bad)
         assert (reason, "limb III" in text) == ("unreachable", True)
 
-    def test_a_singular_state_is_rejected(self, make, monkeypatch):
+    def test_a_singular_state_is_rejected_and_stops(self, make, monkeypatch):
         def singular(*arguments):
             raise SingularityError("joint state", (), 1e-12, 1e-9)
 
         twin = running(make)
         monkeypatch.setattr(feedforward, "inverse_dynamics", singular)
         assert reject(twin.joint_state, *sample(make, 10))[0] == "singular"
+        assert twin.stream.stops == {"singular": 1}
 
     def test_a_new_robot_is_used_from_the_next_sample(self, make):
         twin = running(make)
@@ -286,6 +291,216 @@ class TestStreams:
             message, now = sample(make, i, stamp=0)
             result = twin.joint_state(message, now)
         assert result.stamp == NOW + (WINDOW - 1) * STEP
+
+
+def held(make, index, q):
+    """A joint state at rest, and its arrival time."""
+    return sample(make, index, position=q, velocity=(0.0, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def unreachable(limitless):
+    """Joint states without an assembly, shape (n, 3)."""
+    q = np.random.default_rng(1).uniform(-3.0, 3.0, (5000, 3))
+    return q[limitless.forward_kernel(limitless.parameters, q)[1][:, 0] == 1.0]
+
+
+def edge(robot, inside, outside):
+    """How far from one joint state to the other the robot can be assembled."""
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        fault = robot.forward_kernel(robot.parameters, inside + middle * (outside - inside))[1]
+        low, high = (middle, high) if fault[0] == 0.0 else (low, middle)
+    return low
+
+
+class TestSingularities:
+    inside = np.array([0.2, 0.2, 0.2])
+
+    @settings(
+        max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    )
+    @given(index=st.integers(0))
+    def test_an_edge_of_reach_is_warned_of_then_stopped_before(self, limitless, unreachable, index):
+        outside = unreachable[index % len(unreachable)]
+        part = edge(limitless, self.inside, outside)
+        twin = core(limitless, bad_limit=10**6)
+        warned = False
+        # Slowly, so that the band is not stepped over: the measure falls as the distance's root.
+        way = np.concatenate([np.linspace(1.0, 0.1, 1500), 0.1 * 0.9 ** np.arange(1, 300)])
+        for i, left in enumerate(way):
+            q = self.inside + part * (1.0 - left) * (outside - self.inside)
+            try:
+                twin.joint_state(*held(Maker(Plain()), i, q))
+            except MessageError as error:
+                # A jump: the way led through another edge, to another assembly mode.
+                event(error.reason)
+                assert error.reason in ("singular", "jump")
+                assert twin.stream.stops == {error.reason: 1}
+                assert warned or error.reason == "jump"
+                return
+            warned = twin.near_singular
+        raise AssertionError("the edge was reached without a stop")
+
+    def test_a_state_in_the_band_is_answered_and_counted(self, make):
+        q = motion(0.0)[0]
+        measure = float(ROBOT.singularity(q))
+        for bound, near in ((1.01 * measure, True), (0.99 * measure, False)):
+            twin = core(singularity_warn=bound)
+            results = [twin.joint_state(*held(make, i, q)) for i in range(WINDOW)]
+            assert results[-1] is not None
+            assert twin.near_singular is near
+            assert twin.near_singularities == (WINDOW if near else 0)
+            assert twin.singularity() == measure
+
+    @pytest.mark.parametrize("below", [True, False])
+    def test_the_bounds_hold_for_trajectories(self, make, below):
+        message = trajectory(make)
+        measures = ROBOT.singularity([point.positions for point in message.points])
+        bound = float(measures.min()) * (1.001 if below else 0.999)
+        twin = core(singularity_stop=bound, singularity_warn=1.0)
+        if below:
+            reason, text = reject(twin.trajectory, message, NOW)
+            assert reason == "singular"
+            assert f"point {measures.argmin()}: " in text
+            assert not twin.stream.stopped
+        else:
+            assert twin.trajectory(message, NOW).shape == (6, 3)
+            assert twin.near_singularities == 6
+
+    @given(rows=st.lists(st.floats(-1e3, 1e3), min_size=9, max_size=9))
+    def test_the_quick_bound_is_below_the_measure_and_not_far(self, rows):
+        values = np.linalg.svd(np.reshape(rows, (3, 3)), compute_uv=False)
+        assume(values[-1] > 1e-6 * values[0] and values[0] > 1e-3)
+        measure = values[-1] / values[0]
+        bound = feedforward._clearance(rows)
+        assert measure / 3 * (1 - 1e-6) <= bound <= measure * (1 + 1e-6)
+
+    @pytest.mark.parametrize("name", ["delta", "delta_cu", "prru"])
+    def test_the_defaults_leave_the_workspace_alone(self, name):
+        robot = load(name)
+        limits = robot.limits.position
+        q = np.random.default_rng(1).uniform(limits[:, 0], limits[:, 1], (20_000, 3))
+        q = q[robot.forward_kernel(robot.parameters, q)[1][:, 0] == 0.0]
+        measures = robot.singularity(q)
+        s = Settings()
+        assert (measures < s.singularity_warn).mean() < 1e-3
+        assert (measures < s.singularity_stop).mean() < 1e-4
+
+    def test_a_warning_below_the_stop_is_refused(self):
+        with pytest.raises(ParameterError, match="singularity_warn"):
+            Settings(singularity_warn=0.1, singularity_stop=0.2)
+
+
+class TestJumps:
+    apart = ([1.79937, -1.72257, -0.85939], [1.79928, -1.72205, -0.85825])
+    """Neighbours far from all singularities, whose lowest assemblies are different ones."""
+
+    @pytest.mark.parametrize("joint", range(3))
+    @pytest.mark.parametrize(("factor", "jumps"), [(1.01, True), (0.99, False)])
+    def test_a_joint_that_outruns_its_velocity_limit_stops_the_stream(
+        self, make, joint, factor, jumps
+    ):
+        twin = core(bad_limit=10**6)
+        q = np.zeros(3)
+        for i in range(WINDOW + 3):
+            assert (twin.joint_state(*held(make, i, q)) is None) is (i < WINDOW - 1)
+        # 1 ms after the last sample: twice what 15 rad/s allow, over 5 ms more.
+        q[joint] = factor * 15.0 * (2 * 0.001 + 0.005)
+        message = held(make, WINDOW + 3, q)
+        if not jumps:
+            assert twin.joint_state(*message) is not None
+            return
+        reason, text = reject(twin.joint_state, *message)
+        assert reason == "jump"
+        assert f"arm_{joint + 1} moved by 0.106" in text
+        assert twin.stream.stops == {"jump": 1}
+        # From there on the stream is good again: the window, then good_needed samples.
+        results = [twin.joint_state(*held(make, i, q)) for i in range(20, 20 + WINDOW + 2)]
+        assert [result is None for result in results] == [True] * (WINDOW + 1) + [False]
+        # Nothing of the jump is in the derivatives.
+        assert (results[-1].motion[2] == 0.0).all()
+
+    def test_a_jump_to_another_assembly_mode_stops_the_stream(self, make, limitless):
+        twin = core(limitless)
+        before, after = self.apart
+        assert min(limitless.singularity(self.apart)) > 0.2
+        results = [twin.joint_state(*held(make, i, before)) for i in range(WINDOW)]
+        assert results[-1] is not None
+        reason, text = reject(twin.joint_state, *held(make, WINDOW, after))
+        assert (reason, "another assembly mode" in text) == ("jump", True)
+        assert twin.stream.stops == {"jump": 1}
+
+    def test_no_jump_is_seen_across_a_reset(self, make):
+        twin = core()
+        answers(twin, make, range(WINDOW))
+        twin.reset()
+        assert twin.joint_state(*held(make, WINDOW, [1.2, 1.2, 1.2])) is None
+
+    @settings(max_examples=50, deadline=None)
+    @given(
+        speed=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+        rate=st.sampled_from([20, 100, 1000]),
+        name=st.sampled_from(["delta", "delta_cu", "prru"]),
+    )
+    def test_no_motion_within_the_limits_jumps(self, speed, rate, name):
+        """At full velocity, to and fro between the position limits, at any sample rate."""
+        robot = load(name)
+        make = Maker(Plain())
+        twin = core(robot, differentiate=True, bad_limit=10**6)
+        low, high = robot.limits.position.T
+        middle, half = (low + high) / 2, 0.9 * (high - low) / 2
+        # The sliders' ends are beyond reach when they are far apart.
+        half *= 0.5 if name == "prru" else 1.0
+        for i in range(60):
+            phase = robot.limits.velocity * np.array(speed) * (i / rate) / half
+            message = make.joint_state(
+                robot.joint_names,
+                middle + half * np.sin(phase),
+                robot.limits.velocity * np.array(speed) * np.cos(phase),
+                stamp=NOW + i * SECOND // rate,
+            )
+            with contextlib.suppress(MessageError):
+                twin.joint_state(message, NOW + i * SECOND // rate)
+        assert "jump" not in twin.stream.rejected
+        assert "singular" not in twin.stream.rejected
+
+
+class TestClocks:
+    def test_a_clock_that_goes_back_is_a_new_beginning(self, make):
+        twin = running(make)
+        for i in range(WINDOW):
+            message, now = sample(make, i)
+            message.header.stamp.sec -= 100
+            result = twin.joint_state(message, now - 100 * SECOND)
+            assert (result is None) is (i < WINDOW - 1)
+        exact = inverse_dynamics(ROBOT, *motion((WINDOW - 1) / 1000))
+        assert np.abs(result.effort - exact).max() < 1e-9
+        assert not twin.stream.rejected
+
+    def test_a_clock_that_goes_back_a_little_only_drops_older_stamps(self, make):
+        twin = running(make)
+        assert reject(twin.joint_state, *sample(make, 5))[0] == "stamp order"
+        assert twin.joint_state(*sample(make, 10)) is not None
+
+    def test_a_clock_that_leaps_stops_a_running_stream(self, make):
+        twin = running(make)
+        twin.clock_leapt()
+        assert twin.stream.stops == {"clock jump": 1}
+        late = NOW + 10 * SECOND
+        assert reject(twin.joint_state, sample(make, 10)[0], late)[0] == "stale stamp"
+        results = []
+        for i in range(WINDOW + 3):
+            message, now = sample(make, i)
+            message.header.stamp.sec += 10
+            results.append(twin.joint_state(message, now + 10 * SECOND))
+        assert [result is None for result in results] == [True] * (WINDOW + 1) + [False] * 2
+
+    def test_a_first_clock_is_no_leap(self):
+        twin = core()
+        twin.clock_leapt()
+        assert not twin.stream.stopped
 
 
 class TestLimits:
@@ -343,6 +558,13 @@ class TestLimits:
         monkeypatch.setattr(feedforward, "inverse_dynamics", overflow)
         assert reject(twin.joint_state, *sample(make, 10))[0] == "non-finite result"
         assert twin.stream.stopped
+
+    @pytest.mark.parametrize("value", [math.nan, math.inf])
+    def test_a_trajectory_that_overflows_the_model_stops_the_stream(self, make, monkeypatch, value):
+        twin = running(make)
+        monkeypatch.setattr(feedforward, "inverse_dynamics", lambda *a: np.full((6, 3), value))
+        assert reject(twin.trajectory, trajectory(make), NOW)[0] == "non-finite result"
+        assert twin.stream.stops == {"non-finite result": 1}
 
 
 class TestStopEffort:

@@ -211,7 +211,7 @@ class TestTrajectory:
         names = ("arm_2", "arm_3", "arm_1")
         rows = [(0.2 + i / 10, 0.3, 0.1) for i in range(3)]
         message = trajectory(make, names=names, positions=rows, stamp=NOW)
-        t = reader.trajectory(message, NOW, RULES)
+        t = reader.trajectory(message, NOW)
         assert t.stamp == NOW
         assert t.times.tolist() == [0.0, 0.5, 1.0]
         assert np.allclose(t.q, [(0.1, 0.2, 0.3), (0.1, 0.3, 0.3), (0.1, 0.4, 0.3)])
@@ -219,7 +219,7 @@ class TestTrajectory:
 
     def test_absent_derivatives_are_none(self, make, reader):
         message = trajectory(make, velocities=None, accelerations=None)
-        t = reader.trajectory(message, NOW, RULES)
+        t = reader.trajectory(message, NOW)
         assert (t.qd, t.qdd) == (None, None)
 
     @pytest.mark.parametrize(
@@ -237,14 +237,14 @@ class TestTrajectory:
         ],
     )
     def test_wrong_joints_and_empty_arrays_are_named(self, make, reader, changes, reason):
-        assert refused(reader.trajectory, trajectory(make, **changes), NOW, RULES)[0] == reason
+        assert refused(reader.trajectory, trajectory(make, **changes), NOW)[0] == reason
 
     @pytest.mark.parametrize("what", ["positions", "velocities", "accelerations"])
     @pytest.mark.parametrize("row", [(), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4)])
     @pytest.mark.parametrize("point", range(3))
     def test_a_wrong_length_names_point_and_lengths(self, make, reader, what, row, point):
         message = trajectory(make, **{what: with_entry([Q] * 3, point, row)})
-        reason, text = refused(reader.trajectory, message, NOW, RULES)
+        reason, text = refused(reader.trajectory, message, NOW)
         assert reason == "length"
         assert f"point {point}: {len(row)} {what} for 3" in text
 
@@ -252,7 +252,7 @@ class TestTrajectory:
     @pytest.mark.parametrize("value", DAMAGED)
     def test_a_damaged_value_names_point_and_joint(self, make, reader, what, value):
         message = trajectory(make, **{what: with_entry([Q] * 3, 2, with_entry(Q, 1, value))})
-        reason, text = refused(reader.trajectory, message, NOW, RULES)
+        reason, text = refused(reader.trajectory, message, NOW)
         assert text.startswith("point 2: ") and "arm_2" in text
         assert (reason == "not finite") == (not math.isfinite(value))
 
@@ -266,7 +266,7 @@ class TestTrajectory:
     )
     def test_a_passed_limit_is_rejected(self, make, reader, what, value, reason):
         message = trajectory(make, **{what: with_entry([Q] * 3, 0, with_entry(Q, 2, value))})
-        assert refused(reader.trajectory, message, NOW, RULES)[0] == reason
+        assert refused(reader.trajectory, message, NOW)[0] == reason
 
     @pytest.mark.parametrize(
         "times",
@@ -279,26 +279,26 @@ class TestTrajectory:
         ],
     )
     def test_times_that_do_not_rise_from_zero_are_rejected(self, make, reader, times):
-        assert refused(reader.trajectory, trajectory(make, times=times), NOW, RULES)[0] == "time"
+        assert refused(reader.trajectory, trajectory(make, times=times), NOW)[0] == "time"
 
     def test_a_duration_beyond_the_resolution_of_seconds_is_rejected(self, make, reader):
         end = MAX_DURATION
         times = [end - 2, end - 1, end]
-        t = reader.trajectory(trajectory(make, times=times), NOW, RULES)
+        t = reader.trajectory(trajectory(make, times=times), NOW)
         assert (np.diff(t.times) > 0).all()
         message = trajectory(make, times=[0, 1, end + 1])
-        assert refused(reader.trajectory, message, NOW, RULES)[0] == "bounds"
+        assert refused(reader.trajectory, message, NOW)[0] == "bounds"
 
     def test_only_a_trajectory_whose_end_has_passed_is_over(self, make, reader):
-        assert reader.trajectory(trajectory(make, stamp=NOW - SECOND), NOW, RULES).stamp
-        assert reader.trajectory(trajectory(make, stamp=NOW + SECOND), NOW, RULES).stamp
+        assert reader.trajectory(trajectory(make, stamp=NOW - SECOND), NOW).stamp
+        assert reader.trajectory(trajectory(make, stamp=NOW + SECOND), NOW).stamp
         over = trajectory(make, stamp=NOW - SECOND - 1)
-        assert refused(reader.trajectory, over, NOW, RULES)[0] == "over"
+        assert refused(reader.trajectory, over, NOW)[0] == "over"
 
     def test_too_many_points_are_rejected_unread(self, reader):
         message = Maker(Plain()).trajectory(NAMES, [], [])
         message.points = [None] * (MAX_POINTS + 1)
-        assert refused(reader.trajectory, message, NOW, RULES)[0] == "bounds"
+        assert refused(reader.trajectory, message, NOW)[0] == "bounds"
 
 
 class TestWrench:
@@ -379,7 +379,7 @@ class TestAnything:
         names = [NAMES[i] for i in order]
         shuffled = [[row[i] for i in order] for row in rows]
         message = make.trajectory(names, [i + 1 for i in range(len(rows))], shuffled)
-        t = JointReader(ROBOT).trajectory(message, NOW, RULES)
+        t = JointReader(ROBOT).trajectory(message, NOW)
         assert t.q.tolist() == [list(row) for row in rows]
         assert [ROBOT.joint_names[i] for i in t.columns] == names
 

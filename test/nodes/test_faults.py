@@ -1,0 +1,412 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node delta_dynamics does about clocks, silence, bursts, and nodes that do not fit."""
+
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from test.nodes.harness import SECOND, Domain, Peer, counts_of, stamp_of, values_of
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+from test.nodes.twin import COMMON, MAKE, MODULE, NAMES, ROBOT, STEP, WINDOW, Q, Twin, state
+
+AGAIN = WINDOW + 1
+"""Samples of a stopped stream that are not answered: the window, then good_needed is 2."""
+QUICK = 0.015
+"""stale_after of a node that has to stop within 20 ms, s."""
+DEEP = "qos_overrides./timed/states.subscription.depth:=100"
+OFFER = "qos_overrides./late/joint_torques.publisher.deadline:=7000000000"
+LATE = """
+import time
+import numpy as np
+import delta_dynamics.node as node
+from delta_dynamics import feedforward
+solve = feedforward.inverse_dynamics
+def late(robot, q, qd, qdd):
+    if q.ndim > 1:
+        return np.full(q.shape, np.inf)
+    if q[0] == 0.125:
+        time.sleep(0.02)
+    return solve(robot, q, qd, qdd)
+feedforward.inverse_dynamics = late
+node.main()
+"""
+SENDER = """
+import rclpy
+from test.nodes.harness import Maker, Ros
+from test.nodes.twin import Q, state
+from sensor_msgs.msg import JointState
+rclpy.init()
+node = rclpy.create_node("sender")
+publisher = node.create_publisher(JointState, "/quick/states", 10)
+node.create_timer(1e-3, lambda: publisher.publish(state(node.get_clock().now().nanoseconds)))
+rclpy.spin(node)
+"""
+LISTENER = """
+import rclpy
+from sensor_msgs.msg import JointState
+rclpy.init()
+node = rclpy.create_node("listener")
+node.create_subscription(JointState, "/late/joint_torques", lambda message: None, 10)
+rclpy.spin(node)
+"""
+
+
+class Arrivals:
+    """Messages of a topic with what the middleware says of each."""
+
+    def __init__(self, peer, topic):
+        self.heard = []
+        # As deep as anything here is long, and a lifespan so long that none is lost.
+        peer.node.create_subscription(
+            JointState, topic, lambda m, info: self.heard.append((m, info)), QoSProfile(depth=5000)
+        )
+
+    def ages(self):
+        """From a state's stamp to the torque's publication, s."""
+        stamps = [info["source_timestamp"] - stamp_of(m) for m, info in self.heard]
+        return np.array(stamps) / SECOND
+
+
+@pytest.fixture(scope="module")
+def fleet(peer, launch):
+    """All nodes of this module, started at once."""
+    peer.hear(DiagnosticArray, "/diagnostics")
+    options = {
+        "quick": (f"stale_after:={QUICK}", "on_stop:=zeros"),
+        "timed": ("use_sim_time:=true", "stale_after:=5.0", "on_stop:=zeros", DEEP),
+        "late": ("stale_after:=5.0", "on_stop:=zeros", "acceleration:=differentiate", OFFER),
+    }
+    twins = {}
+    for name, parameters in options.items():
+        remap = ("-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states")
+        code = LATE if name == "late" else None
+        process = launch(MODULE, *COMMON, *parameters, arguments=remap, code=code)
+        twins[name] = Twin(peer, process, name)
+    return twins
+
+
+def at_pace(twin, count, period=1e-3, **fields):
+    """Send joint states one period apart, on time: the stamp of the last, and when it left."""
+    begin = time.perf_counter()
+    for i in range(count):
+        while time.perf_counter() < begin + i * period:
+            pass
+        stamp = twin.stamp(1)
+        twin.send_state(state(stamp, **fields))
+    return stamp, time.monotonic()
+
+
+def is_zeros(message):
+    return list(message.effort) == [0.0, 0.0, 0.0]
+
+
+def running(twin):
+    """Wait until a stream of this node is answered."""
+    torques = twin.received("joint_torques")
+    torques.clear()
+
+    def send():
+        assert twin.process.alive(), twin.process.output
+        at_pace(twin, 12)
+
+    twin.peer.until(lambda: any(not is_zeros(m) for m in torques), 90.0, send)
+    return twin
+
+
+def text_of(array):
+    """The status message and what else is told."""
+    return f"{array.status[0].message}; {values_of(array)['also']}"
+
+
+def count_of(array):
+    """Joint states that the node took and that it says were lost."""
+    values = values_of(array)
+    return sum(int(values[key]) for key in ("messages", "lost: joint_states"))
+
+
+def count_at_rest(quick):
+    """The count once the stream has stopped: then the queue is empty."""
+    quick.peer.until(lambda: is_zeros(quick.received("joint_torques")[-1]))
+    return count_of(quick.diagnostics())
+
+
+@pytest.fixture
+def quick(fleet):
+    return running(fleet["quick"])
+
+
+class TestSilence:
+    def test_a_silent_stream_stops_within_20_ms_at_1_khz(self, quick):
+        torques = quick.received("joint_torques")
+        took = []
+
+        def once():
+            torques.clear()
+            stamp, sent = at_pace(quick, 60)
+            quick.peer.until(lambda: torques and is_zeros(torques[-1]))
+            # Only where the last state was answered: this machine does other things too.
+            if any(stamp_of(m) == stamp and not is_zeros(m) for m in torques):
+                took.append(time.monotonic() - sent)
+            return len(took) >= 5
+
+        quick.peer.until(once, 60.0)
+        assert sorted(took)[1] < 0.020
+        assert min(took) > QUICK - 0.002
+
+
+class TestLoad:
+    def test_a_burst_leaves_nothing_old_and_every_loss_is_counted(self, quick):
+        arrivals = Arrivals(quick.peer, "/quick/joint_torques")
+        quick.peer.until(lambda: quick.peer.node.count_subscribers("/quick/joint_torques") >= 2)
+        running(quick)
+        before = count_at_rest(quick)
+        arrivals.heard.clear()
+        torques = quick.received("joint_torques")
+        recovered, sent = [], 0
+        for _ in range(3):
+            last, ended = at_pace(quick, 2000, 1e-4)
+            sent += 2000
+            while not any(stamp_of(m) > last and not is_zeros(m) for m in torques):
+                assert time.monotonic() < ended + 20.0
+                at_pace(quick, 1)
+                sent += 1
+                quick.peer.spin()
+            recovered.append(time.monotonic() - ended)
+        quick.diagnostics(lambda a: count_of(a) == before + sent)
+        # This machine does other things too.
+        assert min(recovered) < 0.1
+        ages = arrivals.ages()
+        assert len(ages) > 100
+        assert np.percentile(ages, 98) < 0.020
+
+    def test_what_a_standing_node_missed_is_counted_and_skipped(self, quick):
+        array = quick.diagnostics()
+        before = int(values_of(array)["lost: joint_states"])
+        at_pace(quick, 1)
+        quick.process.process.send_signal(signal.SIGSTOP)
+        try:
+            at_pace(quick, 50)
+        finally:
+            quick.process.process.send_signal(signal.SIGCONT)
+        array = quick.diagnostics(lambda a: int(values_of(a)["lost: joint_states"]) > before)
+        # The queue keeps the newest ten; the first of all may have waited in it too.
+        lost = int(values_of(array)["lost: joint_states"]) - before
+        assert lost in (40, 41)
+        assert f"{lost} messages lost in the last second" in text_of(array)
+
+    def test_a_subscriber_that_stands_still_holds_nobody_up(self, fleet, launch):
+        twin = running(fleet["late"])
+        node = twin.peer.node
+        heard = node.count_subscribers("/late/joint_torques")
+        listener = launch(None, code=LISTENER)
+        twin.peer.until(lambda: node.count_subscribers("/late/joint_torques") > heard, 60.0)
+        listener.process.send_signal(signal.SIGSTOP)
+        took = []
+        try:
+            # Ten times as many as the queue of the one that stands still.
+            for _ in range(100):
+                stamp, sent = at_pace(twin, 1)
+                twin.since([stamp])
+                took.append(time.monotonic() - sent)
+        finally:
+            listener.process.send_signal(signal.SIGCONT)
+        assert np.median(took) < 0.020
+        assert max(took[20:]) < 1.0
+
+    def test_every_torque_has_the_middlewares_sequence_number(self, quick):
+        arrivals = Arrivals(quick.peer, "/quick/joint_torques")
+        quick.peer.until(lambda: len(arrivals.heard) >= 20, repeat=lambda: at_pace(quick, 5))
+        numbers = [info["publication_sequence_number"] for _, info in arrivals.heard]
+        assert (np.diff(numbers) == 1).all()
+
+    def test_torques_expire_when_their_stream_would_be_stale(self, quick):
+        def offered(topic):
+            (info,) = quick.peer.node.get_publishers_info_by_topic(topic)
+            profile = info.qos_profile
+            return profile.lifespan.nanoseconds, profile.deadline.nanoseconds
+
+        for topic in ("joint_torques", "commands"):
+            assert offered(f"/quick/{topic}") == (QUICK * SECOND, QUICK * SECOND)
+        assert offered("/late/joint_torques") == (5 * SECOND, 7 * SECOND)
+
+    def test_answers_slower_than_the_stream_are_told(self, fleet):
+        late = running(fleet["late"])
+        line = "callbacks took longer than their period"
+
+        def told():
+            return any(
+                line in text_of(array)
+                and float(values_of(array)["longest callback (ms): joint_states"]) >= 20.0
+                for array in late.peer.received("/diagnostics")
+                if array.status[0].name == "/late"
+            )
+
+        late.peer.until(told, repeat=lambda: at_pace(late, 20, 5e-3, position=(0.125, 0.2, 0.3)))
+
+    def test_a_trajectory_that_overflows_the_model_stops_the_stream(self, fleet):
+        late = running(fleet["late"])
+        late.since([at_pace(late, 9)[0]])
+        torques = late.received("joint_torques")
+        torques.clear()
+        rows = [tuple(Q)] * 3
+        late.peer.send(
+            "/late/joint_trajectory",
+            MAKE.trajectory(NAMES, [0, STEP, SECOND], rows, stamp=late.stamp()),
+        )
+        late.peer.until(lambda: any(map(is_zeros, torques)))
+        array = late.diagnostics(lambda a: a.status[0].level == b"\x02")
+        assert array.status[0].message.startswith("stopped: non-finite result")
+        assert sum(map(is_zeros, torques)) == 1
+        assert late.received("joint_trajectory_ff") == []
+
+
+class TestClocks:
+    start = 1_000 * SECOND
+
+    def tick(self, timed, now):
+        """Bring the node's clock there, told by its diagnostics."""
+        clock = Clock(clock=MAKE.header(now).stamp)
+        timed.peer.until(
+            lambda: any(
+                stamp_of(a) == now
+                for a in timed.peer.received("/diagnostics")
+                if a.status[0].name == "/timed"
+            ),
+            repeat=lambda: timed.peer.send("/clock", clock),
+        )
+
+    def stream(self, timed, begin, count):
+        """States of a motion at constant acceleration: the stamps that are answered."""
+        torques = timed.received("joint_torques")
+        torques.clear()
+        stamps = [begin + i * STEP for i in range(count)]
+        for i, stamp in enumerate(stamps):
+            t = i / 1000
+            q, qd = Q + 0.5 * t + t * t, [0.5 + 2 * t] * 3
+            timed.send_state(state(stamp, position=q, velocity=qd))
+        timed.peer.until(lambda: any(stamp_of(m) == stamps[-1] for m in torques))
+        last = torques[-1]
+        exact = inverse_dynamics(ROBOT, q, qd, [2.0] * 3)
+        assert np.abs(np.array(last.effort) - exact).max() < 1e-6
+        return [(stamp_of(m) - begin) // STEP for m in torques]
+
+    def test_no_torque_is_made_across_a_jump_of_the_clock(self, fleet):
+        timed = fleet["timed"]
+        timed.peer.talk(Clock, "/clock")
+        timed.peer.until(timed.peer.matched, 90.0)
+        self.tick(timed, self.start)
+        assert self.stream(timed, self.start, 20) == list(range(WINDOW - 1, 20))
+        # Back, as when a bag begins anew: the window is filled anew. By as little as stamps may be
+        # ahead, then by more.
+        for back in (SECOND // 20, 100 * SECOND):
+            begin = self.start - back
+            self.tick(timed, begin)
+            assert self.stream(timed, begin, 20) == list(range(WINDOW - 1, 20))
+        assert counts_of(timed.diagnostics(), "stopped") == {}
+        # Forward, as when a player seeks: a stop, its zeros, then the same and good_needed.
+        torques = timed.received("joint_torques")
+        torques.clear()
+        self.tick(timed, self.start)
+        timed.peer.until(lambda: torques)
+        assert [is_zeros(m) for m in torques] == [True]
+        array = timed.diagnostics()
+        assert array.status[0].message.startswith("stopped: clock jump: the clock jumped forward")
+        assert "/clock stands still" in text_of(array)
+        assert counts_of(array, "stopped") == {"clock jump": 1}
+        assert self.stream(timed, self.start, 20) == list(range(AGAIN - 1, 20))
+
+    def test_a_stream_that_ends_is_stopped_while_the_clock_stands(self, fleet):
+        timed = fleet["timed"]
+        array = timed.diagnostics(lambda a: "stale input" in counts_of(a, "stopped"))
+        assert "stopped: stale input: no joint state for 5." in array.status[0].message
+
+
+class TestNeighbours:
+    def told(self, quick, condition):
+        """Seconds until the diagnostics' message is so."""
+        began = time.monotonic()
+        quick.diagnostics(lambda a: condition(text_of(a)))
+        return time.monotonic() - began
+
+    def test_a_publisher_that_does_not_fit_is_told_while_it_is_there(self, quick):
+        node = quick.peer.node
+        worst = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+        publisher = node.create_publisher(JointState, "/quick/states", worst)
+        line = "incompatible QoS of another node on joint_states: reliability"
+        # A second from the event; the rest is discovery.
+        assert self.told(quick, lambda text: line in text) < 5.0
+        node.destroy_publisher(publisher)
+        self.told(quick, lambda text: line not in text)
+        assert int(values_of(quick.diagnostics())["incompatible QoS"]) == 1
+
+    def test_a_subscriber_that_does_not_fit_is_told(self, quick):
+        node = quick.peer.node
+        hasty = QoSProfile(depth=10, deadline=Duration(seconds=QUICK / 2))
+        listener = node.create_subscription(
+            JointState, "/quick/joint_torques", lambda message: None, hasty
+        )
+        line = "incompatible QoS of another node on ~/joint_torques: deadline"
+        assert self.told(quick, lambda text: line in text) < 5.0
+        node.destroy_subscription(listener)
+        self.told(quick, lambda text: line not in text)
+
+    def test_a_node_of_the_same_name_is_told(self, quick, launch):
+        remap = ("-r", "__node:=quick", "-r", "joint_states:=/elsewhere")
+        namesake = launch(MODULE, arguments=remap)
+        try:
+            line = "2 nodes have this name"
+            quick.peer.until(lambda: line in text_of(quick.diagnostics()), 90.0)
+        finally:
+            namesake.close()
+        self.told(quick, lambda text: line not in text)
+
+    def test_another_domain_is_another_world(self, quick):
+        other = Domain()
+        peers = [Peer(other), Peer(other)]
+        stranger, control = peers
+        try:
+            stranger.talk(JointState, "/quick/states")
+            control.hear(JointState, "/quick/states")
+            stranger.hear(JointState, "/quick/joint_torques")
+
+            def send():
+                stranger.send("/quick/states", state(stranger.now()))
+
+            # The same messages do come through within the other domain ...
+            control.until(lambda: len(control.received("/quick/states")) >= 20, repeat=send)
+            # ... while this one is alive.
+            before = count_at_rest(quick)
+            for _ in range(20):
+                send()
+            names = {name for name, _ in stranger.node.get_node_names_and_namespaces()}
+            assert names == {"peer"}
+            assert stranger.received("/quick/joint_torques") == []
+            assert stranger._publishers["/quick/states"].get_subscription_count() == 1
+            at_pace(quick, 10)
+            quick.diagnostics(lambda a: count_of(a) == before + 10)
+        finally:
+            for peer in peers:
+                peer.close()
+            other.close()
+
+    def test_a_killed_publisher_stops_the_stream(self, quick, launch):
+        torques = quick.received("joint_torques")
+        sender = launch(None, code=SENDER)
+        torques.clear()
+        quick.peer.until(lambda: sum(not is_zeros(m) for m in torques) > 20, 60.0)
+        sender.process.kill()
+        sender.wait()
+        quick.peer.until(lambda: is_zeros(torques[-1]))
+        array = quick.diagnostics(lambda a: a.status[0].level == b"\x02")
+        assert "stopped: stale input: no joint state for 0.0" in array.status[0].message
