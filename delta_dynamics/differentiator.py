@@ -7,6 +7,8 @@ its derivative is taken at the newest sample. A motion whose velocity is a polyn
 degree comes out exactly, so the delay is zero for ``order`` 2 and above; ``order`` 1 gives the mean
 slope of the window, which is the acceleration half a window ago.
 
+The fit itself is compiled, as the mechanisms' formulas are.
+
 May import: numpy, pkm_twin's core, the standard library.
 """
 
@@ -19,12 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
+from pkm_twin.kernels import OK, SINGULAR, Kernel
 from pkm_twin.messages import SECOND
 
 Array = NDArray[np.float64]
 
 MAX_INVERSE: Final = 1e8
 """Largest entry of the inverse normal equations; even stamps stay below 1e4."""
+SIZE: Final = 6
+"""Coefficients of the highest degree."""
+NANOSECONDS: Final = float(SECOND)
 
 
 @dataclass
@@ -44,9 +50,9 @@ class Differentiator:
         # Rings: a fit does not ask for the order of its samples.
         self._stamps = np.zeros(self.window, np.int64)
         self._values = np.zeros((self.window, 3))
-        self._powers = np.ones((self.window, self.order + 2))
+        self._flat = self._values.reshape(-1)
+        self._ages = np.zeros(self.window)
         self._count = 0
-        self._ends = [_derivatives(degree, 1.0) for degree in range(self.order + 2)]
 
     @property
     def delay(self) -> float:
@@ -74,38 +80,89 @@ class Differentiator:
         self._count += 1
         if self._count < self.window:
             return None
-        # From -1 at the oldest sample to 1 at the newest, so that the normal equations of a
-        # degree up to 5 stay far from rounding.
         oldest = self._count % self.window
         half = float(stamp - self._stamps[oldest]) / 2
+        np.subtract(self._stamps, stamp, out=self._ages)
+        middle = (oldest + self.window // 2) % self.window
+        at = 1.0 + float(self._ages[middle]) / half if self.middle else 1.0
         degree = self.order if carries else self.order + 1
-        powers = self._powers[:, : degree + 1]
-        t = powers[:, 1]
-        np.divide(self._stamps - stamp, half, out=t)
-        t += 1.0
-        for k in range(2, degree + 1):
-            np.multiply(powers[:, k - 1], t, out=powers[:, k])
-        try:
-            inverse = np.linalg.inv(powers.T @ powers)
-        except np.linalg.LinAlgError:
-            inverse = np.full((1, 1), np.inf)
-        if not np.abs(inverse).max() < MAX_INVERSE:
+        head = np.array([degree, half, at])
+        rates, fault = FIT(_BOUND, head, self._ages, self._flat)
+        if fault.item(0) != OK:
             raise MessageError(
                 "uneven stamps", "the stamps of the window are too uneven to differentiate"
             )
-        c = inverse @ (powers.T @ self._values)
-        half /= SECOND
-        middle = (oldest + self.window // 2) % self.window
-        first, second = self._ends[degree]
-        if self.middle:
-            first, second = _derivatives(degree, float(t[middle]))
+        first, second = rates[:3], rates[3:]
         if qd is None:
-            return (first @ c) / half, (second @ c) / half**2
-        return self._values[middle].copy() if self.middle else qd, (first @ c) / half
+            return first, second
+        return self._values[middle].copy() if self.middle else qd, first
 
 
-def _derivatives(degree: int, at: float) -> tuple[Array, Array]:
-    """What 1, t, t^2 ... contribute to the first and second derivative at ``at``."""
-    first = np.array([k * at ** max(k - 1, 0) for k in range(degree + 1)])
-    second = np.array([k * (k - 1) * at ** max(k - 2, 0) for k in range(degree + 1)])
-    return first, second
+def _fit(p, head, ages, values, rates, scratch, fault):  # type: ignore[no-untyped-def]
+    """First and second derivative (1/s, 1/s2) of a least-squares polynomial through samples.
+
+    ``head``: degree, half the window (ns), and where to read off, from -1 at the oldest sample to
+    1 at the newest, so that the normal equations of a degree up to 5 stay far from rounding.
+    ``ages``: stamps less the newest (ns); ``values``: three numbers a sample; ``p``: the largest
+    entry of the inverse normal equations.
+    """
+    n = int(head[0]) + 1
+    half = head[1]
+    # Moments of t, then of t with the values; the normal equations and their inverse.
+    moments = 0
+    loads = 2 * SIZE
+    matrix = loads + 3 * SIZE
+    inverse = matrix + SIZE * SIZE
+    for k in range(inverse + SIZE * SIZE):
+        scratch[k] = 0.0
+    for i in range(len(ages)):
+        t = 1.0 + ages[i] / half
+        power = 1.0
+        for k in range(2 * n - 1):
+            scratch[moments + k] += power
+            if k < n:
+                for j in range(3):
+                    scratch[loads + 3 * k + j] += power * values[3 * i + j]
+            power *= t
+    for i in range(n):
+        scratch[inverse + SIZE * i + i] = 1.0
+        for j in range(n):
+            scratch[matrix + SIZE * i + j] = scratch[moments + i + j]
+    # Gauss and Jordan: the matrix is positive definite and needs no pivots.
+    for i in range(n):
+        pivot = scratch[matrix + SIZE * i + i]
+        if not pivot > 0.0:
+            fault[0] = SINGULAR
+            return
+        for j in range(n):
+            scratch[matrix + SIZE * i + j] /= pivot
+            scratch[inverse + SIZE * i + j] /= pivot
+        for k in range(n):
+            factor = scratch[matrix + SIZE * k + i]
+            if k != i and factor != 0.0:
+                for j in range(n):
+                    scratch[matrix + SIZE * k + j] -= factor * scratch[matrix + SIZE * i + j]
+                    scratch[inverse + SIZE * k + j] -= factor * scratch[inverse + SIZE * i + j]
+    for i in range(n):
+        for j in range(n):
+            if not abs(scratch[inverse + SIZE * i + j]) < p[0]:
+                fault[0] = SINGULAR
+                return
+    seconds = half / NANOSECONDS
+    for j in range(3):
+        first = 0.0
+        second = 0.0
+        for i in range(n - 1, 0, -1):
+            c = 0.0
+            for k in range(n):
+                c += scratch[inverse + SIZE * i + k] * scratch[loads + 3 * k + j]
+            # Horner: c_1 + 2 c_2 t + 3 c_3 t^2 ... and its derivative.
+            second = second * head[2] + first
+            first = first * head[2] + i * c
+        rates[j] = first / seconds
+        rates[3 + j] = second / (seconds * seconds)
+
+
+FIT: Final = Kernel(_fit, (3, None, None), (6,), 5 * SIZE + 2 * SIZE * SIZE)
+"""The fit as a kernel, to warm up before live use."""
+_BOUND: Final = np.array([MAX_INVERSE])

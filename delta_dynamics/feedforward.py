@@ -14,12 +14,14 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.differentiator import Differentiator
+from delta_dynamics import virtual_work
+from delta_dynamics.continuity import COMPARISON, Continuity
+from delta_dynamics.differentiator import FIT, Differentiator
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError, ParameterError, SingularityError, UnreachableError
 from pkm_twin.guard import Guard
+from pkm_twin.kernels import Kernel
 from pkm_twin.mechanisms.robot import Robot
-from pkm_twin.mechanisms.tracking import MAX_MOVE
 from pkm_twin.messages import SECOND, JointReader, StampRules
 
 Array = NDArray[np.float64]
@@ -28,10 +30,6 @@ OnStop = Literal["nothing", "zeros", "gravity"]
 
 STOPPING: Final = ("non-finite result", "singular", "jump")
 """Reasons for which one sample stops the stream: it has left what the model describes."""
-JUMP_FACTOR: Final = 2.0
-JUMP_SLACK: Final = 5e-3
-"""How far a joint may move between two samples: so many times what its velocity limit allows,
-over the time between their stamps and this slack for stamps that are off, s."""
 
 
 @dataclass(frozen=True)
@@ -76,83 +74,6 @@ class Torques:
     saturated: bool
 
 
-class Continuity:
-    """Whether a stream is clear of singularities and moves without jumps, sample by sample.
-
-    The edge of reach is a singularity too, so one measure (see :meth:`Robot.singularity`) warns
-    of both. Joint positions alone do not tell the assembly mode: modes meet in singularities,
-    where the stream is stopped, and what skips over one shows as a jump of a joint or of the pose.
-    """
-
-    def __init__(self, robot: Robot, settings: Settings, velocity: tuple[float, ...]) -> None:
-        self.robot = robot
-        self._warn, self._stop = settings.singularity_warn, settings.singularity_stop
-        self._velocity = velocity
-        self._radius = float(getattr(robot, "geometry").platform_radius)  # noqa: B009
-        self._scale = [1.0 if unit == "m" else self._radius for unit in robot.pose_units]
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the last sample."""
-        self._last: tuple[int, list[float], list[float], list[float]] | None = None
-
-    def step(self, stamp: int, q: Array) -> bool:
-        """Take a sample: whether it is within the warning band of a singularity.
-
-        :raises MessageError: it is too close to a singularity ("singular"), or it jumped ("jump");
-            the next sample is compared with this one all the same.
-        """
-        robot, last = self.robot, self._last
-        here = q.tolist()
-        pose, fault = robot.forward_kernel(robot.parameters, q)
-        robot.raise_fault(fault, "joint state")
-        rates, _, fault = robot.jacobian_kernel(robot.parameters, q)
-        robot.raise_fault(fault, "joint state")
-        # Pose rates per joint rate, joint by joint; lengths at the platform's rim.
-        x, y, z = self._scale
-        a, b, c, d, e, f, g, h, i = rates.tolist()
-        columns = [x * a, y * b, z * c, x * d, y * e, z * f, x * g, y * h, z * i]
-        place = [s * value for s, value in zip(self._scale, pose.tolist(), strict=True)]
-        self._last = (stamp, here, place, columns)
-        if last is not None:
-            self._compare(last, self._last)
-        if _clearance(columns) >= self._warn:
-            return False
-        measure = float(robot.singularity(q))
-        if not measure >= self._stop:
-            raise MessageError(
-                "singular",
-                f"too close to a singularity or the edge of reach: measure {measure:.3g}, "
-                f"singularity_stop is {self._stop:g}",
-            )
-        return measure < self._warn
-
-    def _compare(self, last: tuple[Any, ...], this: tuple[Any, ...]) -> None:
-        """No joint moves farther than its velocity limit allows, no pose than its rates tell."""
-        period = (this[0] - last[0]) / SECOND
-        moves = [new - old for new, old in zip(this[1], last[1], strict=True)]
-        for joint, (move, velocity) in enumerate(zip(moves, self._velocity, strict=True)):
-            allowed = velocity * (JUMP_FACTOR * period + JUMP_SLACK)
-            if not -allowed <= move <= allowed:
-                raise MessageError(
-                    "jump",
-                    f"{self.robot.joint_names[joint]} moved by {move:g} {self.robot.joint_unit} "
-                    f"in {period:g} s, allowed {allowed:g}",
-                )
-        for k in range(3):
-            told = 0.0
-            for joint in range(3):
-                told += 0.5 * (this[3][3 * joint + k] + last[3][3 * joint + k]) * moves[joint]
-            # The mean of both rates errs by the third power of the move: half of it is plenty.
-            error = abs(this[2][k] - last[2][k] - told) - 0.5 * abs(told)
-            if not error <= MAX_MOVE * self._radius:
-                raise MessageError(
-                    "jump",
-                    f"{self.robot.pose_names[k]} of the platform jumped while the joints did "
-                    "not: another assembly mode",
-                )
-
-
 @dataclass
 class Feedforward:
     """Answers trajectories and a stream of joint states with feedforward efforts."""
@@ -180,7 +101,9 @@ class Feedforward:
             max_age=round(s.stale_after * 1e9),
         )
         self._reader = JointReader(self.robot)
-        self._continuity = Continuity(self.robot, s, self._reader.highest_velocity)
+        self._continuity = Continuity(
+            self.robot, s.singularity_warn, s.singularity_stop, self._reader.highest_velocity
+        )
 
     @property
     def differentiator_delay(self) -> float:
@@ -342,9 +265,8 @@ class Feedforward:
         """
         self._finite(effort)
         limits: Array | None = getattr(self.robot, "limits").effort  # noqa: B009
-        saturated = False
-        if limits is not None and (np.abs(effort) > limits).any():
-            saturated = True
+        saturated = limits is not None and _beyond(effort, limits)
+        if limits is not None and saturated:
             worst = np.argmax(np.abs(effort) / limits)
             joint = int(worst % 3)
             if self.settings.limit_policy == "reject":
@@ -359,8 +281,19 @@ class Feedforward:
         return effort, saturated
 
     def _finite(self, effort: Array) -> None:
-        if not np.isfinite(effort).all():
+        one = effort.ndim == 1
+        if not (all(map(math.isfinite, effort.tolist())) if one else np.isfinite(effort).all()):
             raise MessageError("non-finite result", "the model gave a value that is not finite")
+
+
+def kernels(robot: Robot) -> tuple[Kernel, ...]:
+    """The kernels to warm up before live use.
+
+    :raises ParameterError: a mechanism without masses.
+    """
+    return (
+        *virtual_work.kernels(robot), robot.forward_kernel, robot.jacobian_kernel, FIT, COMPARISON,
+    )  # fmt: skip
 
 
 def _modelled(call: Callable[..., Any], *arguments: Any) -> Any:
@@ -378,20 +311,12 @@ def _modelled(call: Callable[..., Any], *arguments: Any) -> Any:
         raise MessageError("non-finite result", str(error)) from error
 
 
-def _clearance(j: list[float]) -> float:
-    """A lower bound of a 3x3 matrix's reciprocal condition number, at least a third of it.
-
-    By the Frobenius norms of the matrix and of its inverse: the singular values themselves take
-    three times as long.
-    """
-    a, b, c, d, e, f, g, h, i = j
-    m, n, o = e * i - f * h, f * g - d * i, d * h - e * g
-    p, q, r = c * h - b * i, a * i - c * g, b * g - a * h
-    s, t, u = b * f - c * e, c * d - a * f, a * e - b * d
-    matrix = a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i
-    adjugate = m * m + n * n + o * o + p * p + q * q + r * r + s * s + t * t + u * u
-    size = math.sqrt(matrix * adjugate)
-    return abs(a * m + b * n + c * o) / size if size > 0.0 else 0.0
+def _beyond(effort: Array, limits: Array) -> bool:
+    """Whether an effort passes its limit; one sample, the stream's case, without numpy."""
+    if effort.ndim == 1:
+        pairs = zip(effort.tolist(), limits.tolist(), strict=True)
+        return any(abs(value) > limit for value, limit in pairs)
+    return bool((np.abs(effort) > limits).any())
 
 
 def _gradient(values: Array, times: Array) -> Array:

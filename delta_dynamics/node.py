@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,9 +18,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from delta_dynamics.feedforward import Feedforward, Settings, Torques
+from delta_dynamics.feedforward import Feedforward, Settings, Torques, kernels
 from delta_dynamics.reactions import reactions
-from delta_dynamics.virtual_work import kernels
 from pkm_twin import health, load
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.mechanisms.robot import Robot
@@ -43,7 +43,7 @@ class DeltaDynamics(health.TwinNode):
         super().__init__("delta_dynamics")
         robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
         # Before there is a topic to be found by: the first start compiles for many seconds.
-        for kernel in (*kernels(robot), robot.forward_kernel, robot.jacobian_kernel):
+        for kernel in kernels(robot):
             kernel.warm_up()
         robot = _changed(robot, self._declare_changes(robot))
         self._feedforward = Feedforward(robot, self._declare_settings())
@@ -57,6 +57,7 @@ class DeltaDynamics(health.TwinNode):
             self.speak(Float64MultiArray, "~/commands", stale_after) if commands else None
         )
         self._reactions = self._speak_reactions(robot)
+        self._effort = JointState(name=list(robot.joint_names))
         self._pending: Robot | None = None
         self.listen(JointTrajectory, "~/joint_trajectory", self._on_trajectory)
         self.listen(JointState, "joint_states", self._on_joint_state)
@@ -199,7 +200,7 @@ class DeltaDynamics(health.TwinNode):
 
     def _on_joint_state(self, message: JointState) -> None:
         core = self._feedforward
-        self._last_heard = self.steady.now().nanoseconds
+        self._last_heard = time.monotonic_ns()
         with self._telling_stop():
             torques = core.joint_state(message, self.now())
         if torques is None:
@@ -211,7 +212,7 @@ class DeltaDynamics(health.TwinNode):
         if torques.residual is not None:
             self._publish_effort(self._residual, stamp, torques.residual)
         if self._commands is not None:
-            self._commands.publish(Float64MultiArray(data=array("d", torques.effort)))
+            self._commands.publish(Float64MultiArray(data=array("d", torques.effort.tobytes())))
         # A dense solve a sample is too much for the stream's own rate.
         if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
             self._reactions_due = torques.stamp
@@ -231,15 +232,16 @@ class DeltaDynamics(health.TwinNode):
             self._reactions[name].publish(message)
 
     def _publish_effort(self, publisher: Any, stamp: Any, effort: np.ndarray[Any, Any]) -> None:
-        message = JointState(name=list(self._feedforward.robot.joint_names))
+        # One message for all: publishing copies it.
+        message = self._effort
         message.header.stamp = stamp
-        message.effort = array("d", effort)
+        message.effort = array("d", effort.tobytes())
         publisher.publish(message)
 
     def _watch(self) -> None:
         """Stop a stream that has gone silent; runs on the steady clock."""
         core = self._feedforward
-        silent = (self.steady.now().nanoseconds - self._last_heard) / 1e9
+        silent = (time.monotonic_ns() - self._last_heard) / 1e9
         if self._last_heard and not core.stream.stopped and silent > core.settings.stale_after:
             self._stop("stale input", f"no joint state for {silent:.3f} s")
 
@@ -256,7 +258,7 @@ class DeltaDynamics(health.TwinNode):
             return
         self._publish_effort(self._torques, self.get_clock().now().to_msg(), effort)
         if self._commands is not None:
-            self._commands.publish(Float64MultiArray(data=array("d", effort)))
+            self._commands.publish(Float64MultiArray(data=array("d", effort.tobytes())))
 
     def _on_set(self, changes: list[Parameter]) -> Any:
         values = health.values_of(changes)

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import gc
 import os
+import signal
 import sys
 import time
 import traceback
@@ -32,6 +34,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.guard import Pace
+from pkm_twin.interrupts import first_signal, ignore_signals
 
 OK: Final = DiagnosticStatus.OK
 WARN: Final = DiagnosticStatus.WARN
@@ -329,12 +332,17 @@ def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None)
     node: TwinNode | None = None
     begun = False
     try:
-        rclpy.init(args=None if arguments is None else list(arguments))
-        begun = True
-        node = factory()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        executor.spin()
+        # The middleware's handler for SIGINT calls this one; SIGTERM is the middleware's alone.
+        with first_signal(KeyboardInterrupt, (signal.SIGINT,)):
+            rclpy.init(args=None if arguments is None else list(arguments))
+            begun = True
+            executor = SingleThreadedExecutor()
+            node = factory()
+            executor.add_node(node)
+            # What is loaded by now stays: the collector need not look at it again.
+            gc.collect()
+            gc.freeze()
+            executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (PkmTwinError, ParameterException, RuntimeError) as error:
@@ -346,7 +354,9 @@ def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None)
         print(f"refused to start: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     finally:
+        ignore_signals()
         if node is not None:
             node.destroy_node()
-        rclpy.try_shutdown()
+        # rclpy.try_shutdown would bring the old signal handlers back.
+        rclpy.get_default_context().try_shutdown()
     return 0

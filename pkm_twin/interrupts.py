@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ending a process on the first signal: later ones cannot tear its clean-up.
+"""Ending a process on the first signal: the next ones cannot tear its clean-up.
 
 A terminal sends Ctrl-C to every process in it and a launcher sends another, so signals come in
 twos and threes.
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final
@@ -18,11 +19,15 @@ from typing import Final
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 INTERRUPTED: Final = 130
 """Exit code of a command that was interrupted, as a shell gives it."""
+PATIENCE: Final = 2.0
+"""How long after a signal others are ignored while the process cleans up, s. Not for ever: an
+exception that is raised in a callback of a C library is lost."""
 
 
 class _Process:
-    """A plain flag: a lock would stop a handler that interrupts a handler."""
+    """Plain values: a lock would stop a handler that interrupts a handler."""
 
+    asked = -float("inf")
     ending = False
 
 
@@ -38,22 +43,30 @@ def ignore_signals() -> None:
 def first_signal(
     raising: Callable[[], BaseException], numbers: Sequence[signal.Signals] = SIGNALS
 ) -> Iterator[None]:
-    """The first signal raises, later ones are ignored; handlers come back where none came.
+    """The first signal raises, the next ones are ignored; handlers come back where none came.
 
+    Where one came, the process is ending when the block is left: signals are ignored from there.
     Only the main thread can have it so.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    came = False
 
     def end(*_: object) -> None:
-        ignore_signals()
-        raise raising()
+        nonlocal came
+        came = True
+        now = time.monotonic()
+        if now - _Process.asked > PATIENCE:
+            _Process.asked = now
+            raise raising()
 
     before = [signal.signal(number, end) for number in numbers]
     try:
         yield
     finally:
-        if not _Process.ending:
+        if came:
+            ignore_signals()
+        elif not _Process.ending:
             for number, handler in zip(numbers, before, strict=True):
                 signal.signal(number, handler)

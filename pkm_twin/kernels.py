@@ -79,6 +79,7 @@ _ROWS: Final[dict[int, Any]] = {
     7: lambda a, b, c, d, e, f, g: kernel(a, b, c, d, e, f, g),  # type: ignore[name-defined]  # noqa: F821
     8: lambda a, b, c, d, e, f, g, h: kernel(a, b, c, d, e, f, g, h),  # type: ignore[name-defined]  # noqa: F821
     9: lambda a, b, c, d, e, f, g, h, i: kernel(a, b, c, d, e, f, g, h, i),  # type: ignore[name-defined]  # noqa: F821
+    10: lambda a, b, c, d, e, f, g, h, i, j: kernel(a, b, c, d, e, f, g, h, i, j),  # type: ignore[name-defined]  # noqa: F821
 }
 
 
@@ -99,10 +100,11 @@ class Kernel:
     def __init__(
         self,
         function: Callable[..., None],
-        inputs: Sequence[int],
+        inputs: Sequence[int | None],
         outputs: Sequence[int],
         scratch: int = 1,
     ) -> None:
+        """Sizes of inputs (None: any) and outputs."""
         if inputs[0] != FAULT_SIZE:
             raise ValueError(f"a kernel's first input has {FAULT_SIZE} entries, not {inputs[0]}")
         self.function = function
@@ -161,7 +163,8 @@ class Kernel:
         if COMPILED and type(first) is np.ndarray and first.ndim == 1:
             # One sample, the fast way.
             try:
-                if tuple(map(len, inputs)) == self.inputs:  # type: ignore[arg-type]
+                sizes = tuple(map(len, inputs))  # type: ignore[arg-type]
+                if sizes == self.inputs or self._fit(sizes):
                     results = list(map(np.empty, self.outputs))
                     fault = np.zeros(FAULT_SIZE)
                     self._one(p, *inputs, *results, self._space, fault)
@@ -170,7 +173,7 @@ class Kernel:
                 pass  # a plain number, or another type of array
         arrays = [np.asarray(value, _F8) for value in inputs]
         for array, size in zip(arrays, self.inputs, strict=True):
-            if array.ndim == 0 or array.shape[-1] != size:
+            if array.ndim == 0 or size not in (None, array.shape[-1]):
                 raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
         batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
         results = [np.empty((*batch, size)) for size in self.outputs]
@@ -182,6 +185,14 @@ class Kernel:
         else:
             self._interpret(p, arrays, results, batch)
         return tuple(results)
+
+    def _fit(self, sizes: tuple[int, ...]) -> bool:
+        """Whether inputs of these sizes fit, some of which may have any."""
+        return (
+            None in self.inputs
+            and len(sizes) == len(self.inputs)
+            and all(a in (None, b) for a, b in zip(self.inputs, sizes, strict=True))
+        )
 
     def _interpret(
         self, p: Array, arrays: list[Array], results: list[Array], batch: tuple[int, ...]

@@ -170,6 +170,13 @@ class JointReader:
 
     def check_derived(self, qd: Array, qdd: Array) -> None:
         """Differentiated rates and accelerations keep the bounds of measured ones, (..., 3)."""
+        if qd.ndim == 1:
+            # A stream's sample, without numpy.
+            rates = zip(qd.tolist(), self.highest_velocity, strict=True)
+            if all(abs(v) <= high for v, high in rates) and all(
+                abs(a) <= MAX_ACCELERATION for a in qdd.tolist()
+            ):
+                return
         for what, values, high in (
             ("velocity", qd, self._highest_velocity),
             ("acceleration", qdd, MAX_ACCELERATION),

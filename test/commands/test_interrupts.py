@@ -18,15 +18,19 @@ before = [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
 with first_signal(KeyboardInterrupt):
     pass
 assert before == [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
-try:
-    with first_signal(lambda: SystemExit(7)), first_signal(KeyboardInterrupt):
-        print("ready", flush=True)
-        time.sleep(60)
-except KeyboardInterrupt:
-    print("caught", flush=True)
-    # A clean-up, in which further signals come.
-    time.sleep(0.5)
-    print("cleaned up", flush=True)
+with first_signal(lambda: SystemExit(7)):
+    try:
+        with first_signal(KeyboardInterrupt):
+            try:
+                print("ready", flush=True)
+                time.sleep(60)
+            finally:
+                print("caught", flush=True)
+                # A clean-up, in which further signals come.
+                time.sleep(0.3)
+    except KeyboardInterrupt:
+        time.sleep(0.3)
+        print("cleaned up", flush=True)
 """
 
 
@@ -53,6 +57,24 @@ def test_only_the_first_signal_counts(number):
         time.sleep(0.001)
     out, err = process.communicate(timeout=20)
     assert (process.returncode, out, err) == (0, "cleaned up\n", "")
+
+
+def test_an_exception_that_was_lost_does_not_make_a_process_deaf():
+    script = """
+import signal, time
+from pkm_twin import interrupts
+interrupts.PATIENCE = 0.2
+with interrupts.first_signal(lambda: SystemExit(7)):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except SystemExit:
+        pass  # as a callback of a C library does it
+    signal.raise_signal(signal.SIGINT)
+    time.sleep(0.3)
+    signal.raise_signal(signal.SIGINT)
+"""
+    done = subprocess.run([sys.executable, "-c", script], env=environment(), timeout=20)
+    assert done.returncode == 7
 
 
 def test_an_interrupted_command_has_its_own_exit_code(tmp_path):

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
 from delta_dynamics import feedforward, inverse_dynamics
+from delta_dynamics.continuity import COMPARISON, STATE
 from delta_dynamics.feedforward import Feedforward, Settings
 from pkm_twin import load
 from pkm_twin.errors import MessageError, ParameterError, SingularityError
@@ -374,7 +375,10 @@ class TestSingularities:
         values = np.linalg.svd(np.reshape(rows, (3, 3)), compute_uv=False)
         assume(values[-1] > 1e-6 * values[0] and values[0] > 1e-3)
         measure = values[-1] / values[0]
-        bound = feedforward._clearance(rows)
+        here, bounds = np.zeros(3), np.ones(7)
+        first = np.array([-1.0, 0.0, 0.0])
+        _, verdict, _ = COMPARISON(bounds, first, here, here, np.array(rows), np.zeros(STATE))
+        bound = verdict[2]
         assert measure / 3 * (1 - 1e-6) <= bound <= measure * (1 + 1e-6)
 
     @pytest.mark.parametrize("name", ["delta", "delta_cu", "prru"])
