@@ -60,7 +60,7 @@ soak: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m long test/atlas test/nodes
 
 scale: $(VENV)/test.stamp
-	$(BIN)/python -m test.atlas.scale docs/scale.md
+	OMP_NUM_THREADS=1 $(BIN)/python -m test.atlas.scale docs/scale.md
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

@@ -51,7 +51,11 @@ setup(
     extras_require={
         # The real ROS 2 Jazzy as wheels, for machines without a ROS installation. Unpinned names
         # bring another distribution.
-        "jazzy": ["ros-jazzy-rclpy[fastrtps]==7.1.6", "ros-jazzy-common-interfaces==5.3.6"],
+        "jazzy": [
+            "ros-jazzy-rclpy[fastrtps]==7.1.6",
+            "ros-jazzy-common-interfaces==5.3.6",
+            "threadpoolctl",
+        ],
         "test": [
             "colcon-core",
             "colcon-library-path",
@@ -74,11 +78,12 @@ setup(
             "pytest",
             "pytest-timeout",
             "ruff",
+            "threadpoolctl",
             "types-PyYAML",
             "wheel",
             "xarray",
         ],
-        "atlas": ["h5netcdf", "h5py", "plotly", "xarray"],
+        "atlas": ["h5netcdf", "h5py", "plotly", "threadpoolctl", "xarray"],
         "cluster": ["dask[distributed]"],
         "bags": ["pin", "PyNiteFEA"],
         "certificate": ["mpmath", "mujoco", "pin", "pytest", "scipy"],

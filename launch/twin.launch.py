@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Both nodes, for a Delta and an overconstrained head; every argument has a default."""
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -27,6 +27,8 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, (default, text) in arguments.items()
             ),
+            # Matrices here are small: threads cost more than they bring.
+            SetEnvironmentVariable("OMP_NUM_THREADS", "1"),
             Node(
                 package="pkm_twin",
                 executable="delta_dynamics",

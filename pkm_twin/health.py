@@ -35,6 +35,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.guard import Pace
 from pkm_twin.interrupts import first_signal, ignore_signals
+from pkm_twin.threads import one_blas_thread
 
 OK: Final = DiagnosticStatus.OK
 WARN: Final = DiagnosticStatus.WARN
@@ -339,6 +340,7 @@ def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None)
             executor = SingleThreadedExecutor()
             node = factory()
             executor.add_node(node)
+            one_blas_thread()
             # What is loaded by now stays: the collector need not look at it again.
             gc.collect()
             gc.freeze()

@@ -22,6 +22,7 @@ from rich.table import Table
 
 from pkm_twin.errors import PkmTwinError, UnknownNameError
 from pkm_twin.interrupts import INTERRUPTED, first_signal
+from pkm_twin.threads import one_blas_thread
 
 KINDS = ("workspace", "strain-energy", "isotropy", "modes")
 
@@ -93,6 +94,7 @@ def atlas(
         "least_clearance": least_clearance,
     }
     sweep = sweep_of(machine, kind, options)
+    one_blas_thread()
     with (
         first_signal(KeyboardInterrupt),
         _progress(f"{kind} of {machine.name}", sweep.points) as update,

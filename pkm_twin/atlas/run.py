@@ -23,6 +23,7 @@ from pkm_twin.atlas.extras import require
 from pkm_twin.atlas.store import AtlasError, Parts, join, save_part
 from pkm_twin.atlas.sweep import Chunk, Sweep, Values
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.threads import one_blas_thread_for_children
 
 Progress = Callable[[int], None]
 Work = Sequence[tuple[int, Chunk]]
@@ -131,7 +132,7 @@ def _pool(sweep: Sweep, work: Work, workers: int, folder: Path) -> Iterator[int]
     try:
         while True:
             for index, chunk in queue:
-                with _without_interrupts():
+                with _without_interrupts(), one_blas_thread_for_children():
                     flying.add(pool.submit(_keep, sweep, chunk, folder, index))
                 if len(flying) >= IN_FLIGHT * workers:
                     break

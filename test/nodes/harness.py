@@ -173,10 +173,11 @@ class NodeProcess:
         """The exit code of a process that ends by itself."""
         return self.process.wait(timeout)
 
-    def stop(self, number=signal.SIGINT):
+    def stop(self, number=signal.SIGINT, times=1):
         """Signal the process: its exit code, and how long it took to end, s."""
         began = time.monotonic()
-        self.process.send_signal(number)
+        for _ in range(times):
+            self.process.send_signal(number)
         return self.process.wait(DEADLINE), time.monotonic() - began
 
     def close(self):

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One thread for linear algebra: matrices here are small, and threads cost more than they bring.
+
+May import: threadpoolctl if present, the standard library.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+VARIABLES: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""What the libraries read when they are loaded."""
+
+
+def one_blas_thread() -> None:
+    """For this process, from now on; without threadpoolctl nothing happens."""
+    try:
+        from threadpoolctl import threadpool_limits
+    except ImportError:
+        return
+    threadpool_limits(limits=1, user_api="blas")
+
+
+@contextmanager
+def one_blas_thread_for_children() -> Iterator[None]:
+    """For processes that are started here, unless the environment says otherwise."""
+    new = [name for name in VARIABLES if name not in os.environ]
+    os.environ.update(dict.fromkeys(new, "1"))
+    try:
+        yield
+    finally:
+        for name in new:
+            del os.environ[name]
