@@ -134,7 +134,7 @@ class Domain:
         self._lock.close()
 
 
-def _end_with_parent():
+def end_with_parent():
     """In a new process, on Linux: a test run that is killed leaves no node behind."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
@@ -158,7 +158,7 @@ class NodeProcess:
             cwd=tempfile.gettempdir(),
             env=domain.environment(),
             start_new_session=True,
-            preexec_fn=_end_with_parent,
+            preexec_fn=end_with_parent,
         )
 
     @property
