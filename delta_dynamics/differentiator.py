@@ -47,11 +47,12 @@ class Differentiator:
     _carries_velocity: bool | None = None
 
     def __post_init__(self) -> None:
-        # Rings: a fit does not ask for the order of its samples.
+        # Rings; the fit begins at the oldest sample, so that its bits do not hang on where that is.
         self._stamps = np.zeros(self.window, np.int64)
         self._values = np.zeros((self.window, 3))
         self._flat = self._values.reshape(-1)
         self._ages = np.zeros(self.window)
+        self._degree = [np.array([degree, MAX_INVERSE]) for degree in (self.order + 1, self.order)]
         self._count = 0
 
     @property
@@ -85,9 +86,9 @@ class Differentiator:
         np.subtract(self._stamps, stamp, out=self._ages)
         middle = (oldest + self.window // 2) % self.window
         at = 1.0 + float(self._ages[middle]) / half if self.middle else 1.0
-        degree = self.order if carries else self.order + 1
-        head = np.array([degree, half, at])
-        rates, fault = FIT(_BOUND, head, self._ages, self._flat)
+        rates, fault = FIT(
+            self._degree[carries], np.array([half, at, oldest]), self._ages, self._flat
+        )
         if fault.item(0) != OK:
             raise MessageError(
                 "uneven stamps", "the stamps of the window are too uneven to differentiate"
@@ -101,13 +102,14 @@ class Differentiator:
 def _fit(p, head, ages, values, rates, scratch, fault):  # type: ignore[no-untyped-def]
     """First and second derivative (1/s, 1/s2) of a least-squares polynomial through samples.
 
-    ``head``: degree, half the window (ns), and where to read off, from -1 at the oldest sample to
-    1 at the newest, so that the normal equations of a degree up to 5 stay far from rounding.
-    ``ages``: stamps less the newest (ns); ``values``: three numbers a sample; ``p``: the largest
-    entry of the inverse normal equations.
+    ``p``: degree, and the largest entry of the inverse normal equations. ``head``: half the window
+    (ns), where to read off, from -1 at the oldest sample to 1 at the newest, so that the normal
+    equations of a degree up to 5 stay far from rounding, and the place of the oldest sample.
+    ``ages``: stamps less the newest (ns); ``values``: three numbers a sample.
     """
-    n = int(head[0]) + 1
-    half = head[1]
+    n = int(p[0]) + 1
+    half = head[0]
+    oldest = int(head[2])
     # Moments of t, then of t with the values; the normal equations and their inverse.
     moments = 0
     loads = 2 * SIZE
@@ -115,7 +117,8 @@ def _fit(p, head, ages, values, rates, scratch, fault):  # type: ignore[no-untyp
     inverse = matrix + SIZE * SIZE
     for k in range(inverse + SIZE * SIZE):
         scratch[k] = 0.0
-    for i in range(len(ages)):
+    for sample in range(len(ages)):
+        i = (oldest + sample) % len(ages)
         t = 1.0 + ages[i] / half
         power = 1.0
         for k in range(2 * n - 1):
@@ -145,7 +148,7 @@ def _fit(p, head, ages, values, rates, scratch, fault):  # type: ignore[no-untyp
                     scratch[inverse + SIZE * k + j] -= factor * scratch[inverse + SIZE * i + j]
     for i in range(n):
         for j in range(n):
-            if not abs(scratch[inverse + SIZE * i + j]) < p[0]:
+            if not abs(scratch[inverse + SIZE * i + j]) < p[1]:
                 fault[0] = SINGULAR
                 return
     seconds = half / NANOSECONDS
@@ -157,12 +160,11 @@ def _fit(p, head, ages, values, rates, scratch, fault):  # type: ignore[no-untyp
             for k in range(n):
                 c += scratch[inverse + SIZE * i + k] * scratch[loads + 3 * k + j]
             # Horner: c_1 + 2 c_2 t + 3 c_3 t^2 ... and its derivative.
-            second = second * head[2] + first
-            first = first * head[2] + i * c
+            second = second * head[1] + first
+            first = first * head[1] + i * c
         rates[j] = first / seconds
         rates[3 + j] = second / (seconds * seconds)
 
 
 FIT: Final = Kernel(_fit, (3, None, None), (6,), 5 * SIZE + 2 * SIZE * SIZE)
 """The fit as a kernel, to warm up before live use."""
-_BOUND: Final = np.array([MAX_INVERSE])

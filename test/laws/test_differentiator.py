@@ -130,3 +130,22 @@ def test_stamps_that_tell_no_polynomial_are_rejected(cluster):
     with pytest.raises(MessageError) as caught:
         differentiator.push(SECOND + 3600 * SECOND, np.zeros(3), np.ones(3))
     assert caught.value.reason == "uneven stamps"
+
+
+@pytest.mark.parametrize("carries", [True, False])
+def test_what_came_before_the_window_leaves_no_bit(rng, carries):
+    window = 7
+    stamps = stamps_of(rng, 4 * window, 0.8)
+    rows = rng.normal(size=(len(stamps), 2, 3))
+
+    def answers(first):
+        differentiator = Differentiator(2, window)
+        found = [
+            differentiator.push(stamp, q, qd if carries else None)
+            for stamp, (q, qd) in zip(stamps[first:], rows[first:], strict=True)
+        ]
+        return np.array(found[2 * window - first :])
+
+    expected = answers(0)
+    for first in range(1, window + 1):
+        assert answers(first).tobytes() == expected.tobytes()

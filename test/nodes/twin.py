@@ -68,7 +68,19 @@ class Twin:
         return self
 
     def settle(self):
-        """Wait until a new trajectory is answered, and forget everything before."""
+        """Wait until a new trajectory and a new state are answered, and forget everything before.
+
+        A stream that has stopped in a long pause runs again.
+        """
+        self.ask(trajectory(stamp=self.stamp()))
+        sent = set()
+
+        def repeat():
+            sent.add(self.stamp())
+            self.send_state(state(self._last))
+
+        received = self.received("joint_torques")
+        self.peer.until(lambda: any(stamp_of(m) in sent for m in received), repeat=repeat)
         self.ask(trajectory(stamp=self.stamp()))
         for topic in ("joint_torques", "torque_residual", "commands"):
             self.received(topic).clear()
