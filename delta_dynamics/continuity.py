@@ -121,11 +121,18 @@ def _compare(p, head, q, pose, rates, last, state, verdict, scratch, fault):  # 
     period = head[0]
     if period >= 0.0:
         for i in range(2, -1, -1):
-            # The mean of both rates errs by the third power of the move: half of it is plenty.
+            # What the mean of both rates tells errs by the third power of the move; how much, the
+            # change of the rates tells. Half of what is told is for where they turn between.
             told = 0.0
+            bend = 0.0
             for j in range(3):
-                told += 0.5 * (state[6 + 3 * j + i] + last[6 + 3 * j + i]) * (state[j] - last[j])
-            if not abs(state[3 + i] - last[3 + i] - told) - 0.5 * abs(told) <= p[6]:
+                move = state[j] - last[j]
+                rate = state[6 + 3 * j + i]
+                before = last[6 + 3 * j + i]
+                told += 0.5 * (rate + before) * move
+                bend += abs((rate - before) * move)
+            error = abs(state[3 + i] - last[3 + i] - told)
+            if not error - 0.5 * abs(told) - bend <= p[6]:
                 verdict[0] = POSE_JUMP
                 verdict[1] = i
         for i in range(2, -1, -1):

@@ -7,7 +7,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, event, given, settings
+from hypothesis import HealthCheck, assume, event, example, given, settings
 from hypothesis import strategies as st
 
 from delta_dynamics import feedforward, inverse_dynamics
@@ -448,6 +448,7 @@ class TestJumps:
         rate=st.sampled_from([20, 100, 1000]),
         name=st.sampled_from(["delta", "delta_cu", "prru"]),
     )
+    @example(speed=(1.0, 0.875, 1.0), rate=20, name="delta_cu")
     def test_no_motion_within_the_limits_jumps(self, speed, rate, name):
         """At full velocity, to and fro between the position limits, at any sample rate."""
         robot = load(name)
