@@ -163,5 +163,5 @@ def _compare(p, head, q, pose, rates, last, state, verdict, scratch, fault):  # 
     verdict[2] = abs(a * m + b * n + c * o) / size if size > 0.0 else 0.0
 
 
-COMPARISON: Final = Kernel(_compare, (3, 3, 3, 9, STATE), (STATE, 3))
+COMPARISON: Final = Kernel(_compare, (3, 3, 3, 9, STATE), (STATE, 3), batches=False)
 """As a kernel, to warm up before live use."""

@@ -166,5 +166,5 @@ def _fit(p, head, ages, values, rates, scratch, fault):  # type: ignore[no-untyp
         rates[3 + j] = second / (seconds * seconds)
 
 
-FIT: Final = Kernel(_fit, (3, None, None), (6,), 5 * SIZE + 2 * SIZE * SIZE)
+FIT: Final = Kernel(_fit, (3, None, None), (6,), 5 * SIZE + 2 * SIZE * SIZE, batches=False)
 """The fit as a kernel, to warm up before live use."""

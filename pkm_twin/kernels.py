@@ -103,14 +103,17 @@ class Kernel:
         inputs: Sequence[int | None],
         outputs: Sequence[int],
         scratch: int = 1,
+        *,
+        batches: bool = True,
     ) -> None:
-        """Sizes of inputs (None: any) and outputs."""
+        """Sizes of inputs (None: any) and outputs; whether :meth:`warm_up` readies batches too."""
         if inputs[0] != FAULT_SIZE:
             raise ValueError(f"a kernel's first input has {FAULT_SIZE} entries, not {inputs[0]}")
         self.function = function
         self.inputs = tuple(inputs)
         self.outputs = tuple(outputs)
         self.scratch = scratch
+        self.batches = batches
         # One sample runs with the interpreter locked, so calls can share the space.
         self._space = np.empty(scratch)
         self.__doc__ = function.__doc__
@@ -211,4 +214,6 @@ class Kernel:
     def warm_up(self) -> None:
         """Compile, or load from the cache, before the first sample is due."""
         if COMPILED:
-            _ = self._one, self._many
+            _ = self._one
+            if self.batches:
+                _ = self._many
