@@ -7,7 +7,6 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
@@ -18,11 +17,11 @@ from delta_dynamics import virtual_work
 from delta_dynamics.continuity import COMPARISON, Continuity
 from delta_dynamics.differentiator import FIT, Differentiator
 from delta_dynamics.virtual_work import inverse_dynamics
-from pkm_twin.errors import MessageError, ParameterError, SingularityError, UnreachableError
+from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.guard import Guard
 from pkm_twin.kernels import Kernel
 from pkm_twin.mechanisms.robot import Robot
-from pkm_twin.messages import SECOND, JointReader, StampRules
+from pkm_twin.messages import SECOND, JointReader, StampRules, modelled
 
 Array = NDArray[np.float64]
 LimitPolicy = Literal["warn", "reject", "clamp"]
@@ -190,8 +189,8 @@ class Feedforward:
         if qdd is None:
             qdd = _gradient(qd, t.times)
         self._reader.check_derived(qd, qdd)
-        self._check_singularity(_modelled(self.robot.singularity, t.q))
-        efforts, saturated = self._gate(_modelled(inverse_dynamics, self.robot, t.q, qd, qdd))
+        self._check_singularity(modelled(self.robot.singularity, t.q))
+        efforts, saturated = self._gate(modelled(inverse_dynamics, self.robot, t.q, qd, qdd))
         self.saturations += saturated
         return efforts[:, t.columns]
 
@@ -242,7 +241,7 @@ class Feedforward:
                 "the joint state has no velocity; set acceleration to differentiate",
             )
         try:
-            self.near_singular = _modelled(self._continuity.step, sample.stamp, sample.q)
+            self.near_singular = modelled(self._continuity.step, sample.stamp, sample.q)
         except MessageError:
             # No derivative across a jump, nor across samples that the model has no state for.
             self._differentiator.reset()
@@ -253,7 +252,7 @@ class Feedforward:
             return None
         self._reader.check_derived(*rates)
         motion = (sample.q, *rates)
-        effort, saturated = self._gate(_modelled(inverse_dynamics, self.robot, *motion))
+        effort, saturated = self._gate(modelled(inverse_dynamics, self.robot, *motion))
         self._last_good = sample.q
         residual = None if sample.effort is None else sample.effort - effort
         return Torques(sample.stamp, motion, effort, residual, saturated)
@@ -294,21 +293,6 @@ def kernels(robot: Robot) -> tuple[Kernel, ...]:
     return (
         *virtual_work.kernels(robot), robot.forward_kernel, robot.jacobian_kernel, FIT, COMPARISON,
     )  # fmt: skip
-
-
-def _modelled(call: Callable[..., Any], *arguments: Any) -> Any:
-    """What the model answers, its refusals as those of the message."""
-    try:
-        return call(*arguments)
-    except MessageError:
-        raise
-    except UnreachableError as error:
-        raise MessageError("unreachable", str(error)) from error
-    except SingularityError as error:
-        raise MessageError("singular", str(error)) from error
-    except ValueError as error:
-        # The input was finite: the model overflowed.
-        raise MessageError("non-finite result", str(error)) from error
 
 
 def _beyond(effort: Array, limits: Array) -> bool:

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import MessageError
+from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.mechanisms.robot import Robot
 
 Array = NDArray[np.float64]
@@ -293,6 +293,21 @@ def read_wrench(
         if abs(value) > bound or 0.0 < abs(value) < TINY:
             raise MessageError("bounds", f"{label} is {value:g}, allowed up to {bound:g}")
     return WrenchSample(stamp, given or frame, np.array(values, np.float64))
+
+
+def modelled(call: Callable[..., Any], *arguments: Any) -> Any:
+    """What the model answers to a message, its refusals as those of the message."""
+    try:
+        return call(*arguments)
+    except MessageError:
+        raise
+    except UnreachableError as error:
+        raise MessageError("unreachable", str(error)) from error
+    except SingularityError as error:
+        raise MessageError("singular", str(error)) from error
+    except ValueError as error:
+        # The input was finite: the model overflowed.
+        raise MessageError("non-finite result", str(error)) from error
 
 
 def stamp_of(header: Any) -> int:

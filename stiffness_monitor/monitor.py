@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import MessageError, SingularityError, UnreachableError
+from pkm_twin.errors import MessageError
 from pkm_twin.guard import Guard
 from pkm_twin.mechanisms.robot import Robot
-from pkm_twin.messages import JointReader, StampRules, read_wrench
+from pkm_twin.messages import JointReader, StampRules, WrenchSample, modelled, read_wrench
 from stiffness_monitor.compliance import StrainEnergy, compliance, strain_energy
 
 Array = NDArray[np.float64]
@@ -118,22 +118,19 @@ class Monitor:
         s = self.settings
         sample = read_wrench(message, now, self._rules, s.wrench_frame, s.accept_empty_frame)
         q = self._nearest(sample.stamp)
-        try:
-            pose = self.robot.forward(q)
-            rotation = self.robot.rotation(pose)
-            turn = np.eye(3) if sample.frame == s.base_frame else rotation
-            fixed = np.concatenate((turn @ sample.wrench[:3], turn @ sample.wrench[3:]))
-            energy = strain_energy(self.robot, pose, fixed)
-            matrix = compliance(self.robot, pose)
-        except UnreachableError as error:
-            raise MessageError("unreachable", str(error)) from error
-        except SingularityError as error:
-            raise MessageError("singular", str(error)) from error
-        except ValueError as error:
-            # The input was finite: the model overflowed.
-            raise MessageError("non-finite result", str(error)) from error
-        if not (np.isfinite(matrix).all() and np.isfinite(energy.deflection).all()):
+        answer: Answer = modelled(self._answer, sample, q)
+        deflection = answer.energy.deflection
+        if not (np.isfinite(answer.compliance).all() and np.isfinite(deflection).all()):
             raise MessageError("non-finite result", "the model gave a value that is not finite")
+        return answer
+
+    def _answer(self, sample: WrenchSample, q: Array) -> Answer:
+        pose = self.robot.forward(q)
+        rotation = self.robot.rotation(pose)
+        turn = np.eye(3) if sample.frame == self.settings.base_frame else rotation
+        fixed = np.concatenate((turn @ sample.wrench[:3], turn @ sample.wrench[3:]))
+        energy = strain_energy(self.robot, pose, fixed)
+        matrix = compliance(self.robot, pose)
         return Answer(sample.stamp, pose, fixed, matrix, energy, rotation)
 
     def _nearest(self, stamp: int) -> Array:

@@ -1,4 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
+import json
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import yaml
@@ -58,3 +63,21 @@ def finite_difference(function, x, step=1e-6):
         shift = step * np.eye(x.shape[-1])[j]
         columns.append((function(x + shift) - function(x - shift)) / (2 * step))
     return np.stack(columns, -1)
+
+
+def both_ways(program, given):
+    """What a program prints as JSON, with numba and without, fed the text on its input."""
+    results = []
+    for off in ("0", "1"):
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            input=given,
+            capture_output=True,
+            text=True,
+            check=True,
+            env=os.environ | {"PKM_TWIN_NO_NUMBA": off, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        results.append(json.loads(done.stdout))
+    fast, slow = results
+    assert (fast.pop("compiled"), slow.pop("compiled")) == (True, False)
+    return fast, slow

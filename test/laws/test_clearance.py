@@ -5,9 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -20,7 +17,7 @@ from pkm_twin.atlas.workspace import workspace_sweep
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.mechanisms.clearance import BAR, bar, distance, least
 from stiffness_monitor.workspace import clearance, has_clearance, reachable, regular_workspace
-from test.conftest import parameters_of, random_poses
+from test.conftest import both_ways, parameters_of, random_poses
 
 ROBOTS = robot_names()
 
@@ -377,19 +374,7 @@ print(json.dumps(result))
 def test_with_and_without_numba(rng):
     pytest.importorskip("numba")
     given = json.dumps({name: random_poses(load(name), rng, 21).tolist() for name in ROBOTS})
-    results = []
-    for off in ("0", "1"):
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM],
-            input=given,
-            capture_output=True,
-            text=True,
-            check=True,
-            env=os.environ | {"PKM_TWIN_NO_NUMBA": off, "PYTHONPATH": os.pathsep.join(sys.path)},
-        )
-        results.append(json.loads(done.stdout))
-    fast, slow = results
-    assert (fast.pop("compiled"), slow.pop("compiled")) == (True, False)
+    fast, slow = both_ways(PROGRAM, given)
     for name, values in fast.items():
         if name.startswith("kept"):
             assert values == slow[name]

@@ -6,9 +6,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -17,6 +14,7 @@ from pkm_twin import load, parameters
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.mechanisms import config_folder
 from pkm_twin.mechanisms.upr_rpu import UprRpu
+from test.conftest import both_ways
 
 ROBOT = load("upr_rpu")
 FILE = parameters.read_yaml(config_folder() / "upr_rpu.yaml")
@@ -384,19 +382,7 @@ print(json.dumps({
 def test_with_and_without_numba():
     pytest.importorskip("numba")
     poses = json.dumps(branch_poses(ROBOT, 20, 11, margin=0.2).tolist())
-    results = []
-    for off in ("0", "1"):
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM],
-            input=poses,
-            capture_output=True,
-            text=True,
-            check=True,
-            env=os.environ | {"PKM_TWIN_NO_NUMBA": off, "PYTHONPATH": os.pathsep.join(sys.path)},
-        )
-        results.append(json.loads(done.stdout))
-    fast, slow = results
-    assert (fast.pop("compiled"), slow.pop("compiled")) == (True, False)
+    fast, slow = both_ways(PROGRAM, poses)
     for word in ("dominant", "single"):
         assert fast.pop(word) == slow.pop(word)
     for name, values in fast.items():
