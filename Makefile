@@ -28,7 +28,7 @@ $(VENV)/%.stamp: $(VENV)/demo.stamp
 	touch $@
 
 demo: $(VENV)/demo.stamp
-	$(BIN)/python -m pkm_twin.demo --bags bags --out out
+	$(BIN)/python -m pkm_twin.apps.demo --bags bags --out out
 
 test: lint types unit
 

@@ -22,7 +22,7 @@ from delta_dynamics.virtual_work import (
     inverse_dynamics,
     mass_matrix,
 )
-from pkm_twin.mechanisms.tracking import sphere_directions
+from pkm_twin.kinematics.tracking import sphere_directions
 
 __all__ = [
     "Energy",

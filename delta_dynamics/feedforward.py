@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import virtual_work
-from delta_dynamics.continuity import COMPARISON, Continuity
-from delta_dynamics.differentiator import FIT, Differentiator
 from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError, ParameterError
-from pkm_twin.guard import Guard
-from pkm_twin.kernels import Kernel
-from pkm_twin.mechanisms.robot import Robot
-from pkm_twin.messages import SECOND, JointReader, StampRules, modelled
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import SECOND, JointReader, StampRules, modelled
+from pkm_twin.streams.continuity import COMPARISON, Continuity
+from pkm_twin.streams.differentiator import FIT, Differentiator
+from pkm_twin.streams.monitor import Guard
 
 Array = NDArray[np.float64]
 LimitPolicy = Literal["warn", "reject", "clamp"]

@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.virtual_work import bodies, inverse_dynamics
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.mechanisms.joints import MOVING, PAYLOAD, jointed, platform_motion
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.joints import MOVING, PAYLOAD, jointed, platform_motion
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 

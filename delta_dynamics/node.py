@@ -20,9 +20,10 @@ from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, kernels
 from delta_dynamics.reactions import reactions
-from pkm_twin import health, load
+from pkm_twin import load
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros import node as health
 
 CHANGES = {
     "payload.mass": ("payload", "mass"),

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.virtual_work import bodies
 from pkm_twin.errors import SingularityError
-from pkm_twin.mechanisms.bodies import GRAVITY
-from pkm_twin.mechanisms.joints import (
+from pkm_twin.machine.bodies import GRAVITY
+from pkm_twin.machine.joints import (
     GROUND,
     MOVING,
     PAYLOAD,
@@ -26,7 +26,7 @@ from pkm_twin.mechanisms.joints import (
     jointed,
     platform_motion,
 )
-from pkm_twin.mechanisms.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.virtual_work import kernels
-from pkm_twin.mechanisms.bodies import (
+from pkm_twin.machine.bodies import (
     COULOMB,
     GRAVITY,
     HEAD,
     PAYLOAD_MASS,
     VISCOUS,
 )
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError
-from pkm_twin.kernels import Kernel
-from pkm_twin.mechanisms.bodies import ROW, TWIST
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.bodies import ROW, TWIST
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
 
 
 def bodies(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[Array, Array]:
-    """Rows of all bodies, shape (..., bodies, 28), see ``pkm_twin.mechanisms.bodies``.
+    """Rows of all bodies, shape (..., bodies, 28), see ``pkm_twin.machine.bodies``.
 
     :returns: the rows in the order of ``robot.body_names``, and the platform's twist per
         joint rate, shape (..., 6, 3).

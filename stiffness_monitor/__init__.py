@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Elastostatics of parallel kinematic machines: compliance, strain energy, workspace."""
 
-from stiffness_monitor.compliance import StrainEnergy, compliance, stiffness, strain_energy
-from stiffness_monitor.workspace import (
+from pkm_twin.kinematics.workspace import (
     RegularWorkspace,
     clearance,
     reachable,
     regular_workspace,
 )
+from stiffness_monitor.compliance import StrainEnergy, compliance, stiffness, strain_energy
 
 __all__ = [
     "RegularWorkspace",

@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.mechanisms.frame import GROUND, MOVING, Frame, RigidBody, Section, Support
+from pkm_twin.machine.members import GROUND, MOVING, Frame, RigidBody, Section, Support
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -16,10 +16,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.kernels import NOT_FINITE, Kernel
+from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
+from pkm_twin.machine.members import framed
+from pkm_twin.machine.robot import Robot
 from pkm_twin.mechanisms.elements import TIE, WRENCH
-from pkm_twin.mechanisms.frame import framed
-from pkm_twin.mechanisms.robot import Robot
 from stiffness_monitor.statics import frame_compliance, frame_energies
 
 Array = NDArray[np.float64]

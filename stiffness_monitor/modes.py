@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh, solve_triangular  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.mechanisms.frame import Framed, framed
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.members import Framed, framed
+from pkm_twin.machine.robot import Robot
 from stiffness_monitor.beams import System, assemble
 from stiffness_monitor.statics import checked_frame, stiffness_root
 

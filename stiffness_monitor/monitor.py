@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
-from pkm_twin.guard import Guard
-from pkm_twin.mechanisms.robot import Robot
-from pkm_twin.messages import JointReader, StampRules, WrenchSample, modelled, read_wrench
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import JointReader, StampRules, WrenchSample, modelled, read_wrench
+from pkm_twin.streams.monitor import Guard
 from stiffness_monitor.compliance import StrainEnergy, compliance, strain_energy
 
 Array = NDArray[np.float64]

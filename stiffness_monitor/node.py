@@ -18,8 +18,9 @@ from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
-from pkm_twin import health, load
+from pkm_twin import load
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.ros import node as health
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compliance and strain energy of a robot's elastic frame by finite elements, actuators locked.
 
-For every robot that declares its members as a frame (:class:`~pkm_twin.mechanisms.frame.Framed`).
+For every robot that declares its members as a frame (:class:`~pkm_twin.machine.members.Framed`).
 One beam element a member is exact, because loads act at members' ends.
 
 May import: numpy, scipy, pkm_twin's core, this package, the standard library; never rclpy.
@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky, solve_triangular  # type: ignore[import-untyped]
 
 from pkm_twin.errors import SingularityError
-from pkm_twin.mechanisms.frame import Framed, framed
-from pkm_twin.mechanisms.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.machine.members import Framed, framed
+from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 from stiffness_monitor.beams import System, assemble
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from pkm_twin import load
-from pkm_twin.mechanisms import config_folder
+from pkm_twin.machine.catalogue import config_folder
 
 LIMITED = 0.7
 """Part of the joint range that random states are drawn from."""

@@ -18,9 +18,9 @@ ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
 MAY_IMPORT_ROS = {
     "delta_dynamics/node.py",
     "stiffness_monitor/node.py",
-    "pkm_twin/player.py",
-    "pkm_twin/health.py",
-    "pkm_twin/demo.py",
+    "pkm_twin/ros/player.py",
+    "pkm_twin/ros/node.py",
+    "pkm_twin/apps/demo.py",
 }
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 
@@ -139,7 +139,7 @@ class TestNodeTables:
 def test_commands_and_make_targets_exist():
     from typer.main import get_command
 
-    from pkm_twin.cli import app
+    from pkm_twin.apps.cli import app
 
     typed = re.findall(r"^    ((?:pkm-twin|make) .*)$", README, re.MULTILINE)
     lines = [shlex.split(line, comments=True) for line in typed]

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from pkm_twin.bags import BagWriter
+from pkm_twin.bags.reader import BagWriter
 
 Array = NDArray[np.float64]
 Progress = Callable[[float], None]

@@ -21,7 +21,7 @@ from rich.progress import (
 from rich.table import Table
 
 from pkm_twin.errors import PkmTwinError, UnknownNameError
-from pkm_twin.interrupts import INTERRUPTED, first_signal
+from pkm_twin.ros.signals import INTERRUPTED, first_signal
 from pkm_twin.threads import one_blas_thread
 
 KINDS = ("workspace", "strain-energy", "isotropy", "modes")

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin import plots
+from pkm_twin.atlas import plots
 from pkm_twin.atlas.strain_energy import PLANE, WRENCHES, table_2
 from pkm_twin.errors import ParameterError
 

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.isotropy import tilted_pose
+from pkm_twin.codegen.kernels import OK
 from pkm_twin.errors import ParameterError
-from pkm_twin.kernels import OK
-from pkm_twin.mechanisms.robot import Robot
-from stiffness_monitor.workspace import reachable
+from pkm_twin.kinematics.workspace import reachable
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 

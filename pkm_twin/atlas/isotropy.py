@@ -27,9 +27,9 @@ from delta_dynamics.isotropy import (
 )
 from pkm_twin.atlas.grids import circles, ladder, polar_pose, singularity, tilts, turns
 from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
+from pkm_twin.codegen.kernels import OK
 from pkm_twin.errors import ParameterError
-from pkm_twin.kernels import OK
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 

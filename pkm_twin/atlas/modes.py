@@ -29,8 +29,8 @@ from pkm_twin.atlas.grids import (
 )
 from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
-from pkm_twin.mechanisms.frame import GROUND, MOVING, Frame, framed
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.members import GROUND, MOVING, Frame, framed
+from pkm_twin.machine.robot import Robot
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from pkm_twin.atlas.grids import circles, height_range, ladder, nice, polar_pose, size, turns
 from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.robot import Robot
 from stiffness_monitor.compliance import strain_energy
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pkm_twin
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 Values = dict[str, NDArray[Any]]

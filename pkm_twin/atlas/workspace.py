@@ -29,10 +29,10 @@ from pkm_twin.atlas.grids import (
     tilts,
 )
 from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
+from pkm_twin.codegen.kernels import OK
 from pkm_twin.errors import ParameterError
-from pkm_twin.kernels import OK
-from pkm_twin.mechanisms.robot import Robot
-from stiffness_monitor.workspace import clearance, has_clearance, reachable
+from pkm_twin.kinematics.workspace import clearance, has_clearance, reachable
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -22,10 +22,11 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin import parameters
+from pkm_twin.codegen.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
 from pkm_twin.errors import ParameterError
-from pkm_twin.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
-from pkm_twin.mechanisms.bodies import (
+from pkm_twin.kinematics.clearance import BAR, bar, least
+from pkm_twin.machine import schema
+from pkm_twin.machine.bodies import (
     COULOMB,
     HEAD,
     PAYLOAD_COM,
@@ -34,8 +35,8 @@ from pkm_twin.mechanisms.bodies import (
     TWIST,
     VISCOUS,
 )
-from pkm_twin.mechanisms.clearance import BAR, bar, least
-from pkm_twin.mechanisms.frame import (
+from pkm_twin.machine.joints import GROUND, MOVING, Joint, PlatformMotion, joint
+from pkm_twin.machine.members import (
     RIGID,
     Frame,
     Member,
@@ -45,8 +46,7 @@ from pkm_twin.mechanisms.frame import (
     Tube,
     disc,
 )
-from pkm_twin.mechanisms.joints import GROUND, MOVING, Joint, PlatformMotion, joint
-from pkm_twin.mechanisms.robot import (
+from pkm_twin.machine.robot import (
     SINGULARITY_BOUND,
     Friction,
     Limits,
@@ -92,8 +92,8 @@ class Geometry:
     platform_radius: float = length()
     arm_length: float = length()
     forearm_length: float = length()
-    azimuths: Array = parameters.vector(3)
-    closures: tuple[str, ...] = parameters.choices(3, "rod", "rcu")
+    azimuths: Array = schema.vector(3)
+    closures: tuple[str, ...] = schema.choices(3, "rod", "rcu")
 
     def verify(self, path: str) -> None:
         """Limbs apart, and at most one of them an rcu."""
@@ -109,9 +109,9 @@ class Inertia:
     platform_mass: float = mass()
     arm_mass: float = mass()
     forearm_mass: float = mass()
-    arm_com: float = parameters.number(at_least=0.0, at_most=1.0, default=0.5)
-    arm_inertia: float | None = parameters.number(at_least=0.0, default=None)
-    rotor_inertia: float = parameters.number(at_least=0.0, default=0.0)
+    arm_com: float = schema.number(at_least=0.0, at_most=1.0, default=0.5)
+    arm_inertia: float | None = schema.number(at_least=0.0, default=None)
+    rotor_inertia: float = schema.number(at_least=0.0, default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,29 +127,29 @@ class Members:
     ``platform_joint_compliance``: of each rod's end in all directions that it holds, m/N.
     """
 
-    arm: Tube = parameters.section(Tube)
-    forearm: Tube = parameters.section(Tube)
+    arm: Tube = schema.section(Tube)
+    forearm: Tube = schema.section(Tube)
     parallelogram_width: float = length()
-    rcu_forearm: Tube | None = parameters.section(Tube, default=None)
-    platform_inertia: Array | None = parameters.inertia(positive=True, default=None)
-    drive_compliance: float = parameters.number(at_least=0.0, at_most=1.0, default=0.0)
-    elbow_compliance: float = parameters.number(at_least=0.0, at_most=1.0, default=0.0)
-    platform_joint_compliance: float = parameters.number(at_least=0.0, at_most=1.0, default=0.0)
+    rcu_forearm: Tube | None = schema.section(Tube, default=None)
+    platform_inertia: Array | None = schema.inertia(positive=True, default=None)
+    drive_compliance: float = schema.number(at_least=0.0, at_most=1.0, default=0.0)
+    elbow_compliance: float = schema.number(at_least=0.0, at_most=1.0, default=0.0)
+    platform_joint_compliance: float = schema.number(at_least=0.0, at_most=1.0, default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Delta(Robot):
     """A Delta robot, symmetric or with one R-C-U limb (Delta-CU)."""
 
-    mechanism: str = parameters.choice("delta")
-    geometry: Geometry = parameters.section(Geometry)
-    inertia: Inertia = parameters.section(Inertia)
-    payload: Payload = parameters.section(Payload, default={})
-    friction: Friction = parameters.section(Friction, default={})
-    gravity: Array = parameters.vector(3, default=[0, 0, -9.81])
-    joints: tuple[str, ...] = parameters.names(3, default=["joint_1", "joint_2", "joint_3"])
-    limits: Limits = parameters.section(Limits, default={})
-    members: Members | None = parameters.section(Members, default=None)
+    mechanism: str = schema.choice("delta")
+    geometry: Geometry = schema.section(Geometry)
+    inertia: Inertia = schema.section(Inertia)
+    payload: Payload = schema.section(Payload, default={})
+    friction: Friction = schema.section(Friction, default={})
+    gravity: Array = schema.vector(3, default=[0, 0, -9.81])
+    joints: tuple[str, ...] = schema.names(3, default=["joint_1", "joint_2", "joint_3"])
+    limits: Limits = schema.section(Limits, default={})
+    members: Members | None = schema.section(Members, default=None)
 
     description: ClassVar[str] = "Delta robot, three arms with forearms, the platform translates"
     mobility: ClassVar[str] = "3: translations x, y, z"

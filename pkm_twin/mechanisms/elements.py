@@ -22,8 +22,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from pkm_twin.kernels import NOT_FINITE, SINGULAR, scalar
-from pkm_twin.mechanisms.robot import SINGULARITY_BOUND
+from pkm_twin.codegen.kernels import NOT_FINITE, SINGULAR, scalar
+from pkm_twin.machine.robot import SINGULARITY_BOUND
 
 BLOCK: Final = 45
 ELEMENTS: Final = 9

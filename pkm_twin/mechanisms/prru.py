@@ -41,10 +41,11 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin import parameters
+from pkm_twin.codegen.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
 from pkm_twin.errors import ParameterError
-from pkm_twin.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
-from pkm_twin.mechanisms.bodies import (
+from pkm_twin.kinematics.clearance import BAR, bar, least
+from pkm_twin.machine import schema
+from pkm_twin.machine.bodies import (
     HEAD,
     PAYLOAD_COM,
     PAYLOAD_INERTIA,
@@ -53,9 +54,7 @@ from pkm_twin.mechanisms.bodies import (
     TWIST,
     virtual_work,
 )
-from pkm_twin.mechanisms.clearance import BAR, bar, least
-from pkm_twin.mechanisms.frame import Frame, Member, RigidBody, Support, Tube, disc
-from pkm_twin.mechanisms.joints import (
+from pkm_twin.machine.joints import (
     GROUND,
     MOVING,
     Joint,
@@ -63,7 +62,8 @@ from pkm_twin.mechanisms.joints import (
     joint,
     platform_motion,
 )
-from pkm_twin.mechanisms.robot import (
+from pkm_twin.machine.members import Frame, Member, RigidBody, Support, Tube, disc
+from pkm_twin.machine.robot import (
     SINGULARITY_BOUND,
     Friction,
     Limits,
@@ -121,8 +121,8 @@ class Geometry:
     base_radius: float = length()
     platform_radius: float = length()
     limb_length: float = length()
-    azimuths: Array = parameters.vector(3)
-    branch: str = parameters.choice("above", "below")
+    azimuths: Array = schema.vector(3)
+    branch: str = schema.choice("above", "below")
 
     def verify(self, path: str) -> None:
         """Limbs apart, and long enough for the level platform."""
@@ -150,11 +150,11 @@ class Inertia:
     lower_link_mass: float = mass()
     upper_link_mass: float = mass()
     platform_mass: float = mass()
-    link_com: float = parameters.number(at_least=0.0, at_most=1.0, default=0.5)
-    lower_link_inertia: Array | None = parameters.vector(2, at_least=0.0, default=None)
-    upper_link_inertia: Array | None = parameters.vector(2, at_least=0.0, default=None)
-    platform_com: Array = parameters.vector(3, default=[0, 0, 0])
-    platform_inertia: Array | None = parameters.inertia(positive=False, default=None)
+    link_com: float = schema.number(at_least=0.0, at_most=1.0, default=0.5)
+    lower_link_inertia: Array | None = schema.vector(2, at_least=0.0, default=None)
+    upper_link_inertia: Array | None = schema.vector(2, at_least=0.0, default=None)
+    platform_com: Array = schema.vector(3, default=[0, 0, 0])
+    platform_inertia: Array | None = schema.inertia(positive=False, default=None)
 
     def verify(self, path: str) -> None:
         """Axial moments within the triangle rule."""
@@ -170,22 +170,22 @@ class Inertia:
 class Members:
     """A limb's two links as one tube with the masses of both, for elasticity and interference."""
 
-    limb: Tube = parameters.section(Tube)
+    limb: Tube = schema.section(Tube)
 
 
 @dataclass(frozen=True, eq=False)
 class Prru(Robot):
     """A 3-PRRU head with three vertical sliders."""
 
-    mechanism: str = parameters.choice("prru")
-    geometry: Geometry = parameters.section(Geometry)
-    inertia: Inertia = parameters.section(Inertia)
-    payload: Payload = parameters.section(Payload, default={})
-    friction: Friction = parameters.section(Friction, default={})
-    gravity: Array = parameters.vector(3, default=[0, 0, -9.81])
-    joints: tuple[str, ...] = parameters.names(3, default=["slider_1", "slider_2", "slider_3"])
-    limits: Limits = parameters.section(Limits, default={})
-    members: Members | None = parameters.section(Members, default=None)
+    mechanism: str = schema.choice("prru")
+    geometry: Geometry = schema.section(Geometry)
+    inertia: Inertia = schema.section(Inertia)
+    payload: Payload = schema.section(Payload, default={})
+    friction: Friction = schema.section(Friction, default={})
+    gravity: Array = schema.vector(3, default=[0, 0, -9.81])
+    joints: tuple[str, ...] = schema.names(3, default=["slider_1", "slider_2", "slider_3"])
+    limits: Limits = schema.section(Limits, default={})
+    members: Members | None = schema.section(Members, default=None)
 
     description: ClassVar[str] = "3-PRRU head, three vertical sliders and two links a limb"
     mobility: ClassVar[str] = "3: translation z, rotations alpha, beta (x, y, gamma follow)"

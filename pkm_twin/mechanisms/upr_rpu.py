@@ -32,12 +32,11 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin import parameters
+from pkm_twin.codegen.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
 from pkm_twin.errors import ParameterError
-from pkm_twin.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
-from pkm_twin.mechanisms.clearance import BAR, bar, least
-from pkm_twin.mechanisms.elements import BLOCK, SCRATCH, divide, factorise, invert
-from pkm_twin.mechanisms.frame import (
+from pkm_twin.kinematics.clearance import BAR, bar, least
+from pkm_twin.machine import schema
+from pkm_twin.machine.members import (
     GROUND,
     MOVING,
     Frame,
@@ -47,7 +46,8 @@ from pkm_twin.mechanisms.frame import (
     Support,
     disc,
 )
-from pkm_twin.mechanisms.robot import SINGULARITY_BOUND, Robot, length, mass
+from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot, length, mass
+from pkm_twin.mechanisms.elements import BLOCK, SCRATCH, divide, factorise, invert
 
 Array = NDArray[np.float64]
 
@@ -91,10 +91,10 @@ class Geometry:
 class Members:
     """Round bars: moduli (Pa), diameters (m), and the shear factor A / A_shear."""
 
-    youngs_modulus: float = parameters.number(at_least=1e3, at_most=1e14)
-    shear_modulus: float = parameters.number(at_least=1e3, at_most=1e14)
-    diameter: Array = parameters.vector(3, above=0.0, spread=True)
-    shear_factor: float = parameters.number(at_least=0.0, at_most=10.0, default=1.0)
+    youngs_modulus: float = schema.number(at_least=1e3, at_most=1e14)
+    shear_modulus: float = schema.number(at_least=1e3, at_most=1e14)
+    diameter: Array = schema.vector(3, above=0.0, spread=True)
+    shear_factor: float = schema.number(at_least=0.0, at_most=10.0, default=1.0)
 
     def verify(self, path: str) -> None:
         """Diameters whose fourth power is a number to compute with."""
@@ -111,10 +111,10 @@ class JointsCompliance:
     axis, w from A to B. Entries about an axis of the joint are free (.inf); 0 is rigid.
     """
 
-    upr_revolute: Array = parameters.vector(6, at_least=0.0, infinite=True)
-    upr_universal: Array = parameters.vector(6, at_least=0.0, infinite=True)
-    rpu_universal: Array = parameters.vector(6, at_least=0.0, infinite=True)
-    rpu_revolute: Array = parameters.vector(6, at_least=0.0, infinite=True)
+    upr_revolute: Array = schema.vector(6, at_least=0.0, infinite=True)
+    upr_universal: Array = schema.vector(6, at_least=0.0, infinite=True)
+    rpu_universal: Array = schema.vector(6, at_least=0.0, infinite=True)
+    rpu_revolute: Array = schema.vector(6, at_least=0.0, infinite=True)
 
     def verify(self, path: str) -> None:
         """Free exactly where the joint turns; a number in every direction that carries load."""
@@ -137,10 +137,10 @@ class Inertia:
     a thin disc of the platform's radius about its origin.
     """
 
-    density: float = parameters.number(above=0.0, at_most=1e5)
+    density: float = schema.number(above=0.0, at_most=1e5)
     platform_mass: float = mass()
-    platform_com: Array = parameters.vector(3, default=[0, 0, 0])
-    platform_inertia: Array | None = parameters.inertia(positive=False, default=None)
+    platform_com: Array = schema.vector(3, default=[0, 0, 0])
+    platform_inertia: Array | None = schema.inertia(positive=False, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +150,8 @@ class Limits:
     Absent is None: no limit.
     """
 
-    limb_length: Array | None = parameters.interval(above=0.0, count=3, default=None)
-    joint_angle: float | None = parameters.number(above=0.0, at_most=math.pi, default=None)
+    limb_length: Array | None = schema.interval(above=0.0, count=3, default=None)
+    joint_angle: float | None = schema.number(above=0.0, at_most=math.pi, default=None)
 
     @property
     def position(self) -> Array | None:
@@ -173,13 +173,13 @@ class Limits:
 class UprRpu(Robot):
     """A 2UPR-RPU machine with elastic bars and joints."""
 
-    mechanism: str = parameters.choice("upr_rpu")
-    geometry: Geometry = parameters.section(Geometry)
-    members: Members = parameters.section(Members)
-    joints_compliance: JointsCompliance = parameters.section(JointsCompliance)
-    limits: Limits = parameters.section(Limits, default={})
-    joints: tuple[str, ...] = parameters.names(3, default=["limb_1", "limb_2", "limb_3"])
-    inertia: Inertia | None = parameters.section(Inertia, default=None)
+    mechanism: str = schema.choice("upr_rpu")
+    geometry: Geometry = schema.section(Geometry)
+    members: Members = schema.section(Members)
+    joints_compliance: JointsCompliance = schema.section(JointsCompliance)
+    limits: Limits = schema.section(Limits, default={})
+    joints: tuple[str, ...] = schema.names(3, default=["limb_1", "limb_2", "limb_3"])
+    inertia: Inertia | None = schema.section(Inertia, default=None)
 
     description: ClassVar[str] = "2UPR-RPU head, three actuated telescopic limbs"
     mobility: ClassVar[str] = "3: translation along Oo, rotations beta, gamma"

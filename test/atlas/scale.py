@@ -64,7 +64,7 @@ def command(points: int, processes: int, out: Path) -> tuple[float, int]:
     words = ["atlas", "upr_rpu", "strain-energy", "--points", str(points), "--no-picture"]
     words += ["--out", str(out), "--workers", str(processes), "--overwrite"]
     begin = time.monotonic()
-    process = psutil.Popen([sys.executable, "-m", "pkm_twin.cli", *words])
+    process = psutil.Popen([sys.executable, "-m", "pkm_twin.apps.cli", *words])
     peak = 0
     while process.poll() is None:
         total = 0

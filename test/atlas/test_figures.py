@@ -165,7 +165,7 @@ def test_pages_hold_all_they_need(name, small_atlases, tmp_path):
 @pytest.mark.parametrize("name", MODES)
 def test_show_writes_the_page_of_a_stored_modes_atlas(name, small_atlases, tmp_path):
     pytest.importorskip("plotly")
-    from pkm_twin.cli import app
+    from pkm_twin.apps.cli import app
 
     out = tmp_path / "drawn.nc"
     result = CliRunner().invoke(

@@ -13,7 +13,7 @@ from pkm_twin.atlas.grids import polar_pose
 from pkm_twin.atlas.modes import frame_edges, modes_sweep
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.errors import ParameterError
-from pkm_twin.mechanisms.frame import framed
+from pkm_twin.machine.members import framed
 from stiffness_monitor import reachable
 from stiffness_monitor.modes import modes, natural_frequencies
 

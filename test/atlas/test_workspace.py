@@ -14,8 +14,8 @@ from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace import workspace_sweep
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.workspace import clearance
 from stiffness_monitor import reachable, regular_workspace
-from stiffness_monitor.workspace import clearance
 from test.conftest import parameters_of
 
 ROBOTS = ("prru", "delta_cu", "upr_rpu")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pkm_twin.bags import BagMessage, BagWriter
+from pkm_twin.bags.reader import BagMessage, BagWriter
 
 HEADER = "builtin_interfaces/Time stamp\nstring frame_id"
 LINE = "=" * 80

@@ -18,8 +18,8 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 
-from pkm_twin import mcap_format
-from pkm_twin.bags import (
+from pkm_twin.bags import format as mcap_format
+from pkm_twin.bags.reader import (
     BagMessage,
     BagWriter,
     DamagedBagError,
@@ -276,7 +276,7 @@ def test_decompression_bomb(tmp_path: Path, declared: int) -> None:
     path = raw_bag(tmp_path / "bomb.mcap", chunk_record(bomb, size=declared))
     program = (
         "import resource, sys\n"
-        "from pkm_twin.bags import inspect, BagError\n"
+        "from pkm_twin.bags.reader import inspect, BagError\n"
         "resource.setrlimit(resource.RLIMIT_AS, (700_000_000,) * 2)\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "try:\n    inspect(sys.argv[1])\nexcept BagError as error:\n    print(error)\n"
@@ -350,7 +350,7 @@ def test_order_by_log_time_is_stable_and_counted(tmp_path: Path) -> None:
 
 
 def test_order_holds_without_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pkm_twin.mcap_check._RUN_BYTES", 100)
+    monkeypatch.setattr("pkm_twin.bags.strict._RUN_BYTES", 100)
     times = [9, 1, 5, 5, 2, 8, 3, 3, 7]
     path = foreign_bag(tmp_path / "f.mcap", times, use_chunking=False)
     assert [m.log_time for m in read_messages(path)] == sorted(times)
@@ -366,7 +366,7 @@ def test_memory_stays_flat(tmp_path: Path) -> None:
             data = b"\x00\x01\x00\x00" + struct.pack("<I", 200_000) + chance.randbytes(200_000)
             writer.write("/noise", data, index)
     program = (
-        "import resource, sys\nfrom pkm_twin.bags import read_messages\n"
+        "import resource, sys\nfrom pkm_twin.bags.reader import read_messages\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "print(sum(1 for _ in read_messages(sys.argv[1])))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pkm_twin.bags import BagWriter, inspect, read_messages, recover
+from pkm_twin.bags.reader import BagWriter, inspect, read_messages, recover
 from pkm_twin.errors import BagError
 
 TEXT = "std_msgs/msg/String"
@@ -23,7 +23,7 @@ TEXT = "std_msgs/msg/String"
 # large that only time ends them.
 RECORDER = """
 import sys, time, signal
-from pkm_twin.bags import BagWriter
+from pkm_twin.bags.reader import BagWriter
 def stop(number, frame):
     raise SystemExit(0)
 signal.signal(signal.SIGTERM, stop)
@@ -98,7 +98,7 @@ def test_a_lone_message_reaches_the_file_in_time(tmp_path: Path) -> None:
 
 def test_full_disk(tmp_path: Path) -> None:
     program = (
-        "import resource, sys\nfrom pkm_twin.bags import BagWriter, BagError\n"
+        "import resource, sys\nfrom pkm_twin.bags.reader import BagWriter, BagError\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))\n"
         "try:\n"
         "    with BagWriter(sys.argv[1], flush_period=None) as writer:\n"

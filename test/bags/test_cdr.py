@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pkm_twin.cdr import (
+from pkm_twin.bags.cdr import (
     Field,
     MessageCodec,
     live_type_name,

@@ -3,7 +3,7 @@
 
 import pytest
 
-from pkm_twin.bags import read_messages
+from pkm_twin.bags.reader import read_messages
 from pkm_twin.errors import BagError
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(3600)]

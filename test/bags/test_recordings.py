@@ -15,9 +15,9 @@ from bags.recording.capture import machine_parameters, parameters_digest
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward
 from pkm_twin import load
-from pkm_twin.bags import open_bag
+from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
-from pkm_twin.messages import stamp_of
+from pkm_twin.ros.messages import stamp_of
 from stiffness_monitor.monitor import Monitor
 
 FOLDER = Path(__file__).resolve().parents[2] / "bags"

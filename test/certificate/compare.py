@@ -10,7 +10,7 @@ import numpy as np
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.reactions import reactions
 from delta_dynamics.virtual_work import energy
-from pkm_twin.mechanisms.joints import platform_motion
+from pkm_twin.machine.joints import platform_motion
 from test.certificate.lagrange import energies
 from test.certificate.machines import Case, friction, random_case
 from test.certificate.mujoco_models import tree

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin import load
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.robot import Robot
 from stiffness_monitor import compliance
 from test.conftest import parameters_of
 from test.validation.calculix import Mesh, solid_compliance

@@ -20,7 +20,7 @@ from bags.recording.pinocchio_models import DeltaEngine, LoopEngine, PrruEngine
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import forward_dynamics
 from pkm_twin import Robot
-from pkm_twin.mechanisms.joints import platform_motion
+from pkm_twin.machine.joints import platform_motion
 from test.certificate.lagrange import energies
 from test.certificate.machines import build
 from test.conftest import parameters_of

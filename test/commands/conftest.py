@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pkm_twin import cli
-from pkm_twin.bags import BagWriter, open_bag
+from pkm_twin.apps import cli
+from pkm_twin.bags.reader import BagWriter, open_bag
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DELTA = REPOSITORY / "bags/delta_cu_pick_and_place.mcap"
@@ -52,7 +52,7 @@ def process():
 
     def run(*arguments, folder=None):
         done = subprocess.run(
-            [sys.executable, "-m", "pkm_twin.cli", *map(str, arguments)],
+            [sys.executable, "-m", "pkm_twin.apps.cli", *map(str, arguments)],
             capture_output=True,
             text=True,
             timeout=120,

@@ -7,7 +7,7 @@ import random
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from pkm_twin.bags import inspect, read_messages
+from pkm_twin.bags.reader import inspect, read_messages
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
 
 JOINTS = "/joint_states"

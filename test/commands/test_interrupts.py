@@ -13,7 +13,7 @@ from test.commands.conftest import REPOSITORY
 
 SCRIPT = """
 import signal, sys, time
-from pkm_twin.interrupts import first_signal
+from pkm_twin.ros.signals import first_signal
 before = [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
 with first_signal(KeyboardInterrupt):
     pass
@@ -62,7 +62,7 @@ def test_only_the_first_signal_counts(number):
 def test_an_exception_that_was_lost_does_not_make_a_process_deaf():
     script = """
 import signal, time
-from pkm_twin import interrupts
+from pkm_twin.ros import signals as interrupts
 interrupts.PATIENCE = 0.2
 with interrupts.first_signal(lambda: SystemExit(7)):
     try:
@@ -82,7 +82,7 @@ def test_an_interrupted_command_has_its_own_exit_code(tmp_path):
     path = tmp_path / "motion.csv"
     os.mkfifo(path)
     process = subprocess.Popen(
-        [sys.executable, "-m", "pkm_twin.cli", "torques", "delta_cu", str(path)],
+        [sys.executable, "-m", "pkm_twin.apps.cli", "torques", "delta_cu", str(path)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

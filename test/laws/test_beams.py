@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import eigh, null_space
 from scipy.optimize import brentq
 
-from pkm_twin.mechanisms.frame import (
+from pkm_twin.machine.members import (
     GROUND,
     MOVING,
     RIGID,

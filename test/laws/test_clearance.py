@@ -15,8 +15,8 @@ from delta_dynamics.isotropy import tilted_pose
 from pkm_twin import load, robot_names
 from pkm_twin.atlas.workspace import workspace_sweep
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.mechanisms.clearance import BAR, bar, distance, least
-from stiffness_monitor.workspace import clearance, has_clearance, reachable, regular_workspace
+from pkm_twin.kinematics.clearance import BAR, bar, distance, least
+from pkm_twin.kinematics.workspace import clearance, has_clearance, reachable, regular_workspace
 from test.conftest import both_ways, parameters_of, random_poses
 
 ROBOTS = robot_names()
@@ -359,8 +359,9 @@ def test_refused_poses_are_named(name):
 PROGRAM = """
 import json, sys
 import numpy as np
-from pkm_twin import load, kernels
-from stiffness_monitor.workspace import clearance, reachable
+from pkm_twin import load
+from pkm_twin.codegen import kernels
+from pkm_twin.kinematics.workspace import clearance, reachable
 given = json.loads(sys.stdin.read())
 result = {"compiled": kernels.COMPILED}
 for name, poses in given.items():

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from delta_dynamics.differentiator import Differentiator
 from pkm_twin.errors import MessageError
+from pkm_twin.streams.differentiator import Differentiator
 
 SECOND = 10**9
 STEP = SECOND // 1000

@@ -190,7 +190,8 @@ def test_without_numba_the_numbers_are_the_same(name, rng):
     code = f"""
 import numpy as np
 from delta_dynamics import inverse_dynamics
-from pkm_twin import kernels, load
+from pkm_twin import load
+from pkm_twin.codegen import kernels
 assert not kernels.COMPILED
 robot = load({name!r})
 q = np.load("in.npy")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from pkm_twin import load, robot_names
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.parameters import MAX_FILE_SIZE
+from pkm_twin.machine.schema import MAX_FILE_SIZE
 from test.conftest import parameters_of
 
 ROBOTS = robot_names()

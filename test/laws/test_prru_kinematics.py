@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import bodies, energy
-from pkm_twin import parameters
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ def machine(
         "platform_inertia": [0.5, 0.5, 0.8] if symmetric else [list(r) for r in TILTED_INERTIA],
     }
     payload = {"mass": 3.0, "com": [0.05, 0.02, 0.1], "inertia": [0.02, 0.03, 0.04]}
-    return parameters.build(
+    return schema.build(
         Prru,
         {
             "mechanism": "prru",
@@ -500,10 +500,10 @@ def test_refused_parameters(section: str, key: str, value: object) -> None:
         },
         "inertia": dict.fromkeys(MASSES, 1.0),
     }
-    assert parameters.build(Prru, data).joint_names == robot.joint_names
+    assert schema.build(Prru, data).joint_names == robot.joint_names
     data[section][key] = value  # type: ignore[index]
     with pytest.raises(ParameterError) as caught:
-        parameters.build(Prru, data)
+        schema.build(Prru, data)
     assert caught.value.field.startswith(f"{section}.{key}")
 
 
@@ -517,7 +517,7 @@ def test_defaults_are_thin_rods_and_a_thin_disc() -> None:
         platform_com=[0.0, 0.0, 0.0],
         platform_inertia=[25 * 0.0625 / 4, 25 * 0.0625 / 4, 25 * 0.0625 / 2],
     )
-    short = parameters.build(
+    short = schema.build(
         Prru,
         {
             "mechanism": "prru",

@@ -8,10 +8,11 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
 from delta_dynamics.virtual_work import bodies
-from pkm_twin import load, parameters, robot_names
+from pkm_twin import load, robot_names
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from pkm_twin.machine import schema
+from pkm_twin.machine.joints import platform_motion
 from pkm_twin.mechanisms.delta import Delta
-from pkm_twin.mechanisms.joints import platform_motion
 from test.conftest import parameters_of, random_joints
 
 MASSIVE = [name for name in robot_names() if load(name).dynamics_kernel is not None]
@@ -255,7 +256,7 @@ class RevoluteParallelograms(Delta):
 
 @pytest.fixture
 def overconstrained():
-    robot = parameters.build(RevoluteParallelograms, parameters_of("delta"))
+    robot = schema.build(RevoluteParallelograms, parameters_of("delta"))
     return robot.changed(**LOADED)
 
 

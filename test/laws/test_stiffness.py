@@ -8,15 +8,16 @@ import math
 import numpy as np
 import pytest
 
-from pkm_twin import load, parameters
+from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.mechanisms import config_folder
+from pkm_twin.kinematics.workspace import regular_workspace
+from pkm_twin.machine import schema
+from pkm_twin.machine.catalogue import config_folder
 from pkm_twin.mechanisms.upr_rpu import UprRpu
 from stiffness_monitor import compliance, reachable, stiffness, strain_energy
-from stiffness_monitor.workspace import regular_workspace
 
 ROBOT = load("upr_rpu")
-FILE = parameters.read_yaml(config_folder() / "upr_rpu.yaml")
+FILE = schema.read_yaml(config_folder() / "upr_rpu.yaml")
 HOME = np.array([-0.6, 0.0, 0.0])
 SWAPPED = [3, 4, 5, 0, 1, 2, 6, 7, 8]
 
@@ -28,7 +29,7 @@ def random_machine(rng):
         values = 10.0 ** rng.uniform([-10.5] * 3 + [-11.5] * 3, [-8.5] * 3 + [-9.5] * 3)
         return [math.inf if i in free else v for i, v in enumerate(values.tolist())]
 
-    return parameters.build(
+    return schema.build(
         UprRpu,
         {
             "mechanism": "upr_rpu",
@@ -296,7 +297,7 @@ def test_similar_machines():
     j = robot.joints_compliance
     names = ("upr_revolute", "upr_universal", "rpu_universal", "rpu_revolute")
     by = np.array([1 / k] * 3 + [1 / k**3] * 3)
-    large = parameters.build(
+    large = schema.build(
         UprRpu,
         {
             "mechanism": "upr_rpu",

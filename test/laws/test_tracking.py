@@ -6,7 +6,7 @@ import pytest
 
 from pkm_twin import load, robot_names
 from pkm_twin.errors import SingularityError
-from pkm_twin.mechanisms.tracking import boundary_distance, follow, track
+from pkm_twin.kinematics.tracking import boundary_distance, follow, track
 from test.conftest import random_poses
 
 every_robot = pytest.mark.parametrize("name", robot_names())

@@ -10,19 +10,20 @@ import math
 import numpy as np
 import pytest
 
-from pkm_twin import load, parameters
+from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
-from pkm_twin.mechanisms import config_folder
+from pkm_twin.machine import schema
+from pkm_twin.machine.catalogue import config_folder
 from pkm_twin.mechanisms.upr_rpu import UprRpu
 from test.conftest import both_ways
 
 ROBOT = load("upr_rpu")
-FILE = parameters.read_yaml(config_folder() / "upr_rpu.yaml")
+FILE = schema.read_yaml(config_folder() / "upr_rpu.yaml")
 SIZES = [(0.39, 0.26), (0.26, 0.39), (0.3, 0.3), (1.5, 0.2), (0.1, 0.45)]
 
 
 def machine(base, platform):
-    return parameters.build(
+    return schema.build(
         UprRpu, FILE | {"geometry": {"base_radius": base, "platform_radius": platform}}
     )
 
@@ -281,7 +282,7 @@ def test_limits_have_the_common_shape():
     assert ROBOT.limits.velocity is None
     assert ROBOT.limits.effort is None
     assert ROBOT.joint_names == ("limb_1", "limb_2", "limb_3")
-    bare = parameters.build(UprRpu, {k: v for k, v in FILE.items() if k != "limits"})
+    bare = schema.build(UprRpu, {k: v for k, v in FILE.items() if k != "limits"})
     assert bare.limits.position is None
     assert bare.limits.joint_angle is None
 
@@ -344,20 +345,21 @@ def changed_file(dotted, value):
 )
 def test_refused_values_are_named(dotted, value, field):
     with pytest.raises(ParameterError) as caught:
-        parameters.build(UprRpu, changed_file(dotted, value))
+        schema.build(UprRpu, changed_file(dotted, value))
     assert caught.value.field == field
 
 
 def test_misspelt_key_has_its_neighbour_named():
     with pytest.raises(UnknownNameError) as caught:
-        parameters.build(UprRpu, changed_file("members.young_modulus", 2e11))
+        schema.build(UprRpu, changed_file("members.young_modulus", 2e11))
     assert caught.value.closest == "youngs_modulus"
 
 
 PROGRAM = """
 import json, sys
 import numpy as np
-from pkm_twin import load, kernels
+from pkm_twin import load
+from pkm_twin.codegen import kernels
 from stiffness_monitor import compliance, strain_energy
 robot = load("upr_rpu")
 poses = np.array(json.loads(sys.stdin.read()))

@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, assume, event, example, given, settings
 from hypothesis import strategies as st
 
 from delta_dynamics import feedforward, inverse_dynamics
-from delta_dynamics.continuity import COMPARISON, STATE
 from delta_dynamics.feedforward import Feedforward, Settings
 from pkm_twin import load
 from pkm_twin.errors import MessageError, ParameterError, SingularityError
+from pkm_twin.streams.continuity import COMPARISON, STATE
 from test.nodes.harness import SECOND, Maker, Plain
 
 NOW = 1_000 * SECOND

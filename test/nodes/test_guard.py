@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pkm_twin.guard import Pace
+from pkm_twin.streams.monitor import Pace
 
 MILLISECOND = 10**6
 

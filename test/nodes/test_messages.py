@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pkm_twin import load
 from pkm_twin.errors import MessageError
-from pkm_twin.messages import (
+from pkm_twin.ros.messages import (
     MAX_ACCELERATION,
     MAX_DURATION,
     MAX_EFFORT,

@@ -25,16 +25,17 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from pkm_twin.bags import BagWriter
+from pkm_twin.bags.reader import BagWriter
 from pkm_twin.errors import BagError, ParameterError
-from pkm_twin.player import play
+from pkm_twin.ros.player import play
 
 DOMAIN = 1 + os.getpid() % 100
 COUNT = 200
 PERIOD = 0.005
 FIRST = 1_700_000_000 * 10**9
 PROGRAM = (
-    "import sys; from pkm_twin.player import play; print(play(sys.argv[1], **eval(sys.argv[2])))"
+    "import sys; from pkm_twin.ros.player import play; "
+    "print(play(sys.argv[1], **eval(sys.argv[2])))"
 )
 
 

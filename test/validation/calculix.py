@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import qr
 
-from pkm_twin.mechanisms.frame import GROUND, MOVING, Frame, Section
+from pkm_twin.machine.members import GROUND, MOVING, Frame, Section
 from stiffness_monitor.beams import local_axes
 
 CCX = shutil.which("ccx")

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkm_twin.mechanisms.frame import GROUND, MOVING, Frame, Member, Section, Support
+from pkm_twin.machine.members import GROUND, MOVING, Frame, Member, Section, Support
 from stiffness_monitor import compliance
 from stiffness_monitor.beams import local_axes
 from test.certificate.links import (

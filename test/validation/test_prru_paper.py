@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import bodies
-from pkm_twin import load, parameters
+from pkm_twin import load
+from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
 
 Array = NDArray[Any]
@@ -43,7 +44,7 @@ def machine(branch: str, link_com: float, platform_com: tuple[float, ...] = (0, 
         "platform_inertia": [list(row) for row in INERTIA],
     }
     g = robot.geometry
-    return parameters.build(
+    return schema.build(
         Prru,
         {
             "mechanism": "prru",

@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from pkm_twin.kernels import scalar
+from pkm_twin.codegen.kernels import scalar
 
 BAR: Final = 9
 """Size of a row."""

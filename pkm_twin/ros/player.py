@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pkm_twin.bags import Bag, TopicInfo, open_bag
-from pkm_twin.cdr import message_class, message_definition, parse_definition
+from pkm_twin.bags.cdr import message_class, message_definition, parse_definition
+from pkm_twin.bags.reader import Bag, TopicInfo, open_bag
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError
 
 CLOCK_TOPIC = "/clock"

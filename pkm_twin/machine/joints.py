@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.mechanisms.bodies import PAYLOAD_COM, ROW
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.bodies import PAYLOAD_COM, ROW
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 

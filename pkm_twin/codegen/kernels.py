@@ -44,7 +44,7 @@ def _drop_stale_caches() -> None:
 
     numba looks at the outermost function's file only, and kernels call into others.
     """
-    formulas = Path(__file__).parent / "mechanisms"
+    formulas = Path(__file__).parents[1] / "mechanisms"
     newest = max(path.stat().st_mtime for path in (*formulas.glob("*.py"), Path(__file__)))
     for index in (formulas / "__pycache__").glob("*.nbi"):
         with suppress(OSError):

@@ -13,9 +13,10 @@ from typing import Any, ClassVar, Final, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin import kernels, parameters
+from pkm_twin.codegen import kernels
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
-from pkm_twin.kernels import Kernel
+from pkm_twin.machine import schema
 
 Array = NDArray[np.float64]
 R = TypeVar("R", bound="Robot")
@@ -28,12 +29,12 @@ SINGULARITY_BOUND: Final = 1e-9
 
 def length(**options: Any) -> Any:
     """Field: a length above zero, m."""
-    return parameters.number(above=0.0, at_most=MAX_LENGTH, **options)
+    return schema.number(above=0.0, at_most=MAX_LENGTH, **options)
 
 
 def mass(**options: Any) -> Any:
     """Field: a mass of zero or more, kg."""
-    return parameters.number(at_least=0.0, at_most=MAX_MASS, **options)
+    return schema.number(at_least=0.0, at_most=MAX_MASS, **options)
 
 
 def check_azimuths(azimuths: Array, path: str) -> None:
@@ -49,16 +50,16 @@ class Payload:
     """A body fixed to the platform: com from the platform's origin, inertia about the com."""
 
     mass: float = mass(default=0.0)
-    com: Array = parameters.vector(3, default=[0, 0, 0])
-    inertia: Array = parameters.inertia(positive=False, default=[0, 0, 0])
+    com: Array = schema.vector(3, default=[0, 0, 0])
+    inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
 
 
 @dataclass(frozen=True, eq=False)
 class Friction:
     """Friction at the actuated joints: viscous per rate, Coulomb by the rate's sign."""
 
-    viscous: Array = parameters.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
-    coulomb: Array = parameters.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
+    viscous: Array = schema.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
+    coulomb: Array = schema.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
 
 
 def dynamic_head(robot: Any) -> list[float]:
@@ -77,9 +78,9 @@ def dynamic_head(robot: Any) -> list[float]:
 class Limits:
     """Limits of the actuated joints; absent is None. One value stands for all joints."""
 
-    position: Array | None = parameters.interval(count=3, default=None)
-    velocity: Array | None = parameters.vector(3, above=0.0, spread=True, default=None)
-    effort: Array | None = parameters.vector(3, above=0.0, infinite=True, spread=True, default=None)
+    position: Array | None = schema.interval(count=3, default=None)
+    velocity: Array | None = schema.vector(3, above=0.0, spread=True, default=None)
+    effort: Array | None = schema.vector(3, above=0.0, infinite=True, spread=True, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +128,7 @@ class Robot:
     @cached_property
     def parameters(self) -> Array:
         """Flat parameters for the kernels, read-only."""
-        return parameters.frozen(self._pack())
+        return schema.frozen(self._pack())
 
     def _pack(self) -> list[float]:
         raise NotImplementedError
@@ -210,7 +211,7 @@ class Robot:
             if key not in self.changeable:
                 raise UnknownNameError(key, key, self.changeable)
             if isinstance(value, Mapping):
-                new[key] = parameters.replace(getattr(self, key), value, key)
+                new[key] = schema.replace(getattr(self, key), value, key)
             else:
                 fields = {f.name: f for f in dataclasses.fields(self)}
                 new[key] = fields[key].metadata["check"](key, value)

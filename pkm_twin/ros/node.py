@@ -33,8 +33,8 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.guard import Pace
-from pkm_twin.interrupts import first_signal, ignore_signals
+from pkm_twin.ros.signals import first_signal, ignore_signals
+from pkm_twin.streams.monitor import Pace
 from pkm_twin.threads import one_blas_thread
 
 OK: Final = DiagnosticStatus.OK

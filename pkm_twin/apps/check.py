@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.differentiator import Differentiator
+from pkm_twin.apps.recorded import JOINT_STATE, WRENCH, Recording, read_recording
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
-from pkm_twin.recorded import JOINT_STATE, WRENCH, Recording, read_recording
+from pkm_twin.streams.differentiator import Differentiator
 
 Array = NDArray[np.float64]
 

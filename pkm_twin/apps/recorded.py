@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin import load
-from pkm_twin.bags import Bag, open_bag
+from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.errors import BagError, MessageError
-from pkm_twin.mechanisms.robot import Robot
-from pkm_twin.messages import JointReader, JointSample, StampRules, read_wrench, stamp_of
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import JointReader, JointSample, StampRules, read_wrench, stamp_of
 
 Array = NDArray[np.float64]
 

@@ -20,9 +20,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.kernels import OK, SINGULAR, Kernel
 from pkm_twin.errors import MessageError
-from pkm_twin.kernels import OK, SINGULAR, Kernel
-from pkm_twin.messages import SECOND
+from pkm_twin.ros.messages import SECOND
 
 Array = NDArray[np.float64]
 

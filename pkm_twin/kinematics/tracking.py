@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.errors import SingularityError, UnreachableError
-from pkm_twin.mechanisms.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 
 Array = NDArray[np.float64]
 

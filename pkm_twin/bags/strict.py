@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pkm_twin.errors import BagError
-from pkm_twin.mcap_format import (
+from pkm_twin.bags.format import (
     ATTACHMENT,
     ATTACHMENT_INDEX,
     CHANNEL,
@@ -47,6 +46,7 @@ from pkm_twin.mcap_format import (
     read_magic,
     walk,
 )
+from pkm_twin.errors import BagError
 
 # Messages outside chunks are read back in runs of about this size.
 _RUN_BYTES = 1024**2

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -20,11 +20,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pkm_twin.bag_writer import LIBRARY, BagWriter, Sink, mcap_writer, refuse_existing, write_error
-from pkm_twin.cdr import MessageCodec, message_definition
-from pkm_twin.errors import BagError
-from pkm_twin.mcap_check import BagReport, Check, Segment, TopicInfo
-from pkm_twin.mcap_format import (
+from pkm_twin.bags.cdr import MessageCodec, message_definition
+from pkm_twin.bags.format import (
     ATTACHMENT,
     CHANNEL,
     CHUNK,
@@ -59,6 +56,9 @@ from pkm_twin.mcap_format import (
     utf8,
     walk,
 )
+from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo
+from pkm_twin.bags.writer import LIBRARY, BagWriter, Sink, mcap_writer, refuse_existing, write_error
+from pkm_twin.errors import BagError
 
 __all__ = [
     "Bag",

@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.kernels import OK, Kernel
 from pkm_twin.errors import MessageError
-from pkm_twin.kernels import OK, Kernel
-from pkm_twin.mechanisms.robot import Robot
-from pkm_twin.mechanisms.tracking import MAX_MOVE
-from pkm_twin.messages import SECOND
+from pkm_twin.kinematics.tracking import MAX_MOVE
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import SECOND
 
 Array = NDArray[np.float64]
 

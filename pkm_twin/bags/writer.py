@@ -18,9 +18,9 @@ from typing import Any, Self
 
 from mcap.writer import CompressionType, Writer
 
-from pkm_twin.cdr import MessageCodec, live_type_name, message_definition
+from pkm_twin.bags.cdr import MessageCodec, live_type_name, message_definition
+from pkm_twin.bags.format import FREE_BYTES, MAX_CHUNK_BYTES, METADATA_CRC, metadata_crc
 from pkm_twin.errors import BagError
-from pkm_twin.mcap_format import FREE_BYTES, MAX_CHUNK_BYTES, METADATA_CRC, metadata_crc
 
 LIBRARY = "pkm_twin"
 """What the header of our own bags says wrote them."""

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions
 from pkm_twin import load
-from pkm_twin.check import motion
+from pkm_twin.apps.check import motion
+from pkm_twin.apps.recorded import read_recording
 from pkm_twin.errors import (
     BagError,
     ParameterError,
@@ -23,8 +24,7 @@ from pkm_twin.errors import (
     UnknownNameError,
     UnreachableError,
 )
-from pkm_twin.mechanisms.robot import Robot
-from pkm_twin.recorded import read_recording
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 BLOCK = 4096

@@ -17,10 +17,10 @@ from typing import Any, Final, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin import parameters
 from pkm_twin.errors import ParameterError
-from pkm_twin.mechanisms.joints import GROUND, MOVING
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine import schema
+from pkm_twin.machine.joints import GROUND, MOVING
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def cowper(ratio: float) -> float:
 
 def modulus() -> Any:
     """Field: an elastic modulus, Pa."""
-    return parameters.number(at_least=1e3, at_most=1e14)
+    return schema.number(at_least=1e3, at_most=1e14)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +83,10 @@ class Tube:
 
     youngs_modulus: float = modulus()
     shear_modulus: float = modulus()
-    outer_diameter: float = parameters.number(at_least=1e-6, at_most=10.0)
-    density: float | None = parameters.number(above=0.0, at_most=1e5, default=None)
-    inner_diameter: float | None = parameters.number(at_least=0.0, at_most=10.0, default=None)
-    shear_factor: float | None = parameters.number(at_least=0.0, at_most=10.0, default=None)
+    outer_diameter: float = schema.number(at_least=1e-6, at_most=10.0)
+    density: float | None = schema.number(above=0.0, at_most=1e5, default=None)
+    inner_diameter: float | None = schema.number(at_least=0.0, at_most=10.0, default=None)
+    shear_factor: float | None = schema.number(at_least=0.0, at_most=10.0, default=None)
 
     def verify(self, path: str) -> None:
         """One of the two ways to tell the wall."""

@@ -28,10 +28,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pkm_twin.bags import BagWriter, inspect
-from pkm_twin.demo_report import REPORTS, Finding, draw, print_findings
+from pkm_twin.apps.demo_report import REPORTS, Finding, draw, print_findings
+from pkm_twin.bags.reader import BagWriter, inspect
 from pkm_twin.errors import BagError, PkmTwinError
-from pkm_twin.interrupts import INTERRUPTED, first_signal
+from pkm_twin.ros.signals import INTERRUPTED, first_signal
 
 MATCH_SECONDS = 60.0
 """How long a node may take to come up: the first start compiles the kernels."""
@@ -155,7 +155,7 @@ def run_stage(
             f"{stage.module} to come up",
             twin,
         )
-        command = [sys.executable, "-m", "pkm_twin.cli", "play", str(bag)]
+        command = [sys.executable, "-m", "pkm_twin.apps.cli", "play", str(bag)]
         command += ["--clock", "200", "--wait", "20"]
         command += [word for topic in stage.inputs for word in ("--topic", topic)]
         with process([*command, "--quiet"]) as player:

@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from pkm_twin.kernels import scalar
+from pkm_twin.codegen.kernels import scalar
 
 ROW: Final = 28
 TWIST: Final = 18

@@ -15,11 +15,12 @@ from rich.console import Console
 from rich.table import Table
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load, plots
-from pkm_twin.bags import inspect, read_messages
-from pkm_twin.check import motion
-from pkm_twin.messages import stamp_of
-from pkm_twin.recorded import Recording, read_recording
+from pkm_twin import load
+from pkm_twin.apps.check import motion
+from pkm_twin.apps.recorded import Recording, read_recording
+from pkm_twin.atlas import plots
+from pkm_twin.bags.reader import inspect, read_messages
+from pkm_twin.ros.messages import stamp_of
 
 Array = NDArray[np.float64]
 

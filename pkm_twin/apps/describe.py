@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from delta_dynamics import reactions
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.robot import Robot
 
 UNITS = {
     # Fractions of a length and plain numbers first: their names end as those of lengths do.

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.interrupts import INTERRUPTED, first_signal, ignore_signals
+from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -79,7 +79,7 @@ def play(
     the bytes that were recorded. Stamps are old: give the nodes use_sim_time and this command
     --clock 200.
     """
-    from pkm_twin.player import play as play_bag
+    from pkm_twin.ros.player import play as play_bag
 
     pairs = dict(_pair(text) for text in remap)
     result = play_bag(
@@ -100,7 +100,7 @@ def play(
 def robots() -> None:
     """List the robots that can be named."""
     from pkm_twin import load, robot_names
-    from pkm_twin.describe import summary
+    from pkm_twin.apps.describe import summary
 
     for name in robot_names():
         typer.echo(f"{name:12} {summary(load(name))}")
@@ -114,7 +114,7 @@ def info(robot: RobotName, as_json: Json = False) -> None:
     determine because the mechanism is overconstrained.
     """
     from pkm_twin import load
-    from pkm_twin.describe import describe, lines
+    from pkm_twin.apps.describe import describe, lines
 
     data = describe(load(robot))
     if as_json:
@@ -151,8 +151,8 @@ def torques(
     (JOINT.effort_gravity, _inertia, _velocity, _payload, _friction, _external), a bag's measured
     effort, and force and moment in every joint; empty where rigid bodies do not determine it.
     """
-    from pkm_twin import plots
-    from pkm_twin.torques import check_target, motion_of_bag, motion_of_csv, table, write_table
+    from pkm_twin.apps.torques import check_target, motion_of_bag, motion_of_csv, table, write_table
+    from pkm_twin.atlas import plots
 
     check_target(out)
     drawing = out.with_suffix(".png")
@@ -270,8 +270,8 @@ def check(
     Exit code 0: nothing is bad. 1: something is, or it is no bag. 3: the file is damaged, but part
     of it can be saved with `pkm-twin recover`.
     """
-    from pkm_twin.bags import DamagedBagError
-    from pkm_twin.check import Bounds, Verdict, check_bag
+    from pkm_twin.apps.check import Bounds, Verdict, check_bag
+    from pkm_twin.bags.reader import DamagedBagError
 
     try:
         with _progress("reading", None) as update:
@@ -316,7 +316,7 @@ def recover(
     """
     from dataclasses import asdict
 
-    from pkm_twin.bags import recover as recover_bag
+    from pkm_twin.bags.reader import recover as recover_bag
 
     result = recover_bag(bag, out, overwrite=overwrite)
     if as_json:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.kernels import OK, Kernel
 from pkm_twin.errors import ParameterError
-from pkm_twin.kernels import OK, Kernel
-from pkm_twin.mechanisms.robot import Robot
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 

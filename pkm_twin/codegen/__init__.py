@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Expressions, and the code that is made of them: knows nothing of machines."""

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The catalogue of mechanisms, and loading a robot by name or path."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Final
+
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine import schema
+from pkm_twin.machine.robot import Robot
+
+CATALOGUE: Final = {
+    "delta": "pkm_twin.mechanisms.delta:Delta",
+    "prru": "pkm_twin.mechanisms.prru:Prru",
+    "upr_rpu": "pkm_twin.mechanisms.upr_rpu:UprRpu",
+}
+"""Mechanism name to class: one line a mechanism."""
+
+
+def config_folder() -> Path:
+    """The folder of the shipped parameter files, inside the package in every installation."""
+    packed = Path(__file__).resolve().parent.parent / "config"
+    return packed if packed.is_dir() else packed.parent.parent / "config"
+
+
+def robot_names() -> list[str]:
+    """Names that :func:`load` knows."""
+    return sorted(path.stem for path in config_folder().glob("*.yaml"))
+
+
+def load(robot: str | Path) -> Robot:
+    """A robot by its name in ``config/``, or from a parameter file of the same schema.
+
+    :param robot: a name such as ``"delta_cu"``, or a path to a YAML file.
+    :raises UnknownNameError: no such name; the closest one is named.
+    :raises ParameterError: a file, key, type or value that is refused, by its dotted name.
+    """
+    text = str(robot)
+    if isinstance(robot, Path) or text.endswith((".yaml", ".yml")) or "/" in text:
+        path = Path(robot)
+    elif text in robot_names():
+        path = config_folder() / f"{text}.yaml"
+    else:
+        raise UnknownNameError("robot", text, robot_names())
+    data = schema.read_yaml(path)
+    mechanism = data.get("mechanism")
+    if mechanism is None:
+        raise ParameterError("mechanism", None, f"one of {', '.join(sorted(CATALOGUE))}")
+    if not isinstance(mechanism, str) or mechanism not in CATALOGUE:
+        raise UnknownNameError("mechanism", mechanism, CATALOGUE)
+    module, kind = CATALOGUE[mechanism].split(":")
+    result: Robot = schema.build(getattr(importlib.import_module(module), kind), data)
+    result.__dict__["_name"] = path.stem
+    return result
