@@ -269,8 +269,14 @@ def _rod(name: str, entry: Mapping[str, Any], known: set[str]) -> Rod:
     return Rod(name, inner, outer, ends, float(entry.get("mass", 0.0)))
 
 
+def cross(a: Array, b: Array) -> Array:
+    """The product a x b, shape (3,); of one pair numpy's own is ten times slower."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 def across(axis: Array) -> tuple[Array, Array]:
     """Two unit vectors that make a right-handed triple with ``axis``, each of shape (3,)."""
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first = cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first = first / np.linalg.norm(first)
-    return first, np.cross(axis, first)
+    return first, cross(axis, first)

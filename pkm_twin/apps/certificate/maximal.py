@@ -32,6 +32,7 @@ from pkm_twin.apps.certificate.description import (
     Machine,
     UnfitError,
     across,
+    cross,
     read,
 )
 
@@ -132,6 +133,7 @@ class Maximal:
             np.zeros((len(self.names), 6)),
         )
         self._state = self._start
+        self._assembled: dict[bytes, State] = {}
         self.home: Final = self._analyse()
 
     # Motion of points and directions
@@ -147,8 +149,8 @@ class Maximal:
         columns[:, 6 * k : 6 * k + 3] = np.eye(3)
         columns[:, 6 * k + 3 : 6 * k + 6] = -skewed(arm)
         v, w = state.velocity[k, :3], state.velocity[k, 3:]
-        swing = np.cross(w, arm)
-        return Jet(state.com[k] + arm, columns, v + swing, np.cross(w, swing))
+        swing = cross(w, arm)
+        return Jet(state.com[k] + arm, columns, v + swing, cross(w, swing))
 
     def direction(self, body: str, axis: Array) -> Jet:
         """A direction fixed in a body, by its components at home."""
@@ -159,8 +161,8 @@ class Maximal:
         columns = np.zeros((3, self.size))
         columns[:, 6 * k + 3 : 6 * k + 6] = -skewed(value)
         w = self._state.velocity[k, 3:]
-        swing = np.cross(w, value)
-        return Jet(value, columns, swing, np.cross(w, swing))
+        swing = cross(w, value)
+        return Jet(value, columns, swing, cross(w, swing))
 
     def spin(self, body: str) -> tuple[Array, Array]:
         """Columns of a body's angular velocity, shape (3, 6 bodies), and the velocity itself."""
@@ -264,9 +266,16 @@ class Maximal:
 
         :raises UnfitError: a singularity on the way, with where it is.
         """
+        q = np.asarray(q, dtype=float)
+        if q.tobytes() not in self._assembled:
+            # One is enough: torques, place and masses are asked for one state after another.
+            self._assembled = {q.tobytes(): self._follow(q - self.machine.home)}
+        self._state = self._assembled[q.tobytes()]
+        return self._state
+
+    def _follow(self, way: Array) -> State:
         if self.home.condition < SINGULAR:
             raise UnfitError("the actuated joints do not determine the machine at home")
-        way = np.asarray(q, dtype=float) - self.machine.home
         state, gone, step, least = self._start, 0.0, FIRST_STEP, 1.0
         while gone < 1.0:
             step = min(step, 1.0 - gone)
@@ -285,8 +294,7 @@ class Maximal:
                 continue
             state, gone, step = trial, goal, 1.5 * step
             least = min(least, condition / self.home.condition)
-        self._state = replace(state, velocity=np.zeros_like(state.velocity), least=least)
-        return self._state
+        return replace(state, velocity=np.zeros_like(state.velocity), least=least)
 
     def _moved(self, state: State, change: Array) -> State:
         each = change.reshape(-1, 6)
@@ -451,7 +459,7 @@ class Maximal:
             point, (spin, w) = self.point(name, body.com), self.spin(name)
             rotation = self._state.rotation[self.names.index(name)]
             total += body.mass * point.columns.T @ (point.bias - gravity)
-            total += spin.T @ np.cross(w, rotation @ body.inertia @ rotation.T @ w)
+            total += spin.T @ cross(w, rotation @ body.inertia @ rotation.T @ w)
         for rod in self.machine.rods:
             a, b = self.point(rod.inner, rod.ends[0]), self.point(rod.outer, rod.ends[1])
             one, other = a.bias - gravity, b.bias - gravity

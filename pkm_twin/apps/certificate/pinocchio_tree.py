@@ -26,6 +26,7 @@ from pkm_twin.apps.certificate.description import (
     Rod,
     UnfitError,
     across,
+    cross,
     read,
 )
 
@@ -91,6 +92,7 @@ class PinocchioTree:
         self._driven = np.array([self._axes[j.name][0] for j in self.machine.actuated])
         self._others = np.setdiff1d(np.arange(self.model.nv), self._driven)
         self._neutral = pin.neutral(self.model)
+        self._assembled: dict[bytes, Array] = {}
 
     # The tree
 
@@ -207,14 +209,14 @@ class PinocchioTree:
         if kind in ("revolute", "universal", "spherical", "fixed"):
             # The outer frame's own origin: its velocity is that of the twist there.
             for k in range(3):
-                rows.append(np.concatenate([np.eye(3)[k], np.cross(gap, np.eye(3)[k])]))
+                rows.append(np.concatenate([np.eye(3)[k], cross(gap, np.eye(3)[k])]))
                 open_by.append(gap[k])
         if kind in ("prismatic", "cylindrical"):
             for side in across(axes[0]):
-                rows.append(np.concatenate([side, np.cross(gap, side)]))
+                rows.append(np.concatenate([side, cross(gap, side)]))
                 open_by.append(side @ gap)
         if kind in ("revolute", "cylindrical"):
-            tilt = np.cross(axes[0], turn @ axes[0])
+            tilt = cross(axes[0], turn @ axes[0])
             for side in across(axes[0]):
                 rows.append(np.concatenate([np.zeros(3), side]))
                 open_by.append(side @ tilt)
@@ -225,7 +227,7 @@ class PinocchioTree:
                 open_by.append(angle[k])
         if kind == "universal":
             other = turn @ axes[1]
-            rows.append(np.concatenate([np.zeros(3), np.cross(other, axes[0])]))
+            rows.append(np.concatenate([np.zeros(3), cross(other, axes[0])]))
             open_by.append(axes[0] @ other - axes[0] @ axes[1])
         return np.array(rows), np.array(open_by)
 
@@ -275,12 +277,12 @@ class PinocchioTree:
         held, _ = self._held(loop)
         # How the held directions themselves change.
         turning = np.zeros_like(held)
-        slide = relative[:3] + np.cross(relative[3:], between.translation)
+        slide = relative[:3] + cross(relative[3:], between.translation)
         for k, row in enumerate(held):
-            turning[k, 3:] = np.cross(slide, row[:3])
+            turning[k, 3:] = cross(slide, row[:3])
         if loop.joint.kind == "universal":
             other = between.rotation @ loop.joint.axes[1]
-            turning[-1, 3:] = np.cross(np.cross(relative[3:], other), loop.joint.axes[0])
+            turning[-1, 3:] = cross(cross(relative[3:], other), loop.joint.axes[0])
         result: Array = held @ change + turning @ relative
         return result
 
@@ -295,8 +297,14 @@ class PinocchioTree:
 
         :raises UnfitError: Newton's method does not close the loops on the way.
         """
-        way = np.asarray(q, dtype=float) - self.machine.home
-        full = self._neutral
+        q = np.asarray(q, dtype=float)
+        if q.tobytes() not in self._assembled:
+            # One is enough: torques, place and masses are asked for one state after another.
+            self._assembled = {q.tobytes(): self._follow(q - self.machine.home)}
+        return self._assembled[q.tobytes()]
+
+    def _follow(self, way: Array) -> Array:
+        full: Array = self._neutral
         for number in range(1, STEPS + 1):
             ahead = np.zeros(self.model.nv)
             ahead[self._driven] = way / STEPS
@@ -304,8 +312,7 @@ class PinocchioTree:
             rows, _ = self._loop_rows()
             ahead[self._others] = _least(rows[:, self._others], -rows @ ahead)
             full = self._close(pin.integrate(self.model, full, ahead), number)
-        result: Array = full
-        return result
+        return full
 
     def _close(self, full: Array, number: int) -> Array:
         last = math.inf
