@@ -40,9 +40,10 @@ BOUNDS: Final = {
     "batch": 0.0,
 }
 """Greatest difference that passes; places in m and as entries of a rotation, joints in rad or m,
-all else relative. MuJoCo's own arithmetic is coarser, see LOOSE."""
+all else relative."""
 LOOSE: Final = {"mujoco": 1e3}
-"""Engines whose bounds are this much wider: MuJoCo wants some inertia in every body."""
+"""Engines whose bounds are this much wider: MuJoCo wants some inertia in every body, which a
+small machine shows."""
 SMALL: Final = 1e-3
 """A state's efforts are not measured against less than this part of the greatest of all states."""
 
@@ -140,7 +141,8 @@ def certify(
     """Compare a robot with engines that know its plain description only.
 
     :param robot: what is judged.
-    :param description: the same machine as a ``mechanism: machine`` mapping.
+    :param description: the same machine as a ``mechanism: machine`` mapping; of a robot that is
+        loaded it is ``robot.description_data``.
     :param states: how many random states inside the limits.
     :param seed: where the random numbers begin.
     :param engines: names out of ``ENGINES``; what is not installed is told, not raised.
@@ -180,6 +182,11 @@ def certify(
         missing,
         items,
     )
+
+
+def certificate_of(robot: Any, **options: Any) -> Certificate:
+    """As :func:`certify`, with the description that the robot brings."""
+    return certify(robot, robot.description_data, **options)
 
 
 def _own(robot: Any, states: States) -> list[Item]:

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inverse dynamics in maximal coordinates: six for each body, every joint its rows.
 
-All bodies are free; a joint is equations between two of them. A row is made of points and
-directions that move with a body, each with its velocity and the part of its acceleration that
-needs no acceleration of the bodies:
+All bodies are free; a joint is equations between two of them, see ``rows``:
 
     A V = 0,  B V = q',   A V' = -a,  B V' = q'' - b,   T = [A; B]^+ [0; 1]
     tau = T' (M V' + gyroscopic - weight - wrench) + friction + rotors
@@ -29,12 +27,11 @@ from pkm_twin.apps.certificate.description import (
     Body,
     Description,
     Joint,
-    Machine,
     UnfitError,
-    across,
     cross,
     read,
 )
+from pkm_twin.apps.certificate.rows import Jet, Moving
 
 FIRST_STEP: Final = 1.0 / 16.0
 """Part of the way home to goal that the first step goes."""
@@ -43,31 +40,6 @@ FAR: Final = 0.02
 """Longest first correction of a good step, relative to the motion's own size."""
 SINGULAR: Final = 1e-9
 """Least singular value over the greatest: below it the rows do not determine the motion."""
-
-
-class Jet(NamedTuple):
-    """A vector that moves with the bodies."""
-
-    value: Array
-    """Shape (3,)."""
-    columns: Array
-    """Its velocity per body rate, shape (3, 6 bodies)."""
-    rate: Array
-    """Its velocity."""
-    bias: Array
-    """Its acceleration where the bodies' accelerations are zero."""
-
-    def minus(self, other: Jet) -> Jet:
-        """Difference of two."""
-        return Jet(*(a - b for a, b in zip(self, other, strict=True)))
-
-
-class Rows(NamedTuple):
-    """Equations: value = 0, columns V = 0, columns V' + bias = 0."""
-
-    value: Array
-    columns: Array
-    bias: Array
 
 
 @dataclass(frozen=True)
@@ -114,7 +86,7 @@ def skewed(v: Array) -> Array:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-class Maximal:
+class Maximal(Moving):
     """A machine in maximal coordinates.
 
     :raises UnfitError: a description that cannot be read.
@@ -123,7 +95,7 @@ class Maximal:
     name = "maximal"
 
     def __init__(self, description: Description) -> None:
-        self.machine: Final[Machine] = read(description)
+        self.machine = read(description)
         self.names = list(self.machine.bodies)
         self.size = 6 * len(self.names)
         self._coms = np.array([body.com for body in self.machine.bodies.values()])
@@ -164,91 +136,17 @@ class Maximal:
         swing = cross(w, value)
         return Jet(value, columns, swing, cross(w, swing))
 
-    def spin(self, body: str) -> tuple[Array, Array]:
-        """Columns of a body's angular velocity, shape (3, 6 bodies), and the velocity itself."""
+    def spin(self, body: str) -> Jet:
+        """A body's angular velocity; as a vector it is nothing, its value is zero."""
         columns = np.zeros((3, self.size))
         if body == BASE:
-            return columns, np.zeros(3)
+            return self._still(np.zeros(3))
         k = self.names.index(body)
         columns[:, 6 * k + 3 : 6 * k + 6] = np.eye(3)
-        return columns, self._state.velocity[k, 3:]
+        return Jet(np.zeros(3), columns, self._state.velocity[k, 3:], np.zeros(3))
 
     def _still(self, value: Array) -> Jet:
         return Jet(value, np.zeros((3, self.size)), np.zeros(3), np.zeros(3))
-
-    # Rows
-
-    def _joint_rows(self, joint: Joint) -> list[Rows]:
-        inner, outer = joint.inner, joint.outer
-        gap = self.point(outer, joint.at).minus(self.point(inner, joint.at))
-        rows = []
-        if joint.kind in ("revolute", "universal", "spherical", "fixed"):
-            rows.append(Rows(gap.value, gap.columns, gap.bias))
-        if joint.kind in ("prismatic", "cylindrical"):
-            for side in across(joint.axes[0]):
-                rows.append(dot(self.direction(inner, side), gap))
-        if joint.kind in ("revolute", "cylindrical"):
-            axis = self.direction(outer, joint.axes[0])
-            for side in across(joint.axes[0]):
-                rows.append(dot(self.direction(inner, side), axis))
-        if joint.kind in ("prismatic", "fixed", "translation"):
-            for k in range(3):
-                first, second = np.eye(3)[k], np.eye(3)[(k + 1) % 3]
-                rows.append(dot(self.direction(inner, first), self.direction(outer, second)))
-        if joint.kind == "universal":
-            one, other = joint.axes
-            crossed = dot(self.direction(inner, one), self.direction(outer, other))
-            rows.append(crossed._replace(value=crossed.value - one @ other))
-        return rows
-
-    def rates(self, joint: Joint) -> Rows:
-        """Rates of a joint's own axes: columns V are the rates, columns V' + bias their change."""
-        if joint.kind == "prismatic":
-            return self._slide(joint)
-        if joint.kind == "revolute":
-            return self._turning(joint)
-        if joint.kind == "cylindrical":
-            slide, turning = self._slide(joint), self._turning(joint)
-            return stacked([slide, turning])
-        if joint.kind == "universal":
-            # Axis k's rate: the relative turning along what is perpendicular to the other axis.
-            one = self.direction(joint.inner, joint.axes[0]).value
-            other = self.direction(joint.outer, joint.axes[1]).value
-            dual = np.linalg.pinv(np.array([one, other]).T)
-            inner, outer = self.spin(joint.inner)[0], self.spin(joint.outer)[0]
-            return Rows(np.zeros(2), dual @ (outer - inner), np.full(2, np.nan))
-        raise UnfitError(f"joints.{joint.name}: a {joint.kind} joint has no rates of its own")
-
-    def _slide(self, joint: Joint) -> Rows:
-        gap = self.point(joint.outer, joint.at).minus(self.point(joint.inner, joint.at))
-        return dot(self.direction(joint.inner, joint.axes[0]), gap)
-
-    def _turning(self, joint: Joint) -> Rows:
-        axis = self.direction(joint.inner, joint.axes[0])
-        columns, spin = self.spin(joint.outer)
-        inner_columns, inner_spin = self.spin(joint.inner)
-        side, other = across(joint.axes[0])
-        moved = self.direction(joint.outer, side).value
-        cosine = self.direction(joint.inner, side).value @ moved
-        sine = self.direction(joint.inner, other).value @ moved
-        return Rows(
-            np.array([math.atan2(sine, cosine)]),
-            (axis.value @ (columns - inner_columns))[None],
-            np.array([axis.rate @ (spin - inner_spin)]),
-        )
-
-    def closures(self) -> Rows:
-        """All joints' and rods' rows at the present state."""
-        rows = [row for joint in self.machine.joints for row in self._joint_rows(joint)]
-        for rod in self.machine.rods:
-            gap = self.point(rod.outer, rod.ends[1]).minus(self.point(rod.inner, rod.ends[0]))
-            half = dot(gap, gap)
-            rows.append(Rows(half.value / 2 - rod.length**2 / 2, half.columns / 2, half.bias / 2))
-        return stacked(rows, self.size)
-
-    def drives(self) -> Rows:
-        """The actuated joints' rows; the value is the way from home, rad or m."""
-        return stacked([self.rates(joint) for joint in self.machine.actuated], self.size)
 
     def _analyse(self) -> Home:
         closures = self.closures()
@@ -368,7 +266,7 @@ class Maximal:
     def _twist_columns(self) -> Array:
         machine = self.machine
         point = self.point(machine.platform, machine.origin)
-        return np.vstack([point.columns, self.spin(machine.platform)[0]])
+        return np.vstack([point.columns, self.spin(machine.platform).columns])
 
     def _tangent(self) -> Array:
         n = len(self.machine.actuated)
@@ -441,7 +339,7 @@ class Maximal:
     def _mass(self) -> Array:
         total = np.zeros((self.size, self.size))
         for name, body in self._solids():
-            point, (spin, _) = self.point(name, body.com), self.spin(name)
+            point, spin = self.point(name, body.com), self.spin(name).columns
             rotation = self._state.rotation[self.names.index(name)]
             total += body.mass * point.columns.T @ point.columns
             total += spin.T @ (rotation @ body.inertia @ rotation.T) @ spin
@@ -456,10 +354,11 @@ class Maximal:
         gravity = self.machine.gravity
         total = np.zeros(self.size)
         for name, body in self._solids():
-            point, (spin, w) = self.point(name, body.com), self.spin(name)
+            point, spin = self.point(name, body.com), self.spin(name)
             rotation = self._state.rotation[self.names.index(name)]
             total += body.mass * point.columns.T @ (point.bias - gravity)
-            total += spin.T @ cross(w, rotation @ body.inertia @ rotation.T @ w)
+            turning = rotation @ body.inertia @ rotation.T @ spin.rate
+            total += spin.columns.T @ cross(spin.rate, turning)
         for rod in self.machine.rods:
             a, b = self.point(rod.inner, rod.ends[0]), self.point(rod.outer, rod.ends[1])
             one, other = a.bias - gravity, b.bias - gravity
@@ -472,23 +371,3 @@ def drag(joint: Joint, rates: Array) -> Array:
     """Friction's share of the effort at these rates, one a rate, N m or N."""
     result: Array = joint.viscous * rates + joint.coulomb * np.sign(rates)
     return result
-
-
-def dot(a: Jet, b: Jet) -> Rows:
-    """The row a . b."""
-    return Rows(
-        np.array([a.value @ b.value]),
-        (a.value @ b.columns + b.value @ a.columns)[None],
-        np.array([a.value @ b.bias + 2 * a.rate @ b.rate + b.value @ a.bias]),
-    )
-
-
-def stacked(rows: list[Rows], size: int | None = None) -> Rows:
-    """Rows one under another; ``size`` columns where there are none."""
-    if not rows:
-        return Rows(np.zeros(0), np.zeros((0, size or 0)), np.zeros(0))
-    return Rows(
-        np.concatenate([row.value for row in rows]),
-        np.vstack([row.columns for row in rows]),
-        np.concatenate([row.bias for row in rows]),
-    )
