@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The judges beside each other: two engines that share a description and nothing else."""
 
+import importlib
+
 import numpy as np
 import pytest
 from random_machines import FREE, NAMES, plain, variant
@@ -8,35 +10,36 @@ from random_machines import FREE, NAMES, plain, variant
 from pkm_twin.apps.certificate.description import AXES, expand, read
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import random_states
-from pkm_twin.apps.certify import effort_differences, relative
+from pkm_twin.apps.certify import ENGINES, effort_differences, relative
 
-BOUND = 1e-11
-"""Two routes in double precision; the worst over thousands of states is below 1e-12."""
+BOUNDS = {"pinocchio": 1e-11, "mujoco": 1e-8}
+"""Two routes in double precision; MuJoCo's bodies all have some inertia."""
 
 
-def tree(description):
-    pytest.importorskip("pinocchio", reason="Pinocchio is not installed")
-    from pkm_twin.apps.certificate.pinocchio_tree import PinocchioTree
-
-    return PinocchioTree(description)
+def judge_of(engine, description):
+    pytest.importorskip(engine, reason=f"{engine} is not installed")
+    module, kind = ENGINES[engine][0].split(":")
+    return getattr(importlib.import_module(module), kind)(description)
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("number", [0, 1])
-def test_two_routes_agree(name, number):
-    rng = np.random.default_rng([11, NAMES.index(name), number])
-    description = variant(name, rng) if number else plain(name)
-    one, other = Maximal(description), tree(description)
-    states = random_states(one, rng, 1 + number)
-    samples = list(zip(states.q, states.qd, states.qdd, states.wrench, strict=True))
-    got = np.array([one.inverse_dynamics(*sample) for sample in samples])
-    expected = np.array([other.inverse_dynamics(*sample) for sample in samples])
-    assert effort_differences(got, expected).max() < BOUND
-    for q in states.q:
-        for mine, theirs in zip(one.platform(q), other.platform(q), strict=True):
-            assert np.abs(mine - theirs).max() < BOUND
-        assert relative(one.jacobian(q), other.jacobian(q)) < BOUND
-        assert relative(one.mass_matrix(q), other.mass_matrix(q)) < BOUND
+@pytest.mark.parametrize("engine", BOUNDS)
+def test_routes_agree(name, engine):
+    bound = BOUNDS[engine]
+    for number in (0, 1):
+        rng = np.random.default_rng([11, NAMES.index(name), number])
+        description = variant(name, rng) if number else plain(name)
+        one, other = Maximal(description), judge_of(engine, description)
+        states = random_states(one, rng, 1)
+        samples = list(zip(states.q, states.qd, states.qdd, states.wrench, strict=True))
+        got = np.array([one.inverse_dynamics(*sample) for sample in samples])
+        expected = np.array([other.inverse_dynamics(*sample) for sample in samples])
+        assert effort_differences(got, expected).max() < bound
+        for q in states.q:
+            for mine, theirs in zip(one.platform(q), other.platform(q), strict=True):
+                assert np.abs(mine - theirs).max() < 1e-11
+            assert relative(one.jacobian(q), other.jacobian(q)) < 1e-11
+            assert relative(one.mass_matrix(q), other.mass_matrix(q)) < bound
 
 
 @pytest.mark.parametrize("name", NAMES)
