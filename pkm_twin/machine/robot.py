@@ -86,7 +86,7 @@ def check_angles(angle: float, path: str) -> None:
 @remembered
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
-    field = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
+    field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
     entries = [(n, Array, schema.vector(joints, **field)) for n in ("viscous", "coulomb")]
     return dataclasses.make_dataclass("Friction", entries, frozen=True, eq=False)
 
@@ -94,7 +94,7 @@ def friction_of(joints: int) -> Any:
 @remembered
 def limits_of(joints: int) -> Any:
     """Schema of limits of so many actuated joints; absent is None, one value stands for all."""
-    above = {"above": 0.0, "infinite": True, "spread": True, "default": None}
+    above: dict[str, Any] = {"above": 0.0, "infinite": True, "spread": True, "default": None}
     entries = [
         ("position", Any, schema.interval(count=joints, default=None)),
         ("velocity", Any, schema.vector(joints, **above)),

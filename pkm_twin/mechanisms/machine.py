@@ -171,21 +171,13 @@ class JointSpec:
         steps = FREEDOMS[self.type]
         if self.actuated and steps not in ("R", "P"):
             raise ParameterError(f"{path}.actuated", self.type, "a revolute or prismatic joint")
-        for key in ("limits", "drive"):
-            if getattr(self, key) is not None and not self.actuated:
-                raise ParameterError(
-                    f"{path}.{key}", "given", "none for a joint that is not actuated"
-                )
-        if self.rotor_inertia and not self.actuated:
-            raise ParameterError(
-                f"{path}.rotor_inertia", self.rotor_inertia, "0: it is not actuated"
-            )
         if self.rotor_inertia and self.drive is not None:
             raise ParameterError(f"{path}.drive", "given", "either drive or rotor_inertia")
-        if self.friction is not None and steps not in ("R", "P"):
-            raise ParameterError(
-                f"{path}.friction", self.type, "a revolute or prismatic joint, of one freedom"
-            )
+        for key in ("limits", "friction", "rotor_inertia", "drive", "home"):
+            if getattr(self, key) and steps not in ("R", "P"):
+                raise ParameterError(
+                    f"{path}.{key}", self.type, "a revolute or prismatic joint, of one freedom"
+                )
         if steps == "R":
             check_angles(self.home, f"{path}.home")
 
@@ -199,9 +191,11 @@ class JointSpec:
         axes = (
             np.zeros((0, 3)) if rows is None else np.array([unit(r) for r in np.atleast_2d(rows)])
         )
+        inner, outer = self.between
+        at = np.zeros(3) if self.at is None else self.at
         return Joint(
-            name, self.type, *self.between, array(np.zeros(3) if self.at is None else self.at),
-            array(axes), self.actuated, self.home, rub.viscous, rub.coulomb, rotor,
+            name, self.type, inner, outer, array(at), array(axes), self.actuated, self.home,
+            rub.viscous, rub.coulomb, rotor,
         )  # fmt: skip
 
 
@@ -518,7 +512,7 @@ def _graph(data: Mapping[str, Any], specs: Mapping[str, Mapping[str, Any]]) -> G
         else schema.checked(schema.vector(3), "origin", origin)
     )
     joints = {n: j.joint(n, f"joints.{n}") for n, j in specs["joints"].items()}
-    rods = {n: Rod(n, *r.between, r.ends, r.mass) for n, r in specs["rods"].items()}
+    rods = {n: Rod(n, r.between[0], r.between[1], r.ends, r.mass) for n, r in specs["rods"].items()}
     return Graph(bodies, joints, rods, platform, array(place))
 
 
