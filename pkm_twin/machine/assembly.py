@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 ROUNDS: Final = 200
 """Corrections of one closing, and steps towards the zeros."""
+SLOW: Final = 10
+"""Corrections in a row that gain less than 2 %: a minimum that is not zero."""
 STEP: Final = 0.5
 """Largest change of a joint in one correction, rad or m."""
 RANK: Final = 1e-8
@@ -33,8 +35,8 @@ CLOSED: Final = 1e-5
 NEARBY: Final = 0.02
 """How far away from home what is free in general is told from what is free there alone, rad, m."""
 
-SPIN: Final = 1e-4
-"""Centres of mass that move less than this a radian of spin stand still, m."""
+SPIN: Final = 0.05
+"""A part whose centre of mass moves less than this share of the machine a radian only spins."""
 
 
 class Assembly:
@@ -135,21 +137,24 @@ class Assembly:
         """Values that close the loops by least steps of least norm, and the greatest miss left."""
         self.place(values)
         residual, rates = self.residuals()
+        slow = 0
         for _ in range(ROUNDS):
             miss = float(np.linalg.norm(residual))
-            if miss < 1e-15:
+            if miss < 1e-15 or slow > SLOW:
                 break
             step = -np.linalg.lstsq(rates, residual, rcond=RANK)[0]
             step *= min(1.0, STEP / max(float(np.abs(step).max()), 1e-300))
             for _ in range(12):
                 self.place(values + step)
                 residual, rates = self.residuals()
-                if float(np.linalg.norm(residual)) < miss:
+                less = float(np.linalg.norm(residual))
+                if less < miss:
                     break
                 step /= 2
             else:
                 break
             values = values + step
+            slow = slow + 1 if less > 0.98 * miss else 0
         self.place(values)
         residual, _ = self.residuals()
         return values, float(np.abs(residual).max(initial=0.0))
@@ -161,7 +166,7 @@ class Assembly:
         """
         values, miss = self.close(np.zeros(len(self.steps)))
         rng = np.random.default_rng(0)
-        for spread in (0.05, 0.1, 0.2, 0.4, 0.8) * 3:
+        for spread in (0.05, 0.1, 0.2, 0.4, 0.8) * 2:
             if miss <= CLOSED:
                 break
             # Zero may be a place from which no small step helps.
@@ -199,30 +204,33 @@ class Assembly:
     def spins(self, values: Array, held: set[str], platform: str) -> list[str]:
         """Joints that only let a part spin about itself: held, nothing else moves otherwise.
 
-        With the joints ``held`` at rest such a spin moves no centre of mass and no platform: a
-        bar between two ball joints, a pin between two hinges of one axis.
+        With the joints ``held`` at rest such a spin moves no platform and hardly a centre of
+        mass: a bar between two ball joints, a pin between two hinges of one axis.
 
         :param values: a closed assembly, shape (count,).
-        :returns: as many joints as there are spins, none if something else is free as well.
+        :returns: as many joints as there are such spins.
         """
-        loose = [i for i, joint in enumerate(self.steps) if joint not in held]
         rng = np.random.default_rng(1)
         _, miss = self.close(values + rng.uniform(-NEARBY, NEARBY, len(self.steps)))
+        _, rates = self.residuals()
+        # What is in no loop hangs loose and is left to be found so.
+        loose = [i for i, name in enumerate(self.steps) if name not in held and rates[:, i].any()]
         found: list[str] = []
         if miss <= CLOSED and loose:
-            _, rates = self.residuals()
             free = _null(rates[:, loose], RANK)
-            still = []
+            tool = self.links[platform].position
+            turned = np.vstack(self.twist(platform, tool))[:, loose]
+            free = free @ _null(turned @ free, RANK, absolute=True)
+            size = float(np.linalg.norm(np.ptp([p.position for p in self.links.values()], axis=0)))
+            swung = []
             for link in self.urdf.links.values():
-                if link.mass > 0.0 or link.name == platform:
+                if link.mass > 0.0:
                     pose = self.links[link.name]
-                    linear, angular = self.twist(
-                        link.name, pose.rotation @ link.com + pose.position
-                    )
-                    still.append(linear[:, loose])
-                    if link.name == platform:
-                        still.append(angular[:, loose])
-            spins = free @ _null(np.vstack(still) @ free, SPIN, absolute=True)
+                    centre = pose.rotation @ link.com + pose.position
+                    swung.append(self.twist(link.name, centre)[0][:, loose])
+            spins = free
+            if swung:
+                spins = free @ _null(np.vstack(swung) @ free, SPIN * size, absolute=True)
             while spins.shape[1]:
                 single = [
                     float(np.linalg.norm(row)) if self.steps.count(self.steps[i]) == 1 else 0.0

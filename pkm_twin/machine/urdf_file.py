@@ -148,10 +148,8 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
         for end in ("parent", "child")
     )
     origin = urdf_xml.origin(element.find("origin"), where)
-    if kind in ("fixed", "spherical"):
-        axes = []
-    else:
-        axes = [urdf_xml.axis(element, "axis", where)]
+    bare = kind in ("fixed", "spherical")
+    axes = [] if bare else [urdf_xml.axis(element, "axis", where)]
     limits: dict[str, Any] = {}
     limit = element.find("limit")
     if limit is not None and kind in ("revolute", "continuous", "prismatic"):
