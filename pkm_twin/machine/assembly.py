@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.rotations import about
 from pkm_twin.machine.urdf_file import Joint, Urdf
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
@@ -78,7 +79,7 @@ class Assembly:
                 self.axes.append(pose.rotation @ axis)
                 self._points.append(pose.position)
                 if self._kinds[i] == "R":
-                    pose = pose @ Pose(rotation=_about(axis, values[i]))
+                    pose = pose @ Pose(rotation=about(axis, values[i]))
                 else:
                     pose = pose @ Pose(position=axis * values[i])
             self.links[joint.child] = pose
@@ -264,13 +265,6 @@ def _steps(joint: Joint) -> list[tuple[str, Array]]:
         return [("R", axis) for axis in np.eye(3)]
     kind = "P" if joint.type == "prismatic" else "R"
     return [(kind, axis) for axis in joint.axes]
-
-
-def _about(axis: Array, angle: float) -> Array:
-    x, y, z = axis
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned: Array = np.eye(3) + math.sin(angle) * skew + (1.0 - math.cos(angle)) * skew @ skew
-    return turned
 
 
 def _between(first: Array, second: Array) -> Array:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
+from pkm_twin.machine.rotations import from_rpy
 
 Array = NDArray[np.float64]
 
@@ -145,19 +146,7 @@ def origin(element: ET.Element | None, where: str) -> Pose:
             f"{where}.rpy: {angles.tolist()}; a URDF is in radians, does it say degrees?",
             stacklevel=5,
         )
-    return Pose(rotation(angles), position)
-
-
-def rotation(angles: Array) -> Array:
-    """Rz(yaw) Ry(pitch) Rx(roll)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
+    return Pose(from_rpy(angles), position)
 
 
 def vector(text: str | None, where: str, size: int) -> Array:
