@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema, urdf_loops, urdf_xml
 from pkm_twin.machine.urdf_loops import Closure
-from pkm_twin.machine.urdf_xml import Pose
+from pkm_twin.machine.urdf_xml import UNLIMITED, Pose
 
 Array = NDArray[np.float64]
 
@@ -153,7 +153,7 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     limits: dict[str, Any] = {}
     limit = element.find("limit")
     if limit is not None and kind in ("revolute", "continuous", "prismatic"):
-        limits = _limits(limit, where, bounded=kind != "continuous")
+        limits = _limits(limit, where, kind)
     viscous = coulomb = 0.0
     for tag in ("dynamics", "joint_properties"):
         dynamics = element.find(tag)
@@ -167,25 +167,30 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     )
 
 
-def _limits(limit: ET.Element, where: str, bounded: bool) -> dict[str, Any]:
-    """What is stated; a range of no width and rates and efforts of zero are empty entries."""
+def _limits(limit: ET.Element, where: str, kind: str) -> dict[str, Any]:
+    """What is stated; no width and zero are empty entries, what is far off is no limit either."""
     limits: dict[str, Any] = {}
-    if bounded and (limit.get("lower") or limit.get("upper")):
+    if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
         low, high = (
-            urdf_xml.number(limit.get(end, "0"), f"{where}.limit.{end}")
-            for end in ("lower", "upper")
+            _bound(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper")
         )
         if low > high:
             raise ParameterError(f"{where}.limit", [low, high], "lower below upper")
-        if low < high:
+        if low < high and (low > -UNLIMITED[kind] or high < UNLIMITED[kind]):
             limits["position"] = [low, high]
     for key in ("velocity", "effort"):
-        text = limit.get(key, "0")
-        endless = text.strip().lower() in ("inf", "+inf", "infinity")
-        value = 0.0 if endless else urdf_xml.positive(text, f"{where}.limit.{key}")
-        if value > 0.0:
+        value = _bound(limit.get(key, "0"), f"{where}.limit.{key}")
+        if value < 0.0:
+            raise ParameterError(f"{where}.limit.{key}", value, "zero or more")
+        if 0.0 < value < UNLIMITED[key]:
             limits[key] = value
     return limits
+
+
+def _bound(text: str, where: str) -> float:
+    """A limit, which alone of all numbers may be infinite."""
+    endless = text.strip().lower().lstrip("+-") in ("inf", "infinity")
+    return float(text) if endless else urdf_xml.number(text, where)
 
 
 def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:

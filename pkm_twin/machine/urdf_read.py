@@ -61,10 +61,8 @@ def read_urdf(
     ground = urdf.root if base is None else base
     if ground not in urdf.links:
         raise UnknownNameError("base", ground, urdf.links)
-    bodies = _bodies(urdf, tool, ground)
-    if bodies[tool] == GROUND:
-        raise ParameterError("platform", tool, "a link that can move")
     assembly = Assembly(urdf)
+    bodies = _bodies(urdf, assembly.order, tool, ground)
     values, miss = assembly.nearest()
     if miss > EXACT:
         warnings.warn(f"{path}: the loops close within {miss:.1g} only (m or rad)", stacklevel=2)
@@ -124,18 +122,21 @@ def _platform(urdf: Urdf, asked: str | None) -> str:
     )
 
 
-def _bodies(urdf: Urdf, tool: str, ground: str) -> dict[str, str]:
-    """Each link's body: named by its link nearest to the root, the tool's by the tool."""
+def _bodies(urdf: Urdf, order: list[Joint], tool: str, ground: str) -> dict[str, str]:
+    """Each link's body, named by its link nearest to the root; the tool's is named by the tool.
+
+    :raises ParameterError: the tool is fixed to the ground.
+    """
     group = {name: name for name in urdf.links}
-    for joint in Assembly(urdf).order:
+    for joint in order:
         if joint.type == "fixed":
             group[joint.child] = group[joint.parent]
+    if group[tool] == group[ground]:
+        raise ParameterError("platform", tool, "a link that can move")
     names = {group[ground]: GROUND}
-    names.setdefault(group[tool], tool)
-    for first in group.values():
-        # A moving link may have the ground's name.
-        name = first
-        while first not in names and (name == GROUND or name in names.values()):
+    for first, wanted in ((group[tool], tool), *((first, first) for first in group.values())):
+        name = wanted
+        while first not in names and name in names.values():
             name += "_"
         names.setdefault(first, name)
     return {link: names[first] for link, first in group.items()}

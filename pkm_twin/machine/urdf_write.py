@@ -6,7 +6,7 @@ at home, and a joint at home has the value ``home``. Loops that the tree cuts ar
 elements (urdfdom pull request 264), which parsers of trees pass over; ``cylindrical_joint`` and
 ``translation_joint`` are additions to that proposal.
 
-May import: numpy, the standard library, the rotations.
+May import: numpy, the standard library, the rotations, the bounds of what is read.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.machine import rotations
+from pkm_twin.machine.urdf_xml import UNLIMITED
 
 Array = NDArray[np.float64]
 
@@ -28,8 +29,6 @@ GROUND: Final = "base_link"
 """The root link's name."""
 PLATFORM: Final = "platform"
 """The link that stands on the platform's reference point."""
-UNLIMITED: Final = {"revolute": 2.0 * math.pi, "prismatic": 10.0, "rate": 1e6, "effort": 1e6}
-"""What stands for no limit, where a URDF needs a number: rad, m, per second, N m or N."""
 CLOSURES: Final = {
     "revolute": "revolute_joint",
     "prismatic": "prismatic_joint",
@@ -196,7 +195,7 @@ def _joint(robot: ET.Element, joint: UrdfJoint, places: dict[str, Array]) -> Non
         "limit",
         lower=_text([low]),
         upper=_text([high]),
-        velocity=_text([UNLIMITED["rate"] if joint.velocity is None else joint.velocity]),
+        velocity=_text([UNLIMITED["velocity"] if joint.velocity is None else joint.velocity]),
         effort=_text([UNLIMITED["effort"] if joint.effort is None else joint.effort]),
     )
     if joint.damping or joint.friction:
