@@ -89,6 +89,7 @@ setup(
             "types-PyYAML",
             "wheel",
             "xarray",
+            "yourdfpy",
         ],
         "atlas": ["h5netcdf", "h5py", "plotly", "threadpoolctl", "xarray"],
         "cluster": ["dask[distributed]"],

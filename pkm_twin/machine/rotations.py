@@ -43,6 +43,8 @@ def to_rpy(rotation: Array) -> Array:
 
 def across(axis: Array) -> Array:
     """A unit vector across another one, shape (3,)."""
-    side = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    # Rounded, so that of two equal components the last bit does not choose.
+    least = int(np.argmin(np.round(np.abs(axis), 9)))
+    side = np.cross(axis, np.eye(3)[least])
     vector: Array = side / np.linalg.norm(side)
     return vector

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import urdf_file
-from pkm_twin.machine.assembly import Assembly
+from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.urdf_file import Joint, Urdf
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
@@ -39,8 +39,6 @@ PLATFORMS: Final = (
 """Names of links that are taken for the platform, the first that is there."""
 GROUND: Final = "base"
 """The ground's name in a description."""
-EXACT: Final = 1e-9
-"""Loops that miss by more are told, m or rad."""
 
 
 def read_urdf(
@@ -93,12 +91,6 @@ def read_urdf(
             if closure.axes is not None and closure.type == "universal":
                 second = view @ assembly.frame(closure, 1)
                 joints[closure.name]["axes"][1] = _snapped(second.rotation @ closure.axes[1])
-    left = [n for n in passive if urdf.joints[n].viscous > 0.0 or urdf.joints[n].coulomb > 0.0]
-    if left:
-        warnings.warn(
-            f"{path}: friction is of actuated joints only, left out of: {', '.join(left)}",
-            stacklevel=2,
-        )
     return {
         "mechanism": "machine",
         "platform": bodies[tool],
@@ -169,7 +161,7 @@ def _joint(
     )
     if limits:
         data["limits"] = limits
-    if actuated and (joint.viscous > 0.0 or joint.coulomb > 0.0):
+    if "axis" in data and (joint.viscous > 0.0 or joint.coulomb > 0.0):
         data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
     return data
 

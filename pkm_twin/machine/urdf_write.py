@@ -155,16 +155,22 @@ def _inertial(link: ET.Element, body: UrdfBody, place: Array) -> None:
 
 
 def _visuals(link: ET.Element, place: Array, capsules: Iterable[UrdfCapsule]) -> None:
+    round_ends: list[Array] = []
     for capsule in capsules:
         along = capsule.end - capsule.start
         length = float(np.linalg.norm(along))
         radius = _text([capsule.radius])
         shapes = [("sphere", capsule.start, "0 0 0"), ("sphere", capsule.end, "0 0 0")]
         if length > 0.0:
-            x, y, z = along / length
+            # Snapped, so that an angle does not hang on the sign of what is nearly zero.
+            x, y, z = np.round(along / length, 12) + 0.0
             turned = _text([0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)])
             shapes.insert(0, ("cylinder", (capsule.start + capsule.end) / 2, turned))
         for shape, centre, rpy in shapes:
+            if shape == "sphere" and any(np.array_equal(centre, other) for other in round_ends):
+                continue
+            if shape == "sphere":
+                round_ends.append(centre)
             visual = ET.SubElement(link, "visual")
             ET.SubElement(visual, "origin", xyz=_text(centre - place), rpy=rpy)
             geometry = ET.SubElement(visual, "geometry")
@@ -231,6 +237,6 @@ def _control(robot: ET.Element, tree: UrdfTree) -> None:
             ET.SubElement(element, "state_interface", name=interface)
 
 
-def _text(values: Iterable[float], least: float = 1e-15) -> str:
-    """Numbers to 15 digits, so that the last bit of another machine's arithmetic is not seen."""
-    return " ".join(f"{value:.15g}" if abs(value) > least else "0" for value in values)
+def _text(values: Iterable[float], least: float = 1e-12) -> str:
+    """Numbers to 12 digits, so that the last bits of another machine's arithmetic do not show."""
+    return " ".join(f"{value:.12g}" if abs(value) > least else "0" for value in values)
