@@ -17,18 +17,38 @@ from pkm_twin.machine.rotations import about, across
 
 Array = NDArray[np.float64]
 
+BASE: Final = "base"
+"""The ground's name in a description."""
 STEPS: Final = {
     "fixed": (),
     "revolute": ("",),
     "prismatic": ("",),
-    "cylindrical": ("slide", "turn"),
-    "universal": ("a", "b"),
+    "cylindrical": ("1", "2"),
+    "universal": ("1", "2"),
     "spherical": ("x", "y", "z"),
     "translation": ("x", "y", "z"),
+    "free": ("px", "py", "pz", "x", "y", "z"),
 }
 """What the single joints of a type are called after its name."""
 Motion = tuple[Array, Array]
 """Rotation (..., 3, 3) and shift (..., 3), m, that bring a point from home: ``R x + t``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """One single joint: ``kind`` R or P, or nothing if fixed; ``axis`` (3,) and ``point`` (3,) m.
+
+    ``inner``, ``outer``: bodies or rods of the description, or massless links between.
+    ``joint``: the joint or rod it is one axis of.
+    """
+
+    name: str
+    kind: str
+    axis: Array
+    point: Array
+    inner: str
+    outer: str
+    joint: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +69,21 @@ class Row:
     kinds: str
     axes: Array
     home: float
+
+    @property
+    def single(self) -> list[Axis]:
+        """The single joints, with links of their names between them."""
+        if not self.names:
+            nowhere = np.zeros(3)
+            return [Axis(self.source, "", nowhere, self.point, self.inner, self.outer, self.source)]
+        between = [f"{name}_link" for name in self.names[:-1]]
+        links = [self.inner, *between, self.outer]
+        return [
+            Axis(name, kind, axis, self.point, links[i], links[i + 1], self.source)
+            for i, (name, kind, axis) in enumerate(
+                zip(self.names, self.kinds, self.axes, strict=True)
+            )
+        ]
 
     def values(self, inner: Motion, outer: Motion) -> Array:
         """The joints' values in given motions of the two, shape (..., count), rad and m."""
@@ -91,40 +126,29 @@ def joint_row(description: Mapping[str, Any], name: str, inner: str, outer: str)
     return Row(name, kind, inner, outer, point, names, kinds, axes, home)
 
 
-def ball_row(source: str, inner: str, outer: str, point: Array) -> Row:
-    """The row of a rod's ball joint on whose far side the next body hangs."""
-    names = tuple(f"{source}_{end}" for end in STEPS["spherical"])
-    return Row(source, "spherical", inner, outer, point, names, "RRR", np.eye(3), 0.0)
+def free_row(body: str, com: Array) -> Row:
+    """The row of a body that no joint reaches: three slides and three turns from the ground."""
+    names = tuple(f"{body}_free_{end}" for end in STEPS["free"])
+    axes = np.concatenate([np.eye(3), np.eye(3)])
+    return Row(f"{body}_free", "free", BASE, body, com, names, "PPPRRR", axes, 0.0)
 
 
-def rod_row(name: str, rod: Mapping[str, Any], inner: str) -> Row:
-    """A rod on two hinges across it; with the rod they are a right-handed frame."""
+def rod_row(name: str, rod: Mapping[str, Any]) -> Row:
+    """A rod on two hinges across it at its inner end; with the rod they are right-handed."""
     start, end = (np.array(end, dtype=float) for end in rod["ends"])
-    if inner != rod["between"][0]:
-        start, end = end, start
     along = (end - start) / np.linalg.norm(end - start)
     first = across(along)
-    return Row(
-        name,
-        "rod",
-        inner,
-        name,
-        start,
-        (f"{name}_a", f"{name}_b"),
-        "RR",
-        np.array([first, np.cross(along, first)]),
-        0.0,
-    )
+    axes = np.array([first, np.cross(along, first)])
+    names = (f"{name}_1", f"{name}_2")
+    return Row(name, "rod", rod["between"][0], name, start, names, "RR", axes, 0.0)
 
 
 def rod_motion(row: Row, rod: Mapping[str, Any], known: Mapping[str, Motion]) -> Motion:
     """How a rod moves that does not turn about itself, from the motions of its two bodies."""
-    a, b = rod["between"]
-    ends = [np.array(end, dtype=float) for end in rod["ends"]]
-    far, end = (b, ends[1]) if row.inner == a else (a, ends[0])
-    inner = known[row.inner]
+    inner, outer = (known[body] for body in rod["between"])
     start = _moved(inner, row.point)
-    along = np.einsum("...ji,...j->...i", inner[0], _moved(known[far], end) - start)
+    end = _moved(outer, np.array(rod["ends"][1], dtype=float))
+    along = np.einsum("...ji,...j->...i", inner[0], end - start)
     along = along / np.linalg.norm(along, axis=-1)[..., None]
     first, second = row.axes
     turned = np.arctan2(-(along @ second), along @ np.cross(first, second))

@@ -1,33 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A description of ``mechanism: machine`` as a tree of links with one axis a joint.
+"""A description and the single joints of its tree as what the URDF writer takes.
 
-Joints of several freedoms become rows of revolute and prismatic joints with massless links
-between them, rods become links, what the tree cuts becomes closures. The same rows tell the values
-of the URDF's joints from the motions of the bodies.
-
-May import: numpy, the URDF writer.
+May import: numpy, the URDF writer, the rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError
-from pkm_twin.machine.urdf_rows import (
-    Motion,
-    Row,
-    axes_of,
-    ball_row,
-    joint_row,
-    point_of,
-    rod_motion,
-    rod_row,
-)
+from pkm_twin.machine.urdf_rows import BASE, Array, axes_of, point_of
 from pkm_twin.machine.urdf_write import (
     GROUND,
     PLATFORM,
@@ -38,187 +23,110 @@ from pkm_twin.machine.urdf_write import (
     UrdfTree,
 )
 
-Array = NDArray[np.float64]
-
-BASE: Final = "base"
-"""The ground's name in a description."""
-FREEDOMS: Final = {
-    "fixed": 0,
-    "revolute": 1,
-    "prismatic": 1,
-    "cylindrical": 2,
-    "universal": 2,
-    "spherical": 3,
-    "translation": 3,
-    "rod": 5,
-}
 BAR: Final = 0.01
 """Radius of the bars that stand for bodies, per size of the machine."""
+PAYLOAD: Final = "payload"
+"""The link of a payload, apart from the platform's."""
+KINDS: Final = {"R": "revolute", "P": "prismatic", "": "fixed"}
 
 
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """A machine's rows from the ground outwards; ``cut``: joints and rods whose loops they open.
-
-    ``names``: the single joints, in the order of their rows.
-    """
-
-    description: Mapping[str, Any]
-    rows: tuple[Row, ...]
-    cut: tuple[str, ...]
+class SingleJoint(Protocol):
+    """One axis of the tree, see :class:`pkm_twin.machine.urdf_rows.Axis`."""
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The single joints' names, from the ground outwards, the actuated ones among them."""
-        return tuple(name for row in self.rows for name in row.names)
-
-    def values(self, motions: Mapping[str, Motion]) -> Array:
-        """The single joints' values, shape (..., count), rad and m.
-
-        :param motions: of every body but the ground.
-        """
-        first = next(iter(motions.values()))
-        known: dict[str, Motion] = {
-            BASE: (np.broadcast_to(np.eye(3), first[0].shape), np.zeros_like(first[1])),
-            **motions,
-        }
-        rods = self.description.get("rods", {})
-        found = []
-        for row in self.rows:
-            if row.type == "rod":
-                known[row.outer] = rod_motion(row, rods[row.source], known)
-            found.append(row.values(known[row.inner], known[row.outer]))
-        return np.concatenate(found, axis=-1)
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def kind(self) -> str: ...  # noqa: D102
+    @property
+    def axis(self) -> Array: ...  # noqa: D102
+    @property
+    def point(self) -> Array: ...  # noqa: D102
+    @property
+    def inner(self) -> str: ...  # noqa: D102
+    @property
+    def outer(self) -> str: ...  # noqa: D102
+    @property
+    def joint(self) -> str: ...  # noqa: D102
 
 
-def layout(description: Mapping[str, Any], tree: Sequence[str] | None = None) -> Layout:
-    """The rows of a description whose limbs are written out.
+def urdf_tree(
+    description: Mapping[str, Any],
+    axes: Sequence[SingleJoint],
+    cut: Iterable[str],
+    name: str,
+    capsules: Sequence[UrdfCapsule] | None = None,
+) -> UrdfTree:
+    """What :func:`pkm_twin.machine.urdf_write.write_urdf` takes.
 
-    :param tree: the joints and rods of the spanning tree; default those of the fewest freedoms,
-        the actuated joints first.
-    :raises ParameterError: a tree that does not reach a body, or leaves an actuated joint out.
+    :param description: limbs written out; a payload becomes a link of its own.
+    :param axes: the single joints of the tree; names of links between bodies are free.
+    :param cut: joints, and rods at their outer ends, that close the loops.
+    :param capsules: bars to look at, by bodies' names; default from joint to joint of each body.
     """
     joints, rods = description["joints"], description.get("rods", {})
-    edges = {name: (joint["type"], joint["between"]) for name, joint in joints.items()}
-    edges |= {name: ("rod", rod["between"]) for name, rod in rods.items()}
-    chosen = _spanning(description, edges) if tree is None else list(tree)
-    cut = [name for name in edges if name not in chosen]
-    for name in cut:
-        if joints.get(name, {}).get("actuated"):
-            raise ParameterError(f"joints.{name}", name, "actuated joints in the tree")
-    rows: list[Row] = []
-    reached, waiting = [BASE], chosen
-    for body in reached:
-        for name in [n for n in waiting if body in edges[n][1]]:
-            waiting = [n for n in waiting if n != name]
-            a, b = edges[name][1]
-            other = b if a == body else a
-            if other in reached:
-                raise ParameterError(f"tree.{name}", list(tree or ()), "a tree without loops")
-            reached.append(other)
-            if name in rods:
-                rows.append(rod_row(name, rods[name], body))
-                at = np.array(rods[name]["ends"][int(a == body)], dtype=float)
-                rows.append(ball_row(name, name, other, at))
-            else:
-                rows.append(joint_row(description, name, body, other))
-    for body in description["bodies"]:
-        if body not in reached:
-            raise ParameterError(f"bodies.{body}", body, "a body that the tree reaches")
-    rows += [rod_row(name, rods[name], rods[name]["between"][0]) for name in cut if name in rods]
-    return Layout(description, tuple(rows), tuple(cut))
-
-
-def urdf_tree(plan: Layout, name: str) -> UrdfTree:
-    """What :func:`pkm_twin.machine.urdf_write.write_urdf` takes, with bars to look at."""
-    description = plan.description
-    joints, rods = description["joints"], description.get("rods", {})
-    links = _link_names([BASE, *description["bodies"], *rods])
+    known = [BASE, *description["bodies"], *rods]
+    links = _link_names([*known, *(axis.outer for axis in axes)])
+    counts = Counter(axis.joint for axis in axes)
     bodies: list[UrdfBody] = []
     singles: list[UrdfJoint] = []
-    for row in plan.rows:
-        joint = {} if row.type == "rod" or row.source in rods else joints[row.source]
+    for axis in axes:
+        alone = axis.joint in joints and counts[axis.joint] == 1
+        joint = joints[axis.joint] if alone else {}
         limits, friction = joint.get("limits", {}), joint.get("friction", {})
-        parent = links[row.inner]
-        for i, single in enumerate(row.names or (row.source,)):
-            last = i + 1 >= len(row.names)
-            child = links[row.outer] if last else f"{single}_link"
-            if not last:
-                bodies.append(UrdfBody(child, 0.0, row.point, np.zeros((3, 3))))
-            alone = len(row.names) == 1
-            position = limits.get("position") if alone else None
-            singles.append(
-                UrdfJoint(
-                    single,
-                    {"R": "revolute", "P": "prismatic", "": "fixed"}[row.kinds[i : i + 1]],
-                    parent,
-                    child,
-                    row.point,
-                    row.axes[i] if row.names else np.zeros(3),
-                    row.home if i == 0 else 0.0,
-                    None if position is None else (float(position[0]), float(position[1])),
-                    limits.get("velocity") if alone else None,
-                    limits.get("effort") if alone else None,
-                    float(friction.get("viscous", 0.0)) if alone else 0.0,
-                    float(friction.get("coulomb", 0.0)) if alone else 0.0,
-                    bool(joint.get("actuated", False)),
-                )
+        position = limits.get("position")
+        singles.append(
+            UrdfJoint(
+                axis.name,
+                KINDS[axis.kind],
+                links[axis.inner],
+                links[axis.outer],
+                axis.point,
+                axis.axis,
+                float(joint.get("home", 0.0)),
+                None if position is None else (float(position[0]), float(position[1])),
+                limits.get("velocity"),
+                limits.get("effort"),
+                float(friction.get("viscous", 0.0)),
+                float(friction.get("coulomb", 0.0)),
+                bool(joint.get("actuated", False)),
             )
-            parent = child
-        bodies.append(_body(description, row.outer, links))
+        )
+        if axis.outer in known:
+            bodies.append(_body(description, axis.outer, links))
+        else:
+            bodies.append(UrdfBody(links[axis.outer], 0.0, axis.point, np.zeros((3, 3))))
+    platform, origin = str(description["platform"]), _origin(description)
     payload = description.get("payload", {})
-    origin = _origin(description)
-    platform = str(description["platform"])
     if payload.get("mass", 0.0):
         com = origin + np.array(payload.get("com", [0.0, 0.0, 0.0]), dtype=float)
-        bodies.append(UrdfBody("payload", payload["mass"], com, _tensor(payload.get("inertia"))))
-        at = np.zeros(3)
-        singles.append(UrdfJoint("payload_frame", "fixed", links[platform], "payload", com, at))
-    closures = []
-    for source in plan.cut:
-        if source in rods:
-            rod = rods[source]
-            end = np.array(rod["ends"][1], dtype=float)
-            outer = links[rod["between"][1]]
-            none = np.zeros((0, 3))
-            closures.append(
-                UrdfClosure(f"{source}_end", "spherical", links[source], outer, end, none)
-            )
-        else:
-            joint = joints[source]
-            a, b = joint["between"]
-            point = point_of(description, joint)
-            closures.append(
-                UrdfClosure(source, joint["type"], links[a], links[b], point, axes_of(joint))
-            )
-    capsules = _capsules(description, links)
+        bodies.append(UrdfBody(PAYLOAD, payload["mass"], com, _tensor(payload.get("inertia"))))
+        singles.append(
+            UrdfJoint(f"{PAYLOAD}_frame", "fixed", links[platform], PAYLOAD, com, np.zeros(3))
+        )
+    if capsules is None:
+        capsules = _capsules(description)
     return UrdfTree(
-        name, tuple(bodies), tuple(singles), tuple(closures), capsules, links[platform], origin
+        name,
+        tuple(bodies),
+        tuple(singles),
+        tuple(_closure(description, source, links) for source in cut),
+        tuple(UrdfCapsule(links[c.body], c.start, c.end, c.radius) for c in capsules),
+        links[platform],
+        origin,
     )
 
 
-def _spanning(
-    description: Mapping[str, Any], edges: Mapping[str, tuple[str, Sequence[str]]]
-) -> list[str]:
-    """Kruskal: actuated joints first, then the fewest freedoms."""
-    group = {body: body for body in (BASE, *description["bodies"])}
-
-    def root(body: str) -> str:
-        while group[body] != body:
-            body = group[body]
-        return body
-
-    def rank(name: str) -> tuple[bool, int]:
-        actuated = description["joints"].get(name, {}).get("actuated", False)
-        return not actuated, FREEDOMS[edges[name][0]]
-
-    chosen = []
-    for name in sorted(edges, key=rank):
-        a, b = (root(body) for body in edges[name][1])
-        if a != b:
-            group[a] = b
-            chosen.append(name)
-    return chosen
+def _closure(description: Mapping[str, Any], source: str, links: Mapping[str, str]) -> UrdfClosure:
+    rods = description.get("rods", {})
+    if source in rods:
+        rod = rods[source]
+        end = np.array(rod["ends"][1], dtype=float)
+        inner, outer = links[source], links[rod["between"][1]]
+        return UrdfClosure(f"{source}_end", "spherical", inner, outer, end, np.zeros((0, 3)))
+    joint = description["joints"][source]
+    inner, outer = (links[body] for body in joint["between"])
+    point = point_of(description, joint)
+    return UrdfClosure(source, joint["type"], inner, outer, point, axes_of(joint))
 
 
 def _body(description: Mapping[str, Any], name: str, links: Mapping[str, str]) -> UrdfBody:
@@ -234,7 +142,7 @@ def _body(description: Mapping[str, Any], name: str, links: Mapping[str, str]) -
     return UrdfBody(links[name], mass, (start + end) / 2.0, inertia)
 
 
-def _capsules(description: Mapping[str, Any], links: Mapping[str, str]) -> tuple[UrdfCapsule, ...]:
+def _capsules(description: Mapping[str, Any]) -> list[UrdfCapsule]:
     """Rods as they are; a body as bars from one of its joints to the others."""
     rods = description.get("rods", {})
     spots: dict[str, list[Array]] = {body: [] for body in description["bodies"]}
@@ -250,23 +158,23 @@ def _capsules(description: Mapping[str, Any], links: Mapping[str, str]) -> tuple
     points = [point for found in spots.values() for point in found]
     radius = BAR * float(np.linalg.norm(np.ptp(points, axis=0)))
     bars = [
-        UrdfCapsule(links[body], found[0], point, radius)
+        UrdfCapsule(body, found[0], point, radius)
         for body, found in spots.items()
         for point in found[1:]
         if float(np.linalg.norm(point - found[0])) > radius
     ]
     for name, rod in rods.items():
         start, end = (np.array(end, dtype=float) for end in rod["ends"])
-        bars.append(UrdfCapsule(links[name], start, end, radius / 2.0))
-    return tuple(bars)
+        bars.append(UrdfCapsule(name, start, end, radius / 2.0))
+    return bars
 
 
 def _link_names(names: Sequence[str]) -> dict[str, str]:
-    """A link for each body, apart from the two names that every file has."""
+    """A link for each name, apart from those that the file has of its own."""
     links = {BASE: GROUND}
     for name in names:
         link = name
-        while name not in links and link in (GROUND, PLATFORM, "payload", *links.values()):
+        while name not in links and link in (GROUND, PLATFORM, PAYLOAD, *links.values()):
             link += "_body"
         links.setdefault(name, link)
     return links

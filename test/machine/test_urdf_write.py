@@ -15,8 +15,9 @@ import pytest
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import urdf_file
 from pkm_twin.machine.assembly import Assembly
+from pkm_twin.machine.urdf_layout import layout
 from pkm_twin.machine.urdf_read import read_urdf
-from pkm_twin.machine.urdf_tree import layout, urdf_tree
+from pkm_twin.machine.urdf_tree import urdf_tree
 from pkm_twin.machine.urdf_write import write_urdf
 
 from .descriptions import DESCRIPTIONS, five_bar, rod_delta
@@ -30,7 +31,11 @@ def description(request):
 
 
 def text(description, tree=None):
-    return write_urdf(urdf_tree(layout(description, tree), "machine"))
+    return write_urdf(tree_of(description, layout(description, tree)))
+
+
+def tree_of(description, plan):
+    return urdf_tree(description, plan.axes, plan.cut, "machine")
 
 
 def total(description):
@@ -113,7 +118,7 @@ def test_the_layout_tells_the_joint_values_of_closed_assemblies(description, tmp
     plan = layout(description)
     path = tmp_path / "machine.urdf"
     path.write_text(text(description))
-    tree = urdf_tree(plan, "machine")
+    tree = tree_of(description, plan)
     points = {joint.child: joint.point for joint in tree.joints}
     links = {
         row.outer: next(j.child for j in tree.joints if j.name == (row.names or (row.source,))[-1])
@@ -199,8 +204,9 @@ def test_a_given_tree_is_followed_and_a_wrong_one_refused():
     assert [row.outer for row in plan.rows] == ["arm_1", "arm_2", "fore", "tool"]
     with pytest.raises(ParameterError, match=r"joints.right.*actuated joints in the tree"):
         layout(five_bar(), ["left", "elbow_1", "tip", "elbow_2"])
-    with pytest.raises(ParameterError, match=r"bodies.fore"):
-        layout(five_bar(), ["left", "right", "elbow_2"])
+    free = layout(five_bar(), ["left", "right", "elbow_2"])
+    assert free.names[-6:] == tuple(f"fore_free_{c}" for c in ("px", "py", "pz", "x", "y", "z"))
+    assert free.cut == ("elbow_1", "tip")
     with pytest.raises(ParameterError, match="without loops"):
         layout(five_bar(), ["left", "right", "elbow_1", "elbow_2", "tip"])
 
