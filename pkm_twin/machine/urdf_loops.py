@@ -35,6 +35,14 @@ CONSTRAINTS: Final = {
     "fixed": "fixed",
     "link": "fixed",  # a link that was cut in two
 }
+PARTS: Final = (
+    "parent",
+    "parent_origin",
+    "parent_axis",
+    "child",
+    "child_origin",
+    "child_axis",
+)
 LOOPS: Final = {
     name: CONSTRAINTS[name]
     for name in ("revolute", "continuous", "prismatic", "fixed", "spherical")
@@ -83,6 +91,9 @@ def _constraint(element: ET.Element, name: str, links: Sequence[str]) -> Closure
     kind = (element.get("type") or "").removesuffix("_joint")
     if kind not in CONSTRAINTS:
         raise UnknownNameError(f"{where}.type", element.get("type"), CONSTRAINTS)
+    urdf_xml.only(element, where, PARTS)
+    for end in ("parent", "child"):
+        urdf_xml.only(element.find(end), f"{where}.{end}", ())
     ends = tuple(
         urdf_xml.reference(element.find(e), f"{where}.{e}", links) for e in ("parent", "child")
     )
@@ -102,9 +113,11 @@ def _loop(element: ET.Element, name: str, links: Sequence[str]) -> Closure:
     kind = element.get("type")
     if kind not in LOOPS:
         raise UnknownNameError(f"{where}.type", kind, LOOPS)
+    urdf_xml.only(element, where, ("predecessor", "successor", "sucessor", "axis"))
     ends, frames = [], []
     for tags in (("predecessor",), ("successor", "sucessor")):
         end = next((e for tag in tags if (e := element.find(tag)) is not None), None)
+        urdf_xml.only(end, f"{where}.{tags[0]}", ("origin",))
         ends.append(urdf_xml.reference(end, f"{where}.{tags[0]}", links))
         origin = None if end is None else end.find("origin")
         frames.append(urdf_xml.origin(origin, f"{where}.{tags[0]}"))

@@ -145,7 +145,7 @@ def _inertial(link: ET.Element, body: UrdfBody, place: Array) -> None:
     # Also where there is no mass: some simulators take a kilogram for what is not said.
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=_text(body.com - place), rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=_text([body.mass]))
+    ET.SubElement(inertial, "mass", value=f"{body.mass:.15g}")
     keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     upper = body.inertia[np.triu_indices(3)]
     # Rounding that turned axes leave behind says nothing.

@@ -10,7 +10,7 @@ import math
 import stat
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Container, Iterable
+from collections.abc import Collection, Container, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -111,6 +111,16 @@ def name(element: ET.Element, taken: Container[str]) -> str:
     if own in taken:
         raise ParameterError(f"{kind}.{own}", own, "a name that stands once")
     return own
+
+
+def only(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
+    """No child element but these; a misspelt one would be taken for a missing one.
+
+    :raises UnknownNameError: another child, with the closest of these.
+    """
+    for child in element if element is not None else ():
+        if child.tag not in tags and ":" not in child.tag:
+            raise UnknownNameError(where, child.tag, tags)
 
 
 def reference(element: ET.Element | None, where: str, links: Iterable[str]) -> str:

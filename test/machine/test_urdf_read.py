@@ -280,6 +280,22 @@ REFUSED = {
         '<constraint name="k" type="sphercal"/></robot>',
         "constraint.k.type.*did you mean 'spherical'",
     ),
+    "closure's part": (
+        "</robot>",
+        '<constraint name="k" type="link"><parent_orgin xyz="0 0 1"/></constraint></robot>',
+        "constraint.k: 'parent_orgin'.*did you mean 'parent_origin'",
+    ),
+    "closure's nested part": (
+        "</robot>",
+        '<constraint name="k" type="link"><parent link="bob"><origin/></parent></constraint>'
+        "</robot>",
+        "constraint.k.parent: 'origin'",
+    ),
+    "loop's part": (
+        "</robot>",
+        '<loop name="k" type="revolute"><origin/></loop></robot>',
+        "loop.k: 'origin'",
+    ),
     "loop's type": ("</robot>", '<loop name="k" type="planar"/></robot>', "loop.k.type"),
     "closure's link": (
         "</robot>",
