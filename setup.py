@@ -95,6 +95,7 @@ setup(
         "cluster": ["dask[distributed]"],
         "bags": ["pin", "PyNiteFEA"],
         "certificate": ["mpmath", "mujoco", "pin", "pytest", "scipy"],
+        "mjcf": ["mujoco"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },
     entry_points={

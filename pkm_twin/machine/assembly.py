@@ -271,6 +271,8 @@ def _order(urdf: Urdf) -> list[Joint]:
 def _steps(joint: Joint) -> list[tuple[str, Array]]:
     if joint.type == "spherical":
         return [("R", axis) for axis in np.eye(3)]
+    if joint.type == "free":
+        return [(kind, axis) for kind in "PR" for axis in np.eye(3)]
     kind = "P" if joint.type == "prismatic" else "R"
     return [(kind, axis) for axis in joint.axes]
 

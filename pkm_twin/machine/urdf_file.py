@@ -42,7 +42,8 @@ class Link:
 class Joint:
     """A joint of the tree; ``axes``: unit vectors, shape (count, 3), joint frame.
 
-    ``limits``: those of position, velocity and effort that the file states.
+    ``type``: also ``free``, of a body that closures alone hold. ``limits``: those of position,
+    velocity and effort that the file states. ``rotor_inertia``: kg m2 or kg.
     """
 
     name: str
@@ -54,11 +55,12 @@ class Joint:
     limits: dict[str, Any]
     viscous: float
     coulomb: float
+    rotor_inertia: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Urdf:
-    """A file's content; ``root``: the link that has no parent."""
+    """A file's content; ``root``: the link that has no parent; ``gravity``: m/s2, if it tells."""
 
     name: str
     root: str
@@ -66,14 +68,15 @@ class Urdf:
     joints: dict[str, Joint]
     closures: tuple[Closure, ...]
     actuated: tuple[str, ...]
+    gravity: list[float] | None = None
 
 
-def read(path: Path) -> Urdf:
-    """Read a URDF file with its closures.
+def read(path: Path, robot: ET.Element) -> Urdf:
+    """The links, joints and closures of a URDF file.
 
+    :param robot: the file's top element; the path is for what stands beside the file.
     :raises ParameterError: not readable, not a URDF, or an element that is refused, by name.
     """
-    robot = urdf_xml.elements(path)
     if robot.tag != "robot":
         raise ParameterError(str(path), f"<{robot.tag}>", "a <robot> element at the top")
     if any(str(child.tag).startswith("xacro:") for child in robot):

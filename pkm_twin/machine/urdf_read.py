@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A URDF with its loop closures as the plain data of a ``mechanism: machine`` description.
+"""A URDF or MJCF with its loop closures as plain data of a ``mechanism: machine`` description.
 
-May import: numpy, the URDF file's parts, the assembly.
+May import: numpy, the files' parts, the assembly.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.machine import urdf_file
+from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.urdf_file import Joint, Urdf
 from pkm_twin.machine.urdf_loops import Closure
@@ -46,6 +46,8 @@ def read_urdf(
 ) -> dict[str, Any]:
     """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
 
+    A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package.
+
     Links that fixed joints hold together are one body. Home is the assembly nearest to the zeros
     of the joints; ``home`` of a joint is its value there, so that joint values are the URDF's.
 
@@ -54,7 +56,8 @@ def read_urdf(
     :raises ParameterError: a file, element or name that is refused, by its name.
     """
     path = Path(path)
-    urdf = urdf_file.read(path)
+    top = urdf_xml.elements(path)
+    urdf = mjcf_file.read(path) if top.tag == "mujoco" else urdf_file.read(path, top)
     tool = _platform(urdf, platform)
     ground = urdf.root if base is None else base
     if ground not in urdf.links:
@@ -80,6 +83,8 @@ def read_urdf(
     passive = [n for n, j in urdf.joints.items() if j.type != "fixed" and n not in urdf.actuated]
     for name in (*urdf.actuated, *passive):
         joint = urdf.joints[name]
+        if joint.type == "free":
+            continue
         joints[name] = _joint(joint, bodies, places, axes[name], home[name], name in urdf.actuated)
         if name in spins:
             joints[name] = {k: joints[name][k] for k in ("between", "at")} | {"type": "fixed"}
@@ -91,8 +96,10 @@ def read_urdf(
             if closure.axes is not None and closure.type == "universal":
                 second = view @ assembly.frame(closure, 1)
                 joints[closure.name]["axes"][1] = _snapped(second.rotation @ closure.axes[1])
+    gravity = {} if urdf.gravity is None else {"gravity": urdf.gravity}
     return {
         "mechanism": "machine",
+        **gravity,
         "platform": bodies[tool],
         "origin": _snapped(places[tool].position),
         "bodies": _masses(urdf, bodies, places),
@@ -163,6 +170,8 @@ def _joint(
         data["limits"] = limits
     if "axis" in data and (joint.viscous > 0.0 or joint.coulomb > 0.0):
         data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
+    if actuated and joint.rotor_inertia > 0.0:
+        data["rotor_inertia"] = joint.rotor_inertia
     return data
 
 

@@ -13,7 +13,7 @@ import pinocchio as pin
 import pytest
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine import urdf_file
+from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.machine.assembly import Assembly
 from pkm_twin.machine.urdf_layout import layout
 from pkm_twin.machine.urdf_read import read_urdf
@@ -97,7 +97,7 @@ def data_q(model, plan, values):
 
 def closed_states(path, count, spread=0.1):
     """Closed assemblies about home: the tree's values by name, and each link's pose."""
-    urdf = urdf_file.read(path)
+    urdf = urdf_file.read(path, urdf_xml.elements(path))
     assembly = Assembly(urdf)
     rng = np.random.default_rng(3)
     start = []
