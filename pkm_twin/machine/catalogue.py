@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from pathlib import Path
 from typing import Final
@@ -52,5 +53,4 @@ def load(robot: str | Path) -> Robot:
         raise UnknownNameError("mechanism", mechanism, CATALOGUE)
     module, kind = CATALOGUE[mechanism].split(":")
     result: Robot = schema.build(getattr(importlib.import_module(module), kind), data)
-    result.__dict__["_name"] = path.stem
-    return result
+    return dataclasses.replace(result, name=path.stem)

@@ -250,7 +250,8 @@ def build(kind: type[T], data: object, path: str = "") -> T:
     """
     if not isinstance(data, Mapping):
         raise ParameterError(path or "parameters", data, "a mapping of keys to values")
-    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    # A field without a check is no key of the file.
+    fields = {f.name: f for f in dataclasses.fields(kind) if "check" in f.metadata}  # type: ignore[arg-type]
     for key in data:
         if key not in fields:
             raise UnknownNameError(_join(path, str(key)), key, fields)
