@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -52,12 +52,21 @@ class UrdfBody:
 
 
 @dataclass(frozen=True, eq=False)
+class UrdfDrive:
+    """Limits of a joint, None where there is none, and its friction per rate and dry."""
+
+    position: tuple[float, float] | None = None
+    velocity: float | None = None
+    effort: float | None = None
+    damping: float = 0.0
+    friction: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class UrdfJoint:
     """A joint of the tree, one axis or none: ``point`` (3,) m and ``axis`` (3,), base axes at home.
 
-    ``type``: revolute, prismatic or fixed. ``home``: its value at home. ``position``: limits or
-    None, ``velocity`` and ``effort``: greatest or None. ``damping`` and ``friction``: per rate,
-    and dry.
+    ``type``: revolute, prismatic or fixed. ``home``: its value at home.
     """
 
     name: str
@@ -67,11 +76,7 @@ class UrdfJoint:
     point: Array
     axis: Array
     home: float = 0.0
-    position: tuple[float, float] | None = None
-    velocity: float | None = None
-    effort: float | None = None
-    damping: float = 0.0
-    friction: float = 0.0
+    drive: UrdfDrive = field(default_factory=UrdfDrive)
     actuated: bool = False
 
 
@@ -194,19 +199,19 @@ def _joint(robot: ET.Element, joint: UrdfJoint, places: dict[str, Array]) -> Non
     if joint.type == "fixed":
         return
     ET.SubElement(element, "axis", xyz=_text(joint.axis))
-    free = UNLIMITED[joint.type]
-    low, high = joint.position or (-free, free)
+    free, drive = UNLIMITED[joint.type], joint.drive
+    low, high = drive.position or (-free, free)
     ET.SubElement(
         element,
         "limit",
         lower=_text([low]),
         upper=_text([high]),
-        velocity=_text([UNLIMITED["velocity"] if joint.velocity is None else joint.velocity]),
-        effort=_text([UNLIMITED["effort"] if joint.effort is None else joint.effort]),
+        velocity=_text([UNLIMITED["velocity"] if drive.velocity is None else drive.velocity]),
+        effort=_text([UNLIMITED["effort"] if drive.effort is None else drive.effort]),
     )
-    if joint.damping or joint.friction:
+    if drive.damping or drive.friction:
         ET.SubElement(
-            element, "dynamics", damping=_text([joint.damping]), friction=_text([joint.friction])
+            element, "dynamics", damping=_text([drive.damping]), friction=_text([drive.friction])
         )
 
 

@@ -3,7 +3,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+
+from pkm_twin.machine.graph import Body, Graph, Joint, Rod, array
+from pkm_twin.machine.robot_urdf import single_joints
+from pkm_twin.machine.tree import Tree
+from pkm_twin.machine.urdf_tree import urdf_tree
+from pkm_twin.machine.urdf_write import UrdfBody, UrdfDrive
 
 
 def turned(angle, vector):
@@ -191,3 +199,60 @@ DESCRIPTIONS = {
     "stewart": stewart,
     "slides": slides,
 }
+
+
+def graph_of(data):
+    bodies = {}
+    for name, part in data["bodies"].items():
+        inertia = np.array(part["inertia"])
+        inertia = np.diag(inertia) if inertia.ndim == 1 else inertia
+        bodies[name] = Body(name, part["mass"], array(part["com"]), array(inertia))
+    joints = {}
+    for name, j in data["joints"].items():
+        axes = np.reshape(j.get("axes", j.get("axis", [])), (-1, 3))
+        at = j.get("at", data["bodies"].get(j["between"][1], {"com": [0.0] * 3})["com"])
+        friction = j.get("friction", {})
+        joints[name] = Joint(
+            name,
+            j["type"],
+            *j["between"],
+            array(at),
+            array(axes),
+            j.get("actuated", False),
+            j.get("home", 0.0),
+            friction.get("viscous", 0.0),
+            friction.get("coulomb", 0.0),
+        )
+    rods = {
+        name: Rod(name, *r["between"], array(r["ends"]), r["mass"])
+        for name, r in data.get("rods", {}).items()
+    }
+    platform = data["platform"]
+    origin = array(data.get("origin", data["bodies"][platform]["com"]))
+    return Graph(bodies, joints, rods, platform, origin)
+
+
+def tree_of(data):
+    """The tree that is written, its single joints' names and their values at home."""
+    graph = graph_of(data)
+    tree = Tree(graph)
+    axes = single_joints(SimpleNamespace(graph=graph, tree=tree))
+    drives = {}
+    for name, j in data["joints"].items():
+        if j.get("actuated"):
+            limits, friction = j.get("limits", {}), j.get("friction", {})
+            position = limits.get("position")
+            drives[name] = UrdfDrive(
+                None if position is None else tuple(position),
+                limits.get("velocity"),
+                limits.get("effort"),
+                friction.get("viscous", 0.0),
+                friction.get("coulomb", 0.0),
+            )
+    load = data.get("payload")
+    if load is not None:
+        load = UrdfBody("payload", load["mass"], array(load["com"]), np.diag(load["inertia"]))
+    written = urdf_tree(graph, axes, tree.cut, "machine", drives=drives, payload=load)
+    names = [axis.name for axis in axes if axis.kind]
+    homes = [data["joints"].get(name, {}).get("home", 0.0) for name in names]
+    return written, names, np.array(homes)

@@ -12,15 +12,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from pkm_twin.errors import ParameterError
 from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.machine.assembly import Assembly
-from pkm_twin.machine.urdf_layout import layout
 from pkm_twin.machine.urdf_read import read_urdf
-from pkm_twin.machine.urdf_tree import urdf_tree
 from pkm_twin.machine.urdf_write import write_urdf
 
-from .descriptions import DESCRIPTIONS, five_bar, rod_delta
+from .descriptions import DESCRIPTIONS, five_bar, rod_delta, tree_of
 
 GOLDEN = Path(__file__).with_name("five_bar.urdf")
 
@@ -30,12 +27,8 @@ def description(request):
     return DESCRIPTIONS[request.param]()
 
 
-def text(description, tree=None):
-    return write_urdf(tree_of(description, layout(description, tree)))
-
-
-def tree_of(description, plan):
-    return urdf_tree(description, plan.axes, plan.cut, "machine")
+def text(description):
+    return write_urdf(tree_of(description)[0])
 
 
 def total(description):
@@ -48,37 +41,36 @@ def pinocchio(content):
     return model, model.createData()
 
 
-def home_of(description, plan):
-    joints = description["joints"]
-    return np.array([joints.get(name, {}).get("home", 0.0) for name in plan.names])
+def configuration(model, names, values):
+    q = np.zeros(model.nq)
+    for name, value in zip(names, values, strict=True):
+        q[model.joints[model.getJointId(name)].idx_q] = value
+    return q
 
 
 def frames(model, data, names, values):
     """Placements of all links with the joints at these values."""
-    q = np.zeros(model.nq)
-    for name, value in zip(names, values, strict=True):
-        q[model.joints[model.getJointId(name)].idx_q] = value
-    pin.framesForwardKinematics(model, data, q)
+    pin.framesForwardKinematics(model, data, configuration(model, names, values))
     return {f.name: data.oMf[i] for i, f in enumerate(model.frames) if f.type == pin.BODY}
 
 
 def test_pinocchio_reads_the_tree_and_its_whole_mass(description):
-    plan = layout(description)
+    _, names, _ = tree_of(description)
     model, _ = pinocchio(text(description))
-    assert model.nq == model.nv == len(plan.names)
-    assert sum(i.mass for i in model.inertias) == pytest.approx(total(description), rel=1e-11)
+    assert model.nq == model.nv == len(names)
+    assert sum(i.mass for i in model.inertias) == pytest.approx(total(description), rel=1e-13)
 
 
 def test_at_home_every_link_is_parallel_to_the_base_and_every_body_in_place(description):
-    plan = layout(description)
+    _, names, homes = tree_of(description)
     model, data = pinocchio(text(description))
-    at = frames(model, data, plan.names, home_of(description, plan))
+    at = frames(model, data, names, homes)
     for place in at.values():
         np.testing.assert_allclose(place.rotation, np.eye(3), atol=1e-11)
     platform = description["bodies"][description["platform"]]
     origin = description.get("origin", platform["com"])
     np.testing.assert_allclose(at["platform"].translation, origin, atol=1e-11)
-    com = pin.centerOfMass(model, data, data_q(model, plan, home_of(description, plan)))
+    com = pin.centerOfMass(model, data, configuration(model, names, homes))
     parts = [(b["mass"], b["com"]) for b in description["bodies"].values()]
     parts += [(r["mass"], np.mean(r["ends"], axis=0)) for r in description.get("rods", {}).values()]
     if "payload" in description:
@@ -88,59 +80,22 @@ def test_at_home_every_link_is_parallel_to_the_base_and_every_body_in_place(desc
     np.testing.assert_allclose(com, expected, atol=1e-11)
 
 
-def data_q(model, plan, values):
-    q = np.zeros(model.nq)
-    for name, value in zip(plan.names, values, strict=True):
-        q[model.joints[model.getJointId(name)].idx_q] = value
-    return q
-
-
-def closed_states(path, count, spread=0.1):
-    """Closed assemblies about home: the tree's values by name, and each link's pose."""
-    urdf = urdf_file.read(path, urdf_xml.elements(path))
-    assembly = Assembly(urdf)
-    rng = np.random.default_rng(3)
-    start = []
-    for name in assembly.steps:
-        start.append(START.get(name, 0.0))
-    for _ in range(count):
-        values, miss = assembly.close(np.array(start) + rng.uniform(-spread, spread, len(start)))
-        assert miss < 1e-12
-        yield dict(zip(assembly.steps, values, strict=True)), dict(assembly.links)
-
-
 START = {f"rail_{i}": 0.6 for i in range(3)} | {f"leg_{i}": 0.7 for i in range(6)}
 START |= {"left": 0.4, "elbow_2": -0.3}
 
 
-def test_the_layout_tells_the_joint_values_of_closed_assemblies(description, tmp_path):
-    """Bodies' motions in, joint values out, and Pinocchio puts the platform back in its place."""
-    plan = layout(description)
+def test_the_loops_close_about_home(description, tmp_path):
     path = tmp_path / "machine.urdf"
     path.write_text(text(description))
-    tree = tree_of(description, plan)
-    points = {joint.child: joint.point for joint in tree.joints}
-    links = {
-        row.outer: next(j.child for j in tree.joints if j.name == (row.names or (row.source,))[-1])
-        for row in plan.rows
-    }
-    model, data = pinocchio(path.read_text())
-    motions = {body: ([], []) for body in description["bodies"]}
-    states = list(closed_states(path, 6))
-    for _, poses in states:
-        for body, (rotations, shifts) in motions.items():
-            pose = poses[links[body]]
-            rotations.append(pose.rotation)
-            shifts.append(pose.position - pose.rotation @ points[links[body]])
-    motions = {body: (np.array(r), np.array(s)) for body, (r, s) in motions.items()}
-    found = plan.values(motions)
-    assert found.shape == (6, len(plan.names))
-    for (values, poses), row in zip(states, found, strict=True):
-        np.testing.assert_allclose(row, [values[name] for name in plan.names], atol=1e-10)
-        at = frames(model, data, plan.names, row)
-        tool = poses["platform"]
-        np.testing.assert_allclose(at["platform"].translation, tool.position, atol=1e-10)
-        np.testing.assert_allclose(at["platform"].rotation, tool.rotation, atol=1e-10)
+    urdf = urdf_file.read(path, urdf_xml.elements(path))
+    assembly = Assembly(urdf)
+    start = np.array([START.get(name, 0.0) for name in assembly.steps])
+    assembly.place(start)
+    assert np.abs(assembly.residuals()[0]).max() < 1e-11
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        _, miss = assembly.close(start + rng.uniform(-0.1, 0.1, len(start)))
+        assert miss < 1e-12
 
 
 def test_what_is_read_back_is_the_same_machine(description, tmp_path):
@@ -198,19 +153,6 @@ def test_limits_friction_and_interfaces_stand_in_the_file():
     assert robot.find("link[@name='base_link']").find("inertial") is None
 
 
-def test_a_given_tree_is_followed_and_a_wrong_one_refused():
-    plan = layout(five_bar(), ["left", "right", "elbow_1", "tip"])
-    assert plan.cut == ("elbow_2",)
-    assert [row.outer for row in plan.rows] == ["arm_1", "arm_2", "fore", "tool"]
-    with pytest.raises(ParameterError, match=r"joints.right.*actuated joints in the tree"):
-        layout(five_bar(), ["left", "elbow_1", "tip", "elbow_2"])
-    free = layout(five_bar(), ["left", "right", "elbow_2"])
-    assert free.names[-6:] == tuple(f"fore_free_{c}" for c in ("px", "py", "pz", "x", "y", "z"))
-    assert free.cut == ("elbow_1", "tip")
-    with pytest.raises(ParameterError, match="without loops"):
-        layout(five_bar(), ["left", "right", "elbow_1", "elbow_2", "tip"])
-
-
 def test_the_text_is_the_same_byte_for_byte():
     assert text(five_bar()) == GOLDEN.read_text()
 
@@ -235,9 +177,8 @@ def test_yourdfpy_reads_it(description, tmp_path):
     robot = yourdfpy.URDF.load(str(path))
     assert robot.validate()
     assert robot.base_link == "base_link"
-    plan = layout(description)
-    home = home_of(description, plan)
-    robot.update_cfg(dict(zip(plan.names, home, strict=True)))
+    _, names, homes = tree_of(description)
+    robot.update_cfg(dict(zip(names, homes, strict=True)))
     origin = description.get("origin", description["bodies"][description["platform"]]["com"])
     place = robot.get_transform("platform")
     np.testing.assert_allclose(place[:3, 3], origin, atol=1e-7)
