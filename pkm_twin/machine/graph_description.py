@@ -19,21 +19,23 @@ def graph_description(graph: Graph) -> dict[str, Any]:
     Two rods that are taken as one are told as one: what they hold beside, a joint of the graph
     holds already.
     """
-    return {
+    data: dict[str, Any] = {
         "mechanism": "machine",
         "platform": graph.platform,
         "origin": _numbers(graph.origin),
         "bodies": {name: _body(body) for name, body in graph.bodies.items()},
         "joints": {name: _joint(joint) for name, joint in graph.joints.items()},
-        "rods": {
+    }
+    if graph.rods:
+        data["rods"] = {
             name: {
                 "between": [rod.inner, rod.outer],
                 "ends": [_numbers(end) for end in rod.ends],
                 "mass": rod.mass,
             }
             for name, rod in graph.rods.items()
-        },
-    }
+        }
+    return data
 
 
 def _body(body: Body) -> dict[str, Any]:

@@ -59,10 +59,10 @@ def describe_machine_yaml(data: Mapping[str, Any]) -> str:
     keys = sorted(data, key=lambda key: order.index(key) if key in order else len(order))
     lines = [HEAD]
     for key in keys:
-        if key in SECTIONS and isinstance(data[key], Mapping):
+        if key in SECTIONS and data[key] and isinstance(data[key], Mapping):
             lines.append(f"\n{SECTIONS[key]}{key}:\n")
             lines += [_entry(name, value, "  ") for name, value in data[key].items()]
-        elif key in SECTIONS:
+        elif key in SECTIONS and data[key]:
             lines.append(f"\n{SECTIONS[key]}{key}:\n")
             for item in data[key]:
                 entries = "".join(_entry(name, value, "    ") for name, value in item.items())
@@ -74,7 +74,7 @@ def describe_machine_yaml(data: Mapping[str, Any]) -> str:
             lines.append(f"{line}  # {note}\n" if note else f"{line}\n")
     if "pose" not in data:
         at = 1 + sum(key in ("mechanism", "gravity", "platform", "origin") for key in keys)
-        lines.insert(at, f"# pose: [x, y, z]  # {NOTES['pose']}\n")
+        lines.insert(at, f"# pose: [x, y, z]  # for example; {NOTES['pose']}\n")
     return "".join(lines)
 
 

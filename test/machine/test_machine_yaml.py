@@ -41,6 +41,7 @@ def test_hard_names_and_numbers(tmp_path):
         "platform": "yes",
         "bodies": {"toe_b_1/2": {"mass": 1e-9, "com": values}, "3": {}, "a, b": {"mass": np.pi}},
         "joints": {"on": {"between": ["a, b", "no"], "actuated": True}},
+        "rods": {},
         "limbs": [{"azimuths": [0.0, 1.5], "bodies": {"x": {"mass": 1.0}}}],
     }
     assert read_back(data, tmp_path) == data
