@@ -16,6 +16,7 @@ setup(
     packages=[
         "pkm_twin",
         "pkm_twin.apps",
+        "pkm_twin.apps.certificate",
         "pkm_twin.atlas",
         "pkm_twin.bags",
         "pkm_twin.codegen",

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 from pathlib import Path
 from typing import Final
@@ -14,6 +13,7 @@ from pkm_twin.machine.robot import Robot
 
 CATALOGUE: Final = {
     "delta": "pkm_twin.mechanisms.delta:Delta",
+    "machine": "pkm_twin.mechanisms.machine:Machine",
     "prru": "pkm_twin.mechanisms.prru:Prru",
     "upr_rpu": "pkm_twin.mechanisms.upr_rpu:UprRpu",
 }
@@ -52,5 +52,5 @@ def load(robot: str | Path) -> Robot:
     if not isinstance(mechanism, str) or mechanism not in CATALOGUE:
         raise UnknownNameError("mechanism", mechanism, CATALOGUE)
     module, kind = CATALOGUE[mechanism].split(":")
-    result: Robot = schema.build(getattr(importlib.import_module(module), kind), data)
-    return dataclasses.replace(result, name=path.stem)
+    robot: type[Robot] = getattr(importlib.import_module(module), kind)
+    return robot.from_data(data, path.stem)
