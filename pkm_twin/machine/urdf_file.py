@@ -179,8 +179,9 @@ def _limits(limit: ET.Element, where: str, kind: str) -> dict[str, Any]:
         )
         if low > high:
             raise ParameterError(f"{where}.limit", [low, high], "lower below upper")
-        if low < high and (low > -UNLIMITED[kind] or high < UNLIMITED[kind]):
-            limits["position"] = [low, high]
+        far = UNLIMITED[kind]
+        if low < high and (low > -far or high < far):
+            limits["position"] = [max(low, -far), min(high, far)]
     for key in ("velocity", "effort"):
         value = _bound(limit.get(key, "0"), f"{where}.limit.{key}")
         if value < 0.0:

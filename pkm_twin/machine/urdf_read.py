@@ -163,11 +163,8 @@ def _joint(
         value = round(home, 14)
         if value != 0.0:
             data["home"] = value
-    limits = (
-        joint.limits if actuated else {k: joint.limits[k] for k in joint.limits if k == "position"}
-    )
-    if limits:
-        data["limits"] = limits
+    if actuated and joint.limits:
+        data["limits"] = joint.limits
     if "axis" in data and (joint.viscous > 0.0 or joint.coulomb > 0.0):
         data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
     if actuated and joint.rotor_inertia > 0.0:

@@ -72,7 +72,6 @@ def urdf_tree(
                 axis.axis,
                 0.0 if joint is None else joint.home,
                 drive,
-                joint is not None and joint.actuated,
             )
         )
         bodies.append(_body(graph, axis, links[axis.outer]))
@@ -96,6 +95,7 @@ def urdf_tree(
         tuple(singles),
         tuple(closures),
         tuple(_bars(graph, links)),
+        graph.actuated,
         links[graph.platform],
         graph.origin,
     )

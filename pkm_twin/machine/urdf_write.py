@@ -77,7 +77,6 @@ class UrdfJoint:
     axis: Array
     home: float = 0.0
     drive: UrdfDrive = field(default_factory=UrdfDrive)
-    actuated: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +105,8 @@ class UrdfCapsule:
 class UrdfTree:
     """A machine as a tree of links; joints from the ground outwards, each child once.
 
-    ``platform``: the body that carries the tool; ``origin``: its reference point at home, (3,).
+    ``actuated``: joints, in the robot's order. ``platform``: the body that carries the tool;
+    ``origin``: its reference point at home, (3,).
     """
 
     name: str
@@ -114,6 +114,7 @@ class UrdfTree:
     joints: tuple[UrdfJoint, ...]
     closures: tuple[UrdfClosure, ...]
     capsules: tuple[UrdfCapsule, ...]
+    actuated: tuple[str, ...]
     platform: str
     origin: Array
 
@@ -230,14 +231,13 @@ def _control(robot: ET.Element, tree: UrdfTree) -> None:
     control = ET.SubElement(robot, "ros2_control", name=tree.name, type="system")
     hardware = ET.SubElement(control, "hardware")
     ET.SubElement(hardware, "plugin").text = "mock_components/GenericSystem"
-    for joint in tree.joints:
-        if not joint.actuated:
-            continue
-        element = ET.SubElement(control, "joint", name=joint.name)
+    home = {joint.name: joint.home for joint in tree.joints}
+    for name in tree.actuated:
+        element = ET.SubElement(control, "joint", name=name)
         for interface in ("position", "effort"):
             ET.SubElement(element, "command_interface", name=interface)
         position = ET.SubElement(element, "state_interface", name="position")
-        ET.SubElement(position, "param", name="initial_value").text = _text([joint.home])
+        ET.SubElement(position, "param", name="initial_value").text = _text([home[name]])
         for interface in ("velocity", "effort"):
             ET.SubElement(element, "state_interface", name=interface)
 

@@ -8,8 +8,10 @@ import sys
 import numpy as np
 import pytest
 
+from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.urdf_read import read_urdf
+from pkm_twin.mechanisms.machine import Machine
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -134,6 +136,29 @@ def test_a_body_on_a_free_joint_is_held_by_closures_alone(tmp_path):
     held = [n for n, j in data["joints"].items() if "platform" in j["between"]]
     assert held == [f"h{i}" for i in range(6)]
     assert {data["joints"][n]["type"] for n in held} == {"spherical"}
+
+
+def test_it_is_a_machine_of_the_engine(tmp_path):
+    robot = Machine.from_data(read_urdf(save(tmp_path, hexapod()), platform="tool"), "hexapod")
+    assert robot.mobility == "6: x, y, z, roll, pitch, yaw"
+    weight = inverse_dynamics(robot, robot.inverse(robot.home()), np.zeros(6), np.zeros(6))
+    np.testing.assert_allclose(robot.forward(robot.inverse(robot.home())), robot.home(), atol=1e-12)
+    # Virtual work: the rate at which gravity's work grows with each slide.
+    step = 1e-6
+    for k in range(6):
+        q = robot.inverse(robot.home())
+        up, down = (total_height(robot, q + s * step * np.eye(6)[k]) for s in (1, -1))
+        assert weight[k] == pytest.approx(9.81 * (up - down) / (2 * step), abs=1e-5)
+
+
+def total_height(robot, q):
+    """Sum of mass times height, kg m."""
+    rotations, origins = robot.placements(q)
+    total = 0.0
+    for name, body in robot.graph.bodies.items():
+        arm = body.com - robot.engine.tree.at[name]
+        total += body.mass * (origins[name] + rotations[name] @ arm)[2]
+    return total
 
 
 def test_a_weld_and_a_lock_hold(tmp_path):

@@ -7,9 +7,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
 from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.machine.robot_urdf import robot_description, robot_urdf
+from pkm_twin.machine.urdf_read import read_urdf
+from pkm_twin.mechanisms.machine import Machine
 
 from .sketches import closure_rows
 
@@ -93,3 +96,27 @@ def test_the_description_has_all_that_the_graph_has(robot):
     if limits is not None:
         first = data["joints"][robot.joint_names[0]]
         assert first["limits"]["position"] == limits[0].tolist()
+
+
+def test_read_back_it_needs_the_same_efforts(robot, states, tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot_urdf(robot))
+    again = Machine.from_data(read_urdf(path), "again")
+    assert again.joint_names == robot.joint_names
+    rng = np.random.default_rng(6)
+    qd, qdd = rng.normal(size=(2, *states.shape))
+    wrench = rng.normal(size=(len(states), 6))
+    expected = inverse_dynamics(robot, states, qd, qdd, wrench)
+    found = inverse_dynamics(again, states, qd, qdd, wrench)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(again.platform(states)[0], robot.platform(states)[0], atol=1e-9)
+
+
+def test_described_it_needs_the_same_efforts(robot, states):
+    again = Machine.from_data(robot_description(robot), "again")
+    rng = np.random.default_rng(7)
+    qd, qdd = rng.normal(size=(2, *states.shape))
+    expected = inverse_dynamics(robot, states, qd, qdd)
+    np.testing.assert_allclose(
+        inverse_dynamics(again, states, qd, qdd), expected, rtol=1e-9, atol=1e-9
+    )
