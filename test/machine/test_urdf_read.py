@@ -473,3 +473,32 @@ def sketch_home(robot, model, data, ends):
 def test_load_takes_a_urdf(sketch, tmp_path):
     robot = load(str(sketch.save(tmp_path)), platform="platform")
     assert list(robot.joint_names) == sketch.actuated
+
+
+WORDS = ["nan", "inf", "-1", "", "1e400", "1e-320", "1e18", "0 0 0", "fixed", "spherical", "base"]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_files_are_read_or_refused_by_name(tmp_path):
+    rng = np.random.default_rng(8)
+    good = 0
+    path = tmp_path / "damaged.urdf"
+    for _ in range(400):
+        content = bytearray((SMALL, five_bar().urdf()[0])[rng.integers(2)].encode())
+        for _ in range(rng.integers(1, 3)):
+            at = int(rng.integers(len(content)))
+            how = rng.integers(4)
+            if how == 0:
+                content[at] = rng.integers(256)
+            elif how == 1:
+                del content[at : at + int(rng.integers(1, 40))]
+            else:
+                start = content.find(b'="', at) + 2
+                content[start : content.find(b'"', start)] = rng.choice(WORDS).encode()
+        path.write_bytes(bytes(content))
+        try:
+            read_urdf(path)
+            good += 1
+        except ParameterError as error:
+            assert "\n" not in str(error)
+    assert good > 0
