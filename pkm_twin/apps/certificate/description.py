@@ -114,11 +114,17 @@ class Machine:
 
     def of(self, rotation: Array, position: Array) -> Array:
         """Pose coordinates of the platform's place, shape (m,), m and rad."""
-        roll = math.atan2(rotation[2, 1], rotation[2, 2])
-        pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[2, 1], rotation[2, 2]))
-        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
-        full = dict(zip(POSE_NAMES, (*position, roll, pitch, yaw), strict=True))
+        full = dict(zip(POSE_NAMES, (*position, *angles(rotation)), strict=True))
         return np.array([full[name] for name in self.pose])
+
+
+def angles(rotation: Array) -> tuple[float, float, float]:
+    """Roll, pitch and yaw of R = Rz(yaw) Ry(pitch) Rx(roll), rad."""
+    return (
+        math.atan2(rotation[2, 1], rotation[2, 2]),
+        math.atan2(-rotation[2, 0], math.hypot(rotation[2, 1], rotation[2, 2])),
+        math.atan2(rotation[1, 0], rotation[0, 0]),
+    )
 
 
 def vector(value: Any) -> Array:

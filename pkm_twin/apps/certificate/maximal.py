@@ -23,11 +23,13 @@ import numpy as np
 
 from pkm_twin.apps.certificate.description import (
     BASE,
+    POSE_NAMES,
     Array,
     Body,
     Description,
     Joint,
     UnfitError,
+    angles,
     cross,
     read,
 )
@@ -54,6 +56,9 @@ class State:
     """Velocity of the centre, angular velocity, shape (bodies, 6), m/s and rad/s."""
     least: float = 1.0
     """Least singular value over the greatest on the way from home, relative to home's."""
+    pose: float = 1.0
+    """Least determinant of the pose's rates by the joints', relative to home's: at zero the pose
+    folds over and no longer tells the joint state."""
 
 
 class Home(NamedTuple):
@@ -175,10 +180,13 @@ class Maximal(Moving):
         if self.home.condition < SINGULAR:
             raise UnfitError("the actuated joints do not determine the machine at home")
         state, gone, step, least = self._start, 0.0, FIRST_STEP, 1.0
+        folds = []
         while gone < 1.0:
             step = min(step, 1.0 - gone)
             self._state = state
-            state = replace(state, velocity=self._rates_of(way))
+            tangent = self._tangent()
+            folds.append(self._fold(tangent))
+            state = replace(state, velocity=(tangent @ way).reshape(-1, 6))
             self._state = state
             change = self._changes_of(np.zeros(len(way)))
             size = float(np.abs(state.velocity).max())
@@ -192,7 +200,30 @@ class Maximal(Moving):
                 continue
             state, gone, step = trial, goal, 1.5 * step
             least = min(least, condition / self.home.condition)
-        return replace(state, velocity=np.zeros_like(state.velocity), least=least)
+        self._state = state
+        folds.append(self._fold(self._tangent()))
+        pose = min(fold / folds[0] for fold in folds) if folds[0] else 0.0
+        return replace(state, velocity=np.zeros_like(state.velocity), least=least, pose=pose)
+
+    def _fold(self, tangent: Array) -> float:
+        """Determinant of the pose's rates by the joints' rates; one where they are not as many."""
+        machine = self.machine
+        if len(machine.pose) != len(machine.actuated):
+            return 1.0
+        twist = self._twist_columns() @ tangent
+        _, rotation = self._place()
+        _, pitch, yaw = angles(rotation)
+        c, s = math.cos(yaw), math.sin(yaw)
+        # Angular velocity by the rates of roll, pitch and yaw.
+        spin = np.array(
+            [
+                [c * math.cos(pitch), -s, 0.0],
+                [s * math.cos(pitch), c, 0.0],
+                [-math.sin(pitch), 0.0, 1.0],
+            ]
+        )
+        full = np.vstack([twist[:3], np.linalg.solve(spin, twist[3:])])
+        return float(np.linalg.det(full[[POSE_NAMES.index(name) for name in machine.pose]]))
 
     def _moved(self, state: State, change: Array) -> State:
         each = change.reshape(-1, 6)

@@ -19,8 +19,8 @@ WITHIN: Final = 0.8
 NARROW: Final = 0.3
 """Half the range of a joint without limits, rad; of a sliding one this part of the size."""
 CLEAR: Final = 0.1
-"""Least condition on the way from home, relative to home's: nearer to a singularity every engine
-loses digits."""
+"""Least condition and least determinant of the pose on the way from home, relative to home's:
+nearer to a singularity every engine loses digits, and behind a fold the pose has two answers."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class States:
     qdd: Array
     wrench: Array
     drawn: int
-    """How many positions were drawn; the others are out of reach or near a singularity."""
+    """How many positions were drawn; the others are out of reach, near a singularity or folded."""
 
 
 def ranges(judge: Maximal) -> Array:
@@ -74,7 +74,8 @@ def random_states(judge: Maximal, rng: np.random.Generator, count: int) -> State
         drawn += 1
         q = rng.uniform(low, high)
         try:
-            if judge.assemble(q).least >= CLEAR:
+            state = judge.assemble(q)
+            if min(state.least, state.pose) >= CLEAR:
                 found.append(q)
         except UnfitError:
             continue
