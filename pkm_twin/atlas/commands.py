@@ -161,7 +161,7 @@ def sweep_of(machine: Any, kind: str, options: dict[str, Any]) -> Any:
 
 
 def _present(file: Path, picture: bool, html: bool, out: Path | None = None) -> None:
-    from pkm_twin.atlas import figures
+    from pkm_twin.atlas import kinds
     from pkm_twin.atlas.store import open_atlas
 
     with open_atlas(file) as data:
@@ -170,18 +170,15 @@ def _present(file: Path, picture: bool, html: bool, out: Path | None = None) -> 
             Console().print(_factors(data))
         target = out or file
         if picture:
-            for path in figures.save_all(data, target):
+            for path in kinds.save_all(data, target):
                 typer.echo(str(path))
         if html:
-            from pkm_twin.atlas.html import write_page
-
-            typer.echo(str(write_page(data, target.with_suffix(".html"))))
+            typer.echo(str(kinds.write_page(data, target.with_suffix(".html"))))
 
 
 def _factors(data: Any) -> Table:
     """Global factors beside the paper's table 2."""
-    from pkm_twin.atlas.figures import wrench_of
-    from pkm_twin.atlas.strain_energy import table_2
+    from pkm_twin.atlas.strain_energy import table_2, wrench_of
 
     printed = table_2(wrench_of(data))
     table = Table(title="global strain-energy factors")

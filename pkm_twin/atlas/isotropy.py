@@ -10,6 +10,7 @@ May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,8 +26,10 @@ from delta_dynamics.isotropy import (
     energy_transfer_range,
     max_driving_force,
 )
+from pkm_twin.atlas import figures, pages
+from pkm_twin.atlas.extras import require
 from pkm_twin.atlas.grids import circles, ladder, polar_pose, singularity, tilts, turns
-from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
+from pkm_twin.atlas.sweep import Chunk, Field, Kind, Sweep, Values, Variable
 from pkm_twin.codegen.kernels import OK
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.robot import Robot
@@ -37,6 +40,12 @@ POINTS: Final = 48_000
 TILT: Final = math.radians(45.0)
 """Largest tilt of the paper's atlas, rad."""
 CHUNK: Final = 16384
+VIEW: Final = np.array([0.36, 0.8, 0.48])
+"""Where spheres are looked at from, in pose rates."""
+PIXELS: Final = 61
+TAIL: Final = 0.5
+"""Percent of the values on spheres beyond each end of their colours: a few extremes would leave
+all others one colour."""
 
 _SPHERE: Final = ("polar", "turn")
 
@@ -221,3 +230,376 @@ def isotropy_sweep(
     polar = ladder(np.pi / (2 * half), 2 * half + 1)
     turn = turns(4 * half)
     return IsotropySweep(robot, z, energy, first, second, polar, turn)
+
+
+# Figures
+
+
+def sphere_image(values: Array, polar: Array, turn: Array) -> Array:
+    """A sphere of values as it is seen from ``VIEW``, shape (61, 61).
+
+    Around it the values of its rim go on, for a picture that is cut off at the rim.
+
+    :param values: on the directions, shape (polar, turn).
+    """
+    right, up = _view()
+    ticks = np.linspace(-1.0, 1.0, PIXELS)
+    u, v = np.meshgrid(ticks, ticks)
+    outside = np.maximum(np.hypot(u, v), 1.0)
+    u, v = u / outside, v / outside
+    depth = np.sqrt(np.maximum(1.0 - u * u - v * v, 0.0))
+    x = u[..., None] * right + v[..., None] * up + depth[..., None] * VIEW
+    theta = np.arccos(np.clip(x[..., 2], -1.0, 1.0)) / (polar[1] - polar[0])
+    phi = np.mod(np.arctan2(x[..., 1], x[..., 0]), 2 * np.pi) / (turn[1] - turn[0])
+    i = np.minimum(theta.astype(int), len(polar) - 2)
+    j = np.minimum(phi.astype(int), len(turn) - 1)
+    s, t = theta - i, phi - j
+    k = (j + 1) % len(turn)
+    image = (1 - s) * ((1 - t) * values[i, j] + t * values[i, k])
+    image += s * ((1 - t) * values[i + 1, j] + t * values[i + 1, k])
+    return np.asarray(image, np.float64)
+
+
+def spheres(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
+    """Spheres of directions over the grid of poses, coloured by an index.
+
+    :param index: ``eta`` or ``force``.
+    """
+    from matplotlib import cm, colors
+
+    ax = figures.axes_or_new(ax, (8.5, 8))
+    names = atlas[index].dims[:2]
+    polar_grid = names == ("azimuth", "tilt")
+    scale = 1.0 if not polar_grid else 180 / math.pi
+    first, second = (atlas[name].values for name in names)
+    most = 13
+    firsts = range(0, len(first), max(1, math.ceil(len(first) / most)))
+    seconds = range(0, len(second), max(1, math.ceil(len(second) / most)))
+    values = atlas[index].isel({names[0]: list(firsts), names[1]: list(seconds)}).values
+    low, high = np.nanpercentile(values, (TAIL, 100 - TAIL))
+    norm = colors.LogNorm(low, high) if index == "force" else colors.Normalize(low, high)
+    steps = figures.pyplot().get_cmap(
+        figures.MAP if index == "eta" else figures.OTHER_MAP, figures.LEVELS
+    )
+    ring = scale * float(second[seconds[1]] - second[0])
+    radius = 0.46 * ring
+    polar, turn = atlas.polar.values, atlas.turn.values
+    for a, i in enumerate(firsts):
+        for b, j in enumerate(seconds):
+            # The upright pose once; the others on rings, the first further out for room.
+            if not np.isfinite(values[a, b]).all() or (polar_grid and j == 0 and a > 0):
+                continue
+            if polar_grid:
+                out = scale * second[j] + (0.0 if j == 0 else ring)
+                x, y = out * math.cos(first[i]), out * math.sin(first[i])
+            else:
+                x, y = float(first[i]), float(second[j])
+            size = radius if not polar_grid else min(radius, _room(first, scale, second, j, ring))
+            image = ax.imshow(
+                sphere_image(values[a, b], polar, turn),
+                origin="lower",
+                extent=(x - size, x + size, y - size, y + size),
+                cmap=steps,
+                norm=norm,
+                interpolation="bilinear",
+                interpolation_stage="data",
+                zorder=2,
+            )
+            rim = figures.pyplot().Circle((x, y), size, fill=False, ec="0.3", lw=0.6, zorder=2.1)
+            image.set_clip_path(ax.add_patch(rim))
+    if polar_grid:
+        reach = _rings(ax, first[list(firsts)], second[list(seconds)], scale, ring)
+        ax.set_xlabel("around: azimuth of the tilt (deg); outwards: tilt (deg)")
+        ax.set_xticks([])
+        ax.set_yticks([])
+    else:
+        reach = float(np.abs(first).max()) + 1.2 * radius
+        ax.set_xlabel(f"{names[0]} (m)")
+        ax.set_ylabel(f"{names[1]} (m)")
+    ax.set_xlim(-reach, reach)
+    ax.set_ylim(-reach, reach)
+    ax.set_aspect("equal")
+    unit = atlas[index].attrs["units"]
+    label = f"eta_KE = E_M / E_all ({unit})" if index == "eta" else f"F_max ({unit})"
+    colour = cm.ScalarMappable(norm, steps)
+    bar = ax.figure.colorbar(colour, ax=ax, shrink=0.9, fraction=0.04, aspect=32, extend="both")
+    bar.set_label(label)
+    if index == "force":
+        figures.plain_ticks(bar)
+    _triad(atlas, ax)
+    return ax
+
+
+def _room(first: Array, scale: float, second: Array, j: int, ring: float) -> float:
+    out = scale * float(second[j]) + (0.0 if j == 0 else ring)
+    shown = min(len(first), 13)
+    return 0.48 * out * 2 * math.sin(math.pi / shown) if j else math.inf
+
+
+def _rings(ax: Any, azimuths: Array, tilts: Array, scale: float, ring: float) -> float:
+    """Circles of equal tilt with their names; returns the picture's half width."""
+    turn = np.linspace(0, 2 * np.pi, 181)
+    for tilt in tilts[1:]:
+        out = scale * tilt + ring
+        ax.plot(out * np.cos(turn), out * np.sin(turn), color="0.85", lw=0.8, zorder=0)
+    outermost = scale * float(tilts[-1]) + ring
+    for azimuth in azimuths:
+        out = outermost + 0.72 * ring
+        place = (out * math.cos(azimuth), out * math.sin(azimuth))
+        ax.text(*place, f"{math.degrees(azimuth):.0f}°", ha="center", va="center", fontsize=10)
+    between = math.pi / len(azimuths)
+    for k, tilt in enumerate(tilts[1:]):
+        # The spheres of the first ring leave no room on it.
+        out = scale * float(tilt) + (0.35 if k == 0 else 1.0) * ring
+        ax.text(
+            out * math.cos(between),
+            out * math.sin(between),
+            f"{scale * float(tilt):.4g}°",
+            ha="center",
+            va="center",
+            fontsize=9,
+            color="0.3",
+            zorder=3,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
+        )
+    return outermost + ring
+
+
+def _triad(atlas: Any, ax: Any) -> None:
+    """Where the spheres' axes point, in the lower left corner."""
+    right, up = _view()
+    inset = ax.inset_axes((0.01, 0.01, 0.18, 0.18))
+    names = _rates(atlas)
+    for k, name in enumerate(names):
+        tip = np.array([right[k], up[k]])
+        inset.annotate(
+            "", tip, (0.0, 0.0), arrowprops={"arrowstyle": "->", "color": "black", "lw": 1.0}
+        )
+        side = "center" if abs(tip[0]) < 0.3 else "left" if tip[0] > 0 else "right"
+        inset.text(*(1.12 * tip + (0.0, 0.1 * tip[1])), name, ha=side, va="center", fontsize=9)
+    inset.set_xlim(-1.9, 1.3)
+    inset.set_ylim(-1.4, 1.8)
+    inset.set_aspect("equal")
+    inset.axis("off")
+
+
+def _rates(atlas: Any) -> tuple[str, ...]:
+    tilting = "azimuth" in atlas.sizes
+    names = ("z", "alpha", "beta") if tilting else ("x", "y", "z")
+    return tuple(f"d{name}/dt" for name in names)
+
+
+def _view() -> tuple[Array, Array]:
+    """Unit vectors of the picture's right and up, in pose rates."""
+    right = np.cross([0.0, 0.0, 1.0], VIEW)
+    right /= np.linalg.norm(right)
+    return right, np.cross(VIEW, right)
+
+
+def spread_over_poses(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
+    """How far an index differs over the sphere at each pose: greatest less least."""
+    ax = figures.axes_or_new(ax)
+    names = atlas[index].dims[:2]
+    values = (
+        (atlas.eta_greatest - atlas.eta_least).values
+        if index == "eta"
+        else np.ptp(atlas[index].values, axis=(-2, -1))
+    )
+    unit = atlas[index].attrs["units"]
+    what = "spread of eta_KE" if index == "eta" else "spread of F_max"
+    if names == ("azimuth", "tilt"):
+        tilt = np.degrees(atlas.tilt.values)
+        for k, azimuth in enumerate(np.degrees(atlas.azimuth.values)):
+            if azimuth <= 180.0 + 1e-9 and k % max(1, len(atlas.azimuth) // 12) == 0:
+                # Thinner and thinner: azimuths whose lines are the same stay visible.
+                drawn = len(ax.lines)
+                ax.plot(
+                    tilt,
+                    values[k],
+                    color=figures.LINES[drawn % len(figures.LINES)],
+                    lw=max(1.2, 5.0 - 0.65 * drawn),
+                    label=f"{azimuth:.0f}°",
+                )
+        ax.set_xlabel("tilt (deg)")
+        ax.set_ylabel(f"{what} ({unit})")
+        ax.legend(title="azimuth", fontsize=8)
+        ax.grid(alpha=0.3)
+        return ax
+    first, second = (atlas[name].values for name in names)
+    from matplotlib import colors
+
+    mesh = ax.pcolormesh(
+        first,
+        second,
+        np.ma.masked_invalid(values.T),
+        cmap=figures.MAP if index == "eta" else figures.OTHER_MAP,
+        shading="nearest",
+        norm=colors.LogNorm() if index == "force" else None,
+    )
+    ax.set_aspect("equal")
+    ax.set_xlabel(f"{names[0]} (m)")
+    ax.set_ylabel(f"{names[1]} (m)")
+    bar = figures.bar(ax, mesh, f"{what} ({unit})")
+    if index == "force":
+        figures.plain_ticks(bar)
+    return ax
+
+
+def _spheres_eta(atlas: Any) -> Any:
+    return _spheres(atlas, "eta")
+
+
+def _spheres_force(atlas: Any) -> Any:
+    return _spheres(atlas, "force")
+
+
+def _spheres(atlas: Any, index: str) -> Any:
+    figure, ax = figures.pyplot().subplots(figsize=(10.6, 8.6), layout="constrained")
+    spheres(atlas, index, ax)
+    if index == "eta":
+        what = "the platform's part of the kinetic energy, by direction of the pose rates"
+    else:
+        energy = json.loads(atlas.attrs["settings"])["energy"]
+        what = f"largest driving {_effort(atlas)} at a platform energy of {energy:g} J"
+    figure.suptitle(f"{at_height(atlas)}: {what}")
+    return figure
+
+
+def _spreads(atlas: Any) -> Any:
+    figure, axes = figures.pyplot().subplots(1, 2, figsize=(12, 4.8), layout="constrained")
+    titles = ("the platform's part of the kinetic energy", f"largest driving {_effort(atlas)}")
+    for index, title, ax in zip(("eta", "force"), titles, axes, strict=True):
+        spread_over_poses(atlas, index, ax)
+        ax.set_title(title)
+    figure.suptitle(f"{at_height(atlas)}: greatest less least over all directions")
+    return figure
+
+
+def _effort(atlas: Any) -> str:
+    return "force" if atlas.force.attrs["units"] == "N" else "torque"
+
+
+def at_height(atlas: Any) -> str:
+    """Robot and height of an isotropy atlas, as text."""
+    height = json.loads(atlas.attrs["settings"])["height"]
+    return f"{atlas.attrs['robot']} at z = {height:.3f} m"
+
+
+# Page
+
+
+def title(atlas: Any) -> str:
+    """What the page shows, in a line."""
+    return f"Dynamic isotropy of {at_height(atlas)}"
+
+
+def page(atlas: Any) -> Any:
+    """Spheres of an isotropy atlas that turn; a menu chooses eta_KE or F_max."""
+    graph = require("plotly.graph_objects", "atlas")
+    names = atlas.eta.dims[:2]
+    part = pages.thinned(atlas, {names[0]: 13, names[1]: 9, "polar": 25, "turn": 48})
+    polar_grid = names == ("azimuth", "tilt")
+    first, second = (part[name].values for name in names)
+    step = float(second[1] - second[0]) * (180 / math.pi if polar_grid else 1.0)
+    turn = np.append(part.turn.values, part.turn.values[0] + 2 * np.pi)
+    theta = part.polar.values[:, None]
+    ball = np.stack(np.broadcast_arrays(np.sin(theta) * np.cos(turn), np.sin(theta) * np.sin(turn)))
+    up = np.broadcast_to(np.cos(theta), ball.shape[1:])
+    figure = graph.Figure()
+    unit = atlas.force.attrs["units"]
+    labels = ("eta_KE (1)", f"F_max ({unit})")
+    fields = (part.eta.values, np.log10(part.force.values))
+    values = ("eta_KE %{surfacecolor:.3g}", f"F_max 10^%{{surfacecolor:.2f}} {unit}")
+    shown: list[list[Array]] = []
+    places: list[str] = []
+    for i, a in enumerate(first.tolist()):
+        for j, b in enumerate(second.tolist()):
+            layers = [pages.closed(f[i, j]) for f in fields]
+            if not np.isfinite(layers[0]).all() or (polar_grid and j == 0 and i > 0):
+                continue
+            if polar_grid:
+                out = 0.0 if j == 0 else math.degrees(b) + step
+                x, y = out * math.cos(a), out * math.sin(a)
+                name = f"azimuth {math.degrees(a):.0f} deg, tilt {math.degrees(b):.4g} deg"
+            else:
+                x, y, name = a, b, f"x {a:.3f} m, y {b:.3f} m"
+            shown.append(layers)
+            places.append(name)
+            figure.add_surface(
+                x=pages.short(x + 0.44 * step * ball[0]),
+                y=pages.short(y + 0.44 * step * ball[1]),
+                z=pages.short(0.44 * step * up),
+                surfacecolor=pages.short(layers[0]),
+                coloraxis="coloraxis",
+                hovertemplate=f"{name}<br>eta_KE %{{surfacecolor:.3g}}<extra></extra>",
+                lighting={"ambient": 0.85, "diffuse": 0.3, "specular": 0.05},
+            )
+    buttons = []
+    for n, (label, field) in enumerate(zip(labels, fields, strict=True)):
+        data = {
+            "surfacecolor": [pages.few(layers[n]) for layers in shown],
+            "hovertemplate": [f"{name}<br>{values[n]}<extra></extra>" for name in places],
+        }
+        layout = pages.colours(label, field, logarithmic=n == 1, tail=TAIL)
+        buttons.append(pages.button(label, data, layout, list(range(len(shown)))))
+    where = "around: azimuth, outwards: tilt; " if polar_grid else ""
+    rates = ("z", "alpha", "beta") if polar_grid else ("x", "y", "z")
+    ends = ", ".join(f"{axis} d{name}/dt" for axis, name in zip("xyz", rates, strict=True))
+    hidden = {"visible": False}
+    far = float(np.abs(second).max()) + (0.6 * step if not polar_grid else 0.0)
+    if polar_grid:
+        far = math.degrees(far) + 2.2 * step
+    side, thick = [-far, far], [-0.5 * step, 0.5 * step]
+    scene: dict[str, Any] = {
+        "aspectmode": "manual",
+        "aspectratio": pages.aspect([side, side, thick], 2.2 if polar_grid else 1.7),
+        "camera": pages.FLAT,
+        "xaxis": hidden if polar_grid else {"title": "x (m)", "range": side},
+        "yaxis": hidden if polar_grid else {"title": "y (m)", "range": side},
+        "zaxis": hidden,
+    }
+    if polar_grid:
+        figure.add_scatter3d(**_polar_names(first, np.degrees(second), step))
+    figure.update_layout(
+        title=f"{title(atlas)}; {where}axes of a sphere: {ends}",
+        coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8}},
+        scene=scene,
+        margin=pages.MARGIN,
+        updatemenus=[{"buttons": buttons, **pages.MENU}],
+    )
+    figure.update_layout(buttons[0]["args"][1])
+    return figure
+
+
+def _polar_names(azimuth: Array, tilt: Array, step: float) -> dict[str, Any]:
+    """Names of azimuths (rad) around the spheres and of tilts (deg) between them, as a trace."""
+    far = float(tilt[-1]) + 1.9 * step
+    x = (far * np.cos(azimuth)).tolist()
+    y = (far * np.sin(azimuth)).tolist()
+    text = [f"{math.degrees(a):.0f}°" for a in azimuth]
+    between = math.pi / len(azimuth)
+    for k, value in enumerate(tilt[1:].tolist()):
+        # The spheres of the first ring leave no room on it.
+        out = value + (0.35 if k == 0 else 1.0) * step
+        x.append(out * math.cos(between))
+        y.append(out * math.sin(between))
+        text.append(f"{value:.4g}°")
+    return {
+        "x": x,
+        "y": y,
+        "z": [0.44 * step] * len(x),
+        "mode": "text",
+        "text": text,
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
+
+
+KIND: Final = Kind(
+    "isotropy",
+    figures={"eta": _spheres_eta, "force": _spheres_force, "spread": _spreads},
+    page=page,
+    title=title,
+    help="A sphere is all directions of the pose rates at one pose; it looks the same from behind. "
+    "A few values beyond the ends of the colours have the end's colour.",
+)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -145,6 +145,21 @@ class Sweep:
         for name, variable in self.coordinates.items():
             digest.update(name.encode() + np.ascontiguousarray(variable.values).tobytes())
         return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is drawn of a stored atlas of one kind; each module of a kind ends with its own.
+
+    ``figures``: name to the function that draws it; ``page``: the plotly figure; ``title``: of
+    the page; ``help``: the line below it.
+    """
+
+    name: str
+    figures: Mapping[str, Callable[[Any], Any]]
+    page: Callable[[Any], Any]
+    title: Callable[[Any], str]
+    help: str
 
 
 def plain(value: Any) -> Any:

@@ -169,13 +169,13 @@ def test_pictures_show_what_interference_takes_away(tmp_path, monkeypatch):
     """A name for the hatching, in words that say why."""
     from matplotlib import pyplot
 
-    from pkm_twin.atlas import figures
+    from pkm_twin.atlas import kinds
 
     monkeypatch.setattr(workspace, "LAYERS", 15)
     for least, words in ((0.0, "limbs meet nowhere"), (0.03, "limbs are within 30 mm in ")):
         sweep = workspace_sweep(load("delta"), 30000, least_clearance=least)
         with open_atlas(run(sweep, tmp_path / f"{least}.nc", workers=1)) as data:
-            figure = figures.draw(data)["sections"]
+            figure = kinds.draw(data)["sections"]
         assert words in figure.get_suptitle()
         legends = [ax.get_legend() for ax in figure.axes if ax.get_legend()]
         texts = {text.get_text() for legend in legends for text in legend.get_texts()}
@@ -187,7 +187,7 @@ def test_pictures_show_what_interference_takes_away(tmp_path, monkeypatch):
 def test_all_taken_away_is_still_an_atlas(tmp_path, monkeypatch):
     from matplotlib import pyplot
 
-    from pkm_twin.atlas import figures
+    from pkm_twin.atlas import kinds
 
     monkeypatch.setattr(workspace, "LAYERS", 15)
     sweep = workspace_sweep(load("delta"), 4000, least_clearance=0.05)
@@ -195,13 +195,13 @@ def test_all_taken_away_is_still_an_atlas(tmp_path, monkeypatch):
         assert float(data.volume) == 0.0
         assert float(data.interference) == 1.0
         assert float(data.cylinder_radius) == 0.0
-        pyplot.close(figures.draw(data)["sections"])
+        pyplot.close(kinds.draw(data)["sections"])
 
 
 def test_without_members_there_is_no_clearance(tmp_path, monkeypatch):
     from matplotlib import pyplot
 
-    from pkm_twin.atlas import figures
+    from pkm_twin.atlas import kinds
 
     monkeypatch.setattr(workspace, "LAYERS", 15)
     robot = load("delta")
@@ -212,7 +212,7 @@ def test_without_members_there_is_no_clearance(tmp_path, monkeypatch):
         assert set(one.variables) - set(other.variables) == {"clearance", "interference"}
         for variable in other.variables:
             assert one[variable].equals(other[variable])
-        figure = figures.draw(other)["sections"]
+        figure = kinds.draw(other)["sections"]
         assert "limbs" not in figure.get_suptitle()
         pyplot.close(figure)
     options = {"points": 4000, "least_singularity": 0.0, "least_clearance": 0.01}
