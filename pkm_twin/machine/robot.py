@@ -17,6 +17,7 @@ from pkm_twin.codegen import kernels
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.machine import schema
+from pkm_twin.machine.pose_grid import PoseGrid
 
 Array = NDArray[np.float64]
 R = TypeVar("R", bound="Robot")
@@ -138,6 +139,24 @@ class Robot:
         """Names of the actuated joints, in the order of q."""
         joints: tuple[str, str, str] = getattr(self, "joints")  # noqa: B009
         return joints
+
+    @property
+    def joint_units(self) -> tuple[str, ...]:
+        """Units of q, ``m`` or ``rad`` each."""
+        return (self.joint_unit,) * len(self.joint_names)
+
+    def grid(self) -> PoseGrid:
+        """How atlases lay out this machine's poses; without an axis of its own, as a box."""
+        return PoseGrid("box", self.pose_names)
+
+    def search_box(self) -> Array:
+        """Bounds outside of which no pose of the workspace lies, shape (m, 2), m and rad.
+
+        :raises ParameterError: what is missing that would bound the workspace.
+        """
+        raise ParameterError(
+            "search_box", self.name, "a mechanism that tells where its poses end, for atlases"
+        )
 
     def inverse(self, pose: ArrayLike) -> Array:
         """Joint positions q of a pose, shape (..., 3).

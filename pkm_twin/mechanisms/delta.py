@@ -46,6 +46,7 @@ from pkm_twin.machine.members import (
     Tube,
     disc,
 )
+from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import (
     SINGULARITY_BOUND,
     Friction,
@@ -167,6 +168,23 @@ class Delta(Robot):
     def rotation(self, pose: ArrayLike) -> Array:
         """Always the identity, shape (..., 3, 3): the platform only translates."""
         return np.broadcast_to(np.eye(3), (*np.shape(pose)[:-1], 3, 3)).copy()
+
+    def grid(self) -> PoseGrid:
+        """Places about the vertical axis."""
+        return PoseGrid("cylinder", self.pose_names, "z", ("x", "y"))
+
+    def search_box(self) -> Array:
+        """Each platform joint is within arm and forearm of its pivot, below the highest elbow."""
+        g = self.geometry
+        far = g.arm_length + g.forearm_length
+        out = g.base_radius - g.platform_radius
+        box = np.empty((3, 2))
+        for k, cosines in enumerate((np.cos(g.azimuths), np.sin(g.azimuths))):
+            box[k] = (out * cosines).max() - far, (out * cosines).min() + far
+        # An arm at a negative angle points up.
+        low = -math.pi / 2 if self.limits.position is None else float(self.limits.position.min())
+        box[2] = -far, g.arm_length * math.sin(min(max(-low, 0.0), math.pi / 2))
+        return box
 
     def pose_rates(self, platform: PlatformMotion) -> tuple[Array, Array]:
         """First and second derivative of the pose in time: the platform's origin is the pose."""

@@ -63,6 +63,7 @@ from pkm_twin.machine.joints import (
     platform_motion,
 )
 from pkm_twin.machine.members import Frame, Member, RigidBody, Support, Tube, disc
+from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import (
     SINGULARITY_BOUND,
     Friction,
@@ -213,6 +214,24 @@ class Prru(Robot):
         rows, fault = self.rotation_kernel(self.parameters, pose)
         self.raise_fault(fault, "pose")
         return rows.reshape(*rows.shape[:-1], 3, 3)
+
+    def grid(self) -> PoseGrid:
+        """Tilts about the vertical axis, in tilt-and-torsion angles without torsion."""
+        return PoseGrid("cylinder", self.pose_names, "z", ("alpha", "beta"), zero_torsion=True)
+
+    def search_box(self) -> Array:
+        """Each platform joint is within a limb of its slider; tilts up to a right angle.
+
+        :raises ParameterError: sliders without limits travel without end.
+        """
+        g, travel = self.geometry, self.limits.position
+        if travel is None:
+            raise ParameterError(
+                "limits.position", None, "limits of the sliders: without them z has no end"
+            )
+        reach, right = g.limb_length + g.platform_radius, math.pi / 2
+        z = float(travel.min()) - reach, float(travel.max()) + reach
+        return np.array([z, (-right, right), (-right, right)])
 
     def pose_rates(self, platform: PlatformMotion) -> tuple[Array, Array]:
         """First and second derivative of the pose in time.

@@ -46,6 +46,7 @@ from pkm_twin.machine.members import (
     Support,
     disc,
 )
+from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot, length, mass
 from pkm_twin.mechanisms.elements import BLOCK, SCRATCH, divide, factorise, invert
 
@@ -200,6 +201,23 @@ class UprRpu(Robot):
 
     def _home_joints(self) -> Array:
         return np.full(3, 1.5 * self.geometry.base_radius)
+
+    def grid(self) -> PoseGrid:
+        """Tilts about the vertical axis, in the plane of beta and gamma."""
+        return PoseGrid("cylinder", self.pose_names, "z", ("beta", "gamma"))
+
+    def search_box(self) -> Array:
+        """Limbs 1 and 2 end above and below o alike, so it is no deeper than they are long.
+
+        :raises ParameterError: limbs without limits grow without end.
+        """
+        lengths = self.limits.limb_length
+        if lengths is None:
+            raise ParameterError(
+                "limits.limb_length", None, "limits of the limbs: without them z has no end"
+            )
+        right = math.pi / 2
+        return np.array([(-float(lengths[:2].max()), 0.0), (-right, right), (-right, right)])
 
     def rotation(self, pose: ArrayLike) -> Array:
         """R = Rx(beta) Ry(gamma): platform axes as columns in fixed axes, shape (..., 3, 3)."""
