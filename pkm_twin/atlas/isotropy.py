@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Dynamic-isotropy atlas: on every pose of a grid a sphere of directions, coloured by an index.
 
-The indices of delta_dynamics/isotropy.py, eta_KE and F_max, over unit vectors of pose rates. A
-machine that tilts stands on a polar grid of azimuth and tilt (3-PRRU paper, section 5), one that
-translates on a grid of x and y.
+The indices of delta_dynamics/isotropy.py, eta_KE and F_max, over unit vectors of three pose rates.
+A machine that tilts stands on a polar grid of azimuth and tilt (3-PRRU paper, section 5), others on
+a grid of two coordinates: of those across the axis, or of the first two.
 
 May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
 """
@@ -28,10 +28,10 @@ from delta_dynamics.isotropy import (
 )
 from pkm_twin.atlas import figures, pages
 from pkm_twin.atlas.extras import require
-from pkm_twin.atlas.grids import circles, ladder, polar_pose, singularity, tilts, turns
+from pkm_twin.atlas.grids import circles, ladder, turns, workspace_box
 from pkm_twin.atlas.sweep import Chunk, Field, Kind, Sweep, Values, Variable
-from pkm_twin.codegen.kernels import OK
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.workspace import distance_unit, reachable, singularity_at, try_inverse
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -43,6 +43,8 @@ CHUNK: Final = 16384
 VIEW: Final = np.array([0.36, 0.8, 0.48])
 """Where spheres are looked at from, in pose rates."""
 PIXELS: Final = 61
+BEYOND: Final[Mapping[str, Any]] = {"ec": "#D55E00", "lw": 1.6, "ls": "--"}
+"""Rim of a sphere beyond the limits."""
 TAIL: Final = 0.5
 """Percent of the values on spheres beyond each end of their colours: a few extremes would leave
 all others one colour."""
@@ -54,8 +56,9 @@ _SPHERE: Final = ("polar", "turn")
 class IsotropySweep(Sweep):
     """Spheres of eta_KE and F_max over a grid of poses at one height.
 
-    ``first`` and ``second``: the grid's axes: x and y (m), or azimuth and tilt (rad). ``polar``
+    ``first`` and ``second``: the grid's axes: two coordinates, or azimuth and tilt (rad). ``polar``
     angles from the direction's third axis, ``turn`` angles about it, from the first, rad.
+    ``beyond``: also poses beyond the limits; else they are NaN.
     """
 
     height: float
@@ -64,13 +67,14 @@ class IsotropySweep(Sweep):
     second: Array
     polar: Array
     turn: Array
+    beyond: bool
 
     kind: ClassVar[str] = "isotropy"
 
     @property
     def axes(self) -> tuple[str, str]:
         """Names of the grid's axes."""
-        return ("azimuth", "tilt") if tilts(self.robot) else ("x", "y")
+        return ("azimuth", "tilt") if tilting(self.robot) else plane_of(self.robot)[:2]
 
     @property
     def fields(self) -> Mapping[str, Field]:  # type: ignore[override]
@@ -89,23 +93,28 @@ class IsotropySweep(Sweep):
                 self.axes,
                 {"units": "1", "long_name": "distance to a singularity: 0 in one, 1 at best"},
             ),
+            "within_limits": Field(
+                self.axes, {"long_name": "1 where the pose keeps all limits of the machine"}, "i1"
+            ),
         }
 
     @property
     def coordinates(self) -> dict[str, Variable]:
         """The grid's axes, and the angles of the directions."""
         rates = [f"d{name}/dt" for name in self.robot.pose_names]
+        units = dict(zip(self.robot.pose_names, self.robot.pose_units, strict=True))
         what = {
             "azimuth": "direction that the platform leans to",
             "tilt": "lean of the platform's axis, no torsion",
-            "x": "x of the platform's centre",
-            "y": "y of the platform's centre",
         }
         result = {
             name: Variable(
                 (name,),
                 values,
-                {"units": "rad" if tilts(self.robot) else "m", "long_name": what[name]},
+                {
+                    "units": units.get(name, "rad"),
+                    "long_name": what.get(name, f"pose coordinate {name}"),
+                },
             )
             for name, values in zip(self.axes, (self.first, self.second), strict=True)
         }
@@ -126,8 +135,14 @@ class IsotropySweep(Sweep):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Height of the poses, m, and the platform's energy, J."""
-        return {"height": self.height, "energy": self.energy, "points": self.points}
+        """Height of the poses, m or rad, the platform's energy, J, and what is left out."""
+        return {
+            "height": self.height,
+            "height_name": plane_of(self.robot)[2],
+            "energy": self.energy,
+            "beyond_limits": self.beyond,
+            "points": self.points,
+        }
 
     @property
     def rows_a_chunk(self) -> int:
@@ -141,20 +156,27 @@ class IsotropySweep(Sweep):
     def poses(self, chunk: Chunk) -> Array:
         """Poses of a chunk, shape (rows, 3)."""
         second = self.second[chunk.start : chunk.stop]
-        if tilts(self.robot):
-            return polar_pose(self.robot, self.height, second, self.first[chunk.first])
-        x = np.full(len(second), self.first[chunk.first])
-        return np.stack([x, second, np.full(len(second), self.height)], -1)
+        if tilting(self.robot):
+            return self.robot.grid().polar_pose(self.height, second, self.first[chunk.first])
+        poses = np.empty((len(second), 3))
+        where = [self.robot.pose_names.index(name) for name in plane_of(self.robot)]
+        for k, values in zip(where, (self.first[chunk.first], second, self.height), strict=True):
+            poses[:, k] = values
+        return poses
 
     def evaluate(self, chunk: Chunk) -> Values:
-        """Indices at the poses; NaN where a pose is out of reach, its limits too, or singular."""
+        """Indices at the poses; NaN where a pose is out of reach, beyond limits, or singular."""
         robot, poses = self.robot, self.poses(chunk)
-        measure = singularity(robot, poses)
-        _, fault = robot.inverse_kernel(robot.parameters, poses)
-        good = (fault[..., 0] == OK) & (measure > STRETCHED)
-        if not tilts(robot):
+        measure = singularity_at(robot, poses)
+        _, good = try_inverse(robot, poses)
+        good &= measure > STRETCHED
+        within = reachable(robot, poses)
+        if not self.beyond:
+            good &= within
+        if robot.grid().kind == "cylinder" and not tilting(robot):
             # Places outside the circle that the limits of the actuators leave.
-            good &= np.hypot(poses[:, 0], poses[:, 1]) <= self.second[-1] * (1 + 1e-9)
+            out = np.hypot(self.first[chunk.first], self.second[chunk.start : chunk.stop])
+            good &= out <= self.second[-1] * (1 + 1e-9)
         shape = (len(poses), len(self.polar), len(self.turn))
         values = {
             "eta": np.full(shape, np.nan),
@@ -162,6 +184,7 @@ class IsotropySweep(Sweep):
             "eta_least": np.full(len(poses), np.nan),
             "eta_greatest": np.full(len(poses), np.nan),
             "singularity": np.where(good, measure, np.nan),
+            "within_limits": within.astype(np.int8),
         }
         if good.any():
             kept, x = poses[good], self.directions
@@ -193,18 +216,23 @@ def isotropy_sweep(
     height: float | None = None,
     energy: float = ENERGY,
     tilt: float = TILT,
+    beyond_limits: bool = True,
 ) -> IsotropySweep:
     """The isotropy atlas of a robot.
 
     :param points: poses times directions, about; the grid is 12 azimuths by 4 tilts (and the
         upright pose), or 9 by 9 places, unless the spheres then had over 5,000 directions.
-    :param height: of the poses, m; default the home pose's.
+    :param height: of the poses, m; default the home pose's. For a robot without an axis the third
+        pose coordinate, m or rad.
     :param energy: kinetic energy E_M of the platform for F_max, J.
     :param tilt: largest tilt, rad.
-    :raises ParameterError: a robot without masses.
+    :param beyond_limits: also poses beyond the limits, which the file marks; else NaN there.
+    :raises ParameterError: a robot without masses, or whose directions make no sphere.
     """
     if robot.motion_kernel is None:
         raise ParameterError("mechanism", robot.mechanism, "a mechanism with masses (delta, prru)")
+    if len(robot.pose_names) != 3:
+        raise ParameterError("pose", list(robot.pose_names), "three pose coordinates, for spheres")
     if points is not None and points < 1000:
         raise ParameterError("points", points, "1000 or more")
     if not 0.0 < energy < math.inf:
@@ -212,12 +240,24 @@ def isotropy_sweep(
     if not 0.0 < tilt < math.pi / 2:
         raise ParameterError("tilt", tilt, "between 0 and a right angle, rad")
     total = points or POINTS
-    z = float(robot.home()[robot.pose_names.index("z")]) if height is None else height
+    names = plane_of(robot)
+    home = float(robot.home()[robot.pose_names.index(names[2])])
+    z = home if height is None else height
     finer = max(1.0, math.sqrt(total / (60 * 5000)))
-    if tilts(robot):
+    if tilting(robot):
         azimuths, rungs = 12 * round(finer), 4 * round(finer)
         first = turns(azimuths)
         second = ladder(tilt / rungs, rungs + 1)
+    elif robot.grid().kind == "box":
+        box = workspace_box(robot)
+        low, high = box[robot.pose_names.index(names[2])]
+        if not low <= z <= high:
+            raise ParameterError("height", z, f"{low:.3g} to {high:.3g}, where the robot reaches")
+        side = 8 * round(finer) + 1
+        first, second = (
+            np.linspace(float(a), float(b), side)
+            for a, b in (box[robot.pose_names.index(name)] for name in names[:2])
+        )
     else:
         side = 8 * round(finer) + 1
         radius = float(circles(robot, [z]).radius[0])
@@ -229,7 +269,20 @@ def isotropy_sweep(
     half = max(4, round(math.sqrt(a_sphere / 2) / 2))
     polar = ladder(np.pi / (2 * half), 2 * half + 1)
     turn = turns(4 * half)
-    return IsotropySweep(robot, z, energy, first, second, polar, turn)
+    return IsotropySweep(robot, z, energy, first, second, polar, turn, beyond_limits)
+
+
+def tilting(robot: Robot) -> bool:
+    """Whether the robot's poses are tilts about an axis."""
+    return robot.grid().kind == "cylinder" and distance_unit(robot) == "rad"
+
+
+def plane_of(robot: Robot) -> tuple[str, str, str]:
+    """The two pose coordinates of a grid of spheres, and the one that is the same in all."""
+    grid = robot.grid()
+    if grid.kind == "cylinder":
+        return grid.lateral[0], grid.lateral[1], grid.height
+    return robot.pose_names[0], robot.pose_names[1], robot.pose_names[2]
 
 
 # Figures
@@ -275,7 +328,9 @@ def spheres(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
     most = 13
     firsts = range(0, len(first), max(1, math.ceil(len(first) / most)))
     seconds = range(0, len(second), max(1, math.ceil(len(second) / most)))
-    values = atlas[index].isel({names[0]: list(firsts), names[1]: list(seconds)}).values
+    picked = {names[0]: list(firsts), names[1]: list(seconds)}
+    values = atlas[index].isel(picked).values
+    within = atlas.within_limits.isel(picked).values > 0
     low, high = np.nanpercentile(values, (TAIL, 100 - TAIL))
     norm = colors.LogNorm(low, high) if index == "force" else colors.Normalize(low, high)
     steps = figures.pyplot().get_cmap(
@@ -283,11 +338,13 @@ def spheres(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
     )
     ring = scale * float(second[seconds[1]] - second[0])
     radius = 0.46 * ring
+    beyond = False
     polar, turn = atlas.polar.values, atlas.turn.values
     for a, i in enumerate(firsts):
         for b, j in enumerate(seconds):
             # The upright pose once; the others on rings, the first further out for room.
-            if not np.isfinite(values[a, b]).all() or (polar_grid and j == 0 and a > 0):
+            known = np.isfinite(values[a, b]).all()
+            if (polar_grid and j == 0 and a > 0) or (not polar_grid and not known):
                 continue
             if polar_grid:
                 out = scale * second[j] + (0.0 if j == 0 else ring)
@@ -295,6 +352,12 @@ def spheres(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
             else:
                 x, y = float(first[i]), float(second[j])
             size = radius if not polar_grid else min(radius, _room(first, scale, second, j, ring))
+            ring_of = {"ec": "0.3", "lw": 0.6} if within[a, b] else BEYOND
+            rim = figures.pyplot().Circle((x, y), size, fill=False, zorder=2.1, **ring_of)
+            ax.add_patch(rim)
+            beyond |= not within[a, b]
+            if not known:
+                continue
             image = ax.imshow(
                 sphere_image(values[a, b], polar, turn),
                 origin="lower",
@@ -305,19 +368,26 @@ def spheres(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
                 interpolation_stage="data",
                 zorder=2,
             )
-            rim = figures.pyplot().Circle((x, y), size, fill=False, ec="0.3", lw=0.6, zorder=2.1)
-            image.set_clip_path(ax.add_patch(rim))
+            image.set_clip_path(rim)
+    if beyond:
+        label = "beyond the machine's limits"
+        handle = figures.pyplot().Line2D([], [], ls="--", lw=1.6, color=BEYOND["ec"], label=label)
+        ax.legend(handles=[handle], loc="upper right", fontsize=8)
     if polar_grid:
         reach = _rings(ax, first[list(firsts)], second[list(seconds)], scale, ring)
         ax.set_xlabel("around: azimuth of the tilt (deg); outwards: tilt (deg)")
         ax.set_xticks([])
         ax.set_yticks([])
     else:
-        reach = float(np.abs(first).max()) + 1.2 * radius
-        ax.set_xlabel(f"{names[0]} (m)")
-        ax.set_ylabel(f"{names[1]} (m)")
-    ax.set_xlim(-reach, reach)
-    ax.set_ylim(-reach, reach)
+        for label, name in ((ax.set_xlabel, names[0]), (ax.set_ylabel, names[1])):
+            label(f"{name} ({atlas[name].attrs['units']})")
+        side = float(np.ptp(first)) / 2 + 1.2 * radius
+        middle = float(first.mean()), float(second.mean())
+        ax.set_xlim(middle[0] - side, middle[0] + side)
+        ax.set_ylim(middle[1] - side, middle[1] + side)
+    if polar_grid:
+        ax.set_xlim(-reach, reach)
+        ax.set_ylim(-reach, reach)
     ax.set_aspect("equal")
     unit = atlas[index].attrs["units"]
     label = f"eta_KE = E_M / E_all ({unit})" if index == "eta" else f"F_max ({unit})"
@@ -384,9 +454,7 @@ def _triad(atlas: Any, ax: Any) -> None:
 
 
 def _rates(atlas: Any) -> tuple[str, ...]:
-    tilting = "azimuth" in atlas.sizes
-    names = ("z", "alpha", "beta") if tilting else ("x", "y", "z")
-    return tuple(f"d{name}/dt" for name in names)
+    return tuple(f"d{name}/dt" for name in atlas.attrs["pose"].split())
 
 
 def _view() -> tuple[Array, Array]:
@@ -437,8 +505,8 @@ def spread_over_poses(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
         norm=colors.LogNorm() if index == "force" else None,
     )
     ax.set_aspect("equal")
-    ax.set_xlabel(f"{names[0]} (m)")
-    ax.set_ylabel(f"{names[1]} (m)")
+    for label, name in ((ax.set_xlabel, names[0]), (ax.set_ylabel, names[1])):
+        label(f"{name} ({atlas[name].attrs['units']})")
     bar = figures.bar(ax, mesh, f"{what} ({unit})")
     if index == "force":
         figures.plain_ticks(bar)
@@ -481,8 +549,8 @@ def _effort(atlas: Any) -> str:
 
 def at_height(atlas: Any) -> str:
     """Robot and height of an isotropy atlas, as text."""
-    height = json.loads(atlas.attrs["settings"])["height"]
-    return f"{atlas.attrs['robot']} at z = {height:.3f} m"
+    settings = json.loads(atlas.attrs["settings"])
+    return f"{atlas.attrs['robot']} at {settings['height_name']} = {settings['height']:.3f} m"
 
 
 # Page
@@ -498,70 +566,55 @@ def page(atlas: Any) -> Any:
     graph = require("plotly.graph_objects", "atlas")
     names = atlas.eta.dims[:2]
     part = pages.thinned(atlas, {names[0]: 13, names[1]: 9, "polar": 25, "turn": 48})
-    polar_grid = names == ("azimuth", "tilt")
-    first, second = (part[name].values for name in names)
-    step = float(second[1] - second[0]) * (180 / math.pi if polar_grid else 1.0)
-    turn = np.append(part.turn.values, part.turn.values[0] + 2 * np.pi)
-    theta = part.polar.values[:, None]
-    ball = np.stack(np.broadcast_arrays(np.sin(theta) * np.cos(turn), np.sin(theta) * np.sin(turn)))
-    up = np.broadcast_to(np.cos(theta), ball.shape[1:])
-    figure = graph.Figure()
+    balls = _balls(part)
     unit = atlas.force.attrs["units"]
-    labels = ("eta_KE (1)", f"F_max ({unit})")
-    fields = (part.eta.values, np.log10(part.force.values))
-    values = ("eta_KE %{surfacecolor:.3g}", f"F_max 10^%{{surfacecolor:.2f}} {unit}")
-    shown: list[list[Array]] = []
-    places: list[str] = []
-    for i, a in enumerate(first.tolist()):
-        for j, b in enumerate(second.tolist()):
-            layers = [pages.closed(f[i, j]) for f in fields]
-            if not np.isfinite(layers[0]).all() or (polar_grid and j == 0 and i > 0):
-                continue
-            if polar_grid:
-                out = 0.0 if j == 0 else math.degrees(b) + step
-                x, y = out * math.cos(a), out * math.sin(a)
-                name = f"azimuth {math.degrees(a):.0f} deg, tilt {math.degrees(b):.4g} deg"
-            else:
-                x, y, name = a, b, f"x {a:.3f} m, y {b:.3f} m"
-            shown.append(layers)
-            places.append(name)
-            figure.add_surface(
-                x=pages.short(x + 0.44 * step * ball[0]),
-                y=pages.short(y + 0.44 * step * ball[1]),
-                z=pages.short(0.44 * step * up),
-                surfacecolor=pages.short(layers[0]),
-                coloraxis="coloraxis",
-                hovertemplate=f"{name}<br>eta_KE %{{surfacecolor:.3g}}<extra></extra>",
-                lighting={"ambient": 0.85, "diffuse": 0.3, "specular": 0.05},
-            )
+    figure = graph.Figure()
+    for nodes in balls.nodes:
+        figure.add_mesh3d(
+            **{axis: pages.short(nodes[:, k]) for k, axis in enumerate("xyz")},
+            **balls.triangles,
+            coloraxis="coloraxis",
+            lighting={"ambient": 0.85, "diffuse": 0.3, "specular": 0.05},
+        )
     buttons = []
-    for n, (label, field) in enumerate(zip(labels, fields, strict=True)):
+    for label, said, field, logarithmic in (
+        ("eta_KE (1)", "eta_KE %{intensity:.4~g}", balls.eta, False),
+        (f"F_max ({unit})", f"F_max %{{customdata:.4~g}} {unit}", balls.force, True),
+    ):
+        coloured = [np.log10(values) if logarithmic else values for values in field]
         data = {
-            "surfacecolor": [pages.few(layers[n]) for layers in shown],
-            "hovertemplate": [f"{name}<br>{values[n]}<extra></extra>" for name in places],
+            "intensity": [pages.few(values) for values in coloured],
+            "customdata": [pages.few(values) if logarithmic else None for values in field],
+            "hovertemplate": [f"{name}<br>{said}<extra></extra>" for name in balls.names],
         }
-        layout = pages.colours(label, field, logarithmic=n == 1, tail=TAIL)
-        buttons.append(pages.button(label, data, layout, list(range(len(shown)))))
-    where = "around: azimuth, outwards: tilt; " if polar_grid else ""
-    rates = ("z", "alpha", "beta") if polar_grid else ("x", "y", "z")
-    ends = ", ".join(f"{axis} d{name}/dt" for axis, name in zip("xyz", rates, strict=True))
+        layout = pages.colours(label, np.array(coloured), logarithmic=logarithmic, tail=TAIL)
+        buttons.append(pages.button(label, data, layout, list(range(len(balls.nodes)))))
+    first = buttons[0]["args"][0]
+    for k, trace in enumerate(figure.data):
+        trace.update({key: values[k] for key, values in first.items()})
+    if balls.beyond:
+        figure.add_scatter3d(**_rims(balls))
+    rates = _rates(atlas)
+    ends = ", ".join(f"{axis} {rate}" for axis, rate in zip("xyz", rates, strict=True))
     hidden = {"visible": False}
-    far = float(np.abs(second).max()) + (0.6 * step if not polar_grid else 0.0)
-    if polar_grid:
-        far = math.degrees(far) + 2.2 * step
-    side, thick = [-far, far], [-0.5 * step, 0.5 * step]
+    thick = [-0.5 * balls.step, 0.5 * balls.step]
+    sides = [[middle - balls.half, middle + balls.half] for middle in balls.middle]
     scene: dict[str, Any] = {
         "aspectmode": "manual",
-        "aspectratio": pages.aspect([side, side, thick], 2.2 if polar_grid else 1.7),
+        "aspectratio": pages.aspect([*sides, thick], 2.2 if balls.polar else 1.7),
         "camera": pages.FLAT,
-        "xaxis": hidden if polar_grid else {"title": "x (m)", "range": side},
-        "yaxis": hidden if polar_grid else {"title": "y (m)", "range": side},
         "zaxis": hidden,
     }
-    if polar_grid:
-        figure.add_scatter3d(**_polar_names(first, np.degrees(second), step))
+    for axis, name, side in zip(("xaxis", "yaxis"), names, sides, strict=True):
+        shown = {"title": f"{name} ({atlas[name].attrs['units']})", "range": side}
+        scene[axis] = hidden if balls.polar else shown
+    around = ""
+    if balls.polar:
+        around = "around: azimuth, outwards: tilt; "
+        tilts = np.degrees(part.tilt.values)
+        figure.add_scatter3d(**_polar_names(part.azimuth.values, tilts, balls.step))
     figure.update_layout(
-        title=f"{title(atlas)}; {where}axes of a sphere: {ends}",
+        title=f"{title(atlas)}; {around}axes of a sphere: {ends}",
         coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8}},
         scene=scene,
         margin=pages.MARGIN,
@@ -569,6 +622,90 @@ def page(atlas: Any) -> Any:
     )
     figure.update_layout(buttons[0]["args"][1])
     return figure
+
+
+@dataclass(frozen=True, eq=False)
+class _Balls:
+    """The spheres of a page: nodes (n, 3) of each, and the fields at them, shape (n,).
+
+    ``names``: where each sphere is; ``beyond``: middles of those beyond the limits. ``triangles``:
+    of every one of them. ``step``: distance of spheres. ``middle`` and ``half`` width of
+    the picture.
+    """
+
+    nodes: list[Array]
+    triangles: dict[str, NDArray[np.int64]]
+    eta: list[Array]
+    force: list[Array]
+    names: list[str]
+    beyond: list[tuple[float, float]]
+    step: float
+    middle: tuple[float, float]
+    half: float
+    polar: bool
+
+
+def _balls(part: Any) -> _Balls:
+    names = part.eta.dims[:2]
+    polar = names == ("azimuth", "tilt")
+    first, second = (part[name].values for name in names)
+    units = [part[name].attrs["units"] for name in names]
+    step = float(second[1] - second[0]) * (180 / math.pi if polar else 1.0)
+    turn = np.append(part.turn.values, part.turn.values[0] + 2 * np.pi)
+    ball = 0.44 * step * unit_vectors(part.polar.values, turn)
+    whole = pages.triangles(np.ones(ball.shape[:2], bool))
+    within = part.within_limits.values > 0
+    nodes: list[Array] = []
+    said: list[str] = []
+    kept: list[tuple[int, int]] = []
+    beyond: list[tuple[float, float]] = []
+    for i, a in enumerate(first.tolist()):
+        for j, b in enumerate(second.tolist()):
+            known = np.isfinite(part.eta.values[i, j]).all()
+            if not known or (polar and j == 0 and i > 0):
+                continue
+            if polar:
+                out = 0.0 if j == 0 else math.degrees(b) + step
+                x, y = out * math.cos(a), out * math.sin(a)
+                name = f"azimuth {math.degrees(a):.0f} deg, tilt {math.degrees(b):.4g} deg"
+            else:
+                x, y = a, b
+                name = f"{names[0]} {a:.4g} {units[0]}, {names[1]} {b:.4g} {units[1]}"
+            if not within[i, j]:
+                beyond.append((x, y))
+                name += "<br>beyond the machine's limits"
+            said.append(name)
+            nodes.append((ball + np.array([x, y, 0.0])).reshape(-1, 3))
+            kept.append((i, j))
+    eta, force = (
+        [pages.closed(field.values[i, j]).ravel() for i, j in kept]
+        for field in (part.eta, part.force)
+    )
+    if polar:
+        middle, half = (0.0, 0.0), math.degrees(float(second.max())) + 2.2 * step
+    else:
+        middle = float(first.mean()), float(second.mean())
+        half = float(np.ptp(second)) / 2 + 0.6 * step
+    return _Balls(nodes, whole, eta, force, said, beyond, step, middle, half, polar)
+
+
+def _rims(balls: _Balls) -> dict[str, Any]:
+    """Circles around the spheres beyond the limits, as a trace."""
+    turn = np.linspace(0.0, 2 * np.pi, 49)
+    circle = 0.47 * balls.step * np.stack([np.cos(turn), np.sin(turn)], -1)
+    # A gap after each.
+    lines = [np.vstack([circle + middle, [np.nan, np.nan]]) for middle in balls.beyond]
+    x, y = np.concatenate(lines).T
+    return {
+        "x": pages.short(x),
+        "y": pages.short(y),
+        "z": np.zeros(len(x)),
+        "mode": "lines",
+        "line": {"color": BEYOND["ec"], "width": 4},
+        "hoverinfo": "skip",
+        "name": "beyond the limits",
+        "showlegend": True,
+    }
 
 
 def _polar_names(azimuth: Array, tilt: Array, step: float) -> dict[str, Any]:
@@ -587,7 +724,7 @@ def _polar_names(azimuth: Array, tilt: Array, step: float) -> dict[str, Any]:
     return {
         "x": x,
         "y": y,
-        "z": [0.44 * step] * len(x),
+        "z": [0.0] * len(x),
         "mode": "text",
         "text": text,
         "hoverinfo": "skip",

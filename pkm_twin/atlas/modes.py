@@ -22,15 +22,15 @@ from pkm_twin.atlas import figures, pages
 from pkm_twin.atlas.extras import require
 from pkm_twin.atlas.grids import (
     circles,
-    distance_unit,
+    cylinder,
     height_range,
     ladder,
     largest_cylinder,
-    polar_pose,
     turns,
 )
 from pkm_twin.atlas.sweep import Chunk, Field, Kind, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.workspace import distance_unit
 from pkm_twin.machine.members import GROUND, MOVING, Frame, framed
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
@@ -95,8 +95,8 @@ class ModesSweep(Sweep):
 
     @property
     def middle(self) -> Array:
-        """The pose whose shapes are stored: on the axis at the middle height, shape (3,)."""
-        return polar_pose(self.robot, self.heights[len(self.heights) // 2], 0.0, 0.0)
+        """The pose whose shapes are stored: on the axis at the middle height, shape (m,)."""
+        return self.robot.grid().polar_pose(self.heights[len(self.heights) // 2], 0.0, 0.0)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -115,7 +115,9 @@ class ModesSweep(Sweep):
     def evaluate(self, chunk: Chunk) -> Values:
         """Frequencies of one ring, Hz."""
         distance = self.distances[chunk.start : chunk.stop, None]
-        poses = polar_pose(self.robot, self.heights[chunk.first], distance, turns(self.azimuths))
+        poses = self.robot.grid().polar_pose(
+            self.heights[chunk.first], distance, turns(self.azimuths)
+        )
         return {"frequency": natural_frequencies(self.robot, poses, COUNT)}
 
     def summaries(self, partial: Iterable[Values]) -> dict[str, Variable]:
@@ -205,6 +207,7 @@ def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:
     """
     if not has_modes(robot):
         raise ParameterError("robot", robot.name, "a robot whose file has data for modes")
+    grid = cylinder(robot, "modes over it")
     total = POINTS if points is None else points
     if total < 50:
         raise ParameterError("points", total, "50 or more")
@@ -221,7 +224,7 @@ def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:
         raise ParameterError("points", total, "enough for three rings")
     heights = np.linspace(best.low, best.high, layers)
     # Names and lines are the same in every pose: members keep their divisions.
-    pose = polar_pose(robot, heights[layers // 2], 0.0, 0.0)
+    pose = grid.polar_pose(heights[layers // 2], 0.0, 0.0)
     found = modes(robot, pose, COUNT)
     edges = frame_edges(framed(robot).frame(pose), found.nodes)
     return ModesSweep(
@@ -263,14 +266,14 @@ def across(atlas: Any, values: Array) -> tuple[Array, Array, Array, tuple[str, s
     distance, unit = figures.in_degrees(atlas.distance)
     turn, closed = figures.around(atlas.azimuth.values, values, 96)
     x, y = (distance[:, None] * f(turn) for f in (np.cos, np.sin))
-    mechanism = atlas.attrs["mechanism"]
-    if mechanism == "upr_rpu":
-        # As in the strain-energy pictures; azimuth 0 is towards beta.
-        return y, x, closed, (f"gamma ({unit})", f"beta ({unit})")
-    if unit == "deg":
+    first, second = atlas.attrs["lateral"].split()
+    if atlas.attrs["zero_torsion"] == "yes":
         labels = f"tilt towards azimuth 0° ({unit})", f"tilt towards azimuth 90° ({unit})"
         return x, y, closed, labels
-    return x, y, closed, (f"x ({unit})", f"y ({unit})")
+    if unit == "deg":
+        # As in the strain-energy pictures; azimuth 0 is towards the first.
+        return y, x, closed, (f"{second} ({unit})", f"{first} ({unit})")
+    return x, y, closed, (f"{first} ({unit})", f"{second} ({unit})")
 
 
 def frequency_range(atlas: Any, ax: Any = None) -> Any:
@@ -476,8 +479,8 @@ def page(atlas: Any) -> Any:
         coloraxis="coloraxis2",
         flatshading=True,
         lighting={"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0},
-        hovertemplate=f"{labels[0]} %{{x:.3g}}<br>{labels[1]} %{{y:.3g}}<br>z %{{z:.3f}} m"
-        "<br>%{text}<extra></extra>",
+        hovertemplate=f"{labels[0]} %{{x:.4~f}}<br>{labels[1]} %{{y:.4~f}}<br>z %{{z:.4~f}} m"
+        "<br>frequency %{text}<extra></extra>",
         row=1,
         col=2,
     )

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.atlas import figures, pages, plots
-from pkm_twin.atlas.extras import require
-from pkm_twin.atlas.grids import circles, height_range, ladder, nice, polar_pose, size, turns
+from pkm_twin.atlas.grids import circles, cylinder, height_range, ladder, nice, turns
 from pkm_twin.atlas.sweep import Chunk, Field, Kind, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.robot import Robot
@@ -137,12 +136,12 @@ class StrainEnergySweep(Sweep):
         if kept:
             height = self.heights[chunk.first]
             result = strain_energy(
-                self.robot, polar_pose(self.robot, height, tilt[:, None], self.turn), self.wrench
+                self.robot,
+                self.robot.grid().polar_pose(height, tilt[:, None], self.turn),
+                self.wrench,
             )
             energy[:kept], factor[:kept] = result.total, result.factors
             dominant[:kept] = result.factors.argmax(-1)
-            if not any(self.wrench):
-                dominant[:kept] = -1
         ring = factor[:kept].sum(1)
         return {
             "energy": energy,
@@ -182,12 +181,13 @@ def strain_energy_sweep(
     :raises ParameterError: a robot without elastic members, a wrench that is none, or a robot
         that has no regular workspace.
     """
-    if robot.energy_kernel is None:
+    if not robot.element_names:
         raise ParameterError(
             "mechanism", robot.mechanism, "a mechanism with elastic members (upr_rpu)"
         )
     load = checked_wrench(wrench)
-    step = nice(size(robot) / 15)
+    cylinder(robot, "strain energy over tilts")
+    step = nice(float(np.ptp(height_range(robot))) / 15)
     base = _layers(robot, step)
     if points is None:
         return _sweep(robot, load, base, TILT_STEP, AZIMUTHS)
@@ -214,6 +214,10 @@ def checked_wrench(wrench: ArrayLike | str) -> tuple[float, ...]:
     values = np.asarray(wrench, np.float64)
     if values.shape != (6,) or not np.isfinite(values).all():
         raise ParameterError("wrench", values.tolist(), "six finite numbers, N and N m")
+    if not values.any():
+        raise ParameterError(
+            "wrench", values.tolist(), "a wrench above zero: none stores no energy"
+        )
     return tuple(values.tolist())
 
 
@@ -280,8 +284,9 @@ def plane(
     turn, values = figures.around(azimuth, values[shown])
     beta, gamma = (np.degrees(tilt[shown])[:, None] * f(turn) for f in (np.cos, np.sin))
     figures.contours(ax, gamma, beta, values, label, **options)
-    ax.set_xlabel("gamma (deg)")
-    ax.set_ylabel("beta (deg)")
+    first, second = lateral_of(atlas)
+    ax.set_xlabel(f"{second} (deg)")
+    ax.set_ylabel(f"{first} (deg)")
     ax.set_title(f"z = {float(layer.z):.3f} m")
     return ax
 
@@ -341,8 +346,9 @@ def stack(atlas: Any, ax: Any = None, layers: int = 6) -> Any:
         )
     ax.view_init(elev=24, azim=-60)
     ax.set_box_aspect((1, 1, 0.8), zoom=1.12)
-    ax.set_xlabel("gamma (deg)")
-    ax.set_ylabel("beta (deg)")
+    first, second = lateral_of(atlas)
+    ax.set_xlabel(f"{second} (deg)")
+    ax.set_ylabel(f"{first} (deg)")
     ax.set_zlabel("z (m)", labelpad=8)
     bar = ax.figure.colorbar(cm.ScalarMappable(norm, figures.MAP), ax=ax, shrink=0.75, pad=0.12)
     bar.set_label(f"total strain energy ({unit})")
@@ -402,6 +408,12 @@ def load_case(atlas: Any) -> str:
     return f"{atlas.attrs['robot']} under {name}({numbers}) N, N m"
 
 
+def lateral_of(atlas: Any) -> tuple[str, str]:
+    """Names of the two tilts, at azimuth 0 and a quarter turn."""
+    first, second = atlas.attrs["lateral"].split()
+    return first, second
+
+
 # Page
 
 
@@ -415,59 +427,32 @@ def page(atlas: Any) -> Any:
 
     A menu chooses total energy or an element's factor, a slider one height or all.
     """
-    graph = require("plotly.graph_objects", "atlas")
     part = pages.thinned(atlas, {"z": 12, "tilt": pages.MOST, "azimuth": 2 * pages.MOST})
     turn = np.append(part.azimuth.values, part.azimuth.values[0] + 2 * np.pi)
     tilt = np.degrees(part.tilt.values)[:, None]
-    gamma, beta = tilt * np.sin(turn), tilt * np.cos(turn)
     energy, unit = figures.prefixed(part.energy.values, "J")
-    # Over two decades: in steps of equal ratio, or all but the edge is one colour.
-    fields = {f"total strain energy ({unit})": np.log10(energy)}
+
+    def closed(values: Array) -> Array:
+        return np.stack([pages.closed(layer) for layer in values])
+
+    # Over two decades: in steps of equal ratio, or all but the edge is one colour. Nothing has a
+    # logarithm where nothing bears the wrench.
+    ratio = bool(np.nanmin(energy) > 0.0)
+    label = f"total strain energy ({unit})"
+    fields = [pages.Shown(label, "energy", unit, closed(energy), logarithmic=ratio)]
     for k, name in enumerate(part.element.values):
-        fields[f"factor of {name} (1)"] = part.factor.values[..., k]
-    heights = part.z.values.tolist()
-    place = "gamma %{{x:.1f}} deg<br>beta %{{y:.1f}} deg<br>z {:.3f} m<br>{}<extra></extra>"
-    powers, parts = f"energy 10^%{{surfacecolor:.2f}} {unit}", "factor %{surfacecolor:.3g}"
-    figure = graph.Figure()
-    for k, z in enumerate(heights):
-        value = next(iter(fields.values()))[k]
-        figure.add_surface(
-            x=pages.short(gamma),
-            y=pages.short(beta),
-            z=pages.short(np.where(np.isfinite(pages.closed(value)), z, np.nan)),
-            surfacecolor=pages.short(pages.closed(value)),
-            coloraxis="coloraxis",
-            hovertemplate=place.format(z, powers),
-        )
-    buttons = []
-    for n, (label, field) in enumerate(fields.items()):
-        shown = [pages.closed(layer) for layer in field]
-        data = {
-            "surfacecolor": [pages.few(layer) for layer in shown],
-            "hovertemplate": [place.format(z, powers if n == 0 else parts) for z in heights],
-        }
-        buttons.append(pages.button(label, data, pages.colours(label, field, logarithmic=n == 0)))
-    steps = [{"label": "all", "method": "restyle", "args": [{"visible": [True] * len(heights)}]}]
-    for k, z in enumerate(heights):
-        alone = [n == k for n in range(len(heights))]
-        steps.append(
-            {"label": f"{z:.3f}", "method": "restyle", "args": [{"visible": alone}]},
-        )
-    figure.update_layout(
-        title=title(atlas),
-        coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8}},
-        scene={
-            "xaxis": {"title": "gamma (deg)", "range": pages.span(gamma)},
-            "yaxis": {"title": "beta (deg)", "range": pages.span(beta)},
-            "zaxis": {"title": "z (m)", "range": pages.span(part.z.values)},
-            "camera": pages.CAMERA,
-        },
-        margin=pages.MARGIN,
-        updatemenus=[{"buttons": buttons, **pages.MENU}],
-        sliders=[pages.slider(steps, "height (m): ")],
+        values = closed(part.factor.values[..., k])
+        fields.append(pages.Shown(f"factor of {name} (1)", f"factor of {name}", "", values))
+    first, second = lateral_of(atlas)
+    return pages.layers(
+        title(atlas),
+        tilt * np.sin(turn),
+        tilt * np.cos(turn),
+        part.z.values,
+        (second, first, "z"),
+        ("deg", "deg", "m"),
+        fields,
     )
-    figure.update_layout(buttons[0]["args"][1])
-    return figure
 
 
 KIND: Final = Kind(

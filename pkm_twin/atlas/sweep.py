@@ -125,12 +125,18 @@ class Sweep:
     @property
     def attributes(self) -> dict[str, str]:
         """Global attributes of the file: everything that made it."""
+        grid = self.robot.grid()
         return {
             "title": f"{self.kind} atlas of {self.robot.name}",
             "Conventions": "CF-1.10",
             "kind": self.kind,
             "robot": self.robot.name,
             "mechanism": self.robot.mechanism,
+            "pose": " ".join(self.robot.pose_names),
+            "layout": grid.kind,
+            "height": grid.height,
+            "lateral": " ".join(grid.lateral),
+            "zero_torsion": "yes" if grid.zero_torsion else "no",
             "robot_parameters": json.dumps(plain(self.robot), sort_keys=True),
             "settings": json.dumps(self.settings, sort_keys=True),
             "pkm_twin_version": pkm_twin.__version__,
