@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from pkm_twin.atlas import isotropy, modes, pages, plots, strain_energy, workspace
+from pkm_twin.atlas.store import replace_file, writing
 from pkm_twin.atlas.sweep import Kind
 from pkm_twin.errors import UnknownNameError
 
@@ -64,5 +65,6 @@ def write_page(atlas: Any, path: Path) -> Path:
     text = pages.SHELL.format(
         title=html.escape(kind.title(atlas)), plot=plot, help=html.escape(kind.help)
     )
-    path.write_text(text, encoding="utf-8")
+    with writing(path):
+        replace_file(path, text.encode())
     return path

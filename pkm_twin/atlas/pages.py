@@ -196,9 +196,8 @@ def layers(
         if field.logarithmic:
             data |= {"intensity": [few(np.log10(v)) for v in values], "customdata": values}
             said = "customdata"
-        data["hovertemplate"] = (
-            f"{where}<br>{field.name} %{{{said}:.4~g}} {field.unit}<extra></extra>"
-        )
+        label = f"{field.name} %{{{said}:.4~g}} {field.unit}".strip()
+        data["hovertemplate"] = f"{where}<br>{label}<extra></extra>"
         coloured = np.log10(field.values) if field.logarithmic else field.values
         layout = colours(field.label, coloured, logarithmic=field.logarithmic)
         buttons.append(button(field.label, data, layout))

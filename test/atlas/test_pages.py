@@ -16,30 +16,42 @@ from test.atlas.browser import Browser, find_browser
 pytest.importorskip("plotly")
 pytest.importorskip("tornado")
 
-PLACES = [(x, y) for x in np.linspace(0.2, 0.8, 7) for y in np.linspace(0.3, 0.7, 4)]
+POINTS = 12
+"""Places that the mouse is put to for each entry of a page's menu."""
 LISTEN = """
 window.gd = document.querySelector('.js-plotly-plot');
 window.under = null;
 gd.on('plotly_hover', event => { window.under = event.points[0]; });
 gd.on('plotly_unhover', () => { window.under = null; });
+// Where a point of a trace stands on the screen.
+window.place = (trace, at) => {
+  const scene = gd._fullLayout[trace.scene]._scene, camera = scene.glplot.cameraParams;
+  const times = (m, v) => [0, 1, 2, 3].map(
+    i => m[i] * v[0] + m[4 + i] * v[1] + m[8 + i] * v[2] + m[12 + i] * v[3]);
+  const v = at.map((value, k) => value * scene.dataScale[k]).concat(1);
+  const p = times(camera.projection, times(camera.view, times(camera.model, v)));
+  const box = scene.glplot.canvas.getBoundingClientRect();
+  return [box.left + (0.5 + 0.5 * p[0] / p[3]) * box.width,
+          box.top + (0.5 - 0.5 * p[1] / p[3]) * box.height];
+};
+// Points of the traces that have labels, spread over all of them.
+window.known = count => {
+  const traces = gd._fullData.filter(trace => trace.hoverinfo !== 'skip' && trace.x.length);
+  return [...Array(count).keys()].map(k => {
+    const trace = traces[Math.floor(k * traces.length / count)];
+    const n = Math.floor(trace.x.length * ((k * 0.381966 + 0.2) % 1));
+    return window.place(trace, [trace.x[n], trace.y[n], trace.z[n]]);
+  });
+};
 """
 READ = """(() => {
   const label = document.querySelector('.hovertext');
   if (!window.under || !label) return null;
   const spans = [...label.querySelectorAll('tspan')].map(span => span.textContent);
-  const point = window.under, name = point.fullData.scene;
-  const lines = spans.length ? spans : [label.textContent];
-  if (!name) return {lines, off: 0};
-  // Where the point that is told of stands on the screen.
-  const scene = gd._fullLayout[name]._scene, camera = scene.glplot.cameraParams;
-  const times = (m, v) => [0, 1, 2, 3].map(
-    i => m[i] * v[0] + m[4 + i] * v[1] + m[8 + i] * v[2] + m[12 + i] * v[3]);
-  const at = ['x', 'y', 'z'].map((axis, k) => point[axis] * scene.dataScale[k]).concat(1);
-  const p = times(camera.projection, times(camera.view, times(camera.model, at)));
-  const box = scene.glplot.canvas.getBoundingClientRect();
-  const x = box.left + (0.5 + 0.5 * p[0] / p[3]) * box.width;
-  const y = box.top + (0.5 - 0.5 * p[1] / p[3]) * box.height;
-  return {lines, off: Math.hypot(x - window.mouse[0], y - window.mouse[1])};
+  const point = window.under;
+  const [x, y] = window.place(point.fullData, [point.x, point.y, point.z]);
+  return {lines: spans.length ? spans : [label.textContent],
+          off: Math.hypot(x - window.mouse[0], y - window.mouse[1])};
 })()"""
 
 
@@ -68,11 +80,12 @@ def choose(browser, number):
 
 
 def labels(browser):
-    """Lines of the labels at places all over the page, and how far (pixels) the points are."""
-    width, height = browser.run("[innerWidth, innerHeight]")
+    """Lines of the labels at known points, or at what stands before them.
+
+    The points that labels tell of are under the mouse, but for some pixels between points.
+    """
     found = []
-    for across, down in PLACES:
-        x, y = round(across * width), round(down * height)
+    for x, y in browser.run(f"window.known({POINTS})"):
         browser.run(f"window.under = null; window.mouse = [{x}, {y}]")
         # From beside it: a place that the mouse is at already tells nothing new.
         browser.move(x - 3, y)
@@ -85,9 +98,8 @@ def labels(browser):
         label = browser.run(READ)
         if label:
             found.append(label)
-    assert len(found) >= 4, found
-    # Points are some pixels apart.
-    assert np.median([label["off"] for label in found]) < 25, found
+    assert len(found) >= POINTS // 2, found
+    assert np.median([label["off"] for label in found]) < 20, found
     return [label["lines"] for label in found]
 
 
