@@ -54,7 +54,7 @@ _FOREIGN = {
 }
 
 
-class FlawError(Exception):
+class FormatError(Exception):
     """What is wrong and where, before the path is known; never leaves this module."""
 
     def __init__(self, text: str, offset: int | None, reason: str = "damaged") -> None:
@@ -64,7 +64,7 @@ class FlawError(Exception):
         self.reason = reason
 
 
-class Tape:
+class RecordReader:
     """A file read forward, with its position and the CRC of all that was read."""
 
     def __init__(self, file: IO[bytes], size: int) -> None:
@@ -82,14 +82,14 @@ class Tape:
         """Read exactly ``count`` bytes."""
         left = self.size - self.position
         if count > left:
-            raise FlawError(
+            raise FormatError(
                 f"the {what} needs {count} bytes, the file has {left} left: it is cut short",
                 self.position,
                 "truncated",
             )
         data = self._file.read(count)
         if len(data) != count:
-            raise FlawError("the file shrank while it was read", self.position, "truncated")
+            raise FormatError("the file shrank while it was read", self.position, "truncated")
         self.position += count
         self.crc = zlib.crc32(data, self.crc)
         return data
@@ -99,9 +99,9 @@ class Tape:
         at = self.position
         opcode, length = FRAME.unpack(self.read(FRAME.size, "next record"))
         if opcode == 0:
-            raise FlawError("a record has the opcode 0", at)
+            raise FormatError("a record has the opcode 0", at)
         if length > self.size - self.position:
-            raise FlawError(
+            raise FormatError(
                 f"the {opcode_name(opcode)} record has {length} bytes, the file has "
                 f"{self.size - self.position} left: it is cut short",
                 at,
@@ -112,7 +112,7 @@ class Tape:
     def body(self, opcode: int, length: int) -> bytes:
         """Read a record's content."""
         if length > MAX_RECORD_BYTES:
-            raise FlawError(
+            raise FormatError(
                 f"the {opcode_name(opcode)} record has {length} bytes; at most {MAX_RECORD_BYTES}",
                 self.position,
                 "size_cap",
@@ -130,14 +130,14 @@ class Tape:
 
 
 @contextmanager
-def open_tape(path: Path) -> Iterator[Tape]:
+def open_reader(path: Path) -> Iterator[RecordReader]:
     """Open a file for reading; whatever the system refuses becomes a BagError."""
     try:
         if path.is_dir():
             inside = ", ".join(sorted(p.name for p in path.glob("*.mcap"))) or "no .mcap file"
             raise BagError(f"is a folder; name a file in it: {inside}", path=path, reason="folder")
         with path.open("rb") as file:
-            yield Tape(file, os.fstat(file.fileno()).st_size)
+            yield RecordReader(file, os.fstat(file.fileno()).st_size)
     except FileNotFoundError as error:
         raise BagError("does not exist", path=path, reason="not_found") from error
     except OSError as error:
@@ -154,7 +154,7 @@ def utf8(raw: bytes, what: str, offset: int | None) -> str:
     try:
         return raw.decode()
     except UnicodeDecodeError:
-        raise FlawError(f"a text of the {what} record is not UTF-8", offset) from None
+        raise FormatError(f"a text of the {what} record is not UTF-8", offset) from None
 
 
 class Fields:
@@ -170,7 +170,7 @@ class Fields:
         """Read ``count`` bytes."""
         start = self._position
         if count > len(self._body) - start:
-            raise FlawError(
+            raise FormatError(
                 f"a field of the {self._what} record reaches past its end", self._offset
             )
         self._position += count
@@ -203,7 +203,9 @@ class Fields:
         while part.left:
             key = part.text()
             if key in result:
-                raise FlawError(f"the {self._what} record has the key {key!r} twice", self._offset)
+                raise FormatError(
+                    f"the {self._what} record has the key {key!r} twice", self._offset
+                )
             result[key] = part.text()
         return result
 
@@ -215,20 +217,22 @@ class Fields:
     def done(self) -> None:
         """Refuse bytes after the last field."""
         if self.left:
-            raise FlawError(f"the {self._what} record has {self.left} bytes too many", self._offset)
+            raise FormatError(
+                f"the {self._what} record has {self.left} bytes too many", self._offset
+            )
 
 
-def walk(data: bytes, offset: int) -> Iterator[tuple[int, int, int]]:
+def iterate_records(data: bytes, offset: int) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end of each record in unpacked data of the chunk at ``offset``."""
     position = 0
     size = len(data)
     while position < size:
         if size - position < FRAME.size:
-            raise FlawError(f"{size - position} stray bytes end the chunk", offset)
+            raise FormatError(f"{size - position} stray bytes end the chunk", offset)
         opcode, length = FRAME.unpack_from(data, position)
         start = position + FRAME.size
         if opcode == 0 or length > size - start:
-            raise FlawError(
+            raise FormatError(
                 f"record 0x{opcode:02x} with {length} bytes at {position} of the unpacked chunk "
                 f"does not fit its {size} bytes",
                 offset,
@@ -240,7 +244,7 @@ def walk(data: bytes, offset: int) -> Iterator[tuple[int, int, int]]:
 def message_head(data: bytes, start: int, end: int, offset: int) -> tuple[int, int, int, int]:
     """Return channel, sequence, log time and publish time of the message record."""
     if end - start < MESSAGE_HEAD.size:
-        raise FlawError(
+        raise FormatError(
             f"a message record has {end - start} bytes; at least {MESSAGE_HEAD.size}", offset
         )
     number, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(data, start)
@@ -287,18 +291,20 @@ class Records:
         schema = Schema(fields.text(), fields.text(), fields.blob("I"))
         fields.done()
         if number == 0:
-            raise FlawError("a schema has the number 0", offset)
+            raise FormatError("a schema has the number 0", offset)
         if self.schemas.setdefault(number, schema) != schema:
-            raise FlawError(f"schema {number} is defined twice, differently", offset)
+            raise FormatError(f"schema {number} is defined twice, differently", offset)
 
     def _add_channel(self, number: int, fields: Fields, offset: int) -> None:
         channel = Channel(fields.number("H"), fields.text(), fields.text(), fields.texts())
         fields.done()
         schema = self.schemas.get(channel.schema_id)
         if channel.schema_id and schema is None:
-            raise FlawError(f"channel {number} has the unknown schema {channel.schema_id}", offset)
+            raise FormatError(
+                f"channel {number} has the unknown schema {channel.schema_id}", offset
+            )
         if self.channels.setdefault(number, channel) != channel:
-            raise FlawError(f"channel {number} is defined twice, differently", offset)
+            raise FormatError(f"channel {number} is defined twice, differently", offset)
         self.types[number] = schema.name if schema else ""
 
 
@@ -323,7 +329,7 @@ def read_chunk(body: bytes, offset: int) -> _Chunk:
     fields.done()
     data = _unpack(compression, packed, size, offset)
     if crc and zlib.crc32(data) != crc:
-        raise FlawError(
+        raise FormatError(
             f"the chunk's CRC is {zlib.crc32(data):08x}; the file says {crc:08x}", offset, "crc"
         )
     return _Chunk(start, end, compression, len(packed), data, crc != 0)
@@ -332,15 +338,15 @@ def read_chunk(body: bytes, offset: int) -> _Chunk:
 def _unpack(compression: str, packed: bytes, size: int, offset: int) -> bytes:
     """Unpack a chunk to exactly ``size`` bytes, having checked the size first."""
     if compression not in ("", "zstd", "lz4"):
-        raise FlawError(
+        raise FormatError(
             f"unknown compression {compression!r}; known: zstd, lz4, none", offset, "compression"
         )
     if size > MAX_CHUNK_BYTES:
-        raise FlawError(
+        raise FormatError(
             f"the chunk unpacks to {size} bytes; at most {MAX_CHUNK_BYTES}", offset, "size_cap"
         )
     if size > FREE_BYTES and size > MAX_RATIO * len(packed):
-        raise FlawError(
+        raise FormatError(
             f"the chunk unpacks from {len(packed)} to {size} bytes; at most {MAX_RATIO} to 1",
             offset,
             "size_cap",
@@ -351,7 +357,7 @@ def _unpack(compression: str, packed: bytes, size: int, offset: int) -> bytes:
         data = _decompress(compression, packed, size + 1, offset)
     if len(data) != size:
         more = "more" if len(data) > size else str(len(data))
-        raise FlawError(f"the chunk unpacks to {more} bytes; the file says {size}", offset)
+        raise FormatError(f"the chunk unpacks to {more} bytes; the file says {size}", offset)
     return data
 
 
@@ -362,7 +368,7 @@ def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> byt
         library: Any = importlib.import_module(name)
     except ImportError:
         text = f"the chunk is packed with {compression}; its Python package {name} is missing"
-        raise FlawError(text, offset, "compression") from None
+        raise FormatError(text, offset, "compression") from None
     failures = (library.ZstdError,) if compression == "zstd" else (RuntimeError, EOFError)
     try:
         if compression == "lz4":
@@ -372,7 +378,7 @@ def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> byt
         with window.stream_reader(io.BytesIO(packed)) as reader:
             return bytes(reader.read(limit))
     except failures as error:
-        raise FlawError(f"the chunk does not unpack: {error}", offset) from None
+        raise FormatError(f"the chunk does not unpack: {error}", offset) from None
 
 
 def metadata(body: bytes, offset: int) -> tuple[str, dict[str, str], bool]:
@@ -382,7 +388,7 @@ def metadata(body: bytes, offset: int) -> tuple[str, dict[str, str], bool]:
     fields.done()
     crc = entries.pop(METADATA_CRC, None)
     if crc is not None and crc != metadata_crc(name, entries):
-        raise FlawError(f"metadata {name!r} does not match its CRC", offset, "crc")
+        raise FormatError(f"metadata {name!r} does not match its CRC", offset, "crc")
     return name, entries, crc is not None
 
 
@@ -393,54 +399,58 @@ def metadata_crc(name: str, entries: Mapping[str, str]) -> str:
     return f"{zlib.crc32(packed):08x}"
 
 
-def read_magic(tape: Tape) -> None:
+def read_magic(reader: RecordReader) -> None:
     """Read the opening mark; say in plain words what a file without it is."""
-    if tape.size == 0:
-        raise FlawError("the file is empty", 0, "empty")
-    head = tape.read(min(tape.size, 16), "opening mark")
+    if reader.size == 0:
+        raise FormatError("the file is empty", 0, "empty")
+    head = reader.read(min(reader.size, 16), "opening mark")
     for magic, text in _FOREIGN.items():
         if head.startswith(magic):
-            raise FlawError(f"this is {text}", 0, "not_mcap")
-    if tape.size < len(MAGIC) and MAGIC.startswith(head):
-        raise FlawError(f"the file ends after {tape.size} bytes: it is cut short", 0, "truncated")
+            raise FormatError(f"this is {text}", 0, "not_mcap")
+    if reader.size < len(MAGIC) and MAGIC.startswith(head):
+        raise FormatError(
+            f"the file ends after {reader.size} bytes: it is cut short", 0, "truncated"
+        )
     if not head.startswith(MAGIC):
-        raise FlawError(
+        raise FormatError(
             "this is not an MCAP file: it does not start with the MCAP mark", 0, "not_mcap"
         )
-    tape.seek(len(MAGIC))
-    tape.crc = zlib.crc32(MAGIC)
-    if tape.size == len(MAGIC):
-        raise FlawError("the file holds the MCAP mark and nothing else", 0, "truncated")
+    reader.seek(len(MAGIC))
+    reader.crc = zlib.crc32(MAGIC)
+    if reader.size == len(MAGIC):
+        raise FormatError("the file holds the MCAP mark and nothing else", 0, "truncated")
 
 
-def read_attachment(tape: Tape, at: int, length: int) -> tuple[bytes, tuple[object, ...]]:
+def read_attachment(reader: RecordReader, at: int, length: int) -> tuple[bytes, tuple[object, ...]]:
     """Pass over an attachment in blocks; return its head and what its index must say."""
-    end = tape.position + length
+    end = reader.position + length
     if length < 16 + 4 + 4 + 8 + CRC.size:
-        raise FlawError(f"the attachment record has {length} bytes, too few for its fields", at)
-    head = tape.read(16, "attachment")
+        raise FormatError(f"the attachment record has {length} bytes, too few for its fields", at)
+    head = reader.read(16, "attachment")
     texts = []
     for _ in range(2):
-        prefix = tape.read(4, "attachment")
+        prefix = reader.read(4, "attachment")
         (count,) = struct.unpack("<I", prefix)
-        if count > end - tape.position:
-            raise FlawError("a field of the attachment record reaches past its end", at)
-        texts.append(tape.body(ATTACHMENT, count))
+        if count > end - reader.position:
+            raise FormatError("a field of the attachment record reaches past its end", at)
+        texts.append(reader.body(ATTACHMENT, count))
         head += prefix + texts[-1]
-    prefix = tape.read(8, "attachment")
+    prefix = reader.read(8, "attachment")
     (size,) = struct.unpack("<Q", prefix)
-    if size != end - tape.position - CRC.size:
-        raise FlawError(f"the attachment says {size} bytes of data; its record differs", at)
+    if size != end - reader.position - CRC.size:
+        raise FormatError(f"the attachment says {size} bytes of data; its record differs", at)
     head += prefix
     log_time, create_time = struct.unpack("<QQ", head[:16])
     crc = zlib.crc32(head)
     left = size
     while left:
-        block = tape.read(min(left, _BLOCK_BYTES), "attachment")
+        block = reader.read(min(left, _BLOCK_BYTES), "attachment")
         crc = zlib.crc32(block, crc)
         left -= len(block)
-    (stated,) = CRC.unpack(tape.read(CRC.size, "attachment"))
+    (stated,) = CRC.unpack(reader.read(CRC.size, "attachment"))
     if stated and stated != crc:
-        raise FlawError(f"the attachment's CRC is {crc:08x}; the file says {stated:08x}", at, "crc")
+        raise FormatError(
+            f"the attachment's CRC is {crc:08x}; the file says {stated:08x}", at, "crc"
+        )
     name, media = (utf8(text, "attachment", at) for text in texts)
     return head, (at, FRAME.size + length, log_time, create_time, size, name, media)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Strict reading and safe writing of MCAP bags. Imports no ROS.
 
-Reading: the whole file is checked before the first message is handed out. Each record is walked in
+Reading: the whole file is checked before the first message is handed out. Each record is read in
 file order; CRCs, lengths, counts, times and indexes must agree with what is there. Bags written
 here carry a CRC over every byte; where a foreign bag has none, the report says so in a warning.
 
@@ -43,18 +43,18 @@ from pkm_twin.bags.format import (
     SCHEMA,
     Channel,
     Fields,
-    FlawError,
+    FormatError,
+    RecordReader,
     Records,
     Schema,
-    Tape,
+    iterate_records,
     message_head,
     metadata,
     metadata_crc,
     opcode_name,
-    open_tape,
+    open_reader,
     read_chunk,
     utf8,
-    walk,
 )
 from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo
 from pkm_twin.bags.writer import LIBRARY, BagWriter, Sink, mcap_writer, refuse_existing, write_error
@@ -154,12 +154,12 @@ def open_bag(path: str | Path) -> Bag:
     :raises BagError: as :func:`inspect`.
     """
     path = Path(path)
-    with open_tape(path) as tape:
-        check = Check(tape)
+    with open_reader(path) as reader:
+        check = Check(reader)
         try:
             check.run()
-        except FlawError as flaw:
-            raise _bag_error(flaw, path) from None
+        except FormatError as error:
+            raise _bag_error(error, path) from None
     return Bag(path, check)
 
 
@@ -210,34 +210,36 @@ class Bag:
         return {number for number, channel in self._channels.items() if channel.topic in names}
 
     def _in_file(self, wanted: set[int]) -> Iterator[BagMessage]:
-        with open_tape(self._path) as tape:
+        with open_reader(self._path) as reader:
             for segment in self._segments:
-                yield from self._load(tape, segment, wanted)
+                yield from self._load(reader, segment, wanted)
 
     def _ordered(self, wanted: set[int]) -> Iterator[BagMessage]:
         waiting: list[tuple[int, int, int, BagMessage]] = []
         by_start = sorted(self._segments, key=lambda segment: segment.start)
-        with open_tape(self._path) as tape:
+        with open_reader(self._path) as reader:
             for segment in by_start:
                 # Nothing from here on is earlier than this segment's start. A message of exactly
                 # that time stays, since the segment may stand before it in the file.
                 while waiting and waiting[0][0] < segment.start:
                     yield heapq.heappop(waiting)[3]
-                for index, message in enumerate(self._load(tape, segment, wanted)):
+                for index, message in enumerate(self._load(reader, segment, wanted)):
                     entry = (message.log_time, segment.offset, index, message)
                     heapq.heappush(waiting, entry)
             while waiting:
                 yield heapq.heappop(waiting)[3]
 
-    def _load(self, tape: Tape, segment: Segment, wanted: set[int]) -> Iterator[BagMessage]:
+    def _load(
+        self, reader: RecordReader, segment: Segment, wanted: set[int]
+    ) -> Iterator[BagMessage]:
         try:
-            yield from self._parse(segment.read(tape), wanted)
-        except FlawError as flaw:
-            text = f"changed since it was checked: {flaw.text}"
-            raise BagError(text, path=self._path, reason="changed", offset=flaw.offset) from None
+            yield from self._parse(segment.read(reader), wanted)
+        except FormatError as error:
+            text = f"changed since it was checked: {error.text}"
+            raise BagError(text, path=self._path, reason="changed", offset=error.offset) from None
 
     def _parse(self, data: bytes, wanted: set[int]) -> Iterator[BagMessage]:
-        for opcode, start, end in walk(data, 0):
+        for opcode, start, end in iterate_records(data, 0):
             if opcode != MESSAGE:
                 continue
             number, sequence, log_time, publish_time = message_head(data, start, end, 0)
@@ -263,7 +265,7 @@ def _decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
             if codec is None:
                 codec = _codec(channel, schema)
             return codec.decode(data)
-        except (BagError, FlawError) as error:
+        except (BagError, FormatError) as error:
             raise BagError(f"topic {channel.topic}: {error}", reason=error.reason) from error
 
     return decode
@@ -284,14 +286,14 @@ def _codec(channel: Channel, schema: Schema | None) -> MessageCodec:
     return MessageCodec(schema.name, utf8(schema.data, "schema", None))
 
 
-def _bag_error(flaw: FlawError, path: Path) -> BagError:
-    """Turn a flaw into the error a caller sees, with what could still be saved."""
-    if flaw.reason in ("empty", "not_mcap"):
-        return BagError(flaw.text, path=path, reason=flaw.reason, offset=flaw.offset)
-    with open_tape(path) as tape:
-        count = _Salvage(tape).run(None).messages
+def _bag_error(error: FormatError, path: Path) -> BagError:
+    """Turn a format error into the error a caller sees, with what could still be saved."""
+    if error.reason in ("empty", "not_mcap"):
+        return BagError(error.text, path=path, reason=error.reason, offset=error.offset)
+    with open_reader(path) as reader:
+        count = _Salvage(reader).run(None).messages
     return DamagedBagError(
-        flaw.text, path=path, reason=flaw.reason, offset=flaw.offset, salvageable=count
+        error.text, path=path, reason=error.reason, offset=error.offset, salvageable=count
     )
 
 
@@ -302,12 +304,12 @@ class _Salvage:
     of chunks tells where to go on after a record whose length is damaged.
     """
 
-    def __init__(self, tape: Tape) -> None:
-        self._tape = tape
+    def __init__(self, reader: RecordReader) -> None:
+        self._reader = reader
         self._records = Records()
         # Length of each chunk record by its offset, and the end of the data, as the summary says.
         self._known: dict[int, int] = {}
-        self._data_end = tape.size
+        self._data_end = reader.size
         self._chunked = False
         self._target: _Target | None = None
         self.reason = ""
@@ -316,27 +318,27 @@ class _Salvage:
     def run(self, target: _Target | None) -> Self:
         """Scan the file; hand what is whole to ``target``, or only count where that is None."""
         self._target = target
-        with suppress(FlawError):
+        with suppress(FormatError):
             self._read_trusted_summary()
-        self._tape.seek(min(len(MAGIC), self._tape.size))
-        while self._tape.position < self._data_end:
-            at = self._tape.position
+        self._reader.seek(min(len(MAGIC), self._reader.size))
+        while self._reader.position < self._data_end:
+            at = self._reader.position
             end: int | None = None
             opcode = 0
             try:
-                opcode, length = self._tape.frame()
-                end = self._tape.position + length
+                opcode, length = self._reader.frame()
+                end = self._reader.position + length
                 if at in self._known and opcode != CHUNK:
-                    raise FlawError("a chunk's record is damaged", at)
+                    raise FormatError("a chunk's record is damaged", at)
                 if (opcode, length) in ((DATA_END, CRC.size), (FOOTER, FOOTER_BODY.size)):
                     break
                 self._keep(at, opcode, length)
-            except FlawError as flaw:
-                self.reason = self.reason or flaw.text
+            except FormatError as error:
+                self.reason = self.reason or error.text
                 self.chunks_lost += opcode == CHUNK or at in self._known
                 end = self._resume(at, end)
                 self.bytes_lost += end - at
-            self._tape.seek(end)
+            self._reader.seek(end)
         return self
 
     def _resume(self, at: int, end: int | None) -> int:
@@ -348,15 +350,15 @@ class _Salvage:
 
     def _keep(self, at: int, opcode: int, length: int) -> None:
         if opcode in (ATTACHMENT, *range(FIRST_UNKNOWN, 256)):
-            raise FlawError(f"{opcode_name(opcode)} records are not carried over", at)
-        body = self._tape.body(opcode, length)
+            raise FormatError(f"{opcode_name(opcode)} records are not carried over", at)
+        body = self._reader.body(opcode, length)
         if opcode == CHUNK:
             self._chunked = True
             self._keep_chunk(at, body)
         elif opcode == MESSAGE:
             # What looks like one beside chunks is a damaged record of another kind.
             if self._chunked:
-                raise FlawError("a message record stands outside the chunks", at)
+                raise FormatError("a message record stands outside the chunks", at)
             self._deliver([self._message(body, 0, len(body), at)], verified=False)
         elif opcode in (SCHEMA, CHANNEL):
             self._records.add(opcode, body, at)
@@ -367,7 +369,7 @@ class _Salvage:
         elif opcode in (HEADER, MESSAGE_INDEX):
             self._pass_over(opcode, body, at)
         else:
-            raise FlawError(f"a {opcode_name(opcode)} record stands in the data section", at)
+            raise FormatError(f"a {opcode_name(opcode)} record stands in the data section", at)
 
     def _pass_over(self, opcode: int, body: bytes, at: int) -> None:
         """Read a record that is not kept, to find out whether it is what it says it is."""
@@ -384,7 +386,7 @@ class _Salvage:
     def _keep_chunk(self, at: int, body: bytes) -> None:
         chunk = read_chunk(body, at)
         found = []
-        for opcode, start, end in walk(chunk.data, at):
+        for opcode, start, end in iterate_records(chunk.data, at):
             if opcode == MESSAGE:
                 found.append(self._message(chunk.data, start, end, at))
             elif opcode in (SCHEMA, CHANNEL):
@@ -396,7 +398,7 @@ class _Salvage:
     ) -> tuple[tuple[int, int, int, int], bytes]:
         head = message_head(data, start, end, at)
         if head[0] not in self._records.channels:
-            raise FlawError(f"messages of the channel {head[0]}, whose record is lost", at)
+            raise FormatError(f"messages of the channel {head[0]}, whose record is lost", at)
         return head, data[start + MESSAGE_HEAD.size : end]
 
     def _deliver(
@@ -410,23 +412,23 @@ class _Salvage:
 
     def _read_trusted_summary(self) -> None:
         size = FRAME.size + FOOTER_BODY.size + len(MAGIC)
-        at = self._tape.size - size
+        at = self._reader.size - size
         if at < len(MAGIC):
             return
-        self._tape.seek(at)
-        tail = self._tape.read(size, "footer")
+        self._reader.seek(at)
+        tail = self._reader.read(size, "footer")
         opcode, length = FRAME.unpack_from(tail)
         start, _, crc = FOOTER_BODY.unpack_from(tail, FRAME.size)
         if (opcode, length) != (FOOTER, FOOTER_BODY.size) or not crc:
             return
         if not len(MAGIC) < start <= at or at - start > MAX_RECORD_BYTES:
             return
-        self._tape.seek(start)
-        summary = self._tape.read(at - start, "summary")
+        self._reader.seek(start)
+        summary = self._reader.read(at - start, "summary")
         # The CRC goes as far as the footer's own CRC field.
         if zlib.crc32(summary + tail[: -len(MAGIC) - CRC.size]) != crc:
             return
-        for opcode, begin, end in walk(summary, start):
+        for opcode, begin, end in iterate_records(summary, start):
             if opcode in (SCHEMA, CHANNEL):
                 self._records.add(opcode, summary[begin:end], start)
             elif opcode == CHUNK_INDEX:
@@ -497,13 +499,13 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
     """
     source, target = Path(source), Path(target)
     refuse_existing(target, overwrite)
-    reason = _first_flaw(source)
+    reason = _first_error(source)
     if target.exists() and target.samefile(source):
         raise BagError("the target is the source itself", path=target, reason="exists")
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
-        with open_tape(source) as tape, _creating(partial, target):
-            salvage = _write_salvage(tape, partial)
+        with open_reader(source) as reader, _creating(partial, target):
+            salvage = _write_salvage(reader, partial)
             if not salvage.messages:
                 text = f"no message can be recovered: {reason or 'there are none in it'}"
                 raise BagError(text, path=source, reason="nothing")
@@ -520,21 +522,21 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
     )
 
 
-def _first_flaw(source: Path) -> str:
+def _first_error(source: Path) -> str:
     """Return what the strict pass finds wrong, empty for a sound bag."""
-    with open_tape(source) as tape:
+    with open_reader(source) as reader:
         try:
-            Check(tape).run()
-        except FlawError as flaw:
-            if flaw.reason in ("empty", "not_mcap"):
-                raise BagError(flaw.text, path=source, reason=flaw.reason) from None
-            at = "" if flaw.offset is None else f" (byte {flaw.offset})"
-            return flaw.text + at
+            Check(reader).run()
+        except FormatError as error:
+            if error.reason in ("empty", "not_mcap"):
+                raise BagError(error.text, path=source, reason=error.reason) from None
+            at = "" if error.offset is None else f" (byte {error.offset})"
+            return error.text + at
     return ""
 
 
-def _write_salvage(tape: Tape, path: Path) -> _Salvage:
-    salvage = _Salvage(tape)
+def _write_salvage(reader: RecordReader, path: Path) -> _Salvage:
+    salvage = _Salvage(reader)
     with path.open("xb", buffering=0) as file:
         target = _Target(Sink(file))
         salvage.run(target)

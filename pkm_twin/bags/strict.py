@@ -35,16 +35,16 @@ from pkm_twin.bags.format import (
     STATISTICS,
     SUMMARY_OFFSET,
     Fields,
-    FlawError,
+    FormatError,
+    RecordReader,
     Records,
-    Tape,
+    iterate_records,
     message_head,
     metadata,
     opcode_name,
     read_attachment,
     read_chunk,
     read_magic,
-    walk,
 )
 from pkm_twin.errors import BagError
 
@@ -106,10 +106,10 @@ class Segment:
     end: int
     is_chunk: bool
 
-    def read(self, tape: Tape) -> bytes:
+    def read(self, reader: RecordReader) -> bytes:
         """Return the segment's records, checked once more."""
-        tape.seek(self.offset)
-        data = tape.read(self.length, "segment")
+        reader.seek(self.offset)
+        data = reader.read(self.length, "segment")
         return read_chunk(data[FRAME.size :], self.offset).data if self.is_chunk else data
 
 
@@ -130,8 +130,8 @@ class _Span:
 class Check:
     """One pass over a file, in which every statement that it makes about itself is checked."""
 
-    def __init__(self, tape: Tape) -> None:
-        self._tape = tape
+    def __init__(self, reader: RecordReader) -> None:
+        self._reader = reader
         self.records = Records()
         self.segments: list[Segment] = []
         self._spans: dict[int, _Span] = {}
@@ -161,7 +161,7 @@ class Check:
 
     def run(self) -> None:
         """Read the file from its first byte to its last."""
-        read_magic(self._tape)
+        read_magic(self._reader)
         self._read_header()
         self._read_data()
         self._read_summary()
@@ -169,11 +169,11 @@ class Check:
         self._compare_counts()
 
     def _read_header(self) -> None:
-        at = self._tape.position
-        opcode, length = self._tape.frame()
+        at = self._reader.position
+        opcode, length = self._reader.frame()
         if opcode != HEADER:
-            raise FlawError(f"the first record is {opcode_name(opcode)}, not the header", at)
-        fields = Fields(self._tape.body(opcode, length), "header", at)
+            raise FormatError(f"the first record is {opcode_name(opcode)}, not the header", at)
+        fields = Fields(self._reader.body(opcode, length), "header", at)
         self._profile, self._library = fields.text(), fields.text()
         fields.done()
 
@@ -187,8 +187,8 @@ class Check:
             METADATA: self._read_metadata,
         }
         while True:
-            at, crc = self._tape.position, self._tape.crc
-            opcode, length = self._tape.frame()
+            at, crc = self._reader.position, self._reader.crc
+            opcode, length = self._reader.frame()
             if opcode != MESSAGE_INDEX:
                 self._close_chunk(at)
             if opcode == DATA_END:
@@ -198,11 +198,11 @@ class Check:
                 self._read_attachment(at, length)
             elif opcode >= FIRST_UNKNOWN:
                 self._unknown += 1
-                self._tape.skip(length)
+                self._reader.skip(length)
             elif opcode in readers:
-                readers[opcode](at, self._tape.body(opcode, length))
+                readers[opcode](at, self._reader.body(opcode, length))
             else:
-                raise FlawError(f"a {opcode_name(opcode)} record stands in the data section", at)
+                raise FormatError(f"a {opcode_name(opcode)} record stands in the data section", at)
 
     def _read_message(self, at: int, body: bytes) -> None:
         number, _, log_time, _ = message_head(body, 0, len(body), at)
@@ -222,7 +222,7 @@ class Check:
 
     def _count(self, number: int, log_time: int, at: int) -> None:
         if number not in self.records.channels:
-            raise FlawError(f"a message has the unknown channel {number}", at)
+            raise FormatError(f"a message has the unknown channel {number}", at)
         self._out_of_order += self._total.count > 0 and log_time < self._total.end
         self._total.add(log_time)
         self._spans.setdefault(number, _Span()).add(log_time)
@@ -230,7 +230,7 @@ class Check:
     def _read_chunk(self, at: int, body: bytes) -> None:
         chunk = read_chunk(body, at)
         span = _Span()
-        for opcode, start, end in walk(chunk.data, at):
+        for opcode, start, end in iterate_records(chunk.data, at):
             if opcode == MESSAGE:
                 number, _, log_time, _ = message_head(chunk.data, start, end, at)
                 self._count(number, log_time, at)
@@ -239,11 +239,11 @@ class Check:
             elif opcode in (SCHEMA, CHANNEL):
                 self.records.add(opcode, chunk.data[start:end], at)
             elif opcode < FIRST_UNKNOWN:
-                raise FlawError(f"a {opcode_name(opcode)} record stands in a chunk", at)
+                raise FormatError(f"a {opcode_name(opcode)} record stands in a chunk", at)
             else:
                 self._unknown += 1
         if (chunk.start, chunk.end) != (span.start, span.end):
-            raise FlawError(
+            raise FormatError(
                 f"the chunk's messages span {span.start} to {span.end} ns; "
                 f"the file says {chunk.start} to {chunk.end}",
                 at,
@@ -251,7 +251,7 @@ class Check:
         self._chunks_without_crc += not chunk.has_crc
         length = FRAME.size + len(body)
         self.segments.append(Segment(at, length, span.start, span.end, True))
-        self._index_start = self._tape.position
+        self._index_start = self._reader.position
         facts = (chunk.start, chunk.end, length)
         sizes = (chunk.compression, chunk.packed_size, len(chunk.data))
         self._last_chunk = (at, (facts, sizes))
@@ -262,12 +262,12 @@ class Check:
         raw = fields.blob("I")
         fields.done()
         if self._last_chunk is None or number in self._index_offsets:
-            raise FlawError(f"a message index of channel {number} belongs to no chunk", at)
+            raise FormatError(f"a message index of channel {number} belongs to no chunk", at)
         if len(raw) % INDEX_ENTRY.size:
-            raise FlawError(f"a message index has {len(raw)} bytes of 16-byte entries", at)
+            raise FormatError(f"a message index has {len(raw)} bytes of 16-byte entries", at)
         entries = sorted(INDEX_ENTRY.iter_unpack(raw))
         if entries != sorted(self._entries.get(number, [])):
-            raise FlawError(f"the message index of channel {number} differs from the chunk", at)
+            raise FormatError(f"the message index of channel {number} differs from the chunk", at)
         self._index_offsets[number] = at
 
     def _close_chunk(self, at: int) -> None:
@@ -276,7 +276,7 @@ class Check:
             return
         missing = self._entries.keys() - self._index_offsets.keys()
         if self._index_offsets and missing:
-            raise FlawError(f"channels {sorted(missing)} have no message index, others have", at)
+            raise FormatError(f"channels {sorted(missing)} have no message index, others have", at)
         offset, facts = self._last_chunk
         places = tuple(sorted(self._index_offsets.items()))
         self._chunks[offset] = hash((*facts, at - self._index_start, places))
@@ -291,38 +291,38 @@ class Check:
         self._metadata_places.append((at, FRAME.size + len(body), name))
 
     def _read_attachment(self, at: int, length: int) -> None:
-        self._attachment_places.append(read_attachment(self._tape, at, length)[1])
+        self._attachment_places.append(read_attachment(self._reader, at, length)[1])
 
     def _read_data_end(self, at: int, length: int, crc: int) -> None:
-        fields = Fields(self._tape.body(DATA_END, length), "data end", at)
+        fields = Fields(self._reader.body(DATA_END, length), "data end", at)
         stated = fields.number("I")
         fields.done()
         if stated and stated != crc:
-            raise FlawError(f"the data's CRC is {crc:08x}; the file says {stated:08x}", at, "crc")
+            raise FormatError(f"the data's CRC is {crc:08x}; the file says {stated:08x}", at, "crc")
         self._has_data_crc = stated != 0
         self._in_data = (len(self.records.schemas), len(self.records.channels))
 
     def _read_summary(self) -> None:
-        begin = self._tape.position
-        self._tape.crc = 0
+        begin = self._reader.position
+        self._reader.crc = 0
         while True:
-            at, crc = self._tape.position, self._tape.crc
-            opcode, length = self._tape.frame()
-            body = b"" if opcode >= FIRST_UNKNOWN else self._tape.body(opcode, length)
+            at, crc = self._reader.position, self._reader.crc
+            opcode, length = self._reader.frame()
+            body = b"" if opcode >= FIRST_UNKNOWN else self._reader.body(opcode, length)
             if opcode == FOOTER:
                 self._read_footer(begin, at, body, crc)
                 return
             if opcode >= FIRST_UNKNOWN:
                 self._unknown += 1
-                self._tape.skip(length)
+                self._reader.skip(length)
             else:
                 self._read_summary_record(opcode, at, body)
             group = self._groups.setdefault(opcode, [at, at])
             if group[1] != at:
-                raise FlawError(
+                raise FormatError(
                     f"the {opcode_name(opcode)} records of the summary are not together", at
                 )
-            group[1] = self._tape.position
+            group[1] = self._reader.position
 
     def _read_summary_record(self, opcode: int, at: int, body: bytes) -> None:
         if opcode in (SCHEMA, CHANNEL):
@@ -336,23 +336,25 @@ class Check:
             SUMMARY_OFFSET: self._read_summary_offset,
         }
         if opcode not in readers:
-            raise FlawError(f"a {opcode_name(opcode)} record stands in the summary", at)
+            raise FormatError(f"a {opcode_name(opcode)} record stands in the summary", at)
         if SUMMARY_OFFSET in self._groups and opcode != SUMMARY_OFFSET:
-            raise FlawError(f"a {opcode_name(opcode)} record stands among the summary offsets", at)
+            raise FormatError(
+                f"a {opcode_name(opcode)} record stands among the summary offsets", at
+            )
         fields = Fields(body, opcode_name(opcode), at)
         readers[opcode](fields, at)
         fields.done()
 
     def _read_statistics(self, fields: Fields, at: int) -> None:
         if self._statistics:
-            raise FlawError("the summary has two statistics records", at)
+            raise FormatError("the summary has two statistics records", at)
         numbers = fields.numbers("QHIIIIQQ")
         part = fields.part()
         counts: dict[int, int] = {}
         while part.left:
             number, count = part.numbers("HQ")
             if number in counts:
-                raise FlawError(f"the statistics count channel {number} twice", at)
+                raise FormatError(f"the statistics count channel {number} twice", at)
             counts[number] = count
         self._statistics = (numbers, counts)
 
@@ -366,24 +368,26 @@ class Check:
         sizes = (fields.text(), *fields.numbers("QQ"))
         stated = hash(((start, end, length), sizes, index_length, tuple(sorted(places))))
         if self._chunks.get(offset) != stated or offset in self._indexed:
-            raise FlawError(f"a chunk index does not match the chunk at byte {offset}", at)
+            raise FormatError(f"a chunk index does not match the chunk at byte {offset}", at)
         self._indexed.add(offset)
 
     def _read_metadata_index(self, fields: Fields, at: int) -> None:
         offset, length = fields.numbers("QQ")
         if (offset, length, fields.text()) not in self._metadata_places:
-            raise FlawError(f"a metadata index does not match the metadata at byte {offset}", at)
+            raise FormatError(f"a metadata index does not match the metadata at byte {offset}", at)
 
     def _read_attachment_index(self, fields: Fields, at: int) -> None:
         numbers = fields.numbers("QQQQQ")
         if (*numbers, fields.text(), fields.text()) not in self._attachment_places:
-            raise FlawError(f"an attachment index does not match the one at byte {numbers[0]}", at)
+            raise FormatError(
+                f"an attachment index does not match the one at byte {numbers[0]}", at
+            )
 
     def _read_summary_offset(self, fields: Fields, at: int) -> None:
         opcode, start, length = fields.numbers("BQQ")
         # Writers may list a group that has no records.
         if length and self._groups.get(opcode) != [start, start + length]:
-            raise FlawError(
+            raise FormatError(
                 f"a summary offset does not match the {opcode_name(opcode)} records", at
             )
 
@@ -393,32 +397,32 @@ class Check:
         fields.done()
         self._has_summary = at > begin
         if start != (begin if self._has_summary else 0) and (start, at) != (begin, begin):
-            raise FlawError(f"the footer puts the summary at {start}; it is at {begin}", at)
+            raise FormatError(f"the footer puts the summary at {start}; it is at {begin}", at)
         found = self._groups.get(SUMMARY_OFFSET, [0])[0]
         if offset_start not in (found, found or at):
-            raise FlawError(
+            raise FormatError(
                 f"the footer puts the summary offsets at {offset_start}, not {found}", at
             )
         actual = zlib.crc32(FRAME.pack(FOOTER, len(body)) + body[: -CRC.size], crc)
         if stated and stated != actual:
-            raise FlawError(
+            raise FormatError(
                 f"the summary's CRC is {actual:08x}; the file says {stated:08x}", at, "crc"
             )
         if not stated and self._has_summary:
             self._warnings.append("the summary has no CRC")
 
     def _read_end(self) -> None:
-        at = self._tape.position
-        if self._tape.read(len(MAGIC), "closing mark") != MAGIC:
-            raise FlawError("the file does not end with the MCAP mark", at)
-        if self._tape.position != self._tape.size:
-            left = self._tape.size - self._tape.position
-            raise FlawError(f"{left} bytes follow the end of the bag", self._tape.position)
+        at = self._reader.position
+        if self._reader.read(len(MAGIC), "closing mark") != MAGIC:
+            raise FormatError("the file does not end with the MCAP mark", at)
+        if self._reader.position != self._reader.size:
+            left = self._reader.size - self._reader.position
+            raise FormatError(f"{left} bytes follow the end of the bag", self._reader.position)
 
     def _compare_counts(self) -> None:
         if self._indexed and self._indexed != self._chunks.keys():
             missing = min(self._chunks.keys() - self._indexed)
-            raise FlawError("the summary does not list the chunk here, though others", missing)
+            raise FormatError("the summary does not list the chunk here, though others", missing)
         if self._statistics is None:
             return
         (count, schemas, channels, *places, start, end), counts = self._statistics
@@ -434,7 +438,7 @@ class Check:
         ]
         for what, said, found in pairs:
             if said != found:
-                raise FlawError(
+                raise FormatError(
                     f"the {what} is {found}; the statistics say {said}", None, "statistics"
                 )
         # Writers differ in whether a schema or channel that is only in the summary counts.
@@ -444,7 +448,7 @@ class Check:
         ]
         for what, said, low, high in ranges:
             if not low <= said <= high:
-                raise FlawError(
+                raise FormatError(
                     f"the bag has {low} to {high} {what}s; the statistics say {said}",
                     None,
                     "statistics",
