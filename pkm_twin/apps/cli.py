@@ -316,7 +316,7 @@ def recover(
     """
     from dataclasses import asdict
 
-    from pkm_twin.bags.reader import recover as recover_bag
+    from pkm_twin.bags.recover import recover as recover_bag
 
     result = recover_bag(bag, out, overwrite=overwrite)
     if as_json:
