@@ -5,16 +5,11 @@ from __future__ import annotations
 
 import importlib
 import io
-import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import IO, Any
-
-from pkm_twin.errors import BagError
 
 MAX_RECORD_BYTES = 256 * 1024**2
 """Largest record that is loaded; attachments and unknown records are passed through in blocks."""
@@ -24,7 +19,16 @@ MAX_RATIO = 1000
 """Largest ratio of unpacked to packed size, for chunks that unpack to more than FREE_BYTES."""
 FREE_BYTES = 8 * 1024**2
 """A chunk up to this size may have any ratio: a black image packs ten thousand to one."""
+MAX_TOTAL_BYTES = 256 * 1024**3
+"""Most that a bag's file may unpack to, and be read, altogether."""
+MAX_TOTAL_RATIO = 200
+"""Largest ratio of all that is unpacked and read to the file's size, beyond FREE_TOTAL_BYTES."""
+FREE_TOTAL_BYTES = 128 * 1024**2
+"""Every file may unpack to so much."""
+RECORD_COST = 64
+"""Bytes that a record in a chunk counts for beside its own: the time that it takes."""
 MAGIC = b"\x89MCAP0\r\n"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BLOCK_BYTES = 1024**2
 METADATA_CRC = "crc32"
 
@@ -45,17 +49,17 @@ INDEX_ENTRY = struct.Struct("<QQ")
 FOOTER_BODY = struct.Struct("<QQI")
 CRC = struct.Struct("<I")
 
+TOTAL_CAP = "total_cap"
+"""Reason of a file that is refused whole for what it would cost."""
+
 _FOREIGN = {
-    b"SQLite format 3\x00": "an SQLite file (a rosbag2 .db3 bag?), not MCAP; "
-    "`ros2 bag convert` makes an MCAP bag of it",
     b"#ROSBAG V2.0": "a ROS 1 bag, not MCAP",
-    b"\x28\xb5\x2f\xfd": "a zstd-compressed file; unpack it first",
     b"\x1f\x8b": "a gzip-compressed file; unpack it first",
 }
 
 
 class FormatError(Exception):
-    """What is wrong and where, before the path is known; never leaves this module."""
+    """What is wrong and where, before the path is known; never leaves this folder's modules."""
 
     def __init__(self, text: str, offset: int | None, reason: str = "damaged") -> None:
         super().__init__(text)
@@ -64,12 +68,36 @@ class FormatError(Exception):
         self.reason = reason
 
 
+class Budget:
+    """What one file may cost, in bytes read and unpacked, whatever it says of itself.
+
+    Without it a small file of many chunks, each within its own bounds, unpacks to gigabytes.
+    """
+
+    def __init__(self, packed: int) -> None:
+        self._packed = packed
+        self.limit = min(MAX_TOTAL_BYTES, max(FREE_TOTAL_BYTES, MAX_TOTAL_RATIO * packed))
+        self._spent = 0
+
+    def spend(self, count: int, offset: int | None) -> None:
+        """Take ``count`` bytes; once they are used up the file is refused."""
+        self._spent += count
+        if self._spent > self.limit:
+            raise FormatError(
+                f"the file of {self._packed} bytes unpacks to more than {self.limit}: at most "
+                f"{MAX_TOTAL_RATIO} to 1, and {MAX_TOTAL_BYTES} in all",
+                offset,
+                TOTAL_CAP,
+            )
+
+
 class RecordReader:
     """A file read forward, with its position and the CRC of all that was read."""
 
-    def __init__(self, file: IO[bytes], size: int) -> None:
+    def __init__(self, file: IO[bytes], size: int, budget: Budget | None = None) -> None:
         self._file = file
         self.size = size
+        self.budget = budget or Budget(size)
         self.position = 0
         self.crc = 0
 
@@ -87,6 +115,7 @@ class RecordReader:
                 self.position,
                 "truncated",
             )
+        self.budget.spend(count, self.position)
         data = self._file.read(count)
         if len(data) != count:
             raise FormatError("the file shrank while it was read", self.position, "truncated")
@@ -127,21 +156,6 @@ class RecordReader:
             crc = zlib.crc32(block, crc)
             length -= len(block)
         return crc
-
-
-@contextmanager
-def open_reader(path: Path) -> Iterator[RecordReader]:
-    """Open a file for reading; whatever the system refuses becomes a BagError."""
-    try:
-        if path.is_dir():
-            inside = ", ".join(sorted(p.name for p in path.glob("*.mcap"))) or "no .mcap file"
-            raise BagError(f"is a folder; name a file in it: {inside}", path=path, reason="folder")
-        with path.open("rb") as file:
-            yield RecordReader(file, os.fstat(file.fileno()).st_size)
-    except FileNotFoundError as error:
-        raise BagError("does not exist", path=path, reason="not_found") from error
-    except OSError as error:
-        raise BagError(f"cannot be read: {error.strerror}", path=path, reason="io") from error
 
 
 def opcode_name(opcode: int) -> str:
@@ -222,11 +236,15 @@ class Fields:
             )
 
 
-def iterate_records(data: bytes, offset: int) -> Iterator[tuple[int, int, int]]:
+def iterate_records(
+    data: bytes, offset: int, budget: Budget | None = None
+) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end of each record in unpacked data of the chunk at ``offset``."""
     position = 0
     size = len(data)
     while position < size:
+        if budget is not None:
+            budget.spend(RECORD_COST, offset)
         if size - position < FRAME.size:
             raise FormatError(f"{size - position} stray bytes end the chunk", offset)
         opcode, length = FRAME.unpack_from(data, position)
@@ -320,14 +338,14 @@ class _Chunk:
     has_crc: bool
 
 
-def read_chunk(body: bytes, offset: int) -> _Chunk:
+def read_chunk(body: bytes, offset: int, budget: Budget) -> _Chunk:
     """Unpack the chunk record at ``offset`` and compare its CRC, if it has one."""
     fields = Fields(body, "chunk", offset)
     start, end, size, crc = _CHUNK_HEAD.unpack(fields.take(_CHUNK_HEAD.size))
     compression = fields.text()
     packed = fields.blob("Q")
     fields.done()
-    data = _unpack(compression, packed, size, offset)
+    data = _unpack(compression, packed, size, offset, budget)
     if crc and zlib.crc32(data) != crc:
         raise FormatError(
             f"the chunk's CRC is {zlib.crc32(data):08x}; the file says {crc:08x}", offset, "crc"
@@ -335,30 +353,37 @@ def read_chunk(body: bytes, offset: int) -> _Chunk:
     return _Chunk(start, end, compression, len(packed), data, crc != 0)
 
 
-def _unpack(compression: str, packed: bytes, size: int, offset: int) -> bytes:
+def _unpack(compression: str, packed: bytes, size: int, offset: int, budget: Budget) -> bytes:
     """Unpack a chunk to exactly ``size`` bytes, having checked the size first."""
     if compression not in ("", "zstd", "lz4"):
         raise FormatError(
             f"unknown compression {compression!r}; known: zstd, lz4, none", offset, "compression"
         )
-    if size > MAX_CHUNK_BYTES:
-        raise FormatError(
-            f"the chunk unpacks to {size} bytes; at most {MAX_CHUNK_BYTES}", offset, "size_cap"
-        )
-    if size > FREE_BYTES and size > MAX_RATIO * len(packed):
-        raise FormatError(
-            f"the chunk unpacks from {len(packed)} to {size} bytes; at most {MAX_RATIO} to 1",
-            offset,
-            "size_cap",
-        )
-    data = packed
-    if compression:
-        # One byte more than declared is let out, to tell a longer content from an exact one.
-        data = _decompress(compression, packed, size + 1, offset)
+    _check_size("chunk", len(packed), size, offset)
+    if not compression:
+        if len(packed) != size:
+            raise FormatError(f"the chunk has {len(packed)} bytes; the file says {size}", offset)
+        return packed
+    budget.spend(size, offset)
+    # One byte more than declared is let out, to tell a longer content from an exact one.
+    data = _decompress(compression, packed, size + 1, offset)
     if len(data) != size:
         more = "more" if len(data) > size else str(len(data))
         raise FormatError(f"the chunk unpacks to {more} bytes; the file says {size}", offset)
     return data
+
+
+def _check_size(what: str, packed: int, size: int, offset: int) -> None:
+    if size > MAX_CHUNK_BYTES:
+        raise FormatError(
+            f"the {what} unpacks to {size} bytes; at most {MAX_CHUNK_BYTES}", offset, "size_cap"
+        )
+    if size > FREE_BYTES and size > MAX_RATIO * packed:
+        raise FormatError(
+            f"the {what} unpacks from {packed} to {size} bytes; at most {MAX_RATIO} to 1",
+            offset,
+            "size_cap",
+        )
 
 
 def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> bytes:
@@ -367,7 +392,7 @@ def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> byt
     try:
         library: Any = importlib.import_module(name)
     except ImportError:
-        text = f"the chunk is packed with {compression}; its Python package {name} is missing"
+        text = f"the data are packed with {compression}; the Python package {name} is missing"
         raise FormatError(text, offset, "compression") from None
     failures = (library.ZstdError,) if compression == "zstd" else (RuntimeError, EOFError)
     try:
@@ -378,7 +403,25 @@ def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> byt
         with window.stream_reader(io.BytesIO(packed)) as reader:
             return bytes(reader.read(limit))
     except failures as error:
-        raise FormatError(f"the chunk does not unpack: {error}", offset) from None
+        raise FormatError(f"the data do not unpack: {error}", offset) from None
+
+
+def message_data(
+    data: bytes, start: int, end: int, encoding: str, offset: int, budget: Budget
+) -> bytes:
+    """Return a message record's payload, unpacked where rosbag2 has packed each message.
+
+    No plain CDR begins as a zstd frame does, so the bytes tell; rosbag2 says it only beside them.
+    """
+    start += MESSAGE_HEAD.size
+    if data[start : start + len(ZSTD_MAGIC)] != ZSTD_MAGIC or encoding != "cdr":
+        return data[start:end]
+    packed = data[start:end]
+    limit = min(MAX_CHUNK_BYTES, max(FREE_BYTES, MAX_RATIO * len(packed)))
+    unpacked = _decompress("zstd", packed, limit + 1, offset)
+    budget.spend(len(unpacked), offset)
+    _check_size("message", len(packed), len(unpacked), offset)
+    return unpacked
 
 
 def metadata(body: bytes, offset: int) -> tuple[str, dict[str, str], bool]:

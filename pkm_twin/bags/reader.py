@@ -4,6 +4,8 @@
 Reading: the whole file is checked before the first message is handed out. Each record is read in
 file order; CRCs, lengths, counts, times and indexes must agree with what is there. Bags written
 here carry a CRC over every byte; where a foreign bag has none, the report says so in a warning.
+A bag is one MCAP file, or a folder that rosbag2 wrote with its splits, packed by message, by chunk
+or by file.
 
 Times are log times in integer nanoseconds, as in the file.
 """
@@ -11,27 +13,30 @@ Times are log times in integer nanoseconds, as in the file.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pkm_twin.bags.cdr import MessageCodec, message_definition
 from pkm_twin.bags.format import (
     MESSAGE,
-    MESSAGE_HEAD,
+    TOTAL_CAP,
+    Budget,
     Channel,
     FormatError,
     RecordReader,
     Schema,
     iterate_records,
+    message_data,
     message_head,
-    open_reader,
     utf8,
 )
-from pkm_twin.bags.recover import RecoverResult, Salvage, recover
-from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo
+from pkm_twin.bags.recover import RecoverResult, count_salvageable, recover
+from pkm_twin.bags.storage import METADATA_FILE, BagFile, Storage, find_storage
+from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo, join_topics
 from pkm_twin.bags.writer import BagWriter
 from pkm_twin.errors import BagError
 
@@ -49,6 +54,12 @@ __all__ = [
     "read_messages",
     "recover",
 ]
+
+
+MAX_WAITING_BYTES = 256 * 1024**2
+"""Most that is held in memory to put messages into the order of their log times."""
+# What a message takes beside its data.
+_MESSAGE_COST = 512
 
 
 class DamagedBagError(BagError):
@@ -105,31 +116,86 @@ def read_messages(
 def open_bag(path: str | Path) -> Bag:
     """Check a whole bag and return it ready to be read, any number of times.
 
+    A bag is one MCAP file or a folder that rosbag2 wrote, packed or not.
+
     :raises BagError: as :func:`inspect`.
     """
     path = Path(path)
-    with open_reader(path) as reader:
-        check = Check(reader)
+    storage = find_storage(path)
+    parts = []
+    for file in storage.files:
+        with file.open() as reader:
+            check = Check(reader)
+            try:
+                check.run()
+            except FormatError as error:
+                damage = error
+            else:
+                parts.append(_Part(file, check))
+                continue
+        raise _bag_error(damage, file, storage)
+    return Bag(path, parts, storage)
+
+
+class _Part:
+    """One file of a bag, checked."""
+
+    def __init__(self, file: BagFile, check: Check) -> None:
+        self.file = file
+        self.segments = check.segments
+        self.channels = check.records.channels
+        self.types = check.records.types
+        self.report = check.report(file.path)
+        # Channels of one type share its codec, which may be long in the making.
+        schemas = check.records.schemas
+        codecs = {number: _Codec(schemas.get(number)) for number in (0, *schemas)}
+        self.decoders = {
+            number: _decoder(channel, codecs[channel.schema_id])
+            for number, channel in self.channels.items()
+        }
+
+    def numbered(self, topics: Container[str]) -> set[int]:
+        """The channels of these topics."""
+        return {number for number, channel in self.channels.items() if channel.topic in topics}
+
+    def parse(self, segment: Segment, reader: RecordReader, wanted: set[int]) -> list[BagMessage]:
+        """The messages of the wanted channels in a segment, in the order of the file."""
         try:
-            check.run()
+            data = segment.read(reader)
+            return list(self._messages(data, segment.offset, reader.budget, wanted))
         except FormatError as error:
-            raise _bag_error(error, path) from None
-    return Bag(path, check)
+            text = f"changed since it was checked: {error.text}"
+            raise BagError(
+                text, path=self.file.path, reason="changed", offset=error.offset
+            ) from None
+
+    def _messages(
+        self, data: bytes, offset: int, budget: Budget, wanted: set[int]
+    ) -> Iterator[BagMessage]:
+        for opcode, start, end in iterate_records(data, offset):
+            if opcode != MESSAGE:
+                continue
+            number, sequence, log_time, publish_time = message_head(data, start, end, offset)
+            if number in wanted:
+                channel = self.channels[number]
+                yield BagMessage(
+                    channel.topic,
+                    self.types[number],
+                    log_time,
+                    publish_time,
+                    sequence,
+                    message_data(data, start, end, channel.encoding, offset, budget),
+                    self.decoders[number],
+                )
 
 
 class Bag:
     """A bag that has been checked; ``report`` is what the check found."""
 
-    def __init__(self, path: Path, check: Check) -> None:
+    def __init__(self, path: Path, parts: list[_Part], storage: Storage) -> None:
         self._path = path
-        self._segments = check.segments
-        self._channels = check.records.channels
-        self._types = check.records.types
-        self._decoders = {
-            number: _decoder(channel, check.records.schemas.get(channel.schema_id))
-            for number, channel in self._channels.items()
-        }
-        self.report = check.report(path)
+        self._parts = parts
+        self.report = _joined(path, [part.report for part in parts], storage)
 
     def messages(
         self,
@@ -141,91 +207,155 @@ class Bag:
 
         ``log_time``: by log time; messages of one time in the order of the file. Memory holds the
         chunks that overlap in time, which is one or two in a bag recorded in order. ``file``: as
-        they stand in the file.
+        they stand in the files.
 
-        :raises BagError: a topic is not in the bag, or the file changed since it was checked.
+        :raises BagError: a topic is not in the bag, the file changed since it was checked, or more
+            than MAX_WAITING_BYTES overlap in time.
         """
         if order not in ("log_time", "file"):
             raise ValueError(f"order is {order!r}; expected 'log_time' or 'file'")
         wanted = self._wanted(topics)
         return self._ordered(wanted) if order == "log_time" else self._in_file(wanted)
 
-    def _wanted(self, topics: Iterable[str] | None) -> set[int]:
-        if topics is None:
-            return set(self._channels)
-        names = {topics} if isinstance(topics, str) else set(topics)
-        unknown = sorted(names - self.report.topics.keys())
+    def _wanted(self, topics: Iterable[str] | None) -> list[set[int]]:
+        """The channels of ``topics``, a set for each part."""
+        known = self.report.topics
+        names = (
+            known.keys() if topics is None else {topics} if isinstance(topics, str) else set(topics)
+        )
+        unknown = sorted(names - known.keys())
         if unknown:
             raise BagError(
-                f"no topic {', '.join(unknown)}; topics: {', '.join(sorted(self.report.topics))}",
+                f"no topic {', '.join(unknown)}; topics: {', '.join(sorted(known))}",
                 path=self._path,
                 reason="no_topic",
             )
-        return {number for number, channel in self._channels.items() if channel.topic in names}
+        return [part.numbered(names) for part in self._parts]
 
-    def _in_file(self, wanted: set[int]) -> Iterator[BagMessage]:
-        with open_reader(self._path) as reader:
-            for segment in self._segments:
-                yield from self._load(reader, segment, wanted)
+    def _in_file(self, wanted: list[set[int]]) -> Iterator[BagMessage]:
+        for part, numbers in zip(self._parts, wanted, strict=True):
+            with part.file.open() as reader:
+                for segment in part.segments:
+                    yield from part.parse(segment, reader, numbers)
 
-    def _ordered(self, wanted: set[int]) -> Iterator[BagMessage]:
-        waiting: list[tuple[int, int, int, BagMessage]] = []
-        by_start = sorted(self._segments, key=lambda segment: segment.start)
-        with open_reader(self._path) as reader:
-            for segment in by_start:
+    def _ordered(self, wanted: list[set[int]]) -> Iterator[BagMessage]:
+        waiting: list[tuple[int, int, int, int, BagMessage]] = []
+        held = 0
+        places = [(n, segment) for n, part in enumerate(self._parts) for segment in part.segments]
+        places.sort(key=lambda place: (place[1].start, place[0], place[1].offset))
+        with _Readers(self._parts) as readers:
+            for number, segment in places:
                 # Nothing from here on is earlier than this segment's start. A message of exactly
                 # that time stays, since the segment may stand before it in the file.
                 while waiting and waiting[0][0] < segment.start:
-                    yield heapq.heappop(waiting)[3]
-                for index, message in enumerate(self._load(reader, segment, wanted)):
-                    entry = (message.log_time, segment.offset, index, message)
+                    message = heapq.heappop(waiting)[-1]
+                    held -= len(message.data) + _MESSAGE_COST
+                    yield message
+                found = self._parts[number].parse(segment, readers.get(number), wanted[number])
+                for index, message in enumerate(found):
+                    entry = (message.log_time, number, segment.offset, index, message)
                     heapq.heappush(waiting, entry)
+                    held += len(message.data) + _MESSAGE_COST
+                if held > MAX_WAITING_BYTES:
+                    raise BagError(
+                        f"more than {MAX_WAITING_BYTES} bytes of messages overlap in time: they "
+                        "cannot be put in order; read them in the order of the file",
+                        path=self._path,
+                        reason="overlap",
+                        offset=segment.offset,
+                    )
             while waiting:
-                yield heapq.heappop(waiting)[3]
+                yield heapq.heappop(waiting)[-1]
 
-    def _load(
-        self, reader: RecordReader, segment: Segment, wanted: set[int]
-    ) -> Iterator[BagMessage]:
-        try:
-            yield from self._parse(segment.read(reader), wanted)
-        except FormatError as error:
-            text = f"changed since it was checked: {error.text}"
-            raise BagError(text, path=self._path, reason="changed", offset=error.offset) from None
 
-    def _parse(self, data: bytes, wanted: set[int]) -> Iterator[BagMessage]:
-        for opcode, start, end in iterate_records(data, 0):
-            if opcode != MESSAGE:
-                continue
-            number, sequence, log_time, publish_time = message_head(data, start, end, 0)
-            if number in wanted:
-                yield BagMessage(
-                    self._channels[number].topic,
-                    self._types[number],
-                    log_time,
-                    publish_time,
-                    sequence,
-                    data[start + MESSAGE_HEAD.size : end],
-                    self._decoders[number],
+class _Readers:
+    """The file that is being read; splits follow each other, so one is open at a time."""
+
+    def __init__(self, parts: list[_Part]) -> None:
+        self._parts = parts
+        self._open = ExitStack()
+        self._current: tuple[int, RecordReader] | None = None
+
+    def get(self, number: int) -> RecordReader:
+        if self._current is None or self._current[0] != number:
+            self._open.close()
+            reader = self._open.enter_context(self._parts[number].file.open())
+            self._current = (number, reader)
+        return self._current[1]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open.close()
+
+
+def _joined(path: Path, reports: list[BagReport], storage: Storage) -> BagReport:
+    """One report of all the files of a bag."""
+    topics: dict[str, TopicInfo] = {}
+    for report in reports:
+        for name, info in report.topics.items():
+            known = topics.get(name)
+            if known and known.type != info.type:
+                raise BagError(
+                    f"topic {name} has two types, {known.type} and {info.type}",
+                    path=report.path,
+                    reason="type",
                 )
+            topics[name] = join_topics(known, info) if known else info
+    filled = [report for report in reports if report.message_count]
+    count = sum(report.message_count for report in reports)
+    warnings = list(dict.fromkeys(text for report in reports for text in report.warnings))
+    if storage.message_count is not None and storage.message_count != count:
+        warnings.append(
+            f"{METADATA_FILE} states {storage.message_count} messages, there are {count}"
+        )
+    return BagReport(
+        path=path,
+        profile=reports[0].profile,
+        library=reports[0].library,
+        topics=dict(sorted(topics.items())),
+        message_count=count,
+        start_time=min((report.start_time for report in filled), default=0),
+        end_time=max((report.end_time for report in filled), default=0),
+        has_crc=all(report.has_crc for report in reports),
+        has_index=all(report.has_index for report in reports),
+        has_summary=all(report.has_summary for report in reports),
+        warnings=tuple(warnings),
+        out_of_order=sum(report.out_of_order for report in reports),
+        metadata={name: entries for r in reports for name, entries in r.metadata.items()},
+    )
 
 
-def _decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
-    """Return a function that decodes the channel's messages; the codec is made at the first."""
-    codec: MessageCodec | None = None
+class _Codec:
+    """A type's codec, made at its first message."""
+
+    def __init__(self, schema: Schema | None) -> None:
+        self._schema = schema
+
+    def get(self, channel: Channel) -> MessageCodec:
+        _require_encoding(channel, self._schema)
+        return self._made
+
+    @cached_property
+    def _made(self) -> MessageCodec:
+        assert self._schema is not None  # noqa: S101  asked for with the encoding
+        return MessageCodec(self._schema.name, utf8(self._schema.data, "schema", None))
+
+
+def _decoder(channel: Channel, codec: _Codec) -> Callable[[bytes], Any]:
+    """Return a function that decodes the channel's messages."""
 
     def decode(data: bytes) -> Any:
-        nonlocal codec
         try:
-            if codec is None:
-                codec = _codec(channel, schema)
-            return codec.decode(data)
+            return codec.get(channel).decode(data)
         except (BagError, FormatError) as error:
             raise BagError(f"topic {channel.topic}: {error}", reason=error.reason) from error
 
     return decode
 
 
-def _codec(channel: Channel, schema: Schema | None) -> MessageCodec:
+def _require_encoding(channel: Channel, schema: Schema | None) -> None:
     name = schema.name if schema else "no schema"
     if channel.encoding != "cdr":
         raise BagError(
@@ -237,15 +367,16 @@ def _codec(channel: Channel, schema: Schema | None) -> MessageCodec:
         raise BagError(
             f"type {name} has the schema encoding {found}; expected 'ros2msg'", reason="encoding"
         )
-    return MessageCodec(schema.name, utf8(schema.data, "schema", None))
 
 
-def _bag_error(error: FormatError, path: Path) -> BagError:
+def _bag_error(error: FormatError, file: BagFile, storage: Storage) -> BagError:
     """Turn a format error into the error a caller sees, with what could still be saved."""
-    if error.reason in ("empty", "not_mcap"):
-        return BagError(error.text, path=path, reason=error.reason, offset=error.offset)
-    with open_reader(path) as reader:
-        count = Salvage(reader).run(None).messages
+    if error.reason in ("empty", "not_mcap", TOTAL_CAP):
+        return BagError(error.text, path=file.path, reason=error.reason, offset=error.offset)
     return DamagedBagError(
-        error.text, path=path, reason=error.reason, offset=error.offset, salvageable=count
+        error.text,
+        path=file.path,
+        reason=error.reason,
+        offset=error.offset,
+        salvageable=count_salvageable(storage.files),
     )

@@ -28,17 +28,20 @@ from pkm_twin.bags.format import (
     INDEX_ENTRY,
     MAGIC,
     MESSAGE,
+    MESSAGE_HEAD,
     MESSAGE_INDEX,
     METADATA,
     METADATA_INDEX,
     SCHEMA,
     STATISTICS,
     SUMMARY_OFFSET,
+    ZSTD_MAGIC,
     Fields,
     FormatError,
     RecordReader,
     Records,
     iterate_records,
+    message_data,
     message_head,
     metadata,
     opcode_name,
@@ -110,7 +113,9 @@ class Segment:
         """Return the segment's records, checked once more."""
         reader.seek(self.offset)
         data = reader.read(self.length, "segment")
-        return read_chunk(data[FRAME.size :], self.offset).data if self.is_chunk else data
+        if not self.is_chunk:
+            return data
+        return read_chunk(data[FRAME.size :], self.offset, reader.budget).data
 
 
 @dataclass(slots=True)
@@ -139,9 +144,10 @@ class Check:
         self._out_of_order = 0
         self._profile = self._library = ""
         self._metadata: dict[str, dict[str, str]] = {}
-        self._warnings: list[str] = []
-        # Of the last chunk: (log time, position) by channel, and each index record's offset.
-        self._entries: dict[int, list[tuple[int, int]]] = {}
+        self._summary_without_crc = False
+        # Of the last chunk: log times and positions by channel, packed as its index must have them,
+        # and each index record's offset.
+        self._entries: dict[int, bytearray] = {}
         self._index_offsets: dict[int, int] = {}
         self._index_start = 0
         self._last_chunk: tuple[int, tuple[object, ...]] | None = None
@@ -149,8 +155,8 @@ class Check:
         self._chunks: dict[int, int] = {}
         self._chunks_without_crc = 0
         self._indexed: set[int] = set()
-        self._metadata_places: list[tuple[int, int, str]] = []
-        self._attachment_places: list[tuple[object, ...]] = []
+        self._metadata_places: set[tuple[int, int, str]] = set()
+        self._attachment_places: set[tuple[object, ...]] = set()
         self._unknown = 0
         self._has_data_crc = False
         self._has_summary = False
@@ -207,6 +213,7 @@ class Check:
     def _read_message(self, at: int, body: bytes) -> None:
         number, _, log_time, _ = message_head(body, 0, len(body), at)
         self._count(number, log_time, at)
+        self._prove(number, body, 0, len(body), at)
         length = FRAME.size + len(body)
         last = self.segments[-1] if self.segments else None
         if (
@@ -227,15 +234,23 @@ class Check:
         self._total.add(log_time)
         self._spans.setdefault(number, _Span()).add(log_time)
 
+    def _prove(self, number: int, data: bytes, start: int, end: int, at: int) -> None:
+        """See that a message which is packed by itself can be unpacked."""
+        if data.startswith(ZSTD_MAGIC, start + MESSAGE_HEAD.size):
+            encoding = self.records.channels[number].encoding
+            message_data(data, start, end, encoding, at, self._reader.budget)
+
     def _read_chunk(self, at: int, body: bytes) -> None:
-        chunk = read_chunk(body, at)
+        chunk = read_chunk(body, at, self._reader.budget)
         span = _Span()
-        for opcode, start, end in iterate_records(chunk.data, at):
+        for opcode, start, end in iterate_records(chunk.data, at, self._reader.budget):
             if opcode == MESSAGE:
                 number, _, log_time, _ = message_head(chunk.data, start, end, at)
                 self._count(number, log_time, at)
+                self._prove(number, chunk.data, start, end, at)
                 span.add(log_time)
-                self._entries.setdefault(number, []).append((log_time, start - FRAME.size))
+                entry = INDEX_ENTRY.pack(log_time, start - FRAME.size)
+                self._entries.setdefault(number, bytearray()).extend(entry)
             elif opcode in (SCHEMA, CHANNEL):
                 self.records.add(opcode, chunk.data[start:end], at)
             elif opcode < FIRST_UNKNOWN:
@@ -265,8 +280,11 @@ class Check:
             raise FormatError(f"a message index of channel {number} belongs to no chunk", at)
         if len(raw) % INDEX_ENTRY.size:
             raise FormatError(f"a message index has {len(raw)} bytes of 16-byte entries", at)
-        entries = sorted(INDEX_ENTRY.iter_unpack(raw))
-        if entries != sorted(self._entries.get(number, [])):
+        entries = self._entries.get(number, b"")
+        # Writers differ in their order.
+        if raw != entries and sorted(INDEX_ENTRY.iter_unpack(raw)) != sorted(
+            INDEX_ENTRY.iter_unpack(entries)
+        ):
             raise FormatError(f"the message index of channel {number} differs from the chunk", at)
         self._index_offsets[number] = at
 
@@ -288,10 +306,10 @@ class Check:
         name, entries, _ = metadata(body, at)
         # rosbag2 writes its record anew when it closes a bag: the last one holds.
         self._metadata[name] = entries
-        self._metadata_places.append((at, FRAME.size + len(body), name))
+        self._metadata_places.add((at, FRAME.size + len(body), name))
 
     def _read_attachment(self, at: int, length: int) -> None:
-        self._attachment_places.append(read_attachment(self._reader, at, length)[1])
+        self._attachment_places.add(read_attachment(self._reader, at, length)[1])
 
     def _read_data_end(self, at: int, length: int, crc: int) -> None:
         fields = Fields(self._reader.body(DATA_END, length), "data end", at)
@@ -408,8 +426,7 @@ class Check:
             raise FormatError(
                 f"the summary's CRC is {actual:08x}; the file says {stated:08x}", at, "crc"
             )
-        if not stated and self._has_summary:
-            self._warnings.append("the summary has no CRC")
+        self._summary_without_crc = not stated and self._has_summary
 
     def _read_end(self) -> None:
         at = self._reader.position
@@ -477,15 +494,16 @@ class Check:
 
     def _all_warnings(self, covered: bool) -> Iterator[str]:
         if not covered:
+            without = f"{self._chunks_without_crc} of {len(self._chunks)} chunks have no CRC"
+            bare = not self._chunks or self._chunks_without_crc == len(self._chunks)
             yield (
-                f"{self._chunks_without_crc} of {len(self._chunks)} chunks have no CRC: a changed "
-                "value would go unseen"
-                if self._chunks
-                else "the messages have no CRC: a changed value would go unseen"
+                f"{'the messages have no CRC' if bare else without}, as rosbag2 writes by default: "
+                "lengths, counts, times and indexes agree, a changed value would go unseen"
             )
-        if not self._has_data_crc:
+        elif not self._has_data_crc:
             yield "the data section has no CRC of its own: metadata and record headers are unproven"
-        yield from self._warnings
+        if covered and self._summary_without_crc:
+            yield "the summary has no CRC"
         if not self._has_summary:
             yield "there is no summary: read by a scan, the message count is unproven"
         elif self._statistics is None:
@@ -497,11 +515,15 @@ class Check:
 
     def _topics(self, path: Path) -> dict[str, TopicInfo]:
         topics: dict[str, TopicInfo] = {}
+        # Many channels may share one long definition.
+        definitions = {
+            number: schema.data.decode(errors="replace")
+            for number, schema in self.records.schemas.items()
+        }
         for number, channel in self.records.channels.items():
             kind = self.records.types[number]
             schema = self.records.schemas.get(channel.schema_id)
             span = self._spans.get(number, _Span())
-            definition = schema.data.decode(errors="replace") if schema else ""
             qos = channel.metadata.get("offered_qos_profiles", "")
             info = TopicInfo(
                 type=kind,
@@ -509,7 +531,7 @@ class Check:
                 start=span.start,
                 end=span.end,
                 offered_qos=qos,
-                definition=definition,
+                definition=definitions.get(channel.schema_id, ""),
                 encoding=channel.encoding,
                 schema_encoding=schema.encoding if schema else "",
             )
@@ -520,12 +542,12 @@ class Check:
                     path=path,
                     reason="type",
                 )
-            topics[channel.topic] = _join(known, info) if known else info
+            topics[channel.topic] = join_topics(known, info) if known else info
         return dict(sorted(topics.items()))
 
 
-def _join(one: TopicInfo, other: TopicInfo) -> TopicInfo:
-    """Join two channels of one topic, which is how two publishers are recorded."""
+def join_topics(one: TopicInfo, other: TopicInfo) -> TopicInfo:
+    """Join two channels of one topic: two publishers, or two files of a bag."""
     if not (one.count and other.count):
         return one if one.count or not other.count else other
     start, end = min(one.start, other.start), max(one.end, other.end)
