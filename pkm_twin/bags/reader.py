@@ -36,7 +36,7 @@ from pkm_twin.bags.format import (
 )
 from pkm_twin.bags.recover import RecoverResult, count_salvageable, recover
 from pkm_twin.bags.storage import METADATA_FILE, BagFile, Storage, find_storage
-from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo, join_topics
+from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo, join_topic
 from pkm_twin.bags.writer import BagWriter
 from pkm_twin.errors import BagError
 
@@ -295,14 +295,7 @@ def _joined(path: Path, reports: list[BagReport], storage: Storage) -> BagReport
     topics: dict[str, TopicInfo] = {}
     for report in reports:
         for name, info in report.topics.items():
-            known = topics.get(name)
-            if known and known.type != info.type:
-                raise BagError(
-                    f"topic {name} has two types, {known.type} and {info.type}",
-                    path=report.path,
-                    reason="type",
-                )
-            topics[name] = join_topics(known, info) if known else info
+            join_topic(topics, name, info, report.path)
     filled = [report for report in reports if report.message_count]
     count = sum(report.message_count for report in reports)
     warnings = list(dict.fromkeys(text for report in reports for text in report.warnings))

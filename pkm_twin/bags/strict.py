@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pkm_twin.bags.cdr import parse_definition
 from pkm_twin.bags.format import (
     ATTACHMENT,
     ATTACHMENT_INDEX,
@@ -535,20 +536,46 @@ class Check:
                 encoding=channel.encoding,
                 schema_encoding=schema.encoding if schema else "",
             )
-            known = topics.get(channel.topic)
-            if known and known.type != kind:
-                raise BagError(
-                    f"topic {channel.topic} has two types, {known.type} and {kind}",
-                    path=path,
-                    reason="type",
-                )
-            topics[channel.topic] = join_topics(known, info) if known else info
+            join_topic(topics, channel.topic, info, path)
         return dict(sorted(topics.items()))
 
 
-def join_topics(one: TopicInfo, other: TopicInfo) -> TopicInfo:
-    """Join two channels of one topic: two publishers, or two files of a bag."""
-    if not (one.count and other.count):
-        return one if one.count or not other.count else other
-    start, end = min(one.start, other.start), max(one.end, other.end)
-    return replace(one, count=one.count + other.count, start=start, end=end)
+def join_topic(topics: dict[str, TopicInfo], name: str, info: TopicInfo, path: Path) -> None:
+    """Add a channel of the topic ``name``: another publisher's, or of another file of the bag.
+
+    :raises BagError: it is not of the type, with the fields, that the topic has so far.
+    """
+    known = topics.get(name)
+    if known is None:
+        topics[name] = info
+        return
+    if known.type != info.type:
+        raise BagError(
+            f"topic {name} has two types, {known.type} and {info.type}", path=path, reason="type"
+        )
+    if not _one_form(known, info):
+        raise BagError(
+            f"topic {name} has two forms of the type {info.type}: definition or encoding differ",
+            path=path,
+            reason="type",
+        )
+    if not (known.count and info.count):
+        topics[name] = known if known.count or not info.count else info
+        return
+    start, end = min(known.start, info.start), max(known.end, info.end)
+    topics[name] = replace(known, count=known.count + info.count, start=start, end=end)
+
+
+def _one_form(one: TopicInfo, other: TopicInfo) -> bool:
+    """Whether messages of both can be read alike; definitions may differ in comments."""
+    if (one.encoding, one.schema_encoding) != (other.encoding, other.schema_encoding):
+        return False
+    if one.definition == other.definition:
+        return True
+    if one.schema_encoding != "ros2msg":
+        return False
+    try:
+        fields = [parse_definition(info.type, info.definition) for info in (one, other)]
+    except BagError:
+        return False
+    return fields[0] == fields[1]
