@@ -195,7 +195,7 @@ class TestNoEvidence:
     def test_no_masses(self, twin, tmp_path):
         bag = rewrite(STIFFNESS, tmp_path / "s.mcap", seconds=0.2)
         item = items_of(twin("check", bag, "--json"))["torque residual"]
-        assert (item["verdict"], "no masses" in item["value"]) == ("unknown", True)
+        assert (item["verdict"], "masses" in item["value"]) == ("unknown", True)
 
     def test_too_short(self, twin, tmp_path):
         bag = rewrite(DELTA, tmp_path / "s.mcap", seconds=0.002, topics=[JOINTS])
