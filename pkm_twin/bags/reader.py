@@ -364,7 +364,9 @@ def _require_encoding(channel: Channel, schema: Schema | None) -> None:
 
 def _bag_error(error: FormatError, file: BagFile, storage: Storage) -> BagError:
     """Turn a format error into the error a caller sees, with what could still be saved."""
-    if error.reason in ("empty", "not_mcap", TOTAL_CAP):
+    # Of a bag of several files an empty one is damage to the bag.
+    alone = len(storage.files) == 1
+    if error.reason == TOTAL_CAP or (alone and error.reason in ("empty", "not_mcap")):
         return BagError(error.text, path=file.path, reason=error.reason, offset=error.offset)
     return DamagedBagError(
         error.text,
