@@ -19,20 +19,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, Final
 
-import yaml
-
 from pkm_twin.bags.format import ZSTD_MAGIC, Budget, FormatError, RecordReader
+from pkm_twin.bags.plain_yaml import load_plain
 from pkm_twin.errors import BagError
 from pkm_twin.files import open_regular
 
 METADATA_FILE: Final = "metadata.yaml"
 MAX_METADATA_BYTES: Final = 4 * 1024**2
 """Largest ``metadata.yaml`` that is read; one of a hundred topics has some 60 kB."""
-MAX_METADATA_DEPTH: Final = 50
-"""Deepest nesting in it; rosbag2 writes eight."""
 SQLITE_MAGIC: Final = b"SQLite format 3\x00"
 _BLOCK_BYTES = 1024**2
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class BagFile:
@@ -253,27 +249,15 @@ def _described(folder: Path, root: _Field) -> Storage:
 
 
 def _load(path: Path) -> object:
-    """Read plain YAML: no tags, no aliases (a few of which stand for gigabytes), not deep."""
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > MAX_METADATA_BYTES:
                 text = f"has {size} bytes; at most {MAX_METADATA_BYTES}"
                 raise BagError(text, path=path, reason="metadata")
-            content = file.read(MAX_METADATA_BYTES).decode()
-        depth = 0
-        for event in yaml.parse(content, Loader=_LOADER):
-            depth += isinstance(event, yaml.CollectionStartEvent)
-            depth -= isinstance(event, yaml.CollectionEndEvent)
-            if isinstance(event, yaml.AliasEvent) or depth > MAX_METADATA_DEPTH:
-                what = "an alias" if isinstance(event, yaml.AliasEvent) else "deep nesting"
-                line = event.start_mark.line + 1 if event.start_mark else 0
-                text = f"has {what} in line {line}; expected plain YAML"
-                raise BagError(text, path=path, reason="metadata")
-        return yaml.load(content, Loader=_LOADER)  # noqa: S506  a safe loader
+            return load_plain(file.read(MAX_METADATA_BYTES).decode())
     except OSError as error:
         text = f"cannot be read: {error.strerror or error}"
         raise BagError(text, path=path, reason="io") from error
-    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        text = f"is not plain YAML: {' '.join(str(error).split()) or type(error).__name__}"
-        raise BagError(text, path=path, reason="metadata") from None
+    except ValueError as error:
+        raise BagError(f"is not plain YAML: {error}", path=path, reason="metadata") from None
