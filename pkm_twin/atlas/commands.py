@@ -3,27 +3,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
+from pkm_twin.console import numbers, progress
 from pkm_twin.errors import PkmTwinError, UnknownNameError
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
 from pkm_twin.threads import one_blas_thread
 
+WRENCH = "P1, P2, P3 or six numbers with commas between"
 KINDS = ("workspace", "strain-energy", "isotropy", "modes")
 
 # typer of Ubuntu 24.04 reads no unions.
@@ -97,7 +89,7 @@ def atlas(
     one_blas_thread()
     with (
         first_signal(KeyboardInterrupt),
-        _progress(f"{kind} of {machine.name}", sweep.points) as update,
+        progress(f"{kind} of {machine.name}", sweep.points) as update,
     ):
         try:
             run(
@@ -139,7 +131,9 @@ def sweep_of(machine: Any, kind: str, options: dict[str, Any]) -> Any:
         from pkm_twin.atlas.strain_energy import WRENCHES, strain_energy_sweep
 
         text = options["wrench"]
-        return strain_energy_sweep(machine, text if text in WRENCHES else _numbers(text), points)
+        return strain_energy_sweep(
+            machine, text if text in WRENCHES else numbers(text, 6, WRENCH), points
+        )
     if kind == "isotropy":
         from pkm_twin.atlas.isotropy import isotropy_sweep
 
@@ -192,40 +186,6 @@ def _factors(data: Any) -> Table:
             row += [f"{printed[k]:.3g}", f"{mean - printed[k]:+.1e}"]
         table.add_row(*row)
     return table
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 6:
-        raise typer.BadParameter(f"{text!r} is not P1, P2, P3 or six numbers with commas between")
-    return values
-
-
-@contextmanager
-def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar with time left, on stderr."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as drawing:
-        task: Any = None
-
-        def update(done: int) -> None:
-            nonlocal task
-            if task is None:
-                # Begins with what an earlier run left, so that the time left is that of the rest.
-                task = drawing.add_task(what, total=total, completed=done)
-            drawing.update(task, completed=done)
-
-        yield update
 
 
 def main() -> None:
