@@ -425,7 +425,7 @@ def recover(
         raise typer.Exit(SALVAGED)
 
 
-app.command()(atlases.atlas)
+app.add_typer(atlases.app, name="atlas")
 app.command()(atlases.show)
 
 

@@ -237,6 +237,8 @@ def isotropy_sweep(
         raise ParameterError("points", points, "1000 or more")
     if not 0.0 < energy < math.inf:
         raise ParameterError("energy", energy, "above zero, J")
+    if height is not None and not math.isfinite(height):
+        raise ParameterError("height", height, "a finite number, m")
     if not 0.0 < tilt < math.pi / 2:
         raise ParameterError("tilt", tilt, "between 0 and a right angle, rad")
     total = points or POINTS

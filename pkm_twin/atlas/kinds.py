@@ -7,19 +7,23 @@ import html
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 from pkm_twin.atlas import isotropy, modes, pages, plots, strain_energy, workspace
-from pkm_twin.atlas.store import replace_file, writing
+from pkm_twin.atlas.store import reading, replace_file, writing
 from pkm_twin.atlas.sweep import Kind
 from pkm_twin.errors import UnknownNameError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from xarray import Dataset
 
 KINDS: Final[Mapping[str, Kind]] = MappingProxyType(
     {module.KIND.name: module.KIND for module in (workspace, strain_energy, isotropy, modes)}
 )
 
 
-def kind_of(atlas: Any) -> Kind:
+def kind_of(atlas: Dataset) -> Kind:
     """The kind of a stored atlas.
 
     :raises UnknownNameError: a kind that this version does not know.
@@ -30,16 +34,23 @@ def kind_of(atlas: Any) -> Kind:
     return KINDS[name]
 
 
-def draw(atlas: Any) -> dict[str, Any]:
+def draw(atlas: Dataset) -> dict[str, Figure]:
     """All figures of an atlas: name to matplotlib figure.
 
     :param atlas: an ``xarray.Dataset`` of ``open_atlas``.
     :raises UnknownNameError: a kind without pictures.
     """
-    return {name: figure(atlas) for name, figure in kind_of(atlas).figures.items()}
+    kind = kind_of(atlas)
+    with reading(source(atlas)):
+        return {name: figure(atlas) for name, figure in kind.figures.items()}
 
 
-def save_all(atlas: Any, out: Path) -> list[Path]:
+def source(atlas: Dataset) -> Path:
+    """The file that an atlas came from, for errors."""
+    return Path(str(atlas.encoding.get("source", "atlas")))
+
+
+def save_all(atlas: Dataset, out: Path) -> list[Path]:
     """Write all figures as PNG beside a path, ``<stem>_<figure>.png``."""
     return [
         plots.save(figure, out.with_name(f"{out.stem}_{name}.png"))
@@ -47,14 +58,16 @@ def save_all(atlas: Any, out: Path) -> list[Path]:
     ]
 
 
-def write_page(atlas: Any, path: Path) -> Path:
+def write_page(atlas: Dataset, path: Path) -> Path:
     """Write an atlas as one HTML file that needs no network: plotly's script is inside.
 
     :param atlas: an ``xarray.Dataset`` of ``open_atlas``.
     :raises MissingExtraError: plotly is not installed.
     """
     kind = kind_of(atlas)
-    plot = kind.page(atlas).to_html(
+    with reading(source(atlas)):
+        drawn = kind.page(atlas)
+    plot = drawn.to_html(
         include_plotlyjs=True,
         full_html=False,
         config=pages.CONFIG,

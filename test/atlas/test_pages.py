@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 
@@ -16,8 +17,10 @@ from test.atlas.browser import Browser, find_browser
 pytest.importorskip("plotly")
 pytest.importorskip("tornado")
 
-POINTS = 12
+POINTS = 8
 """Places that the mouse is put to for each entry of a page's menu."""
+LONG = functools.partial(pytest.param, marks=pytest.mark.long)
+"""Robots whose pages are of the same kind as those of the default run."""
 LISTEN = """
 window.gd = document.querySelector('.js-plotly-plot');
 window.under = null;
@@ -105,7 +108,7 @@ def labels(browser):
 
 def number(line):
     """Name, number and unit of a line like "gamma -4.5 deg"."""
-    match = re.fullmatch(r"(.*?) ([-−]?[\d.]+(?:e[-+−]?\d+)?(?:[kmµnp]?)) ?(.*)", line.strip())
+    match = re.fullmatch(r"(.*) ([-−]?[\d.]+(?:e[-+−]?\d+)?(?:[kmµnp]?)) ?(.*)", line.strip())
     assert match, line
     name, text, unit = match.groups()
     return name, float(text.replace("−", "-")), unit
@@ -134,7 +137,7 @@ def test_strain_energy(browser, small_atlases, tmp_path):
                     assert shown == pytest.approx(stored, rel=1e-3, abs=1e-4)
 
 
-@pytest.mark.parametrize("robot", ["prru", "delta_cu"])
+@pytest.mark.parametrize("robot", ["prru", LONG("delta_cu")])
 def test_isotropy(browser, robot, small_atlases, tmp_path):
     """A label names the sphere; which of its points it tells of, its number does."""
     with open_atlas(small_atlases[f"isotropy {robot}"]) as data:
@@ -152,7 +155,7 @@ def test_isotropy(browser, robot, small_atlases, tmp_path):
                 assert ("beyond the machine's limits" in lines) == (int(point.within_limits) == 0)
 
 
-@pytest.mark.parametrize("robot", ["prru", "delta_cu", "upr_rpu"])
+@pytest.mark.parametrize("robot", ["delta_cu", LONG("prru"), LONG("upr_rpu")])
 def test_workspace(browser, robot, small_atlases, tmp_path):
     with open_atlas(small_atlases[f"workspace {robot}"]) as data:
         show(browser, data, tmp_path)
@@ -172,7 +175,7 @@ def test_workspace(browser, robot, small_atlases, tmp_path):
                 assert number(value)[1] == pytest.approx(stored, rel=1e-3, abs=1e-4)
 
 
-@pytest.mark.parametrize("robot", ["prru", "delta_cu", "upr_rpu"])
+@pytest.mark.parametrize("robot", ["prru", LONG("delta_cu"), LONG("upr_rpu")])
 def test_modes(browser, robot, small_atlases, tmp_path):
     with open_atlas(small_atlases[f"modes {robot}"]) as data:
         show(browser, data, tmp_path)

@@ -8,13 +8,12 @@ import pytest
 
 from pkm_twin import load
 from pkm_twin.atlas import workspace
-from pkm_twin.atlas.commands import sweep_of
-from pkm_twin.atlas.grids import circles, largest_cylinder, nice, polar_pose, singularity
+from pkm_twin.atlas.grids import circles, largest_cylinder, nice
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace import workspace_sweep
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.workspace import clearance
+from pkm_twin.kinematics.workspace import clearance, singularity_at
 from stiffness_monitor import reachable, regular_workspace
 from test.conftest import parameters_of
 
@@ -69,7 +68,7 @@ def test_the_cylinder_is_reachable_and_no_wider_one_is(reach_atlas):
     assert len(heights) > 5
 
     def whole(factor):
-        poses = polar_pose(robot, heights[:, None], factor * radius, TURN)
+        poses = robot.grid().polar_pose(heights[:, None], factor * radius, TURN)
         return reachable(robot, poses).all()
 
     assert whole(0.999)
@@ -97,7 +96,7 @@ def test_no_cylinder_where_nothing_is_reachable():
     far = circles(load("delta"), [-5.0, -4.0])
     assert (far.radius == 0.0).all()
     assert largest_cylinder(far).radius == 0.0
-    assert singularity(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
+    assert singularity_at(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
 
 
 def test_a_bound_on_singularity_takes_away(tmp_path, monkeypatch):
@@ -158,13 +157,6 @@ def test_the_box_holds_what_interference_takes_away(variant):
         assert (one == other).all()
 
 
-def test_the_command_line_gives_both_bounds():
-    options = {"points": 4000, "least_singularity": 0.2, "least_clearance": 0.03}
-    sweep = sweep_of(load("delta"), "workspace", options)
-    assert (sweep.least, sweep.least_clearance) == (0.2, 0.03)
-    assert sweep.settings["least_clearance"] == 0.03
-
-
 def test_pictures_show_what_interference_takes_away(tmp_path, monkeypatch):
     """A name for the hatching, in words that say why."""
     from matplotlib import pyplot
@@ -215,9 +207,8 @@ def test_without_members_there_is_no_clearance(tmp_path, monkeypatch):
         figure = kinds.draw(other)["sections"]
         assert "limbs" not in figure.get_suptitle()
         pyplot.close(figure)
-    options = {"points": 4000, "least_singularity": 0.0, "least_clearance": 0.01}
     with pytest.raises(ParameterError) as caught:
-        sweep_of(load("delta"), "workspace", options)
+        workspace_sweep(load("delta"), 4000, least_clearance=0.01)
     assert caught.value.field == "least_clearance"
 
 
