@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -37,8 +36,7 @@ UNITS = {
 
 def summary(robot: Robot) -> str:
     """One line that tells a robot from its siblings."""
-    closures = getattr(getattr(robot, "geometry", None), "closures", None)
-    return robot.description + (f"; closures {', '.join(closures)}" if closures else "")
+    return robot.description
 
 
 def describe(robot: Robot) -> dict[str, Any]:
@@ -51,23 +49,23 @@ def describe(robot: Robot) -> dict[str, Any]:
         "description": summary(robot),
         "joints": list(robot.joint_names),
         "joint_unit": robot.joint_unit,
-        "effort_unit": robot.effort_unit if robot.dynamics_kernel is not None else None,
+        "effort_unit": robot.effort_unit if robot.has_masses else None,
         "pose": dict(zip(robot.pose_names, robot.pose_units, strict=True)),
         "mobility": robot.mobility,
         "overconstrained": overconstraint(robot),
         "home_pose": dict(zip(robot.pose_names, home.tolist(), strict=True)),
         "home_joints": dict(zip(robot.joint_names, q.tolist(), strict=True)),
         "singularity_at_home": float(robot.singularity(q)),
-        "parameters": _plain(robot),
+        "parameters": robot.parameter_sections(),
     }
 
 
 def overconstraint(robot: Robot) -> list[str]:
     """What rigid-body statics cannot determine, by name; empty where it determines all."""
-    if robot.dynamics_kernel is not None:
-        zero = np.zeros(3)
-        return list(reactions(robot, robot.inverse(robot.home()), zero, zero).indeterminate)
-    return list(robot.redundant_constraints)
+    if robot.has_masses:
+        still = np.zeros(len(robot.joint_names))
+        return list(reactions(robot, robot.inverse(robot.home()), still, still).indeterminate)
+    return list(robot.engine.mobility.parts)
 
 
 def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
@@ -121,14 +119,6 @@ def _unit(key: str, units: dict[str, str]) -> str:
     if key in units:
         return units[key]
     return next((unit for end, unit in units.items() if key.endswith(f"_{end}")), "")
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _number(value: Any) -> str:

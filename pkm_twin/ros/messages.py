@@ -94,13 +94,18 @@ class Trajectory:
 
 @dataclass
 class JointReader:
-    """Reads joint states and trajectories of one robot."""
+    """Reads joint states and trajectories of one robot.
+
+    ``limited``: positions and velocities beyond the robot's limits are refused, else only those
+    beyond all machines.
+    """
 
     robot: Robot
+    limited: bool = True
     _known: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        limits: Any = getattr(self.robot, "limits", None)
+        limits: Any = getattr(self.robot, "limits", None) if self.limited else None
         reach = 100.0 if self.robot.joint_unit == "m" else 2000.0 * math.pi
         position = getattr(limits, "position", None)
         velocity = getattr(limits, "velocity", None)
