@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from random_machines import FILES, plain
 
 import pkm_twin.apps.certificate as judges
 from pkm_twin.apps import certify as certification
 from pkm_twin.apps.certify import ENGINES, Certificate, certify
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.catalogue import CATALOGUE
+from test.machine.random_machines import FILES, plain
 
 needs_machines = pytest.mark.skipif(
     "machine" not in CATALOGUE, reason="load knows no mechanism machine"
