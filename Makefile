@@ -52,7 +52,7 @@ bench: $(VENV)/bench.stamp
 
 certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m test.certificate
-	$(BIN)/python test/machine/certificate_page.py
+	$(BIN)/python -m test.machine.certificate_page
 
 fuzz: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m long test/bags
