@@ -49,23 +49,25 @@ class DeltaDynamics(health.TwinNode):
         robot = _changed(robot, self._declare_changes(robot))
         self._feedforward = Feedforward(robot, self._declare_settings())
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
-        self._trajectory = self.speak(JointTrajectory, "~/joint_trajectory_ff")
+        self._trajectory = self.create_guarded_publisher(JointTrajectory, "~/joint_trajectory_ff")
         # A torque is worth nothing once the stream that it answers would be stale.
         stale_after = self._feedforward.settings.stale_after
-        self._torques = self.speak(JointState, "~/joint_torques", stale_after)
-        self._residual = self.speak(JointState, "~/torque_residual")
+        self._torques = self.create_guarded_publisher(JointState, "~/joint_torques", stale_after)
+        self._residual = self.create_guarded_publisher(JointState, "~/torque_residual")
         self._commands = (
-            self.speak(Float64MultiArray, "~/commands", stale_after) if commands else None
+            self.create_guarded_publisher(Float64MultiArray, "~/commands", stale_after)
+            if commands
+            else None
         )
-        self._reactions = self._speak_reactions(robot)
+        self._reactions = self._create_reaction_publishers(robot)
         self._effort = JointState(name=list(robot.joint_names))
         self._pending: Robot | None = None
-        self.listen(JointTrajectory, "~/joint_trajectory", self._on_trajectory)
-        self.listen(JointState, "joint_states", self._on_joint_state)
+        self.create_guarded_subscription(JointTrajectory, "~/joint_trajectory", self._on_trajectory)
+        self.create_guarded_subscription(JointState, "joint_states", self._on_joint_state)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
         self._last_heard = 0
-        self.every(min(0.25 * stale_after, 0.1), self._watch)
+        self.create_guarded_timer(min(0.25 * stale_after, 0.1), self._watch)
         # A step after which no stamp that was good before is good now.
         self.start(leap=stale_after + self._feedforward.settings.future_tolerance)
 
@@ -117,7 +119,7 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
         return level, message, values
 
-    def _speak_reactions(self, robot: Robot) -> dict[str, Any]:
+    def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
         """A publisher for each joint's reaction, where the parameter asks for them."""
         wanted = self.declare("publish_reactions", False, "publish ~/reactions/*", read_only=True)
         rate = self.declare("reactions_rate", 50.0, "Hz of ~/reactions/*", read_only=True)
@@ -128,7 +130,9 @@ class DeltaDynamics(health.TwinNode):
         if not wanted:
             return {}
         return {
-            name: self.speak(WrenchStamped, f"~/reactions/{name.replace(' ', '_')}")
+            name: self.create_guarded_publisher(
+                WrenchStamped, f"~/reactions/{name.replace(' ', '_')}"
+            )
             for name in reactions(robot, robot.inverse(robot.home()), *np.zeros((2, 3))).names
         }
 

@@ -35,18 +35,20 @@ class StiffnessMonitor(health.TwinNode):
         for kernel in kernels(robot):
             kernel.warm_up()
         self._monitor = Monitor(robot, self._declare_settings())
-        self._compliance = self.speak(Float64MultiArray, "~/compliance")
-        self._energy = self.speak(DiagnosticArray, "~/strain_energy")
-        self._dominant = self.speak(String, "~/dominant_element")
-        self._deflection = self.speak(TransformStamped, "~/deflection")
+        self._compliance = self.create_guarded_publisher(Float64MultiArray, "~/compliance")
+        self._energy = self.create_guarded_publisher(DiagnosticArray, "~/strain_energy")
+        self._dominant = self.create_guarded_publisher(String, "~/dominant_element")
+        self._deflection = self.create_guarded_publisher(TransformStamped, "~/deflection")
         self._known = 0
         """Stamp of the joint state whose frequencies were published last."""
         rate = self._declare_frequencies_rate()
         if rate > 0.0 and has_modes(robot):
-            self._frequencies = self.speak(Float64MultiArray, "~/natural_frequencies")
-            self.every(1.0 / rate, self._publish_frequencies)
-        self.listen(JointState, "joint_states", self._on_joint_state)
-        self.listen(WrenchStamped, "wrench", self._on_wrench)
+            self._frequencies = self.create_guarded_publisher(
+                Float64MultiArray, "~/natural_frequencies"
+            )
+            self.create_guarded_timer(1.0 / rate, self._publish_frequencies)
+        self.create_guarded_subscription(JointState, "joint_states", self._on_joint_state)
+        self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
         self.start()
 
     def summary(self) -> str:

@@ -15,6 +15,7 @@ from pkm_twin import robot_names
 REPOSITORY = Path(__file__).resolve().parents[1]
 PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
+CREATORS = ("create_guarded_subscription", "create_guarded_publisher")
 MAY_IMPORT_ROS = {
     "delta_dynamics/node.py",
     "stiffness_monitor/node.py",
@@ -113,7 +114,7 @@ class TestNodeTables:
                 topics[re.sub("<.*>", "<>", cells[2].strip("`"))] = cells[3]
         calls = {}
         for call in ast.walk(ast.parse((REPOSITORY / node / "node.py").read_text("utf-8"))):
-            if isinstance(call, ast.Call) and getattr(call.func, "attr", "") in ("listen", "speak"):
+            if isinstance(call, ast.Call) and getattr(call.func, "attr", "") in CREATORS:
                 kind, topic = call.args[:2]
                 calls[text_of(topic)] = kind.id
         assert {topic: kind.split("/")[1] for topic, kind in topics.items()} == calls

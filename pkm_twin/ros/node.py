@@ -84,7 +84,7 @@ class TwinNode(Node):
         :param leap: how far the ROS clock has to go forward at once for :meth:`clock_leapt`, s.
         """
         self.refuse_unknown_parameters()
-        self.every(1.0, self._publish_diagnostics)
+        self.create_guarded_timer(1.0, self._publish_diagnostics)
         # Kept: the middleware calls the handle without holding it.
         self._jump_handle = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -138,7 +138,9 @@ class TwinNode(Node):
             if name not in declared:
                 raise UnknownNameError(name, name, declared)
 
-    def listen(self, kind: type[M], topic: str, callback: Callable[[M], None]) -> None:
+    def create_guarded_subscription(
+        self, kind: type[M], topic: str, callback: Callable[[M], None]
+    ) -> None:
         """Subscribe, with QoS overrides by parameter and a callback that cannot end the node."""
         pace = self._paces[topic] = Pace()
         name = self.resolve_topic_name(topic)
@@ -169,7 +171,9 @@ class TwinNode(Node):
             ),
         )
 
-    def speak(self, kind: type[M], topic: str, expiry: float | None = None) -> Any:
+    def create_guarded_publisher(
+        self, kind: type[M], topic: str, expiry: float | None = None
+    ) -> Any:
         """A publisher with QoS overrides by parameter.
 
         :param expiry: lifespan and deadline that the topic offers, s; None is none.
@@ -189,7 +193,7 @@ class TwinNode(Node):
             ),
         )
 
-    def every(self, period: float, callback: Callable[[], None]) -> None:
+    def create_guarded_timer(self, period: float, callback: Callable[[], None]) -> None:
         """A timer on the steady clock, with a callback that cannot end the node; period in s."""
 
         def guarded() -> None:
