@@ -21,7 +21,7 @@ from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import SECOND, JointReader, StampRules, modelled
 from pkm_twin.streams.continuity import COMPARISON, Continuity
 from pkm_twin.streams.differentiator import FIT, Differentiator
-from pkm_twin.streams.monitor import Guard
+from pkm_twin.streams.monitor import StreamMonitor
 
 Array = NDArray[np.float64]
 LimitPolicy = Literal["warn", "reject", "clamp"]
@@ -42,8 +42,8 @@ class Settings:
     stale_after: float = 0.1
     future_tolerance: float = 0.1
     accept_zero_stamp: bool = False
-    bad_limit: int = 5
-    good_needed: int = 5
+    trip_count: int = 5
+    recovery_count: int = 5
     on_stop: OnStop = "nothing"
     singularity_warn: float = 0.05
     singularity_stop: float = 0.01
@@ -82,9 +82,9 @@ class Feedforward:
 
     def __post_init__(self) -> None:
         s = self.settings
-        self.stream = Guard(s.bad_limit, s.good_needed)
+        self.stream = StreamMonitor(s.trip_count, s.recovery_count)
         # Each trajectory stands for itself: a bad one does not speak against the next.
-        self.trajectories = Guard(bad_limit=2**62, good_needed=1)
+        self.trajectories = StreamMonitor(trip_count=2**62, recovery_count=1)
         self.saturations = 0
         self.dropped = 0
         self.near_singular = False

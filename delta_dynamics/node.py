@@ -178,8 +178,10 @@ class DeltaDynamics(health.TwinNode):
                 "future_tolerance", fixed("future_tolerance", 0.1, "s"), 0.0, 3600.0
             ),
             accept_zero_stamp=fixed("accept_zero_stamp", False, "use arrival time"),
-            bad_limit=_within("bad_limit", fixed("bad_limit", 5, "rejects to stop"), 1, 10**6),
-            good_needed=_within("good_needed", fixed("good_needed", 5, "to go on"), 1, 10**6),
+            trip_count=_within("trip_count", fixed("trip_count", 5, "rejects to stop"), 1, 10**6),
+            recovery_count=_within(
+                "recovery_count", fixed("recovery_count", 5, "to go on"), 1, 10**6
+            ),
             on_stop=on_stop,
             singularity_warn=fraction("singularity_warn", 0.05, "measure below which to warn"),
             singularity_stop=fraction("singularity_stop", 0.01, "measure below which to stop"),

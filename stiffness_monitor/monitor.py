@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import JointReader, StampRules, WrenchSample, modelled, read_wrench
-from pkm_twin.streams.monitor import Guard
+from pkm_twin.streams.monitor import StreamMonitor
 from stiffness_monitor.compliance import StrainEnergy, compliance, strain_energy
 
 Array = NDArray[np.float64]
@@ -59,8 +59,8 @@ class Monitor:
 
     def __post_init__(self) -> None:
         s = self.settings
-        self.states = Guard(bad_limit=2**62, good_needed=1)
-        self.wrenches = Guard(bad_limit=2**62, good_needed=1)
+        self.states = StreamMonitor(trip_count=2**62, recovery_count=1)
+        self.wrenches = StreamMonitor(trip_count=2**62, recovery_count=1)
         self.dropped = 0
         self.last_reject = ""
         self._rules = StampRules(s.accept_zero_stamp, round(s.future_tolerance * 1e9))

@@ -15,15 +15,15 @@ SMOOTHING: Final = 0.1
 
 
 @dataclass
-class Guard:
+class StreamMonitor:
     """Whether a stream may be answered.
 
-    ``bad_limit`` rejects in a row stop it; a stop holds until ``good_needed`` good samples in
+    ``trip_count`` rejects in a row stop it; a stop holds until ``recovery_count`` good samples in
     a row. Both stop reasons and rejects are counted by reason.
     """
 
-    bad_limit: int = 5
-    good_needed: int = 5
+    trip_count: int = 5
+    recovery_count: int = 5
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     stops: Counter[str] = field(default_factory=Counter)
@@ -39,7 +39,7 @@ class Guard:
         self.reason, self.text = reason, text
         self._good = 0
         self._bad += 1
-        return self._bad >= self.bad_limit and self.stop(reason, text)
+        return self._bad >= self.trip_count and self.stop(reason, text)
 
     def stop(self, reason: str, text: str) -> bool:
         """Stop the stream; True where it ran until now."""
@@ -56,7 +56,7 @@ class Guard:
         self._bad = 0
         if self.stopped:
             self._good += 1
-            if self._good < self.good_needed:
+            if self._good < self.recovery_count:
                 return False
             self.stopped = False
         self.accepted += 1

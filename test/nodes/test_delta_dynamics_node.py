@@ -183,7 +183,7 @@ class TestStreams:
         """Every answer of a permuted stream is, to the bit, the core's for the ordered one."""
         core = Feedforward(
             ROBOT,
-            Settings(differentiate=differentiate, window=WINDOW, good_needed=1, stale_after=5.0),
+            Settings(differentiate=differentiate, window=WINDOW, recovery_count=1, stale_after=5.0),
         )
         begin = twin.stamp()
         twin.peer.until(lambda: twin.peer.now() > begin + 31 * STEP)
@@ -247,7 +247,7 @@ class TestStreams:
         assert counts_of(array, "joint states rejected")["not finite"] == 5
         assert counts_of(array, "stopped") == {"not finite": 1}
         good = warning.stream(3)
-        # good_needed is 2.
+        # recovery_count is 2.
         assert [stamp_of(m) for m in warning.since(bad[:1] + good)] == good[1:]
         assert warning.diagnostics().status[0].level == b"\x01"
 
@@ -265,7 +265,7 @@ class TestStale:
         assert counts_of(array, "stopped")["stale input"] >= 1
         assert len(torques) == 1
         torques.clear()
-        # The window is filled anew, then good_needed answers are held back.
+        # The window is filled anew, then recovery_count answers are held back.
         stamps = rejecting.stream(WINDOW + 3)
         assert [stamp_of(m) for m in rejecting.since(stamps)] == stamps[WINDOW:]
 

@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 from test.nodes.twin import COMMON, MAKE, MODULE, NAMES, ROBOT, STEP, WINDOW, Q, Twin, state
 
 AGAIN = WINDOW + 1
-"""Samples of a stopped stream that are not answered: the window, then good_needed is 2."""
+"""Samples of a stopped stream that are not answered: the window, then recovery_count is 2."""
 QUICK = 0.015
 """stale_after of a node that has to stop within 20 ms, s."""
 DEEP = "qos_overrides./timed/states.subscription.depth:=100"
@@ -314,7 +314,7 @@ class TestClocks:
             self.tick(timed, begin)
             assert self.stream(timed, begin, 20) == list(range(WINDOW - 1, 20))
         assert counts_of(timed.diagnostics(), "stopped") == {}
-        # Forward, as when a player seeks: a stop, its zeros, then the same and good_needed.
+        # Forward, as when a player seeks: a stop, its zeros, then the same and recovery_count.
         torques = timed.received("joint_torques")
         torques.clear()
         self.tick(timed, self.start)

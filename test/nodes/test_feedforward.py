@@ -38,7 +38,7 @@ def motion(t):
 
 
 def core(robot=ROBOT, **changes):
-    fields = {"window": WINDOW, "good_needed": 3, "bad_limit": 4} | changes
+    fields = {"window": WINDOW, "recovery_count": 3, "trip_count": 4} | changes
     return Feedforward(robot, Settings(**fields))
 
 
@@ -247,7 +247,7 @@ class TestStreams:
     def test_a_gap_longer_than_stale_after_stops_and_fills_the_window_anew(self, make):
         twin = running(make)
         results = answers(twin, make, range(10 + 101, 10 + 101 + WINDOW + 2))
-        # The window is filled, then good_needed is 3.
+        # The window is filled, then recovery_count is 3.
         assert [result is None for result in results] == [True] * (WINDOW + 1) + [False]
         assert twin.stream.stops == {"stale input": 1}
         assert running(make).joint_state(*sample(make, 10 + 99)) is not None
@@ -326,7 +326,7 @@ class TestSingularities:
     def test_an_edge_of_reach_is_warned_of_then_stopped_before(self, limitless, unreachable, index):
         outside = unreachable[index % len(unreachable)]
         part = edge(limitless, self.inside, outside)
-        twin = core(limitless, bad_limit=10**6)
+        twin = core(limitless, trip_count=10**6)
         warned = False
         # Slowly, so that the band is not stepped over: the measure falls as the distance's root.
         way = np.concatenate([np.linspace(1.0, 0.1, 1500), 0.1 * 0.9 ** np.arange(1, 300)])
@@ -406,7 +406,7 @@ class TestJumps:
     def test_a_joint_that_outruns_its_velocity_limit_stops_the_stream(
         self, make, joint, factor, jumps
     ):
-        twin = core(bad_limit=10**6)
+        twin = core(trip_count=10**6)
         q = np.zeros(3)
         for i in range(WINDOW + 3):
             assert (twin.joint_state(*held(make, i, q)) is None) is (i < WINDOW - 1)
@@ -420,7 +420,7 @@ class TestJumps:
         assert reason == "jump"
         assert f"arm_{joint + 1} moved by 0.106" in text
         assert twin.stream.stops == {"jump": 1}
-        # From there on the stream is good again: the window, then good_needed samples.
+        # From there on the stream is good again: the window, then recovery_count samples.
         results = [twin.joint_state(*held(make, i, q)) for i in range(20, 20 + WINDOW + 2)]
         assert [result is None for result in results] == [True] * (WINDOW + 1) + [False]
         # Nothing of the jump is in the derivatives.
@@ -453,7 +453,7 @@ class TestJumps:
         """At full velocity, to and fro between the position limits, at any sample rate."""
         robot = load(name)
         make = Maker(Plain())
-        twin = core(robot, differentiate=True, bad_limit=10**6)
+        twin = core(robot, differentiate=True, trip_count=10**6)
         low, high = robot.limits.position.T
         middle, half = (low + high) / 2, 0.9 * (high - low) / 2
         # The sliders' ends are beyond reach when they are far apart.
@@ -702,7 +702,7 @@ class TestAnything:
     )
     def test_streams(self, limitless, spoils, steps, limited, rates):
         make = Maker(Plain())
-        twin = core(ROBOT if limited else limitless, differentiate=True, good_needed=1)
+        twin = core(ROBOT if limited else limitless, differentiate=True, recovery_count=1)
         now, last = NOW, 0
         for i, step in enumerate(steps):
             now += step
