@@ -88,7 +88,7 @@ class Monitor:
         :raises MessageError: the message is rejected, and counted.
         """
         try:
-            sample = self._reader.joint_state(message, now, self._rules)
+            sample = self._reader.positions(message, now, self._rules)
             if self._recent and sample.stamp < self._recent[-1][0]:
                 self.dropped += 1
                 raise MessageError(
