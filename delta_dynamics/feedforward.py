@@ -171,8 +171,7 @@ class Feedforward:
         try:
             efforts = yield from self._trajectory_steps(message, now)
         except MessageError as error:
-            self.trajectories.reject(error.reason, str(error))
-            self.last_reject = str(error)
+            self.refuse_trajectory(error)
             if error.reason == "non-finite result":
                 # The input was finite: the model itself cannot be trusted now.
                 self.stream.stop(error.reason, str(error))
@@ -188,12 +187,24 @@ class Feedforward:
         try:
             torques = self._joint_state(message, now)
         except MessageError as error:
-            self._reject(error)
+            self.refuse_joint_state(error)
             raise
         if torques is None or not self.stream.accept():
             return None
         self.saturations += torques.saturated
         return torques
+
+    def refuse_trajectory(self, error: MessageError) -> None:
+        """Count a trajectory that is refused."""
+        self.trajectories.reject(error.reason, str(error))
+        self.last_reject = str(error)
+
+    def refuse_joint_state(self, error: MessageError) -> None:
+        """Count a joint state that is refused; several in a row stop the stream."""
+        self.stream.reject(error.reason, str(error))
+        self.last_reject = str(error)
+        if error.reason in STOPPING:
+            self.stream.stop(error.reason, str(error))
 
     def check_age(self, torques: Torques, now: int) -> None:
         """Refuse efforts that come too late, as after the process stood still.
@@ -207,7 +218,7 @@ class Feedforward:
                 f"the answer is ready {age / SECOND:.3f} s after the state's stamp, allowed "
                 f"{self.settings.stale_after:g} s",
             )
-            self._reject(error)
+            self.refuse_joint_state(error)
             raise error
 
     def stop_effort(self) -> Array | None:
@@ -218,12 +229,6 @@ class Feedforward:
         if self.settings.on_stop == "zeros" or self._last_good is None:
             return zero
         return inverse_dynamics(self.robot, self._last_good, zero, zero)
-
-    def _reject(self, error: MessageError) -> None:
-        self.stream.reject(error.reason, str(error))
-        self.last_reject = str(error)
-        if error.reason in STOPPING:
-            self.stream.stop(error.reason, str(error))
 
     def _trajectory_steps(self, message: Any, now: int) -> Generator[None, None, Array]:
         robot, settings, reader = self.robot, self.settings, self._reader

@@ -79,6 +79,7 @@ class TopicStatistics:
     answers that took longer than the mean time between messages.
     """
 
+    messages: int = 0
     missed: int = 0
     overruns: int = 0
     longest: float = 0.0
@@ -101,6 +102,7 @@ class TopicStatistics:
             longest = 2.0 * self._period if self._periods > 1 else period
             weight = max(SMOOTHING, 1.0 / self._periods)
             self._period += (min(period, longest) - self._period) * weight
+        self.messages += 1
         self._sent = sent
         last, self._number = self._number, number or 0
         self._missing = self._number - last - 1 if last else 0
