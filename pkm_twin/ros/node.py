@@ -71,6 +71,9 @@ MAX_TEXT: Final = 500
 MAX_TASKS: Final = 10
 """How much work may wait beside the callbacks."""
 
+LOOK: Final = 0.5
+"""How often the events executor looks whether the context has ended, s."""
+
 M = TypeVar("M")
 Task = Generator[None, None, None]
 
@@ -666,11 +669,14 @@ def verdict(check: Callable[[], object]) -> SetParametersResult:
 
 def spin(node: TwinNode) -> None:
     """Run callbacks, and between them a step of what waits, until the context ends."""
-    executor = EventsExecutor() if node.executor_kind == "events" else SingleThreadedExecutor()
+    events = node.executor_kind == "events"
+    executor = EventsExecutor() if events else SingleThreadedExecutor()
     executor.add_node(node)
+    # Without a bound the one waits for ever; with one the other makes a timer a message.
+    patience = LOOK if events else None
     while node.context.ok():
         try:
-            executor.spin_once(timeout_sec=0.0 if node.busy else None)
+            executor.spin_once(timeout_sec=0.0 if node.busy else patience)
             node.work()
         except (KeyboardInterrupt, ExternalShutdownException):
             raise

@@ -135,7 +135,12 @@ class Domain:
 
 
 def end_with_parent():
-    """In a new process, on Linux: a test run that is killed leaves no node behind."""
+    """In a new process: it takes signals whatever this one does about them.
+
+    On Linux a test run that is killed leaves no node behind.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
@@ -208,8 +213,8 @@ class Peer:
     def now(self):
         return self.node.get_clock().now().nanoseconds
 
-    def talk(self, kind, topic):
-        self._publishers[topic] = self.node.create_publisher(kind, topic, 10)
+    def talk(self, kind, topic, qos=10):
+        self._publishers[topic] = self.node.create_publisher(kind, topic, qos)
 
     def hear(self, kind, topic):
         received = self._received[topic] = []

@@ -252,3 +252,12 @@ def test_types_that_do_not_fit(tmp_path: Path, kind: str, definition: str, text:
     with pytest.raises(BagError, match=text) as caught:
         play(tmp_path / "t.mcap")
     assert caught.value.reason == "type"
+
+
+def test_log_times_that_no_clock_can_tell_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "late.mcap"
+    with BagWriter(path) as writer:
+        writer.add_topic("/note", "std_msgs/msg/String")
+        writer.write("/note", String(data="late"), 2**31 * 10**9)
+    with pytest.raises(BagError, match="do not fit a /clock"):
+        play(path, clock=100.0, progress=False)
