@@ -83,7 +83,7 @@ class Source:
 
     def wrench(self, now):
         frame = str(self.rng.choice(["platform", "platform", "", "base_link", "x" * 300]))
-        return self.make.wrench(self.values(6)[:6] + [0.0] * 6, self.stamp(now), frame)
+        return self.make.wrench((self.values(6) + [0.0] * 6)[:6], self.stamp(now), frame)
 
     def damaged(self, data):
         """Bytes with some of them changed, cut, or behind more."""
