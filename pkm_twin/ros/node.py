@@ -659,7 +659,7 @@ class TwinNode(LifecycleNode):
         troubles = self._troubles()
         if level == ERROR:
             troubles.insert(0, (level, message))
-        elif level != OK or not troubles:
+        elif level != OK or not troubles or not self.active:
             troubles.append((level, message))
         status = DiagnosticStatus(
             level=max(level for level, _ in troubles),
