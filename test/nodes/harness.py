@@ -23,8 +23,8 @@ except ImportError:  # The tests of the pure cores run without ROS.
     rclpy = None
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-DEADLINE = 20.0
-"""How long a condition is waited for, s."""
+DEADLINE = 60.0
+"""How long a condition is waited for, s: no verdict but for what will never be so."""
 SECOND = 10**9
 
 
@@ -179,11 +179,10 @@ class NodeProcess:
         return self.process.wait(timeout)
 
     def stop(self, number=signal.SIGINT, times=1):
-        """Signal the process: its exit code, and how long it took to end, s."""
-        began = time.monotonic()
+        """Signal the process: its exit code."""
         for _ in range(times):
             self.process.send_signal(number)
-        return self.process.wait(DEADLINE), time.monotonic() - began
+        return self.process.wait(DEADLINE)
 
     def close(self):
         """End the process by its id, whatever state it is in."""

@@ -315,7 +315,7 @@ class TestLifeCycle:
         assert self.label(waiting) == "unconfigured"
         self.change(waiting, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
         assert self.label(waiting) == "finalized"
-        assert waiting.process.stop()[0] == 0
+        assert waiting.process.stop() == 0
 
     def test_a_node_that_has_heard_nothing_says_so(self, peer, launch):
         peer.hear(DiagnosticArray, "/diagnostics")
