@@ -41,10 +41,10 @@ def main(source, target):
             "",
             "Round trip over DDS at 1 kHz, `joint_states` to `~/joint_torques`, beside a node that "
             f"sends the same message back: {trip['slices']} slices of each in turn, medians. "
-            "Ratios are to the echo with the same executor. Not answered in a slice are also the samples "
-            "that fill the node's window.",
+            "Ratios are to the echo with the same executor. Not answered are also the samples that "
+            "fill the node's window.",
             "",
-            "| node | p50 (us) | p99 (us) | CPU a message (us) | not answered | ratios of the three |",
+            "| node | p50 (us) | p99 (us) | CPU (us a message) | not answered | ratios to the echo |",
             "|---|---:|---:|---:|---:|---|",
         ]
         for name, f in trip["figures"].items():
