@@ -167,7 +167,7 @@ def info(robot: RobotName, as_json: Json = False) -> None:
     table = Table(show_header=False)
     for what, value in lines(data):
         table.add_row(what, Text(value))
-    tabletable_console().print(table)
+    table_console().print(table)
 
 
 @app.command()
@@ -386,7 +386,7 @@ def check(
         for item in report.items:
             verdict = Text(item.verdict, style=colours[item.verdict])
             table.add_row(item.what, Text(item.value), Text(item.bound), verdict)
-        tabletable_console().print(table)
+        table_console().print(table)
         bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
         text = f"bad: {', '.join(bad)}" if bad else "good"
         typer.echo(text + (f"; not judged: {', '.join(unknown)}" if unknown else ""))
