@@ -12,7 +12,7 @@ help:
 	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
 	@echo "make certificate  torques and compliance against other engines, into docs/certificate.md"
-	@echo "make fuzz         damage every kind of byte of a bag, at length"
+	@echo "make fuzz         every bit of a bag turned over; files and command lines at random (MINUTES, SEED)"
 	@echo "make soak         ten million poses, and minutes of both nodes, in flat memory"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
 	@echo "make clean        remove .venv, out and caches"
@@ -53,8 +53,13 @@ bench: $(VENV)/bench.stamp
 certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m test.certificate
 
+# Time and seed of the random files and command lines.
+MINUTES ?= 10
+SEED ?= 1
+
 fuzz: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m long test/bags
+	$(BIN)/python -m test.bags.fuzz --minutes $(MINUTES) --seed $(SEED) --page docs/fuzz.md
 
 soak: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m long test/atlas test/nodes

@@ -84,6 +84,7 @@ setup(
             "psutil",
             "pytest",
             "pytest-timeout",
+            "rosbags",
             "ruff",
             "threadpoolctl",
             "types-PyYAML",
