@@ -11,7 +11,7 @@ help:
 	@echo "make test         lint, types and tests"
 	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
-	@echo "make certificate  torques and compliance against other engines, into docs/certificate.md"
+	@echo "make certificate  torques and compliance against other engines, into docs/certificate*.md"
 	@echo "make fuzz         every bit of a bag turned over; files and command lines at random (MINUTES, SEED)"
 	@echo "make soak         ten million poses, and minutes of both nodes, in flat memory"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
@@ -52,6 +52,7 @@ bench: $(VENV)/bench.stamp
 
 certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m test.certificate
+	$(BIN)/python test/machine/certificate_page.py
 
 # Time and seed of the random files and command lines.
 MINUTES ?= 10

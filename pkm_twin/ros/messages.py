@@ -105,18 +105,19 @@ class JointReader:
     _known: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        limits: Any = getattr(self.robot, "limits", None) if self.limited else None
-        reach = 100.0 if self.robot.joint_unit == "m" else 2000.0 * math.pi
-        position = getattr(limits, "position", None)
-        velocity = getattr(limits, "velocity", None)
+        joints = len(self.robot.joint_names)
+        limits = self.robot.limits
+        position = limits.position if self.limited else None
+        velocity = limits.velocity if self.limited else None
+        reach = [100.0 if unit == "m" else 2000.0 * math.pi for unit in self.robot.joint_units]
         self._limited = {"position": position is not None, "velocity": velocity is not None}
-        self._position = [(-reach, reach)] * 3 if position is None else position.tolist()
-        rates = [MAX_RATE] * 3 if velocity is None else velocity.tolist()
+        self._position = [(-r, r) for r in reach] if position is None else position.tolist()
+        rates = [MAX_RATE] * joints if velocity is None else velocity.tolist()
         self._velocity = [(-rate, rate) for rate in rates]
         self.highest_velocity: tuple[float, ...] = tuple(rates)
         self._highest_velocity = np.array(rates)
-        self._acceleration = [(-MAX_ACCELERATION, MAX_ACCELERATION)] * 3
-        self._effort = [(-MAX_EFFORT, MAX_EFFORT)] * 3
+        self._acceleration = [(-MAX_ACCELERATION, MAX_ACCELERATION)] * joints
+        self._effort = [(-MAX_EFFORT, MAX_EFFORT)] * joints
 
     def joint_state(self, message: Any, now: int, rules: StampRules) -> JointSample:
         """A sensor_msgs/JointState, matched by name in any order; other joints are ignored.

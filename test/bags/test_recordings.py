@@ -194,7 +194,7 @@ class TestPickAndPlace:
         _, held = self.phases(bags, time)
         bare = load("delta_cu")
         loaded = bare.changed(payload={"mass": float(facts_of(bag)["payload_mass_kg"])})
-        still = np.zeros(3)
+        still = np.zeros(len(bare.joint_names))
         q = {stamp_of(m.message.header): m.message.position for m in bag.messages([STATES])}
         at = EPOCH + np.round(time[held] * SECOND).astype(np.int64)
         q = np.array([q[1_000_000 * round(stamp / 1_000_000)] for stamp in at.tolist()])
