@@ -102,8 +102,8 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "delta_dynamics = delta_dynamics.node:main",
-            "stiffness_monitor = stiffness_monitor.node:main",
+            "delta_dynamics = pkm_twin.apps.nodes:delta_dynamics",
+            "stiffness_monitor = pkm_twin.apps.nodes:stiffness_monitor",
             "pkm-twin = pkm_twin.apps.cli:main",
         ],
     },

@@ -585,7 +585,7 @@ def batch(kind: Kind, tally: Tally, seed: int) -> None:
         tally.failures.append(f"seed {seed}: {what}: {failing[0]!r}"[:2000])
 
 
-def run(minutes: float, seed: int, folder: Path, only: str = "") -> list[Tally]:
+def run(seconds: float, seed: int, folder: Path, only: str = "") -> list[Tally]:
     """Each kind in turn for its share of the time."""
     kinds = [kind for kind in KINDS if only in kind.name]
     tallies = []
@@ -595,7 +595,7 @@ def run(minutes: float, seed: int, folder: Path, only: str = "") -> list[Tally]:
         subject, tally = kind(place), Tally(kind.name)
         chance = random.Random(f"{seed} {kind.name}")
         begin = time.monotonic()
-        while time.monotonic() - begin < 60 * minutes / len(kinds):
+        while time.monotonic() - begin < seconds / len(kinds):
             batch(subject, tally, chance.randrange(2**32))
         tally.spent = time.monotonic() - begin
         tallies.append(tally)
@@ -636,13 +636,13 @@ Largest memory of the process: {memory:.0f} MB. What an earlier search found sta
 def main() -> int:
     """Run from a command line; 0 where everything held."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0, help="time for all kinds together")
+    parser.add_argument("--seconds", type=float, default=600.0, help="time for all kinds together")
     parser.add_argument("--seed", type=int, default=1, help="another seed, other examples")
     parser.add_argument("--only", default="", help="only kinds with this text in their name")
     parser.add_argument("--page", type=Path, help="Markdown file to write")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        tallies = run(options.minutes, options.seed, Path(folder), options.only)
+        tallies = run(options.seconds, options.seed, Path(folder), options.only)
     if options.page:
         options.page.write_text(page(tallies, options.seed), encoding="utf-8")
     return int(any(tally.failures for tally in tallies))
