@@ -85,6 +85,7 @@ setup(
             "psutil",
             "pytest",
             "pytest-timeout",
+            "rosbags",
             "ruff",
             "threadpoolctl",
             "types-PyYAML",

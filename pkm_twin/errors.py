@@ -19,7 +19,8 @@ class ParameterError(PkmTwinError, ValueError):
     """
 
     def __init__(self, field: str, value: object, bound: str) -> None:
-        super().__init__(f"{field}: {_short(value)} is refused; allowed: {bound}")
+        text = f"{field}: {_short(value)} is refused; allowed: {bound}"
+        super().__init__(one_line(text, 2000))
         self.field = field
         self.value = value
         self.bound = bound

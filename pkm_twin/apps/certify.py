@@ -22,6 +22,7 @@ from pkm_twin.apps.certificate.description import UnfitError
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import States, random_states
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.robot_urdf import robot_description
 
 Array = NDArray[np.float64]
 

@@ -464,8 +464,8 @@ def certify(
             table.add_column(column)
         for item in result.items:
             verdict = Text("good", "green") if item.good else Text("bad", "red")
-            numbers = (f"{value:.1e}" for value in (item.worst, item.median, item.bound))
-            table.add_row(item.engine, item.what, *numbers, verdict)
+            values = (f"{value:.1e}" for value in (item.worst, item.median, item.bound))
+            table.add_row(item.engine, item.what, *values, verdict)
         table_console().print(table)
         for name, reason in result.missing.items():
             typer.echo(f"{name} was not asked: {reason}")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from delta_dynamics import reactions
+from pkm_twin.apps.recorded import why_no_torques
 from pkm_twin.machine.robot import Robot
 
 UNITS = {
@@ -49,7 +50,8 @@ def describe(robot: Robot) -> dict[str, Any]:
         "description": summary(robot),
         "joints": list(robot.joint_names),
         "joint_unit": robot.joint_unit,
-        "effort_unit": robot.effort_unit if robot.has_masses else None,
+        "joint_units": list(robot.joint_units),
+        "effort_unit": None if why_no_torques(robot) else robot.effort_unit,
         "pose": dict(zip(robot.pose_names, robot.pose_units, strict=True)),
         "mobility": robot.mobility,
         "overconstrained": overconstraint(robot),
@@ -62,21 +64,25 @@ def describe(robot: Robot) -> dict[str, Any]:
 
 def overconstraint(robot: Robot) -> list[str]:
     """What rigid-body statics cannot determine, by name; empty where it determines all."""
-    if robot.has_masses:
-        still = np.zeros(len(robot.joint_names))
-        return list(reactions(robot, robot.inverse(robot.home()), still, still).indeterminate)
-    return list(robot.engine.mobility.parts)
+    if not why_no_torques(robot):
+        zero = np.zeros(len(robot.joint_names))
+        return list(reactions(robot, robot.inverse(robot.home()), zero, zero).indeterminate)
+    mobility = robot.engine.mobility
+    if not mobility.redundant:
+        return []
+    count = f"{mobility.redundant} of {mobility.closures} closure equations"
+    return [f"{count} are redundant, among {', '.join(mobility.parts)}"]
 
 
 def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
     """The same as pairs of words for a table."""
     pose = ", ".join(f"{name} ({unit})" for name, unit in data["pose"].items())
-    joint_units = dict.fromkeys(data["joints"], data["joint_unit"])
+    joint_units = dict(zip(data["joints"], data["joint_units"], strict=True))
     rows = [
         ("robot", f"{data['name']}: {data['description']}"),
         ("mobility", data["mobility"]),
         ("pose", pose),
-        ("actuated joints", f"{', '.join(data['joints'])} ({data['joint_unit']})"),
+        ("actuated joints", ", ".join(f"{name} ({unit})" for name, unit in joint_units.items())),
         ("home pose", _pairs(data["home_pose"], data["pose"])),
         ("home joints", _pairs(data["home_joints"], joint_units)),
         ("distance to singularity at home", f"{data['singularity_at_home']:.3f} (1 is best)"),
@@ -87,7 +93,7 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     units = UNITS | _joint_units(data["joint_unit"], data["effort_unit"])
     for section, value in data["parameters"].items():
-        if section not in ("mechanism", "joints"):
+        if section not in ("mechanism", "name", "joints"):
             rows += _rows(section, value, units)
     return rows
 

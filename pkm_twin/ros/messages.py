@@ -12,7 +12,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -385,11 +385,6 @@ def read_wrench(
 def shown(name: str) -> str:
     """A foreign name between quotes, cut where it is long."""
     return repr(name if len(name) <= MAX_SHOWN else name[:MAX_SHOWN] + "...")
-
-
-def joint_units(robot: Robot) -> tuple[str, ...]:
-    """Unit of every actuated joint's position, rad or m."""
-    return (robot.joint_unit,) * len(robot.joint_names)
 
 
 def as_message_error(call: Callable[..., Any], *arguments: Any) -> Any:

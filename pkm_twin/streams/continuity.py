@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.tracking import MAX_MOVE
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, joint_units
+from pkm_twin.ros.messages import SECOND
 
 Array = NDArray[np.float64]
 
@@ -134,7 +134,7 @@ class Continuity:
         moves = move.tolist()
         for joint, (moved, velocity) in enumerate(zip(moves, self._velocity, strict=True)):
             if not abs(moved) <= velocity * factor:
-                unit = joint_units(self.robot)[joint]
+                unit = self.robot.joint_units[joint]
                 raise MessageError(
                     "jump",
                     f"{self.robot.joint_names[joint]} moved by {moved:g} {unit} in {period:g} s, "
