@@ -49,12 +49,12 @@ _UNKNOWN: Final = object()
 
 def length(**options: Any) -> Any:
     """Field: a length above zero, m."""
-    return schema.number(above=0.0, at_most=MAX_LENGTH, **options)
+    return schema.number(above=0.0, at_most=MAX_LENGTH, unit="m", **options)
 
 
 def mass(**options: Any) -> Any:
     """Field: a mass of zero or more, kg."""
-    return schema.number(at_least=0.0, at_most=MAX_MASS, **options)
+    return schema.number(at_least=0.0, at_most=MAX_MASS, unit="kg", **options)
 
 
 def check_azimuths(azimuths: Array, path: str) -> None:
@@ -71,7 +71,7 @@ class Payload:
     """A body fixed to the platform: com from its reference point, inertia about the com."""
 
     mass: float = mass(default=0.0)
-    com: Array = schema.vector(3, default=[0, 0, 0])
+    com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
 
 
@@ -89,7 +89,8 @@ def check_angles(angle: float, path: str) -> None:
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
     field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
-    entries = [(n, Array, schema.vector(joints, **field)) for n in ("viscous", "coulomb")]
+    units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
+    entries = [(n, Array, schema.vector(joints, unit=u, **field)) for n, u in units.items()]
     return dataclasses.make_dataclass("Friction", entries, frozen=True, eq=False)
 
 
@@ -98,9 +99,9 @@ def limits_of(joints: int) -> Any:
     """Schema of limits of so many actuated joints; absent is None, one value stands for all."""
     above: dict[str, Any] = {"above": 0.0, "infinite": True, "spread": True, "default": None}
     entries = [
-        ("position", Any, schema.interval(count=joints, default=None)),
-        ("velocity", Any, schema.vector(joints, **above)),
-        ("effort", Any, schema.vector(joints, **above)),
+        ("position", Any, schema.interval(count=joints, unit="{joint}", default=None)),
+        ("velocity", Any, schema.vector(joints, unit="{joint}/s", **above)),
+        ("effort", Any, schema.vector(joints, unit="{effort}", **above)),
     ]
     return dataclasses.make_dataclass("Limits", entries, frozen=True, eq=False)
 
@@ -158,7 +159,7 @@ class Robot:
     """The name that the robot was loaded by."""
     payload: Payload = schema.section(Payload, default={})
     friction: Coefficients = schema.section(friction_of(3), default={})
-    gravity: Array = schema.vector(3, default=[0, 0, -9.81])
+    gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])
     limits: JointLimits = schema.section(limits_of(3), default={})
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
@@ -344,6 +345,21 @@ class Robot:
         """The parameters by section, as plain data."""
         fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
         return {name: schema.plain(getattr(self, name)) for name in fields}
+
+    def parameter_units(self) -> dict[str, Any]:
+        """Units of the same, by section; empty where a parameter has none."""
+        words = {"{joint}": self.joint_unit, "{effort}": self.effort_unit}
+
+        def told(unit: Any) -> Any:
+            if isinstance(unit, dict):
+                return {name: told(entry) for name, entry in unit.items()}
+            for word, meant in words.items():
+                unit = unit.replace(word, meant)
+            return unit
+
+        names = self.parameter_sections()
+        found: dict[str, Any] = told({n: u for n, u in schema.units(self).items() if n in names})
+        return found
 
     @cached_property
     def joints_count(self) -> int:

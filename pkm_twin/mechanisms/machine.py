@@ -35,7 +35,7 @@ from pkm_twin.machine.graph import (
     rotation_about_z,
     unit,
 )
-from pkm_twin.machine.members import Beam, Structure, Tube
+from pkm_twin.machine.members import Beam, Structure, Tube, compliances
 from pkm_twin.machine.robot import (
     Payload,
     Robot,
@@ -59,8 +59,8 @@ class MemberSpec:
     ``section``: with the body's mass along the bar; without one the body is rigid.
     """
 
-    start: Array = schema.vector(3, key="from")
-    end: Array = schema.vector(3, key="to")
+    start: Array = schema.vector(3, key="from", unit="m")
+    end: Array = schema.vector(3, key="to", unit="m")
     section: Tube | None = schema.section(Tube, default=None)
     radius: float | None = length(default=None)
 
@@ -84,7 +84,7 @@ class BodySpec:
     """Mass (kg), centre of mass (m) and inertia about it (kg m2), base axes at home."""
 
     mass: float = mass(default=0.0)
-    com: Array | None = schema.vector(3, default=None)
+    com: Array | None = schema.vector(3, unit="m", default=None)
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
     member: MemberSpec | None = schema.section(MemberSpec, default=None)
 
@@ -98,17 +98,17 @@ class BodySpec:
 class FrictionSpec:
     """Friction of one joint: N m s/rad or N s/m, and N m or N."""
 
-    viscous: float = schema.number(at_least=0.0, default=0.0)
-    coulomb: float = schema.number(at_least=0.0, default=0.0)
+    viscous: float = schema.number(at_least=0.0, unit="{effort} per {joint}/s", default=0.0)
+    coulomb: float = schema.number(at_least=0.0, unit="{effort}", default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class LimitSpec:
     """Limits of one actuated joint: position [min, max], rate, effort."""
 
-    position: Array | None = schema.interval(default=None)
-    velocity: float | None = schema.number(above=0.0, default=None)
-    effort: float | None = schema.number(above=0.0, default=None)
+    position: Array | None = schema.interval(unit="{joint}", default=None)
+    velocity: float | None = schema.number(above=0.0, unit="{joint}/s", default=None)
+    effort: float | None = schema.number(above=0.0, unit="{effort}", default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +117,9 @@ class DriveSpec:
     or belt of ``lead`` metres a turn; reflected to the joint it is ``rotor_inertia``.
     """
 
-    inertia: float = schema.number(at_least=0.0)
-    ratio: float | None = schema.number(above=0.0, default=None)
-    lead: float | None = schema.number(above=0.0, default=None)
+    inertia: float = schema.number(at_least=0.0, unit="kg m2")
+    ratio: float | None = schema.number(above=0.0, unit="turns a turn", default=None)
+    lead: float | None = schema.number(above=0.0, unit="m a turn", default=None)
 
     def verify(self, path: str) -> None:
         """One of the two."""
@@ -141,16 +141,16 @@ class JointSpec:
 
     type: str = schema.choice(*FREEDOMS)
     between: tuple[str, ...] = schema.names(2)
-    at: Array | None = schema.vector(3, default=None)
+    at: Array | None = schema.vector(3, unit="m", default=None)
     axis: Array | None = schema.vector(3, default=None)
     axes: Array | None = schema.matrix(2, 3, default=None)
     actuated: bool = schema.flag(default=False)
-    home: float = schema.number(default=0.0)
+    home: float = schema.number(unit="{joint}", default=0.0)
     limits: LimitSpec | None = schema.section(LimitSpec, default=None)
     friction: FrictionSpec | None = schema.section(FrictionSpec, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, default=0.0)
+    rotor_inertia: float = schema.number(at_least=0.0, unit="kg m2 or kg", default=0.0)
     drive: DriveSpec | None = schema.section(DriveSpec, default=None)
-    compliance: Array | None = schema.vector(6, at_least=0.0, infinite=True, default=None)
+    compliance: Array | None = compliances(default=None)
 
     def verify(self, path: str) -> None:
         """The axes that its type has, and a point where there has to be one."""
@@ -204,7 +204,7 @@ class RodSpec:
     """A thin even straight bar with a ball joint at each end: points (m), mass (kg)."""
 
     between: tuple[str, ...] = schema.names(2)
-    ends: Array = schema.matrix(2, 3)
+    ends: Array = schema.matrix(2, 3, unit="m")
     mass: float = mass(default=0.0)
     section: Tube | None = schema.section(Tube, default=None)
     radius: float | None = length(default=None)
