@@ -150,7 +150,13 @@ def robots() -> None:
 
 
 @app.command()
-def info(robot: RobotName, as_json: Json = False) -> None:
+def info(
+    robot: RobotName,
+    as_json: Json = False,
+    picture: Annotated[
+        Path | None, typer.Option(help="draw the robot at home into this file, .png or .svg")
+    ] = None,
+) -> None:
     """Print all of a robot, with units.
 
     Dimensions, masses, limits, home pose, mobility, and which reactions rigid bodies do not
@@ -159,7 +165,12 @@ def info(robot: RobotName, as_json: Json = False) -> None:
     from pkm_twin import load
     from pkm_twin.apps.describe import describe, lines
 
-    data = describe(load(robot))
+    loaded = load(robot)
+    data = describe(loaded)
+    if picture is not None:
+        from pkm_twin.apps import drawing
+
+        drawing.picture(loaded, picture)
     if as_json:
         # JSON has no infinity: a free axis is null.
         print_json(_finite(data))
