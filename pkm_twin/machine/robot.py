@@ -44,7 +44,6 @@ SINGULARITY_BOUND: Final = 1e-9
 """Least singularity measure (0 singular, 1 best) at which a Jacobian is inverted."""
 
 _NONE: Final = np.zeros(0)
-_UNKNOWN: Final = object()
 
 
 def length(**options: Any) -> Any:
@@ -260,18 +259,16 @@ class Robot:
 
     @cached_property
     def calls(self) -> dict[str, Any]:
-        """Functions for one sample that are made once a robot, by name; None: there is none."""
+        """Functions for one sample, made once a robot, by name."""
         return {}
 
     def call_one(
         self, name: str, kernel: Callable[[], Kernel], p: Array, *inputs: Any
     ) -> Array | None:
         """First output of one good sample, as fast as can be; None where it takes a batch's way."""
-        call = self.calls.get(name, _UNKNOWN)
-        if call is _UNKNOWN:
-            call = self.calls[name] = kernel().first_of_one(p)
+        call = self.calls.get(name)
         if call is None:
-            return None
+            call = self.calls[name] = kernel().first_of_one(p)
         try:
             result: Array | None = call(*inputs)
         except (TypeError, ValueError):
