@@ -204,7 +204,7 @@ def _loads(t: Traced) -> Program:
     forces = Forces(motion)
     # Rods stand for themselves here.
     forces.inertia(bodies, np.zeros(len(graph.rods), dtype=object))
-    forces.friction(passive)
+    forces.passive(passive)
     body_rows: list[Any] = []
     for name in t.tree.links:
         body_rows += [*motion.origin[name], *forces.force[name], *forces.moment[name]]

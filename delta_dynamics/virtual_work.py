@@ -17,8 +17,8 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.motion import Motion, cross
-from pkm_twin.machine.graph import BASE, FREEDOMS
-from pkm_twin.machine.inertia import Layout, rubbing
+from pkm_twin.machine.graph import BASE, FREEDOMS, Joint
+from pkm_twin.machine.inertia import Layout, loaded_joints
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -169,31 +169,46 @@ class Forces:
             self.push(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
             self.push(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
 
-    def friction(self, values: Objects) -> None:
-        """What passive joints rub, from their viscous and Coulomb coefficients."""
-        m = self.motion
-        for k, name in enumerate(rubbing(m.graph)):
-            joint = m.graph.joints[name]
-            axis = m.direction(joint.inner, joint.axes[0])
-            inner, outer = joint.inner, joint.outer
-            if FREEDOMS[joint.kind] == "R":
-                rate = axis @ (m.omega[outer] - m.omega[inner])
-            else:
-                rate = axis @ (m.velocity(outer, joint.at) - self._carried(inner, outer, joint.at))
-            load = axis * (values[2 * k] * rate + values[2 * k + 1] * sign(rate))
-            if FREEDOMS[joint.kind] == "R":
-                self.moment[outer] = self.moment[outer] + load
-                self.moment[inner] = self.moment[inner] - load
-                continue
-            at = m.point(outer, joint.at)
-            for body, force in ((outer, load), (inner, -load)):
-                self.force[body] = self.force[body] + force
-                self.moment[body] = self.moment[body] + cross(at - m.origin[body], force)
+    def passive(self, values: Objects) -> None:
+        """What passive joints rub, and what their rotors resist: three numbers a joint."""
+        for k, joint in enumerate(loaded_joints(self.motion.graph)):
+            viscous, coulomb, rotor = values[3 * k : 3 * k + 3]
+            rate, second = self._relative(joint, accelerated=True)
+            self._pair(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
 
-    def _carried(self, inner: str, outer: str, point: Array) -> Any:
-        """Velocity of the inner body where the outer one's point is."""
-        m = self.motion
-        return m.speed[inner] + cross(m.omega[inner], m.point(outer, point) - m.origin[inner])
+    def passive_momenta(self, values: Objects) -> None:
+        """Momenta of the passive joints' rotors."""
+        for k, joint in enumerate(loaded_joints(self.motion.graph)):
+            self._pair(joint, values[3 * k + 2] * self._relative(joint, accelerated=False)[0])
+
+    def _relative(self, joint: Joint, *, accelerated: bool) -> tuple[Any, Any]:
+        """Rate and acceleration of a passive joint, of its outer body against its inner one."""
+        m, a, b = self.motion, joint.inner, joint.outer
+        axis = m.direction(a, joint.axes[0])
+        second: Any = 0.0
+        if FREEDOMS[joint.kind] == "R":
+            if accelerated:
+                second = axis @ (m.alpha[b] - m.alpha[a])
+            return axis @ (m.omega[b] - m.omega[a]), second
+        # Against the point of the inner body that is where the outer one's is.
+        lever = m.point(b, joint.at) - m.origin[a]
+        if accelerated:
+            carried = m.change[a] + m.spin(a) @ lever
+            second = axis @ (m.acceleration(b, joint.at) - carried)
+        return axis @ (m.velocity(b, joint.at) - m.speed[a] - cross(m.omega[a], lever)), second
+
+    def _pair(self, joint: Joint, amount: Any) -> None:
+        """An effort along a joint's freedom on its outer body, its opposite on the inner one."""
+        m, a, b = self.motion, joint.inner, joint.outer
+        load = m.direction(a, joint.axes[0]) * amount
+        if FREEDOMS[joint.kind] == "R":
+            self.moment[b] = self.moment[b] + load
+            self.moment[a] = self.moment[a] - load
+            return
+        at = m.point(b, joint.at)
+        for body, force in ((b, load), (a, -load)):
+            self.force[body] = self.force[body] + force
+            self.moment[body] = self.moment[body] + cross(at - m.origin[body], force)
 
     def generalised(self) -> tuple[Objects, Objects]:
         """Down the tree: generalised forces of the unknown rates and of the actuated joints."""
@@ -241,7 +256,7 @@ def _torques(t: Traced) -> Program:
     t.set_accelerations(qdd, gravity)
     forces = Forces(t.motion)
     forces.inertia(bodies, rods)
-    forces.friction(passive)
+    forces.passive(passive)
     graph = t.engine.graph
     forces.push(graph.platform, graph.origin, -wrench[:3])
     forces.moment[graph.platform] = forces.moment[graph.platform] - wrench[3:]
@@ -257,7 +272,7 @@ def _torques(t: Traced) -> Program:
 
 
 def _masses(t: Traced) -> Program:
-    layout, (bodies, rods, *_, rotors, _) = _begun(t)
+    layout, (bodies, rods, *_, rotors, passive) = _begun(t)
     columns = t.rate_columns()
     n = t.joints
     table: list[list[Any]] = [[0.0] * n for _ in range(n)]
@@ -265,6 +280,7 @@ def _masses(t: Traced) -> Program:
         t.motion.set_rates(columns[j], np.eye(n)[j])
         forces = Forces(t.motion)
         forces.momenta(bodies, rods)
+        forces.passive_momenta(passive)
         unknown, driven = forces.generalised()
         for k in range(j + 1):
             value = driven[k] + columns[k] @ unknown
@@ -274,13 +290,14 @@ def _masses(t: Traced) -> Program:
 
 
 def _energy(t: Traced) -> Program:
-    layout, (bodies, rods, gravity, _, _, rotors, _) = _begun(t)
+    layout, (bodies, rods, gravity, _, _, rotors, passive) = _begun(t)
     n = t.joints
     qd = t.tape.inputs("qd", n)
     u = t.set_rates(qd)
     motion = t.motion
     forces = Forces(motion)
     forces.momenta(bodies, rods)
+    forces.passive_momenta(passive)
     unknown, driven = forces.generalised()
     double = driven @ qd + u @ unknown + sum((rotors[k] * qd[k] * qd[k] for k in range(n)), 0.0)
     weighted: Any = np.zeros(3)

@@ -328,6 +328,31 @@ class Engine:
         return self.kernel("acceleration", _acceleration)
 
 
+def choose_coordinates(graph: Graph) -> tuple[str, ...]:
+    """Pose coordinates that determine the platform at home, the first ones that do.
+
+    :raises ParameterError: something is free to move while the actuated joints are held.
+    """
+    engine = Engine(graph, ())
+    motion, closed = engine.at(engine.tree.home, graph.home)
+    ju, jq = (numbers(m) for m in matrices(engine.tree, closed))
+    kept = engine.kept
+    rates = np.vstack([-np.linalg.solve(ju[kept], jq[kept]), np.eye(engine.joints)])
+    chosen: list[str] = []
+    table = np.zeros((0, engine.joints))
+    for name, coordinate in poses.COORDINATES.items():
+        row = np.zeros(engine.tree.unknown_rates + engine.joints)
+        ((_, columns),) = poses.rows((coordinate,), motion, [0.0])
+        for (kind, k), value in columns.items():
+            row[k if kind == "u" else engine.tree.unknown_rates + k] = float(value)
+        scale = 1.0 / engine.tree.size if coordinate.axis is not None else 1.0
+        extended = np.vstack([table, scale * row @ rates])
+        if np.linalg.matrix_rank(extended, 1e-6) == len(extended):
+            chosen.append(name)
+            table = extended
+    return tuple(chosen)
+
+
 def _rank(matrix: Array) -> int:
     if not matrix.size:
         return 0

@@ -55,7 +55,8 @@ def unit(vector: ArrayLike) -> Array:
 def across(axis: Array) -> tuple[Array, Array]:
     """Two unit vectors across an axis and each other, right-handed with it."""
     first = np.zeros(3)
-    first[int(np.argmin(np.abs(axis)))] = 1.0
+    # Rounded: where two components are equal, the last bit must not choose.
+    first[int(np.argmin(np.round(np.abs(axis), 9)))] = 1.0
     first = unit(np.cross(axis, first))
     return first, np.cross(axis, first)
 
@@ -84,7 +85,8 @@ class Joint:
     """A joint between an inner and an outer body, through the point ``at`` at home.
 
     ``axes``: shape (k, 3), see AXES; of a universal joint the first is fixed in the inner body.
-    ``home``: the joint's value at home. ``viscous``, ``coulomb``: friction along its freedom.
+    ``home``: the joint's value at home. ``viscous``, ``coulomb``: friction along its freedom;
+    ``rotor_inertia``: against its acceleration, kg m2 or kg.
     ``given``: a joint that stands for what other parts hold: it carries no load itself.
     ``directions``: of reactions; without them the joint's own axes. ``normal``: name of a universal
     joint's direction across both axes. ``label``: its name among the reactions, else its own.
@@ -107,6 +109,11 @@ class Joint:
     normal: str = "n"
     limits: Array | None = None
     compliance: Array | None = None
+
+    @property
+    def loaded(self) -> bool:
+        """Whether a passive joint has friction or a rotor."""
+        return not self.actuated and bool(self.viscous or self.coulomb or self.rotor_inertia)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +181,7 @@ class Graph:
         joints = [
             (
                 j.name, j.kind, j.inner, j.outer, j.at.tolist(), j.axes.tolist(), j.actuated,
-                j.home, j.given, not j.actuated and bool(j.viscous or j.coulomb),
+                j.home, j.given, j.loaded,
             )
             for j in self.joints.values()
         ]  # fmt: skip

@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.machine.graph import Array, Graph
+from pkm_twin.machine.graph import Array, Graph, Joint
 from pkm_twin.machine.tree import Tree
 
 Objects = NDArray[Any]
@@ -24,7 +24,7 @@ RODS: Final = 1
 GRAVITY: Final = 2
 ROTORS: Final = 5
 FRICTION: Final = (3, 4, 6)
-"""Parts of the inputs; friction is viscous, Coulomb, and that of passive joints."""
+"""Parts of the inputs; friction is viscous, Coulomb, and of passive joints with their rotors."""
 
 
 def ten_numbers(mass: float, com: Array, inertia: Array) -> Array:
@@ -41,11 +41,9 @@ def ten_numbers(mass: float, com: Array, inertia: Array) -> Array:
     )  # fmt: skip
 
 
-def rubbing(graph: Graph) -> tuple[str, ...]:
-    """Passive joints that are given friction."""
-    return tuple(
-        j.name for j in graph.joints.values() if not j.actuated and (j.viscous or j.coulomb)
-    )
+def loaded_joints(graph: Graph) -> tuple[Joint, ...]:
+    """Passive joints with friction or a rotor."""
+    return tuple(joint for joint in graph.joints.values() if joint.loaded)
 
 
 class Coefficients(Protocol):
@@ -71,7 +69,15 @@ class Layout:
         """Starts of the parts that :meth:`part` names, and the end."""
         graph = self.tree.graph
         n = len(graph.actuated)
-        sizes = [10 * len(self.tree.links), len(graph.rods), 3, n, n, n, 2 * len(rubbing(graph))]
+        sizes = [
+            10 * len(self.tree.links),
+            len(graph.rods),
+            3,
+            n,
+            n,
+            n,
+            3 * len(loaded_joints(graph)),
+        ]
         return np.cumsum([0, *sizes])
 
     @property
@@ -110,7 +116,6 @@ class Layout:
                 ten_numbers(body.mass, axes.T @ (body.com - link.at), axes.T @ body.inertia @ axes)
             )
         drives = [graph.joints[name] for name in graph.actuated]
-        passive = [graph.joints[name] for name in rubbing(graph)]
         return np.concatenate(
             [
                 *bodies,
@@ -119,7 +124,11 @@ class Layout:
                 friction.viscous,
                 friction.coulomb,
                 [j.rotor_inertia for j in drives],
-                [value for j in passive for value in (j.viscous, j.coulomb)],
+                [
+                    value
+                    for j in loaded_joints(graph)
+                    for value in (j.viscous, j.coulomb, j.rotor_inertia)
+                ],
             ]
         )
 

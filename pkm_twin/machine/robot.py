@@ -13,6 +13,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache as remembered
 from functools import cached_property
 from typing import Any, ClassVar, Final, Protocol, TypeVar
 
@@ -28,8 +29,10 @@ from pkm_twin.kinematics.passive import passive_names, passive_program
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import FREEDOMS, Graph
-from pkm_twin.machine.inertia import Layout
+from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.members import Beam, Structure
+from pkm_twin.machine.pose_grid import PoseGrid
+from pkm_twin.machine.reach import position_box
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -57,6 +60,7 @@ def mass(**options: Any) -> Any:
 def check_azimuths(azimuths: Array, path: str) -> None:
     """Refuse limbs that stand in one place."""
     for i in range(len(azimuths)):
+        check_angles(float(azimuths[i]), f"{path}[{i}]")
         apart = math.remainder(float(azimuths[i] - azimuths[i - 1]), 2 * math.pi)
         if abs(apart) < 1e-3:
             raise ParameterError(path, azimuths.tolist(), "limbs at least 0.001 rad apart")
@@ -71,21 +75,34 @@ class Payload:
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
 
 
-@dataclass(frozen=True, eq=False)
-class Friction:
-    """Friction at the actuated joints: viscous per rate, Coulomb by the rate's sign."""
+def check_angles(angle: float, path: str) -> None:
+    """Refuse an angle that was meant in degrees."""
+    if abs(angle) > 4 * math.pi:
+        raise ParameterError(
+            path,
+            angle,
+            f"an angle in rad; degrees? {angle:g} degrees are {math.radians(angle):.6g}",
+        )
 
-    viscous: Array = schema.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
-    coulomb: Array = schema.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
+
+@remembered
+def friction_of(joints: int) -> Any:
+    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
+    field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
+    entries = [(n, Array, schema.vector(joints, **field)) for n in ("viscous", "coulomb")]
+    return dataclasses.make_dataclass("Friction", entries, frozen=True, eq=False)
 
 
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Limits of the actuated joints; absent is None. One value stands for all joints."""
-
-    position: Array | None = schema.interval(count=3, default=None)
-    velocity: Array | None = schema.vector(3, above=0.0, spread=True, default=None)
-    effort: Array | None = schema.vector(3, above=0.0, infinite=True, spread=True, default=None)
+@remembered
+def limits_of(joints: int) -> Any:
+    """Schema of limits of so many actuated joints; absent is None, one value stands for all."""
+    above: dict[str, Any] = {"above": 0.0, "infinite": True, "spread": True, "default": None}
+    entries = [
+        ("position", Any, schema.interval(count=joints, default=None)),
+        ("velocity", Any, schema.vector(joints, **above)),
+        ("effort", Any, schema.vector(joints, **above)),
+    ]
+    return dataclasses.make_dataclass("Limits", entries, frozen=True, eq=False)
 
 
 class JointLimits(Protocol):
@@ -140,14 +157,22 @@ class Robot:
     name: str = ""
     """The name that the robot was loaded by."""
     payload: Payload = schema.section(Payload, default={})
-    friction: Friction = schema.section(Friction, default={})
+    friction: Coefficients = schema.section(friction_of(3), default={})
     gravity: Array = schema.vector(3, default=[0, 0, -9.81])
-    limits: JointLimits = schema.section(Limits, default={})
+    limits: JointLimits = schema.section(limits_of(3), default={})
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
     changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
     has_start: ClassVar[bool] = False
     has_inverse: ClassVar[bool] = False
+
+    @classmethod
+    def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
+        """A robot of a parameter file's data.
+
+        :raises ParameterError: by the field.
+        """
+        return dataclasses.replace(schema.build(cls, data), name=name)
 
     # What a mechanism gives.
 
@@ -295,6 +320,30 @@ class Robot:
     def effort_units(self) -> tuple[str, ...]:
         """Units of the efforts, ``N m`` or ``N``."""
         return tuple("N" if unit == "m" else "N m" for unit in self.joint_units)
+
+    @property
+    def joint_unit(self) -> str:
+        """Unit of q where the joints are of one kind, else ``rad or m``."""
+        return _common(self.joint_units)
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of the efforts where the joints are of one kind, else ``N m or N``."""
+        return _common(self.effort_units)
+
+    @property
+    def has_masses(self) -> bool:
+        """Whether the robot's file gives what dynamics need."""
+        try:
+            self.massive()
+        except ParameterError:
+            return False
+        return True
+
+    def parameter_sections(self) -> dict[str, Any]:
+        """The parameters by section, as plain data."""
+        fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
+        return {name: schema.plain(getattr(self, name)) for name in fields}
 
     @cached_property
     def joints_count(self) -> int:
@@ -515,6 +564,25 @@ class Robot:
             self.refuse_joints(status, q)
         return flat
 
+    def grid(self) -> PoseGrid:
+        """How atlases lay out this machine's poses; without an axis of its own, as a box."""
+        return PoseGrid("box", self.pose_names)
+
+    def search_box(self) -> Array:
+        """Bounds outside of which no pose of the workspace lies, shape (m, 2), m and rad.
+
+        :raises ParameterError: what is missing that would bound the workspace.
+        """
+        place = position_box(self.graph, self.limits.position)
+        rows = []
+        for c in self.coordinates:
+            if c.axis is not None:
+                rows.append(place[c.axis])
+            else:
+                far = np.pi if len(c.entries) == 2 else np.pi / 2
+                rows.append(np.array([-far, far]))
+        return np.array(rows)
+
     def changed(self: R, **sections: Mapping[str, object] | object) -> R:
         """A copy with new values, e.g. ``payload={"mass": 0.2}, gravity=[0, 0, -9.81]``.
 
@@ -559,6 +627,10 @@ class Robot:
         if measure is not None:
             raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached)
         raise UnreachableError("joint state", part, index, miss, reached)
+
+
+def _common(units: Sequence[str]) -> str:
+    return " or ".join(sorted(set(units), reverse=True))
 
 
 def _first(codes: Array) -> tuple[int, ...] | None:
