@@ -15,7 +15,7 @@ help:
 	@echo "make test         lint, types and tests"
 	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
-	@echo "make certificate  torques and compliance against other engines, into docs/certificate.md"
+	@echo "make certificate  torques and compliance against other engines, into docs/certificate*.md"
 	@echo "make fuzz         damage every kind of byte of a bag, and both nodes, at length (SECONDS, SEED)"
 	@echo "make soak         ten million poses, and both nodes in all weathers, in flat memory (MINUTES)"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
@@ -56,6 +56,7 @@ bench: $(VENV)/bench.stamp
 
 certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m test.certificate
+	$(BIN)/python test/machine/certificate_page.py
 
 fuzz: $(VENV)/test.stamp
 	FUZZ_SECONDS=$(SECONDS) FUZZ_SEED=$(SEED) $(BIN)/python -m pytest -m long test/bags test/nodes/test_fuzz.py

@@ -16,6 +16,7 @@ setup(
     packages=[
         "pkm_twin",
         "pkm_twin.apps",
+        "pkm_twin.apps.certificate",
         "pkm_twin.atlas",
         "pkm_twin.bags",
         "pkm_twin.codegen",
@@ -89,11 +90,13 @@ setup(
             "types-PyYAML",
             "wheel",
             "xarray",
+            "yourdfpy",
         ],
         "atlas": ["h5netcdf", "h5py", "plotly", "threadpoolctl", "xarray"],
         "cluster": ["dask[distributed]"],
         "bags": ["pin", "PyNiteFEA"],
         "certificate": ["mpmath", "mujoco", "pin", "pytest", "scipy"],
+        "mjcf": ["mujoco"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },
     entry_points={

@@ -21,9 +21,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delta_dynamics.virtual_work import bodies, inverse_dynamics
+from delta_dynamics.virtual_work import body_mass_matrix, inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.machine.joints import MOVING, PAYLOAD, jointed, platform_motion
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -82,7 +81,7 @@ def joint_motion(
     """
     q, inverse = _inverse_jacobian(robot, np.asarray(pose, np.float64))
     qd = np.einsum("...ij,...j->...i", inverse, np.asarray(rates, np.float64))
-    _, bias = jointed(robot).pose_rates(platform_motion(robot, q, qd))
+    bias = robot.pose_acceleration(q, qd, np.zeros(robot.joints_count))
     rest = np.asarray(accelerations, np.float64) - bias
     qdd = np.einsum("...ij,...j->...i", inverse, rest)
     q, qd, qdd = np.broadcast_arrays(q, qd, qdd)
@@ -98,15 +97,8 @@ def energy_matrices(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
     :returns: platform with payload, and all bodies; shape (..., 3, 3) each.
     """
     q, inverse = _inverse_jacobian(robot, np.asarray(pose, np.float64))
-    # At rest a unit acceleration of joint k gives each body the inertia couple I w_k.
-    rows, _ = bodies(robot, q[..., None, :], _NONE, np.eye(3))
-    masses, couples = rows[..., 0, :, 0], rows[..., 7:10]
-    linear = rows[..., 0, :, 10:19].reshape(*rows.shape[:-3], rows.shape[-2], 3, 3)
-    angular = rows[..., 0, :, 19:28].reshape(*rows.shape[:-3], rows.shape[-2], 3, 3)
-    each = np.einsum("...b,...bji,...bki->...bjk", masses, linear, linear)
-    each += np.einsum("...bji,...kbi->...bjk", angular, couples)
-    moving = [robot.body_names.index(name) for name in (MOVING, PAYLOAD)]
-    pair = np.stack([each[..., moving, :, :].sum(-3), each.sum(-3)], -3)
+    platform = body_mass_matrix(robot, q, robot.graph.platform)
+    pair = np.stack([platform, mass_matrix(robot, q)], -3)
     turn = inverse[..., None, :, :]
     forms = turn.swapaxes(-1, -2) @ pair @ turn
     forms = (forms + forms.swapaxes(-1, -2)) / 2

@@ -8,48 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.kernels import OK, Kernel
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
-
-
-def clearance(robot: Robot, pose: ArrayLike) -> Array:
-    """Least distance between the surfaces of members of different limbs, shape (...), m.
-
-    Members are round bars between their joints, of the outer diameters in the robot's file:
-    the bars of the 2UPR-RPU, the limbs of the 3-PRRU, arms and rods of a Delta. Zero where two
-    touch; below zero they are in each other, by the axes' distance less the radii. Of platform,
-    base, drives and joints the files tell no shape, so they are not counted.
-
-    :param pose: shape (..., 3), in the robot's pose parameters.
-    :raises ParameterError: the file does not tell the members' diameters.
-    :raises UnreachableError: a pose that is none of the mechanism's, by limb, sample and miss.
-    :raises SingularityError: a pose where the mechanism is singular.
-    :raises ValueError: a pose that is not finite.
-    """
-    kernel = _clearance_kernel(robot)
-    if kernel is None:
-        raise ParameterError("members", None, "a section that gives the members' outer diameters")
-    poses = np.asarray(pose, np.float64)
-    gap, fault = kernel(robot.parameters, poses, robot.inverse(poses))
-    robot.raise_fault(fault, "pose")
-    return np.asarray(gap[..., 0])
-
-
-def has_clearance(robot: Robot) -> bool:
-    """Whether :func:`clearance` is known: the robot's file tells the members' diameters."""
-    return _clearance_kernel(robot) is not None
-
-
-def _clearance_kernel(robot: Robot) -> Kernel | None:
-    return None if robot.radii is None else robot.clearance_kernel
 
 
 def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> NDArray[np.bool_]:
@@ -66,31 +33,25 @@ def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> ND
     poses = np.asarray(pose, np.float64)
     if not np.isfinite(poses).all():
         raise ValueError("a pose is not finite")
-    p = robot.parameters
-    q, fault = robot.inverse_kernel(p, poses)
-    inside = fault[..., 0] == OK
-    # Lengths of refused poses are empty memory.
-    q = np.where(inside[..., None], q, 0.0)
-    back, fault = robot.forward_kernel(p, q)
+    q, inside = robot.try_inverse(poses)
+    back, found = robot.try_forward(np.where(inside[..., None], q, 0.0))
     scale = 1e-6 * (1.0 + np.abs(poses))
-    inside &= fault[..., 0] == OK
+    inside &= found
     inside &= (np.abs(np.where(inside[..., None], back, np.inf) - poses) < scale).all(-1)
-    limits: Any = getattr(robot, "limits", None)
-    if limits is not None and limits.position is not None:
-        low, high = limits.position[:, 0], limits.position[:, 1]
-        inside &= ((q >= low) & (q <= high)).all(-1)
-    bound = getattr(limits, "joint_angle", None)
-    if bound is not None and robot.angles_kernel is not None:
-        angles, fault = robot.angles_kernel(p, poses)
-        inside &= (fault[..., 0] == OK) & (np.where(inside[..., None], angles, 0.0) <= bound).all(
-            -1
-        )
-    kernel = _clearance_kernel(robot)
-    if kernel is not None and least_clearance > -math.inf:
+    limits = robot.limits.position
+    if limits is not None:
+        with np.errstate(invalid="ignore"):
+            inside &= ((q >= limits[:, 0]) & (q <= limits[:, 1])).all(-1)
+    bound = getattr(robot.limits, "joint_angle", None)
+    angles = None if bound is None else robot.limit_angles(poses)
+    if bound is not None and angles is not None:
+        with np.errstate(invalid="ignore"):
+            inside &= (angles <= bound).all(-1)
+    if has_clearance(robot) and least_clearance > -math.inf:
         # The dearest test, so only where all others hold.
         inside = np.asarray(inside)
-        gap, fault = kernel(p, poses[inside], q[inside])
-        inside[inside] = (fault[:, 0] == OK) & (gap[:, 0] > least_clearance)
+        gap = joint_clearance(robot, q[inside], refuse=False)
+        inside[inside] = gap > least_clearance
     return np.asarray(inside)
 
 
@@ -157,7 +118,7 @@ def regular_workspace(
     :param directions: rays a circle.
     :param step: first search along a ray, rad; a bisection refines it to 1e-9 rad.
     """
-    if robot.angles_kernel is None:
+    if robot.limit_angles(np.zeros(len(robot.pose_names))) is None:
         raise ParameterError("mechanism", robot.mechanism, "a mechanism with two tilts (upr_rpu)")
     heights = np.atleast_1d(np.asarray(z, np.float64))
     turn = np.arange(directions) * (2 * np.pi / directions)

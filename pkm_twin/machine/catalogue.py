@@ -13,6 +13,7 @@ from pkm_twin.machine.robot import Robot
 
 CATALOGUE: Final = {
     "delta": "pkm_twin.mechanisms.delta:Delta",
+    "machine": "pkm_twin.mechanisms.machine:Machine",
     "prru": "pkm_twin.mechanisms.prru:Prru",
     "upr_rpu": "pkm_twin.mechanisms.upr_rpu:UprRpu",
 }
@@ -51,6 +52,5 @@ def load(robot: str | Path) -> Robot:
     if not isinstance(mechanism, str) or mechanism not in CATALOGUE:
         raise UnknownNameError("mechanism", mechanism, CATALOGUE)
     module, kind = CATALOGUE[mechanism].split(":")
-    result: Robot = schema.build(getattr(importlib.import_module(module), kind), data)
-    result.__dict__["_name"] = path.stem
-    return result
+    robot: type[Robot] = getattr(importlib.import_module(module), kind)
+    return robot.from_data(data, path.stem)
