@@ -27,7 +27,7 @@ JUMP_SLACK: Final = 5e-3
 over the time between their stamps and this slack for stamps that are off, s."""
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class _State:
     """A sample: q (n,), the pose (m,) and its rates per joint rate (m, n), angles at the rim."""
 
@@ -84,6 +84,9 @@ class Continuity:
         self.warn, self.stop = warn, stop
         self._velocity = tuple(velocity)
         self._largest = MAX_MOVE * robot.size
+        self._rows = robot.pose_scales
+        self._matrix = robot.pose_scales[:, None]
+        self._joints = robot.joint_scales
         self._clearance = Clearance()
         self.reset()
 
@@ -103,10 +106,9 @@ class Continuity:
             The next sample is then compared with the one before.
         :raises UnreachableError: the robot has no assembly there.
         """
-        robot = self.robot
-        pose = robot.pose_scales * robot.forward(q)
-        rates = robot.pose_scales[:, None] * robot.jacobian(q)
-        clearance = self._clearance.at_least(rates / robot.joint_scales, self.warn)
+        pose = self._rows * self.robot.forward(q)
+        rates = self._matrix * self.robot.jacobian(q)
+        clearance = self._clearance.at_least(rates / self._joints, self.warn)
         state = _State(stamp, q, pose, rates, clearance, self._clearance.greatest)
         if self._last is not None:
             self._check_jump(self._last, state)
@@ -145,7 +147,7 @@ class Continuity:
         # What is predicted is no longer than the joints' move times the greatest singular value,
         # so most samples need no more than two lengths.
         if (
-            _length(shift) + 0.5 * greatest * _length(move * self.robot.joint_scales)
+            _length(shift) + 0.5 * greatest * _length(move * self._joints)
             <= self._largest
         ):
             return
