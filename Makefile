@@ -56,7 +56,7 @@ bench: $(VENV)/bench.stamp
 
 certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m test.certificate
-	$(BIN)/python test/machine/certificate_page.py
+	$(BIN)/python -m test.machine.certificate_page
 
 fuzz: $(VENV)/test.stamp
 	FUZZ_SECONDS=$(SECONDS) FUZZ_SEED=$(SEED) $(BIN)/python -m pytest -m long test/bags test/nodes/test_fuzz.py

@@ -47,7 +47,7 @@ setup(
         "matplotlib>=3.6",
         "lz4",
         "mcap>=1.6",
-        "numba>=0.58",
+        "llvmlite>=0.41",
         "numpy>=1.26",
         "PyYAML>=6",
         "rich>=13",

@@ -327,7 +327,7 @@ def kernels(robot: Robot) -> tuple[Kernel, ...]:
 
     :raises ParameterError: a mechanism without masses.
     """
-    return (*virtual_work.kernels(robot), robot.forward_kernel, robot.jacobian_kernel)
+    return (*virtual_work.kernels(robot), robot.engine.forward, robot.engine.jacobian)
 
 
 def _of_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:

@@ -172,7 +172,7 @@ class DeltaDynamics(health.TwinNode):
             level, message = health.ERROR, f"stopped: {core.stream.reason}: {core.stream.text}"
         values: dict[str, object] = {
             "robot": core.robot.name,
-            "payload mass": core.robot.payload.mass,  # type: ignore[attr-defined]
+            "payload mass": core.robot.payload.mass,
             "joint states answered": core.stream.accepted,
             "trajectories answered": core.trajectories.accepted,
             "effort limit passed": core.saturations,

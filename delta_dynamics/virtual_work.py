@@ -198,7 +198,7 @@ class Forces:
         return axis @ (m.velocity(b, joint.at) - m.speed[a] - cross(m.omega[a], lever)), second
 
     def _pair(self, joint: Joint, amount: Any) -> None:
-        """An effort along a joint's freedom on its outer body, and the opposite on its inner one."""
+        """An effort along a joint's freedom on its outer body, its opposite on the inner one."""
         m, a, b = self.motion, joint.inner, joint.outer
         load = m.direction(a, joint.axes[0]) * amount
         if FREEDOMS[joint.kind] == "R":

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -51,16 +49,21 @@ def describe(robot: Robot) -> dict[str, Any]:
         "mechanism": robot.mechanism,
         "description": summary(robot),
         "joints": list(robot.joint_names),
-        "joint_unit": _common(robot.joint_units),
+        "joint_unit": robot.joint_unit,
         "joint_units": list(robot.joint_units),
-        "effort_unit": None if why_no_torques(robot) else _common(robot.effort_units),
+        "effort_unit": None if why_no_torques(robot) else robot.effort_unit,
         "pose": dict(zip(robot.pose_names, robot.pose_units, strict=True)),
         "mobility": robot.mobility,
         "overconstrained": overconstraint(robot),
         "home_pose": dict(zip(robot.pose_names, home.tolist(), strict=True)),
         "home_joints": dict(zip(robot.joint_names, q.tolist(), strict=True)),
+        "bodies": list(robot.body_names[:-1]),
+        "joint_count": len(robot.graph.joints),
+        "closures": robot.engine.mobility.closures,
+        "rank": robot.engine.mobility.rank,
+        "redundant_closures": robot.engine.mobility.redundant,
         "singularity_at_home": float(robot.singularity(q)),
-        "parameters": _plain(robot),
+        "parameters": robot.parameter_sections(),
     }
 
 
@@ -76,11 +79,6 @@ def overconstraint(robot: Robot) -> list[str]:
     return [f"{count} are redundant, among {', '.join(mobility.parts)}"]
 
 
-def _common(units: Sequence[str]) -> str:
-    """The unit of all joints, or the units of machines that have both."""
-    return " or ".join(dict.fromkeys(units))
-
-
 def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
     """The same as pairs of words for a table."""
     pose = ", ".join(f"{name} ({unit})" for name, unit in data["pose"].items())
@@ -88,6 +86,12 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("robot", f"{data['name']}: {data['description']}"),
         ("mobility", data["mobility"]),
+        ("bodies and rods", ", ".join(data["bodies"])),
+        (
+            "closures",
+            f"{data['closures']} equations of rank {data['rank']}, "
+            f"{data['redundant_closures']} redundant",
+        ),
         ("pose", pose),
         ("actuated joints", ", ".join(f"{name} ({unit})" for name, unit in joint_units.items())),
         ("home pose", _pairs(data["home_pose"], data["pose"])),
@@ -132,14 +136,6 @@ def _unit(key: str, units: dict[str, str]) -> str:
     if key in units:
         return units[key]
     return next((unit for end, unit in units.items() if key.endswith(f"_{end}")), "")
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _number(value: Any) -> str:

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from pkm_twin.atlas.store import replace_file, writing
 
 if TYPE_CHECKING:
     from pkm_twin.apps.demo_report import DynamicsSeries, StiffnessSeries
@@ -30,11 +33,17 @@ def columns(count: int, rows: int) -> tuple[Any, list[Any]]:
 
 
 def save(figure: Any, path: Path) -> Path:
-    """Write a figure as PNG and close it."""
+    """Write a figure as PNG, whole or not at all, and close it.
+
+    :raises AtlasError: the file cannot be written.
+    """
     from matplotlib import pyplot
 
-    figure.savefig(path, dpi=110)
+    data = io.BytesIO()
+    figure.savefig(data, dpi=110, format="png")
     pyplot.close(figure)
+    with writing(path):
+        replace_file(path, data.getvalue())
     return path
 
 

@@ -16,7 +16,7 @@ from pkm_twin.atlas.store import open_atlas
 from test.atlas.conftest import same
 
 ROOT = Path(__file__).parents[2]
-COMMAND = [sys.executable, "-m", "pkm_twin.atlas.commands"]
+COMMAND = [sys.executable, "-m", "pkm_twin.apps.cli"]
 SWEEP = ["atlas", "upr_rpu", "strain-energy", "--wrench", "P2", "--points", "20000"]
 
 

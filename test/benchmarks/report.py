@@ -44,7 +44,7 @@ def main(source, target):
             "Ratios are to the echo with the same executor. Not answered are also the samples that "
             "fill the node's window.",
             "",
-            "| node | p50 (us) | p99 (us) | CPU (us a message) | not answered | ratios to the echo |",
+            "| node | p50 (us) | p99 (us) | CPU a message (us) | not answered | to the echo |",
             "|---|---:|---:|---:|---:|---|",
         ]
         for name, f in trip["figures"].items():
