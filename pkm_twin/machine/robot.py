@@ -290,7 +290,7 @@ class Robot:
     @cached_property
     def own_inertial(self) -> Array:
         """The same without the payload."""
-        return schema.frozen(self._layout.pack(self.gravity, self.friction))
+        return schema.frozen(self._layout.pack(self.graph, self.gravity, self.friction))
 
     @property
     def _layout(self) -> Layout:
