@@ -73,9 +73,12 @@ BeyondLimits = Annotated[
 
 def _version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version
+        from importlib.metadata import PackageNotFoundError, version
 
-        typer.echo(f"pkm-twin {version('pkm_twin')}")
+        try:
+            typer.echo(f"pkm-twin {version('pkm_twin')}")
+        except PackageNotFoundError:
+            typer.echo("pkm-twin, not installed: run from its sources")
         raise typer.Exit
 
 
