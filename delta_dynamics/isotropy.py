@@ -357,7 +357,8 @@ def _scaled(matrix: Array) -> Array:
 def _conic(h: Array) -> Array:
     """Y' H y at y = (1, u, v)."""
     rows = np.einsum("ij,juv->iuv", _scaled(h), _LINES)
-    return np.sum([_product(_LINES[i], rows[i]) for i in range(3)], axis=0)
+    products = [_product(_LINES[i], rows[i]) for i in range(3)]
+    return np.asarray(np.sum(products, axis=0), np.float64)
 
 
 def _stationary(g: Array, h: Array) -> Array:
