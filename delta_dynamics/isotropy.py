@@ -25,9 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eig  # type: ignore[import-untyped]
 from scipy.optimize import minimize  # type: ignore[import-untyped]
 
-from delta_dynamics.virtual_work import bodies, inverse_dynamics
+from delta_dynamics.virtual_work import body_mass_matrix, inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.machine.joints import MOVING, PAYLOAD, jointed, platform_motion
 from pkm_twin.machine.pose_grid import zero_torsion
 from pkm_twin.machine.robot import Robot
 
@@ -83,7 +82,7 @@ def joint_motion(
     """
     q, inverse = _inverse_jacobian(robot, np.asarray(pose, np.float64))
     qd = np.einsum("...ij,...j->...i", inverse, np.asarray(rates, np.float64))
-    _, bias = jointed(robot).pose_rates(platform_motion(robot, q, qd))
+    bias = robot.pose_acceleration(q, qd, np.zeros(robot.joints_count))
     rest = np.asarray(accelerations, np.float64) - bias
     qdd = np.einsum("...ij,...j->...i", inverse, rest)
     q, qd, qdd = np.broadcast_arrays(q, qd, qdd)
@@ -99,15 +98,8 @@ def energy_matrices(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
     :returns: platform with payload, and all bodies; shape (..., 3, 3) each.
     """
     q, inverse = _inverse_jacobian(robot, np.asarray(pose, np.float64))
-    # At rest a unit acceleration of joint k gives each body the inertia couple I w_k.
-    rows, _ = bodies(robot, q[..., None, :], _NONE, np.eye(3))
-    masses, couples = rows[..., 0, :, 0], rows[..., 7:10]
-    linear = rows[..., 0, :, 10:19].reshape(*rows.shape[:-3], rows.shape[-2], 3, 3)
-    angular = rows[..., 0, :, 19:28].reshape(*rows.shape[:-3], rows.shape[-2], 3, 3)
-    each = np.einsum("...b,...bji,...bki->...bjk", masses, linear, linear)
-    each += np.einsum("...bji,...kbi->...bjk", angular, couples)
-    moving = [robot.body_names.index(name) for name in (MOVING, PAYLOAD)]
-    pair = np.stack([each[..., moving, :, :].sum(-3), each.sum(-3)], -3)
+    platform = body_mass_matrix(robot, q, robot.graph.platform)
+    pair = np.stack([platform, mass_matrix(robot, q)], -3)
     turn = inverse[..., None, :, :]
     forms = turn.swapaxes(-1, -2) @ pair @ turn
     forms = (forms + forms.swapaxes(-1, -2)) / 2
@@ -357,8 +349,8 @@ def _scaled(matrix: Array) -> Array:
 def _conic(h: Array) -> Array:
     """Y' H y at y = (1, u, v)."""
     rows = np.einsum("ij,juv->iuv", _scaled(h), _LINES)
-    products = [_product(_LINES[i], rows[i]) for i in range(3)]
-    return np.asarray(np.sum(products, axis=0), np.float64)
+    total = np.sum([_product(_LINES[i], rows[i]) for i in range(3)], axis=0)
+    return np.asarray(total, np.float64)
 
 
 def _stationary(g: Array, h: Array) -> Array:

@@ -91,51 +91,6 @@ def first_cells(text, row):
             yield from re.findall(r"`([^`]+)`", cells[row])
 
 
-def strings(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
-
-
-def text_of(node):
-    """A string's text, each inserted value as <>."""
-    if isinstance(node, ast.JoinedStr):
-        return "".join(text_of(part) for part in node.values)
-    return node.value if isinstance(node, ast.Constant) else "<>"
-
-
-@pytest.mark.parametrize("node", ["delta_dynamics", "stiffness_monitor"])
-class TestNodeTables:
-    def test_topics(self, node):
-        topics = {}
-        for line in section(node).splitlines():
-            cells = [cell.strip() for cell in line.split("|")]
-            if len(cells) > 4 and cells[1] in ("in", "out"):
-                topics[re.sub("<.*>", "<>", cells[2].strip("`"))] = cells[3]
-        calls = {}
-        for call in ast.walk(ast.parse((REPOSITORY / node / "node.py").read_text("utf-8"))):
-            if isinstance(call, ast.Call) and getattr(call.func, "attr", "") in ("listen", "speak"):
-                kind, topic = call.args[:2]
-                calls[text_of(topic)] = kind.id
-        assert {topic: kind.split("/")[1] for topic, kind in topics.items()} == calls
-
-    def test_parameters(self, node):
-        table = [line for line in section(node).splitlines() if line.startswith("|")]
-        table = table[next(i for i, line in enumerate(table) if "| parameter |" in line) :]
-        named = set(first_cells("\n".join(table), 1))
-        known = strings(REPOSITORY / node / "node.py")
-        assert "mechanism" in named
-        assert named <= known
-        declared = {
-            call.args[0].value
-            for call in ast.walk(ast.parse((REPOSITORY / node / "node.py").read_text("utf-8")))
-            if isinstance(call, ast.Call)
-            and getattr(call.func, "attr", "") == "declare"
-            and isinstance(call.args[0], ast.Constant)
-        }
-        assert declared
-        assert declared <= named
-
-
 def test_commands_and_make_targets_exist():
     from typer.main import get_command
 

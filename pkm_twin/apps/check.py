@@ -162,25 +162,22 @@ def _timing(r: Recording, bounds: Bounds) -> list[Item]:
 
 def _limits(r: Recording) -> list[Item]:
     """Effort limits; position and velocity limits are already a node's reason to refuse."""
-    effort = getattr(getattr(r.robot, "limits", None), "effort", None)
+    effort = r.robot.limits.effort
     bounds = list(ranges(r.robot))
     if effort is not None:
-        bounds.append(("effort", -effort, effort, r.robot.effort_unit))
+        bounds.append(("effort", -effort, effort, list(r.robot.effort_units)))
     recorded = {"position": r.q, "velocity": r.qd, "effort": r.effort}
     items = []
-    for what, low, high, unit in bounds:
+    for what, low, high, units in bounds:
         values = recorded[what]
         if values is None:
             continue
         used = np.maximum((values - high).max(0), (low - values).max(0))
-        items.append(
-            _item(
-                f"{what} limits",
-                f"least margin {-used.max():.4g} {unit}",
-                "0 or more",
-                bool((used <= 0).all()),
-            )
-        )
+        # Joints that turn and joints that slide have no common margin.
+        worst = {u: max(x for x, v in zip(used, units, strict=True) if v == u) for u in units}
+        margins = ", ".join(f"{-most:.4g} {unit}" for unit, most in worst.items())
+        good = bool((used <= 0).all())
+        items.append(_item(f"{what} limits", f"least margin {margins}", "0 or more", good))
     return items
 
 
@@ -214,13 +211,13 @@ def _residuals(r: Recording, bounds: Bounds) -> list[Item]:
         return [Item(what, "too few joint states in a row", bound, Verdict.UNKNOWN)]
     rms = np.sqrt(np.mean(residual[used] ** 2, 0))
     peak = np.abs(r.effort).max(0)
-    unit = r.robot.effort_unit
+    units = r.robot.effort_units
     good = rms <= bounds.residual * peak
     hint = "" if r.load or good.all() else "; a payload that nobody told of? --payload"
     return [
         _item(
             f"{what} of {name}",
-            f"RMS {rms[i]:.4g} {unit}, {100 * rms[i] / max(peak[i], 1e-12):.2f} % of "
+            f"RMS {rms[i]:.4g} {units[i]}, {100 * rms[i] / max(peak[i], 1e-12):.2f} % of "
             f"{peak[i]:.4g}{'' if good[i] else hint}",
             bound,
             bool(good[i]),

@@ -425,6 +425,55 @@ def recover(
         raise typer.Exit(SALVAGED)
 
 
+@app.command()
+def certify(
+    robot: RobotName,
+    states: Annotated[int, typer.Option(min=1, max=100000, help="random states")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="where the random numbers begin")] = 1,
+    engine: Annotated[
+        list[str], typer.Option(help="ask only these: maximal, pinocchio, mujoco")
+    ] = [],  # noqa: B006  typer copies it
+    as_json: Json = False,
+) -> None:
+    """Compare a robot's torques and places with other engines.
+
+    Three engines compute the machine anew from its description alone, with no line of the twin's
+    mechanics: bodies free in space with every joint as equations (needs nothing more), Pinocchio
+    and MuJoCo (`pip install pkm_twin[certificate]`), each as a tree with loops. Compared are
+    torques with wrench, payload and friction, the platform's place and Jacobian, and the mass
+    matrix, over random states inside the limits; and the twin's own round trip from joints to pose
+    and back.
+
+    Exit code 0: all bounds are kept. 1: one is not, or the machine cannot be judged.
+    """
+    from pkm_twin import load
+    from pkm_twin.apps.certify import ENGINES, certificate_of
+
+    unknown = [name for name in engine if name not in ENGINES]
+    if unknown:
+        raise typer.BadParameter(f"no engine {unknown[0]!r}; there are {', '.join(ENGINES)}")
+    with progress("states", states) as update:
+        result = certificate_of(
+            load(robot), states=states, seed=seed, engines=engine or tuple(ENGINES), progress=update
+        )
+    if as_json:
+        print_json(result.as_json())
+    else:
+        table = Table(title=Text(f"{result.robot}: {result.states} states, seed {result.seed}"))
+        for column in ("engine", "what", "worst", "median", "bound", "verdict"):
+            table.add_column(column)
+        for item in result.items:
+            verdict = Text("good", "green") if item.good else Text("bad", "red")
+            values = (f"{value:.1e}" for value in (item.worst, item.median, item.bound))
+            table.add_row(item.engine, item.what, *values, verdict)
+        table_console().print(table)
+        for name, reason in result.missing.items():
+            typer.echo(f"{name} was not asked: {reason}")
+        typer.echo("good" if result.good else "bad")
+    if not result.good:
+        raise typer.Exit(REFUSED)
+
+
 app.add_typer(atlases.app, name="atlas")
 app.command()(atlases.show)
 

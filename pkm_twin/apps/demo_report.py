@@ -81,7 +81,7 @@ def report_dynamics(
 ) -> tuple[list[Finding], DynamicsSeries]:
     """Compare recorded efforts with the answered ones."""
     r = read_recording(bag)
-    robot, unit = r.robot, r.robot.effort_unit
+    robot, unit = r.robot, " or ".join(dict.fromkeys(r.robot.effort_units))
     torques = _by_stamp(recording, f"/{prefix}/delta_dynamics/joint_torques")
     residuals = _by_stamp(recording, f"/{prefix}/delta_dynamics/torque_residual")
     answered = [i for i, s in enumerate(r.stamps.tolist()) if s in torques and s in residuals]

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,14 +39,14 @@ class Beyond:
         )
 
 
-def ranges(robot: Robot) -> Iterator[tuple[str, Array, Array, str]]:
-    """Quantity, lowest and highest values (n,) and unit of what a robot's file bounds."""
-    limits: Any = getattr(robot, "limits", None)
-    position, velocity = (getattr(limits, name, None) for name in ("position", "velocity"))
-    if position is not None:
-        yield "position", position[:, 0], position[:, 1], robot.joint_unit
-    if velocity is not None:
-        yield "velocity", -velocity, velocity, f"{robot.joint_unit}/s"
+def ranges(robot: Robot) -> Iterator[tuple[str, Array, Array, list[str]]]:
+    """Quantity, lowest and highest values (n,) and units of what a robot's file bounds."""
+    limits = robot.limits
+    units = list(robot.joint_units)
+    if limits.position is not None:
+        yield "position", limits.position[:, 0], limits.position[:, 1], units
+    if limits.velocity is not None:
+        yield "velocity", -limits.velocity, limits.velocity, [f"{unit}/s" for unit in units]
 
 
 def beyond_limits(
@@ -63,7 +62,7 @@ def beyond_limits(
     single = values["position"].ndim == 1
     outside = np.zeros(values["position"].shape[:-1], np.bool_)
     found = []
-    for quantity, low, high, unit in ranges(robot):
+    for quantity, low, high, units in ranges(robot):
         if quantity not in values:
             continue
         # A rounding's breadth is no fault: a pose on the limit itself is within it.
@@ -77,7 +76,7 @@ def beyond_limits(
                 value = float(values[quantity].reshape(rows.shape)[worst, i])
                 at = None if single else worst
                 bounds = float(low[i]), float(high[i])
-                found.append(Beyond(name, quantity, value, *bounds, unit, at))
+                found.append(Beyond(name, quantity, value, *bounds, units[i], at))
     return outside, found
 
 

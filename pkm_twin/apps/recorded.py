@@ -14,7 +14,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
 from pkm_twin.bags.cdr import parse_definition
 from pkm_twin.bags.reader import Bag, open_bag
@@ -441,9 +440,8 @@ def read_recording(
 
 def why_no_torques(robot: Robot) -> str:
     """Why the model has no torques for this robot; empty where it has."""
-    zero = np.zeros(len(robot.joint_names))
     try:
-        inverse_dynamics(robot, robot.inverse(robot.home()), zero, zero)
+        robot.massive()
     except ParameterError as error:
         return str(error)
     return ""

@@ -22,7 +22,6 @@ from scipy.stats import qmc  # type: ignore[import-untyped]
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import (
     CLEAR,
-    position_limits,
     reachable,
     singularity_at,
     try_forward,
@@ -112,7 +111,7 @@ def _around(poses: Array, margin: Array, bounds: Array) -> Array:
 
 def _from_joints(robot: Robot) -> Array:
     """Reachable poses of joint states between the limits, shape (k, m); none without limits."""
-    limits = position_limits(robot)
+    limits = robot.limits.position
     count = len(robot.joint_names)
     if limits is None or not np.isfinite(limits).all():
         return np.empty((0, len(robot.pose_names)))

@@ -229,8 +229,7 @@ def isotropy_sweep(
     :param beyond_limits: also poses beyond the limits, which the file marks; else NaN there.
     :raises ParameterError: a robot without masses, or whose directions make no sphere.
     """
-    if robot.motion_kernel is None:
-        raise ParameterError("mechanism", robot.mechanism, "a mechanism with masses (delta, prru)")
+    robot.massive()
     if len(robot.pose_names) != 3:
         raise ParameterError("pose", list(robot.pose_names), "three pose coordinates, for spheres")
     if points is not None and points < 1000:

@@ -31,9 +31,10 @@ from pkm_twin.atlas.grids import (
 from pkm_twin.atlas.sweep import Chunk, Field, Kind, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import distance_unit
-from pkm_twin.machine.members import GROUND, MOVING, Frame, framed
+from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
+from stiffness_monitor.structure import Member, StructuralModel, structural_model
 
 Array = NDArray[np.float64]
 
@@ -157,7 +158,7 @@ class ModesSweep(Sweep):
         }
 
 
-def frame_edges(frame: Frame, nodes: tuple[str, ...]) -> NDArray[np.int64]:
+def structure_edges(model: StructuralModel, nodes: tuple[str, ...]) -> NDArray[np.int64]:
     """Pairs of nodes to draw lines between, shape (edges, 2).
 
     Along the members; from a member's end to those that stand on it; the platform as spokes from
@@ -166,26 +167,27 @@ def frame_edges(frame: Frame, nodes: tuple[str, ...]) -> NDArray[np.int64]:
     :param nodes: names as :func:`stiffness_monitor.modes.modes` gives them: the platform's origin,
         then ``<member> <k>/<elements>``.
     """
-    of: dict[str, list[int]] = {member.name: [] for member in frame.members}
+    members = [part for part in model.parts if isinstance(part, Member)]
+    of: dict[str, list[int]] = {member.name: [] for member in members}
     for index, name in enumerate(nodes[1:], start=1):
         of[name.rpartition(" ")[0]].append(index)
     lines: list[tuple[int, int]] = []
     corners: list[tuple[int, Array]] = []
-    for member in frame.members:
+    for member in members:
         own = of[member.name]
         lines += pairwise(own)
         for support, node, point in (
             (member.inner, own[0], member.start),
             (member.outer, own[-1], member.end),
         ):
-            if support is None or support.body == GROUND:
+            if support is None or support.body == BASE:
                 continue
-            if support.body == MOVING:
+            if support.body == model.platform:
                 corners.append((node, point))
-            else:
+            elif support.body in of:
                 lines.append((of[support.body][-1], node))
     # Around the platform by angle, in the plane of its points.
-    arms = np.array([point - frame.origin for _, point in corners])
+    arms = np.array([point - model.origin for _, point in corners])
     across = np.linalg.svd(arms - arms.mean(0))[2][:2]
     turn = np.arctan2(*((arms - arms.mean(0)) @ across.T).T)
     around = [corners[k][0] for k in np.argsort(turn)]
@@ -226,7 +228,7 @@ def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:
     # Names and lines are the same in every pose: members keep their divisions.
     pose = grid.polar_pose(heights[layers // 2], 0.0, 0.0)
     found = modes(robot, pose, COUNT)
-    edges = frame_edges(framed(robot).frame(pose), found.nodes)
+    edges = structure_edges(structural_model(robot, pose), found.nodes)
     return ModesSweep(
         robot,
         heights,

@@ -133,7 +133,7 @@ def torques(motion: Any, table: Mapping[str, Any]) -> Any:
     robot = motion.robot
     figure, axes = columns(1, len(robot.joint_names))
     terms = ("gravity", "inertia", "velocity", "payload", "friction", "external")
-    for ax, joint in zip(axes[0], robot.joint_names, strict=True):
+    for ax, joint, unit in zip(axes[0], robot.joint_names, robot.effort_units, strict=True):
         if motion.measured is not None:
             ax.plot(table["time"], table[f"{joint}.measured"], color="0.7", lw=2, label="measured")
         ax.plot(table["time"], table[f"{joint}.effort"], color="black", lw=1, label="sum")
@@ -153,7 +153,7 @@ def torques(motion: Any, table: Mapping[str, Any]) -> Any:
             )
         ax.set_title(f"{robot.name}: effort of {joint}")
         ax.set_xlabel("time (s)")
-        ax.set_ylabel(f"effort ({robot.effort_unit})")
+        ax.set_ylabel(f"effort ({unit})")
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
         ax.grid(alpha=0.3)
     return figure

@@ -137,7 +137,7 @@ class Sweep:
             "height": grid.height,
             "lateral": " ".join(grid.lateral),
             "zero_torsion": "yes" if grid.zero_torsion else "no",
-            "robot_parameters": json.dumps(plain(self.robot), sort_keys=True),
+            "robot_parameters": json.dumps(self.robot.parameter_sections(), sort_keys=True),
             "settings": json.dumps(self.settings, sort_keys=True),
             "pkm_twin_version": pkm_twin.__version__,
         }
@@ -146,7 +146,8 @@ class Sweep:
     def fingerprint(self) -> str:
         """Equal for two sweeps exactly if their results are."""
         digest = hashlib.sha256(json.dumps(self.attributes, sort_keys=True).encode())
-        digest.update(self.robot.parameters.tobytes())
+        digest.update(self.robot.graph.key.encode())
+        digest.update(self.robot.own_inertial.tobytes())
         digest.update(str(self.rows_a_chunk).encode())
         for name, variable in self.coordinates.items():
             digest.update(name.encode() + np.ascontiguousarray(variable.values).tobytes())

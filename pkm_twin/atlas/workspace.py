@@ -28,10 +28,9 @@ from pkm_twin.atlas.extras import require
 from pkm_twin.atlas.grids import FULL, circles, largest_cylinder, workspace_box
 from pkm_twin.atlas.sweep import Chunk, Field, Kind, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.clearance import clearance, has_clearance
 from pkm_twin.kinematics.workspace import (
-    clearance,
     distance_unit,
-    has_clearance,
     has_joint_angles,
     joint_angle_at,
     reachable,

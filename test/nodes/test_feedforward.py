@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, assume, event, example, given, settings
 from hypothesis import strategies as st
 
 from delta_dynamics import feedforward, inverse_dynamics
-from delta_dynamics.feedforward import Feedforward, Settings
+from delta_dynamics.feedforward import SLICE, Feedforward, Settings
 from pkm_twin import load
 from pkm_twin.errors import MessageError, ParameterError, SingularityError
-from pkm_twin.streams.continuity import COMPARISON, STATE
+from pkm_twin.streams.continuity import Clearance
 from test.nodes.harness import SECOND, Maker, Plain
 
 NOW = 1_000 * SECOND
@@ -38,7 +38,7 @@ def motion(t):
 
 
 def core(robot=ROBOT, **changes):
-    fields = {"window": WINDOW, "good_needed": 3, "bad_limit": 4} | changes
+    fields = {"window": WINDOW, "recovery_count": 3, "trip_count": 4} | changes
     return Feedforward(robot, Settings(**fields))
 
 
@@ -247,7 +247,7 @@ class TestStreams:
     def test_a_gap_longer_than_stale_after_stops_and_fills_the_window_anew(self, make):
         twin = running(make)
         results = answers(twin, make, range(10 + 101, 10 + 101 + WINDOW + 2))
-        # The window is filled, then good_needed is 3.
+        # The window is filled, then recovery_count is 3.
         assert [result is None for result in results] == [True] * (WINDOW + 1) + [False]
         assert twin.stream.stops == {"stale input": 1}
         assert running(make).joint_state(*sample(make, 10 + 99)) is not None
@@ -326,7 +326,7 @@ class TestSingularities:
     def test_an_edge_of_reach_is_warned_of_then_stopped_before(self, limitless, unreachable, index):
         outside = unreachable[index % len(unreachable)]
         part = edge(limitless, self.inside, outside)
-        twin = core(limitless, bad_limit=10**6)
+        twin = core(limitless, trip_count=10**6)
         warned = False
         # Slowly, so that the band is not stepped over: the measure falls as the distance's root.
         way = np.concatenate([np.linspace(1.0, 0.1, 1500), 0.1 * 0.9 ** np.arange(1, 300)])
@@ -370,16 +370,24 @@ class TestSingularities:
             assert twin.trajectory(message, NOW).shape == (6, 3)
             assert twin.near_singularities == 6
 
-    @given(rows=st.lists(st.floats(-1e3, 1e3), min_size=9, max_size=9))
-    def test_the_quick_bound_is_below_the_measure_and_not_far(self, rows):
-        values = np.linalg.svd(np.reshape(rows, (3, 3)), compute_uv=False)
-        assume(values[-1] > 1e-6 * values[0] and values[0] > 1e-3)
-        measure = values[-1] / values[0]
-        here, bounds = np.zeros(3), np.ones(7)
-        first = np.array([-1.0, 0.0, 0.0])
-        _, verdict, _ = COMPARISON(bounds, first, here, here, np.array(rows), np.zeros(STATE))
-        bound = verdict[2]
-        assert measure / 3 * (1 - 1e-6) <= bound <= measure * (1 + 1e-6)
+    @given(
+        shape=st.tuples(st.integers(1, 6), st.integers(1, 6)),
+        seed=st.integers(0, 2**32 - 1),
+        step=st.sampled_from([0.0, 1e-4, 1e-2, 0.3, 3.0]),
+        wanted=st.floats(0.0, 0.5),
+    )
+    def test_the_bound_along_a_stream_is_below_the_measure(self, shape, seed, step, wanted):
+        rng = np.random.default_rng(seed)
+        clearance = Clearance()
+        matrix = rng.normal(size=shape)
+        for _ in range(20):
+            matrix = matrix + step * rng.normal(size=shape)
+            values = np.linalg.svd(matrix, compute_uv=False)
+            measure = values[-1] / values[0]
+            bound = clearance.at_least(matrix, wanted)
+            assert bound <= measure * (1 + 1e-12)
+            assert bound >= min(wanted, measure) * (1 - 1e-12)
+            assert clearance.greatest >= values[0] * (1 - 1e-12)
 
     @pytest.mark.parametrize("name", ["delta", "delta_cu", "prru"])
     def test_the_defaults_leave_the_workspace_alone(self, name):
@@ -406,7 +414,7 @@ class TestJumps:
     def test_a_joint_that_outruns_its_velocity_limit_stops_the_stream(
         self, make, joint, factor, jumps
     ):
-        twin = core(bad_limit=10**6)
+        twin = core(trip_count=10**6)
         q = np.zeros(3)
         for i in range(WINDOW + 3):
             assert (twin.joint_state(*held(make, i, q)) is None) is (i < WINDOW - 1)
@@ -420,7 +428,7 @@ class TestJumps:
         assert reason == "jump"
         assert f"arm_{joint + 1} moved by 0.106" in text
         assert twin.stream.stops == {"jump": 1}
-        # From there on the stream is good again: the window, then good_needed samples.
+        # From there on the stream is good again: the window, then recovery_count samples.
         results = [twin.joint_state(*held(make, i, q)) for i in range(20, 20 + WINDOW + 2)]
         assert [result is None for result in results] == [True] * (WINDOW + 1) + [False]
         # Nothing of the jump is in the derivatives.
@@ -453,7 +461,7 @@ class TestJumps:
         """At full velocity, to and fro between the position limits, at any sample rate."""
         robot = load(name)
         make = Maker(Plain())
-        twin = core(robot, differentiate=True, bad_limit=10**6)
+        twin = core(robot, differentiate=True, trip_count=10**6)
         low, high = robot.limits.position.T
         middle, half = (low + high) / 2, 0.9 * (high - low) / 2
         # The sliders' ends are beyond reach when they are far apart.
@@ -470,6 +478,129 @@ class TestJumps:
                 twin.joint_state(message, NOW + i * SECOND // rate)
         assert "jump" not in twin.stream.rejected
         assert "singular" not in twin.stream.rejected
+
+
+class TestRefusedSamples:
+    """What is refused moves nothing that a good sample is judged by."""
+
+    @pytest.mark.parametrize(
+        "bad",
+        [
+            {"position": (math.nan, 0.0, 0.0)},
+            {"velocity": ()},
+            {"position": UNREACHABLE},
+            {"velocity": (1e9, 0.0, 0.0)},
+            {"velocity": (14.0, -14.0, 14.0), "ahead": 1},
+            {"position": (0.4, 0.4, 0.4), "ahead": 1},
+        ],
+    )
+    def test_one_bad_sample_costs_none_but_itself(self, make, limitless, bad):
+        # As far ahead as stamps may be, but what is allowed of a move grows with its time.
+        bad = {"ahead": 99} | bad
+        ahead = bad.pop("ahead")
+        robot = ROBOT.changed(limits={"effort": 60.0})
+        robot = limitless if bad.get("position") == UNREACHABLE else robot
+        twin = core(robot, trip_count=10**6, limit_policy="reject", recovery_count=1)
+        answers(twin, make, range(10))
+        stamp = NOW + (9 + ahead) * STEP
+        for _ in range(3):
+            reject(twin.joint_state, sample(make, 9, stamp=stamp, **bad)[0], NOW + 9 * STEP)
+        # A jump ends the window, so that nothing is differentiated across it.
+        begins = WINDOW - 1 if twin.stream.rejected.keys() & {"jump", "unreachable"} else 0
+        results = answers(twin, make, range(10, 10 + WINDOW + 3))
+        assert [result is None for result in results] == [True] * begins + [False] * (
+            len(results) - begins
+        )
+        exact = inverse_dynamics(robot, *motion((10 + WINDOW + 2) / 1000))
+        assert np.abs(results[-1].effort - exact).max() < 1e-9
+        assert twin.stream.rejected.total() == 3
+
+    def test_a_reject_during_a_stop_leaves_its_reason(self, make):
+        twin = running(make)
+        for i in range(10, 14):
+            reject(twin.joint_state, *sample(make, i, position=(math.nan, 0.0, 0.0)))
+        before = twin.stream.reason, twin.stream.text
+        assert before[0] == "not finite"
+        reject(twin.joint_state, *sample(make, 14, names=("a", "b", "c")))
+        twin.time_jumped_forward()
+        assert (twin.stream.reason, twin.stream.text) == before
+        assert twin.stream.stops == {"not finite": 1}
+
+    def test_a_stop_that_is_ended_by_hand_answers_at_once(self, make):
+        twin = running(make)
+        for i in range(10, 14):
+            reject(twin.joint_state, *sample(make, i, position=(math.nan, 0.0, 0.0)))
+        assert twin.stream.resume()
+        assert not twin.stream.resume()
+        assert twin.joint_state(*sample(make, 14)) is not None
+
+    def test_a_torque_that_is_late_is_refused(self, make):
+        twin = running(make)
+        result = twin.joint_state(*sample(make, 10))
+        twin.check_age(result, result.stamp + SECOND // 10)
+        reason, _ = reject(twin.check_age, result, result.stamp + SECOND // 10 + 1)
+        assert reason == "late answer"
+        assert twin.stream.rejected == {"late answer": 1}
+
+
+class TestSettings:
+    def test_other_settings_hold_from_the_next_sample_on(self, make):
+        twin = running(make)
+        twin.change_settings(Settings(window=WINDOW, trip_count=1, singularity_warn=1.0))
+        assert twin.joint_state(*sample(make, 10)) is not None
+        assert twin.near_singular
+        reject(twin.joint_state, *sample(make, 11, position=(math.nan, 0.0, 0.0)))
+        assert twin.stream.stopped
+
+    def test_a_new_window_is_filled_anew(self, make):
+        twin = running(make)
+        twin.change_settings(Settings(window=WINDOW + 1, recovery_count=1))
+        results = answers(twin, make, range(10, 20))
+        assert [result is None for result in results] == [True] * WINDOW + [False] * (10 - WINDOW)
+
+
+class TestSlices:
+    def test_a_long_trajectory_is_that_of_its_points(self, make):
+        count = 2 * SLICE + 7
+        times = np.arange(count) / 500
+        q, qd, qdd = motion(0.1 * times)
+        message = make.trajectory(NAMES, [round(t * SECOND) for t in times], q, qd, qdd)
+        twin = core()
+        steps = twin.trajectory_steps(message, NOW)
+        turns = 0
+        while True:
+            try:
+                next(steps)
+            except StopIteration as end:
+                efforts = end.value
+                break
+            turns += 1
+            # The stream goes on between the slices.
+            assert twin.joint_state(*sample(make, turns)) is None or turns >= WINDOW
+        assert turns == 4
+        assert np.abs(efforts - inverse_dynamics(ROBOT, q, qd, qdd)).max() < 1e-12
+
+    def test_the_robot_is_that_of_the_beginning(self, make):
+        message = trajectory(make)
+        twin = core()
+        expected = core().trajectory(message, NOW)
+        steps = twin.trajectory_steps(message, NOW)
+        next(steps)
+        twin.change_robot(ROBOT.changed(payload={"mass": 2.0}))
+        with pytest.raises(StopIteration) as end:
+            for _ in range(100):
+                next(steps)
+        assert (end.value.value == expected).all()
+
+    def test_a_bad_point_is_told_by_its_number(self, make, limitless):
+        count = SLICE + 9
+        rows = [[0.3] * 3] * count
+        rows[SLICE + 4] = UNREACHABLE
+        zero = [[0.0] * 3] * count
+        message = make.trajectory(NAMES, [i * STEP for i in range(count)], rows, zero, zero)
+        reason, text = reject(core(limitless).trajectory, message, NOW)
+        assert reason == "unreachable"
+        assert f"counted from point {SLICE}: " in text and "sample 4" in text
 
 
 class TestClocks:
@@ -491,7 +622,7 @@ class TestClocks:
 
     def test_a_clock_that_leaps_stops_a_running_stream(self, make):
         twin = running(make)
-        twin.clock_leapt()
+        twin.time_jumped_forward()
         assert twin.stream.stops == {"clock jump": 1}
         late = NOW + 10 * SECOND
         assert reject(twin.joint_state, sample(make, 10)[0], late)[0] == "stale stamp"
@@ -504,7 +635,7 @@ class TestClocks:
 
     def test_a_first_clock_is_no_leap(self):
         twin = core()
-        twin.clock_leapt()
+        twin.time_jumped_forward()
         assert not twin.stream.stopped
 
 
@@ -702,7 +833,7 @@ class TestAnything:
     )
     def test_streams(self, limitless, spoils, steps, limited, rates):
         make = Maker(Plain())
-        twin = core(ROBOT if limited else limitless, differentiate=True, good_needed=1)
+        twin = core(ROBOT if limited else limitless, differentiate=True, recovery_count=1)
         now, last = NOW, 0
         for i, step in enumerate(steps):
             now += step
