@@ -99,6 +99,7 @@ setup(
     entry_points={
         "console_scripts": [
             "delta_dynamics = delta_dynamics.node:main",
+            "command_gate = delta_dynamics.gate_node:main",
             "stiffness_monitor = stiffness_monitor.node:main",
             "pkm-twin = pkm_twin.apps.cli:main",
         ],

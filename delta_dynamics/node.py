@@ -49,6 +49,11 @@ class DeltaDynamics(health.TwinNode):
         robot = _changed(robot, self._declare_changes(robot))
         self._feedforward = Feedforward(robot, self._declare_settings())
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
+        if commands and "on_stop" not in self._parameter_overrides:
+            # A controller of plain commands holds the last one for ever.
+            raise ParameterError(
+                "on_stop", None, "nothing, zeros or gravity, by name where publish_commands is true"
+            )
         self._trajectory = self.create_guarded_publisher(JointTrajectory, "~/joint_trajectory_ff")
         # A torque is worth nothing once the stream that it answers would be stale.
         stale_after = self._feedforward.settings.stale_after

@@ -17,11 +17,13 @@ PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
 CREATORS = ("create_guarded_subscription", "create_guarded_publisher")
 MAY_IMPORT_ROS = {
+    "delta_dynamics/gate_node.py",
     "delta_dynamics/node.py",
     "stiffness_monitor/node.py",
     "pkm_twin/ros/player.py",
     "pkm_twin/ros/node.py",
     "pkm_twin/apps/demo.py",
+    "pkm_twin/apps/guard_check.py",
 }
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 

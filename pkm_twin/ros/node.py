@@ -31,9 +31,10 @@ from rclpy.qos import (
     qos_policy_name_from_kind,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
 
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.ros.signals import first_signal, ignore_signals
+from pkm_twin.ros.signals import SIGNALS, first_signal, ignore_signals
 from pkm_twin.streams.monitor import Pace
 from pkm_twin.threads import one_blas_thread
 
@@ -139,9 +140,21 @@ class TwinNode(Node):
                 raise UnknownNameError(name, name, declared)
 
     def create_guarded_subscription(
-        self, kind: type[M], topic: str, callback: Callable[[M], None]
+        self,
+        kind: type[M],
+        topic: str,
+        callback: Callable[[M], None],
+        expiry: float | None = None,
     ) -> None:
-        """Subscribe, with QoS overrides by parameter and a callback that cannot end the node."""
+        """Subscribe, with QoS overrides by parameter and a callback that cannot end the node.
+
+        :param expiry: lifespan and deadline that the publisher has to offer, s; None is any.
+        """
+        qos = input_qos()
+        overrides: tuple[Any, ...] = OVERRIDES
+        if expiry is not None:
+            qos.lifespan = qos.deadline = Duration(seconds=expiry)
+            overrides = (*overrides, *EXPIRY)
         pace = self._paces[topic] = Pace()
         name = self.resolve_topic_name(topic)
 
@@ -164,8 +177,8 @@ class TwinNode(Node):
             kind,
             topic,
             guarded,
-            input_qos(),
-            qos_overriding_options=QoSOverridingOptions(OVERRIDES),
+            qos,
+            qos_overriding_options=QoSOverridingOptions(overrides),
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=lambda event: self._misfit(topic, event)
             ),
@@ -218,6 +231,9 @@ class TwinNode(Node):
             self._last_exception = text
             self.get_logger().error(f"{where}: exception in the callback\n{text}")
         self.stream_broken(where)
+
+    def farewell(self) -> None:
+        """The last thing to do while the topics are still there; see :func:`run`."""
 
     def stream_broken(self, where: str) -> None:
         """A callback failed: whatever it feeds cannot be trusted now."""
@@ -329,17 +345,27 @@ def verdict(check: Callable[[], object]) -> SetParametersResult:
     return SetParametersResult(successful=True)
 
 
-def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None) -> int:
+def run(
+    factory: Callable[[], TwinNode],
+    arguments: Sequence[str] | None = None,
+    *,
+    farewell: bool = False,
+) -> int:
     """Run a node until SIGINT or SIGTERM.
 
+    :param farewell: call :meth:`TwinNode.farewell` at the end. Signals are then not the
+        middleware's, which would close the topics at once, and end the node at its next event.
     :returns: 0 after a signal, 1 where the node refuses its configuration.
     """
     node: TwinNode | None = None
     begun = False
     try:
         # The middleware's handler for SIGINT calls this one; SIGTERM is the middleware's alone.
-        with first_signal(KeyboardInterrupt, (signal.SIGINT,)):
-            rclpy.init(args=None if arguments is None else list(arguments))
+        with first_signal(KeyboardInterrupt, SIGNALS if farewell else (signal.SIGINT,)):
+            rclpy.init(
+                args=None if arguments is None else list(arguments),
+                signal_handler_options=SignalHandlerOptions.NO if farewell else None,
+            )
             begun = True
             executor = SingleThreadedExecutor()
             node = factory()
@@ -362,6 +388,8 @@ def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None)
     finally:
         ignore_signals()
         if node is not None:
+            if farewell:
+                node.farewell()
             node.destroy_node()
         # rclpy.try_shutdown would bring the old signal handlers back.
         rclpy.get_default_context().try_shutdown()

@@ -369,6 +369,7 @@ class TestParameters:
             (["singularity_stop:=0.2"], "at least singularity_stop, 0.2"),
             (["limit_policy:=clip"], "did you mean 'clamp'"),
             (["acceleration:=guess"], "acceleration: 'guess'"),
+            (["publish_commands:=true"], "on_stop: None is refused"),
             (["use_sim_time:=maybe"], "use_sim_time"),
             (["qos_overrides./joint_states.subscription.reliability:=best"], "`reliability`"),
         ],
@@ -498,11 +499,20 @@ class TestLayers:
         "delta_dynamics",
         "pkm_twin.streams.differentiator",
         "delta_dynamics.feedforward",
+        "delta_dynamics.gate",
         "stiffness_monitor",
         "stiffness_monitor.monitor",
     )
     # What runs nodes or talks to them; all else must run without ROS.
-    with_ros = ("node.py", "player.py", "health.py", "demo.py", "recorder.py")
+    with_ros = (
+        "node.py",
+        "gate_node.py",
+        "guard_check.py",
+        "player.py",
+        "health.py",
+        "demo.py",
+        "recorder.py",
+    )
 
     def test_the_core_imports_no_rclpy(self, domain):
         code = f"import sys, {', '.join(self.core)}; sys.exit('rclpy' in sys.modules)"
@@ -524,5 +534,5 @@ class TestLayers:
                         continue
                     if any(module.split(".")[0] == "rclpy" for module in modules):
                         importers.add(path)
-        assert {"node.py", "health.py"} <= {path.name for path in importers}
+        assert {path.name for path in importers} >= {"node.py", "gate_node.py"}
         assert [path for path in importers if path.name not in self.with_ros] == []
