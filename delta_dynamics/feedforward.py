@@ -18,7 +18,7 @@ from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, JointReader, StampRules, modelled
+from pkm_twin.ros.messages import SECOND, JointReader, StampRules, as_message_error
 from pkm_twin.streams.continuity import COMPARISON, Continuity
 from pkm_twin.streams.differentiator import FIT, Differentiator
 from pkm_twin.streams.monitor import StreamMonitor
@@ -120,7 +120,7 @@ class Feedforward:
         self._last_stamp = 0
         self._begin_anew()
 
-    def clock_leapt(self) -> None:
+    def time_jumped_forward(self) -> None:
         """The clock jumped forward: what was fresh is stale, so a running stream stops."""
         if self._last_stamp:
             self.stream.stop("clock jump", "the clock jumped forward")
@@ -189,8 +189,10 @@ class Feedforward:
         if qdd is None:
             qdd = _gradient(qd, t.times)
         self._reader.check_derived(qd, qdd)
-        self._check_singularity(modelled(self.robot.singularity, t.q))
-        efforts, saturated = self._gate(modelled(inverse_dynamics, self.robot, t.q, qd, qdd))
+        self._check_singularity(as_message_error(self.robot.singularity, t.q))
+        efforts, saturated = self._gate(
+            as_message_error(inverse_dynamics, self.robot, t.q, qd, qdd)
+        )
         self.saturations += saturated
         return efforts[:, t.columns]
 
@@ -241,7 +243,7 @@ class Feedforward:
                 "the joint state has no velocity; set acceleration to differentiate",
             )
         try:
-            self.near_singular = modelled(self._continuity.step, sample.stamp, sample.q)
+            self.near_singular = as_message_error(self._continuity.step, sample.stamp, sample.q)
         except MessageError:
             # No derivative across a jump, nor across samples that the model has no state for.
             self._differentiator.reset()
@@ -252,7 +254,7 @@ class Feedforward:
             return None
         self._reader.check_derived(*rates)
         motion = (sample.q, *rates)
-        effort, saturated = self._gate(modelled(inverse_dynamics, self.robot, *motion))
+        effort, saturated = self._gate(as_message_error(inverse_dynamics, self.robot, *motion))
         self._last_good = sample.q
         residual = None if sample.effort is None else sample.effort - effort
         return Torques(sample.stamp, motion, effort, residual, saturated)

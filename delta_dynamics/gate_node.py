@@ -62,7 +62,7 @@ class CommandGate(health.TwinNode):
             f"{settings.on_stop} after {settings.deadline:g} s without a torque"
         )
 
-    def clock_jumped(self) -> None:
+    def time_jumped_backward(self) -> None:
         """Closed until torques by the new clock come."""
         self._gate.reset()
 

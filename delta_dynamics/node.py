@@ -81,14 +81,14 @@ class DeltaDynamics(health.TwinNode):
         robot = self._feedforward.robot
         return f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}"
 
-    def clock_jumped(self) -> None:
+    def time_jumped_backward(self) -> None:
         """No torque across the seam: the stream starts anew."""
         self._feedforward.reset()
 
-    def clock_leapt(self) -> None:
+    def time_jumped_forward(self) -> None:
         """What was fresh is stale now: a running stream stops."""
         with self._telling_stop():
-            self._feedforward.clock_leapt()
+            self._feedforward.time_jumped_forward()
 
     def stream_broken(self, where: str) -> None:
         """Whatever failed: the stream is stopped."""

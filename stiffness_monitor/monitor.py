@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import JointReader, StampRules, WrenchSample, modelled, read_wrench
+from pkm_twin.ros.messages import (
+    JointReader,
+    StampRules,
+    WrenchSample,
+    as_message_error,
+    read_wrench,
+)
 from pkm_twin.streams.monitor import StreamMonitor
 from stiffness_monitor.compliance import StrainEnergy, compliance, strain_energy
 
@@ -118,7 +124,7 @@ class Monitor:
         s = self.settings
         sample = read_wrench(message, now, self._rules, s.wrench_frame, s.accept_empty_frame)
         q = self._nearest(sample.stamp)
-        answer: Answer = modelled(self._answer, sample, q)
+        answer: Answer = as_message_error(self._answer, sample, q)
         deflection = answer.energy.deflection
         if not (np.isfinite(answer.compliance).all() and np.isfinite(deflection).all()):
             raise MessageError("non-finite result", "the model gave a value that is not finite")

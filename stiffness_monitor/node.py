@@ -59,7 +59,7 @@ class StiffnessMonitor(health.TwinNode):
             f"wrench in {settings.wrench_frame}"
         )
 
-    def clock_jumped(self) -> None:
+    def time_jumped_backward(self) -> None:
         """No pose across the seam."""
         self._monitor.reset()
         self._known = 0

@@ -313,7 +313,7 @@ def read_wrench(
     return WrenchSample(stamp, given or frame, np.array(values, np.float64))
 
 
-def modelled(call: Callable[..., Any], *arguments: Any) -> Any:
+def as_message_error(call: Callable[..., Any], *arguments: Any) -> Any:
     """What the model answers to a message, its refusals as those of the message."""
     try:
         return call(*arguments)

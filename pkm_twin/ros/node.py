@@ -35,7 +35,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.ros.signals import SIGNALS, first_signal, ignore_signals
-from pkm_twin.streams.monitor import Pace
+from pkm_twin.streams.monitor import TopicStatistics
 from pkm_twin.threads import one_blas_thread
 
 OK: Final = DiagnosticStatus.OK
@@ -70,7 +70,7 @@ class TwinNode(Node):
         self._seen = dict.fromkeys(("messages", "exceptions"), 0)
         self._last_exception = ""
         self._last_kind = ""
-        self._paces: dict[str, Pace] = {}
+        self._statistics: dict[str, TopicStatistics] = {}
         self._reported = (0, 0, 0)
         self._unfit: dict[str, str] = {}
         self._incompatible = 0
@@ -82,7 +82,7 @@ class TwinNode(Node):
     def start(self, leap: float | None = None) -> None:
         """Refuse unknown parameters, begin the diagnostics, and say where the node listens.
 
-        :param leap: how far the ROS clock has to go forward at once for :meth:`clock_leapt`, s.
+        :param leap: how far the ROS clock goes forward at once for :meth:`time_jumped_forward`, s.
         """
         self.refuse_unknown_parameters()
         self.create_guarded_timer(1.0, self._publish_diagnostics)
@@ -107,12 +107,12 @@ class TwinNode(Node):
         """Level, message and values of the node's diagnostic status."""
         raise NotImplementedError
 
-    def clock_jumped(self) -> None:
+    def time_jumped_backward(self) -> None:
         """The ROS clock went back or changed: forget everything that depends on time."""
 
-    def clock_leapt(self) -> None:
+    def time_jumped_forward(self) -> None:
         """The ROS clock went forward by more than a stream's messages may be apart."""
-        self.clock_jumped()
+        self.time_jumped_backward()
 
     def now(self) -> int:
         """The ROS clock, ns."""
@@ -155,7 +155,7 @@ class TwinNode(Node):
         if expiry is not None:
             qos.lifespan = qos.deadline = Duration(seconds=expiry)
             overrides = (*overrides, *EXPIRY)
-        pace = self._paces[topic] = Pace()
+        statistics = self._statistics[topic] = TopicStatistics()
         name = self.resolve_topic_name(topic)
 
         def guarded(message: M, info: Any) -> None:
@@ -164,14 +164,14 @@ class TwinNode(Node):
             try:
                 number, sent = info["publication_sequence_number"], info["source_timestamp"]
                 # Two publishers number their messages each: then nothing can be said.
-                if pace.arrived(number, sent) and self.count_publishers(name) == 1:
-                    pace.confirm()
+                if statistics.received(number, sent) and self.count_publishers(name) == 1:
+                    statistics.count_missed()
                 callback(message)
             except MessageError as error:
                 self.log_throttled(error.reason, f"{topic}: rejected, {error.reason}: {error}")
             except Exception as error:
                 self.caught(topic, error)
-            pace.answered(time.perf_counter() - began)
+            statistics.handled(time.perf_counter() - began)
 
         self.create_subscription(
             kind,
@@ -249,9 +249,9 @@ class TwinNode(Node):
         # One is an enumeration of Python, the other may be the binding's.
         same_clock = int(jump.clock_change) == int(ClockChange.ROS_TIME_NO_CHANGE)
         if same_clock and jump.delta.nanoseconds > 0:
-            self.clock_leapt()
+            self.time_jumped_forward()
         else:
-            self.clock_jumped()
+            self.time_jumped_backward()
 
     def _misfit(self, topic: str, event: Any) -> None:
         """Another node's QoS on a topic does not fit: nothing comes through between the two."""
@@ -293,8 +293,8 @@ class TwinNode(Node):
         if namesakes > 1:
             found.append((WARN, f"{namesakes} nodes have this name"))
         taken = self._seen["messages"]
-        lost = sum(pace.lost for pace in self._paces.values())
-        overruns = sum(pace.overruns for pace in self._paces.values())
+        lost = sum(topic.missed for topic in self._statistics.values())
+        overruns = sum(topic.overruns for topic in self._statistics.values())
         before, self._reported = self._reported, (taken, lost, overruns)
         taken, lost, overruns = (a - b for a, b in zip(self._reported, before, strict=True))
         if lost:
@@ -321,10 +321,10 @@ class TwinNode(Node):
         # The message is the worst; what else there is stands here.
         values["also"] = "; ".join(text for _, text in troubles[1:])
         values["incompatible QoS"] = self._incompatible
-        for topic, pace in self._paces.items():
-            values[f"lost: {topic}"] = pace.lost
-            values[f"overruns: {topic}"] = pace.overruns
-            values[f"longest callback (ms): {topic}"] = f"{1e3 * pace.longest:.3f}"
+        for topic, statistics in self._statistics.items():
+            values[f"lost: {topic}"] = statistics.missed
+            values[f"overruns: {topic}"] = statistics.overruns
+            values[f"longest callback (ms): {topic}"] = f"{1e3 * statistics.longest:.3f}"
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()

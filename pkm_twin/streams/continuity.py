@@ -122,17 +122,17 @@ def _compare(p, head, q, pose, rates, last, state, verdict, scratch, fault):  # 
     if period >= 0.0:
         for i in range(2, -1, -1):
             # What the mean of both rates tells errs by the third power of the move; how much, the
-            # change of the rates tells. Half of what is told is for where they turn between.
-            told = 0.0
+            # change of the rates tells. Half of what is predicted is for where they turn between.
+            predicted = 0.0
             bend = 0.0
             for j in range(3):
                 move = state[j] - last[j]
                 rate = state[6 + 3 * j + i]
                 before = last[6 + 3 * j + i]
-                told += 0.5 * (rate + before) * move
+                predicted += 0.5 * (rate + before) * move
                 bend += abs((rate - before) * move)
-            error = abs(state[3 + i] - last[3 + i] - told)
-            if not error - 0.5 * abs(told) - bend <= p[6]:
+            error = abs(state[3 + i] - last[3 + i] - predicted)
+            if not error - 0.5 * abs(predicted) - bend <= p[6]:
                 verdict[0] = POSE_JUMP
                 verdict[1] = i
         for i in range(2, -1, -1):

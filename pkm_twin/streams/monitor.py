@@ -64,14 +64,14 @@ class StreamMonitor:
 
 
 @dataclass
-class Pace:
+class TopicStatistics:
     """Whether a topic's messages come whole, and whether they are answered at their pace.
 
-    ``lost``: messages between two that came, by the middleware's own numbers. ``overruns``:
+    ``missed``: messages between two that came, by the middleware's own numbers. ``overruns``:
     answers that took longer than the mean time between messages.
     """
 
-    lost: int = 0
+    missed: int = 0
     overruns: int = 0
     longest: float = 0.0
     _number: int = 0
@@ -80,7 +80,7 @@ class Pace:
     _periods: int = 0
     _missing: int = 0
 
-    def arrived(self, number: int | None, sent: int) -> bool:
+    def received(self, number: int | None, sent: int) -> bool:
         """Take the number that the publisher gave (None: it gives none) and its time, ns.
 
         :returns: True where messages are missing before this one. They are counted by
@@ -98,11 +98,11 @@ class Pace:
         self._missing = self._number - last - 1 if last else 0
         return self._missing > 0
 
-    def confirm(self) -> None:
+    def count_missed(self) -> None:
         """Count what is missing before the newest message."""
-        self.lost += self._missing
+        self.missed += self._missing
 
-    def answered(self, took: float) -> None:
+    def handled(self, took: float) -> None:
         """The newest message took so long to answer, s."""
         self.longest = max(self.longest, took)
         self.overruns += 0.0 < self._period < took

@@ -491,7 +491,7 @@ class TestClocks:
 
     def test_a_clock_that_leaps_stops_a_running_stream(self, make):
         twin = running(make)
-        twin.clock_leapt()
+        twin.time_jumped_forward()
         assert twin.stream.stops == {"clock jump": 1}
         late = NOW + 10 * SECOND
         assert reject(twin.joint_state, sample(make, 10)[0], late)[0] == "stale stamp"
@@ -504,7 +504,7 @@ class TestClocks:
 
     def test_a_first_clock_is_no_leap(self):
         twin = core()
-        twin.clock_leapt()
+        twin.time_jumped_forward()
         assert not twin.stream.stopped
 
 
