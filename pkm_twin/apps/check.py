@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -14,28 +13,11 @@ from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.recorded import JOINT_STATE, WRENCH, Recording, read_recording
+from pkm_twin.apps.verdict import Item, Verdict
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.streams.differentiator import Differentiator
 
 Array = NDArray[np.float64]
-
-
-class Verdict(StrEnum):
-    """Not enough evidence is a verdict of its own."""
-
-    GOOD = "good"
-    BAD = "bad"
-    UNKNOWN = "unknown"
-
-
-@dataclass(frozen=True)
-class Item:
-    """One judged property: its value against its bound, in words."""
-
-    what: str
-    value: str
-    bound: str
-    verdict: Verdict
 
 
 @dataclass(frozen=True)

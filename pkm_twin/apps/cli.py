@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
@@ -270,7 +271,8 @@ def check(
     Exit code 0: nothing is bad. 1: something is, or it is no bag. 3: the file is damaged, but part
     of it can be saved with `pkm-twin recover`.
     """
-    from pkm_twin.apps.check import Bounds, Verdict, check_bag
+    from pkm_twin.apps.check import Bounds, check_bag
+    from pkm_twin.apps.verdict import Verdict
     from pkm_twin.bags.reader import DamagedBagError
 
     try:
@@ -332,6 +334,7 @@ def recover(
         raise typer.Exit(SALVAGED)
 
 
+app.command()(guard_check)
 app.command()(atlases.atlas)
 app.command()(atlases.show)
 

@@ -34,7 +34,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.ros.signals import SIGNALS, first_signal, ignore_signals
+from pkm_twin.ros.signals import SIGNALS, first_signal, ignore_signals, noted_signals
 from pkm_twin.streams.monitor import TopicStatistics
 from pkm_twin.threads import one_blas_thread
 
@@ -374,7 +374,12 @@ def run(
             # What is loaded by now stays: the collector need not look at it again.
             gc.collect()
             gc.freeze()
-            executor.spin()
+            if not farewell:
+                executor.spin()
+                return 0
+            with noted_signals() as asked:
+                while not asked():
+                    executor.spin_once()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (PkmTwinError, ParameterException, RuntimeError) as error:
