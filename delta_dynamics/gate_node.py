@@ -21,7 +21,7 @@ from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
 
-PAYLOAD = ("mass", "com")
+PAYLOAD = {"payload.mass": "mass", "payload.com": "com"}
 """What of the payload may change while the gate runs: the part that has a weight."""
 LAST_WORD = 0.5
 """How long the end waits for the controller to acknowledge the last command, s."""
@@ -123,10 +123,10 @@ class CommandGate(health.TwinNode):
         values = {"effort_limits": self.declare("effort_limits", limits.tolist(), text)}
         if settings.on_stop == "gravity":
             payload: Any = getattr(robot, "payload")  # noqa: B009
-            for key in PAYLOAD:
+            for name, key in PAYLOAD.items():
                 value = getattr(payload, key)
                 default = value.tolist() if isinstance(value, np.ndarray) else value
-                values[f"payload.{key}"] = self.declare(f"payload.{key}", default, "as its file")
+                values[name] = self.declare(name, default, f"robot's {name}, as in its file")
         robot = _changed(robot, values)
         if settings.on_stop == "gravity":
             # Refused here where the robot has no masses; and compiled before it is needed.
@@ -191,7 +191,7 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
     sections: dict[str, Any] = {}
     if "effort_limits" in values:
         sections["limits"] = {"effort": list(values["effort_limits"])}
-    payload = {key: values[f"payload.{key}"] for key in PAYLOAD if f"payload.{key}" in values}
+    payload = {key: values[name] for name, key in PAYLOAD.items() if name in values}
     if payload:
         sections["payload"] = {k: v if k == "mass" else list(v) for k, v in payload.items()}
     return robot.changed(**sections)

@@ -106,7 +106,14 @@ def text_of(node):
     return node.value if isinstance(node, ast.Constant) else "<>"
 
 
-@pytest.mark.parametrize("node", ["delta_dynamics", "stiffness_monitor"])
+NODES = {
+    "delta_dynamics": "delta_dynamics/node.py",
+    "command_gate": "delta_dynamics/gate_node.py",
+    "stiffness_monitor": "stiffness_monitor/node.py",
+}
+
+
+@pytest.mark.parametrize("node", NODES)
 class TestNodeTables:
     def test_topics(self, node):
         topics = {}
@@ -115,7 +122,7 @@ class TestNodeTables:
             if len(cells) > 4 and cells[1] in ("in", "out"):
                 topics[re.sub("<.*>", "<>", cells[2].strip("`"))] = cells[3]
         calls = {}
-        for call in ast.walk(ast.parse((REPOSITORY / node / "node.py").read_text("utf-8"))):
+        for call in ast.walk(ast.parse((REPOSITORY / NODES[node]).read_text("utf-8"))):
             if isinstance(call, ast.Call) and getattr(call.func, "attr", "") in CREATORS:
                 kind, topic = call.args[:2]
                 calls[text_of(topic)] = kind.id
@@ -125,12 +132,12 @@ class TestNodeTables:
         table = [line for line in section(node).splitlines() if line.startswith("|")]
         table = table[next(i for i, line in enumerate(table) if "| parameter |" in line) :]
         named = set(first_cells("\n".join(table), 1))
-        known = strings(REPOSITORY / node / "node.py")
+        known = strings(REPOSITORY / NODES[node])
         assert "mechanism" in named
         assert named <= known
         declared = {
             call.args[0].value
-            for call in ast.walk(ast.parse((REPOSITORY / node / "node.py").read_text("utf-8")))
+            for call in ast.walk(ast.parse((REPOSITORY / NODES[node]).read_text("utf-8")))
             if isinstance(call, ast.Call)
             and getattr(call.func, "attr", "") == "declare"
             and isinstance(call.args[0], ast.Constant)
