@@ -7,8 +7,9 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +19,9 @@ from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, JointReader, StampRules, as_message_error
-from pkm_twin.streams.continuity import COMPARISON, Continuity
-from pkm_twin.streams.differentiator import FIT, Differentiator
+from pkm_twin.ros.messages import SECOND, JointReader, StampRules, Trajectory, as_message_error
+from pkm_twin.streams.continuity import Continuity
+from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.monitor import StreamMonitor
 
 Array = NDArray[np.float64]
@@ -29,6 +30,8 @@ OnStop = Literal["nothing", "zeros", "gravity"]
 
 STOPPING: Final = ("non-finite result", "singular", "jump")
 """Reasons for which one sample stops the stream: it has left what the model describes."""
+SLICE: Final = 256
+"""Points of a trajectory that are answered in one go: about a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +63,23 @@ class Settings:
                 "differentiator.window", self.window, f"at least order + 2, {self.order + 2}"
             )
 
+    @property
+    def stamp_rules(self) -> StampRules:
+        """What the stamp of a joint state has to keep to."""
+        return StampRules(
+            accept_zero=self.accept_zero_stamp,
+            future_tolerance=round(self.future_tolerance * SECOND),
+            max_age=round(self.stale_after * SECOND),
+        )
+
 
 @dataclass(frozen=True)
 class Torques:
-    """Efforts for one joint state; ``residual`` is measured less predicted, None if unmeasured."""
+    """Efforts for one joint state; ``residual`` is measured minus predicted, None if unmeasured."""
 
     stamp: int
     motion: tuple[Array, Array, Array]
-    """q, qd, qdd, shape (3,) each."""
+    """q, qd, qdd, shape (n,) each."""
     effort: Array
     residual: Array | None
     saturated: bool
@@ -94,11 +106,7 @@ class Feedforward:
         self._last_now = 0
         self._last_good: Array | None = None
         self._differentiator = Differentiator(s.order, s.window)
-        self._rules = StampRules(
-            accept_zero=s.accept_zero_stamp,
-            future_tolerance=round(s.future_tolerance * 1e9),
-            max_age=round(s.stale_after * 1e9),
-        )
+        self._rules = s.stamp_rules
         self._reader = JointReader(self.robot)
         self._continuity = Continuity(
             self.robot, s.singularity_warn, s.singularity_stop, self._reader.highest_velocity
@@ -114,6 +122,17 @@ class Feedforward:
         self.robot = robot
         self._reader = JointReader(robot)
         self._continuity.robot = robot
+
+    def change_settings(self, settings: Settings) -> None:
+        """Answer by other settings from the next sample on."""
+        before, self.settings = self.settings, settings
+        self.stream.trip_count = settings.trip_count
+        self.stream.recovery_count = settings.recovery_count
+        self._rules = settings.stamp_rules
+        self._continuity.warn = settings.singularity_warn
+        self._continuity.stop = settings.singularity_stop
+        if (before.order, before.window) != (settings.order, settings.window):
+            self._differentiator = Differentiator(settings.order, settings.window)
 
     def reset(self) -> None:
         """Forget the stream, as when the clock jumps: no torque across the seam."""
@@ -131,15 +150,28 @@ class Feedforward:
         return None if self._last_good is None else float(self.robot.singularity(self._last_good))
 
     def trajectory(self, message: Any, now: int) -> Array:
-        """Efforts for every point, shape (points, 3), in the message's joint order.
+        """Efforts for every point, shape (points, n), in the message's joint order.
 
         :raises MessageError: the message is rejected, and counted.
         """
+        steps = self.trajectory_steps(message, now)
+        while True:
+            try:
+                next(steps)
+            except StopIteration as end:
+                return cast(Array, end.value)
+
+    def trajectory_steps(self, message: Any, now: int) -> Generator[None, None, Array]:
+        """As :meth:`trajectory`, a few milliseconds at a time: it yields between them.
+
+        The robot and the settings are those of the beginning.
+
+        :returns: the generator's value, the efforts.
+        """
         try:
-            efforts = self._trajectory(message, now)
+            efforts = yield from self._trajectory_steps(message, now)
         except MessageError as error:
-            self.trajectories.reject(error.reason, str(error))
-            self.last_reject = str(error)
+            self.refuse_trajectory(error)
             if error.reason == "non-finite result":
                 # The input was finite: the model itself cannot be trusted now.
                 self.stream.stop(error.reason, str(error))
@@ -155,55 +187,76 @@ class Feedforward:
         try:
             torques = self._joint_state(message, now)
         except MessageError as error:
-            self.stream.reject(error.reason, str(error))
-            self.last_reject = str(error)
-            if error.reason in STOPPING:
-                self.stream.stop(error.reason, str(error))
+            self.refuse_joint_state(error)
             raise
         if torques is None or not self.stream.accept():
             return None
         self.saturations += torques.saturated
         return torques
 
+    def refuse_trajectory(self, error: MessageError) -> None:
+        """Count a trajectory that is refused."""
+        self.trajectories.reject(error.reason, str(error))
+        self.last_reject = str(error)
+
+    def refuse_joint_state(self, error: MessageError) -> None:
+        """Count a joint state that is refused; several in a row stop the stream."""
+        self.stream.reject(error.reason, str(error))
+        self.last_reject = str(error)
+        if error.reason in STOPPING:
+            self.stream.stop(error.reason, str(error))
+
+    def check_age(self, torques: Torques, now: int) -> None:
+        """Refuse efforts that come too late, as after the process stood still.
+
+        :raises MessageError: the state is older than ``stale_after`` by now; counted.
+        """
+        age = now - torques.stamp
+        if age > self.settings.stale_after * SECOND:
+            error = MessageError(
+                "late answer",
+                f"the answer is ready {age / SECOND:.3f} s after the state's stamp, allowed "
+                f"{self.settings.stale_after:g} s",
+            )
+            self.refuse_joint_state(error)
+            raise error
+
     def stop_effort(self) -> Array | None:
         """What is sent once on entering a stop, by the setting ``on_stop``; None is nothing."""
         if self.settings.on_stop == "nothing":
             return None
+        zero = np.zeros(len(self.robot.joint_names))
         if self.settings.on_stop == "zeros" or self._last_good is None:
-            return np.zeros(3)
-        zero = np.zeros(3)
+            return zero
         return inverse_dynamics(self.robot, self._last_good, zero, zero)
 
-    def _trajectory(self, message: Any, now: int) -> Array:
-        t = self._reader.trajectory(message, now)
-        qd, qdd = t.qd, t.qdd
-        for what, values in (("velocities", qd), ("accelerations", qdd)):
-            if values is None and not self.settings.differentiate:
-                raise MessageError(
-                    f"no {what}", f"the points carry no {what}; set acceleration to differentiate"
-                )
-        if (qd is None or qdd is None) and len(t.times) < 3:
-            raise MessageError("too short", f"{len(t.times)} points; 3 to differentiate")
-        if qd is None:
-            qd = _gradient(t.q, t.times)
-        if qdd is None:
-            qdd = _gradient(qd, t.times)
-        self._reader.check_derived(qd, qdd)
-        self._check_singularity(as_message_error(self.robot.singularity, t.q))
-        efforts, saturated = self._gate(
-            as_message_error(inverse_dynamics, self.robot, t.q, qd, qdd)
-        )
+    def _trajectory_steps(self, message: Any, now: int) -> Generator[None, None, Array]:
+        robot, settings, reader = self.robot, self.settings, self._reader
+        t = reader.trajectory(message, now)
+        yield
+        qd, qdd = _derivatives(t, settings.differentiate)
+        reader.check_derived(qd, qdd)
+        efforts = np.empty_like(t.q)
+        saturated = False
+        for first in range(0, len(t.q), SLICE):
+            yield
+            part = slice(first, first + SLICE)
+            q = t.q[part]
+            self._check_singularity(_of_points(first, robot.singularity, q), first)
+            solved = _of_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])
+            efforts[part], beyond = _gate(robot, settings.limit_policy, solved)
+            saturated |= beyond
         self.saturations += saturated
         return efforts[:, t.columns]
 
-    def _check_singularity(self, measures: Array) -> None:
-        """All points of a trajectory, shape (points,)."""
+    def _check_singularity(self, measures: Array, first: int) -> None:
+        """Points of a trajectory from ``first`` on, shape (points,)."""
         worst = int(measures.argmin())
         stop = self.settings.singularity_stop
         if not measures[worst] >= stop:
             raise MessageError(
                 "singular",
-                f"point {worst}: too close to a singularity or the edge of reach: measure "
+                f"point {first + worst}: too close to a singularity or the edge of reach: measure "
                 f"{measures[worst]:.3g}, singularity_stop is {stop:g}",
             )
         self.near_singularities += int((measures < self.settings.singularity_warn).sum())
@@ -223,6 +276,7 @@ class Feedforward:
         self._last_now = now
 
     def _joint_state(self, message: Any, now: int) -> Torques | None:
+        """A refused sample leaves nothing behind that the next one is judged by."""
         self._take_time(now)
         sample = self._reader.joint_state(message, now, self._rules)
         silence = sample.stamp - self._last_stamp
@@ -231,60 +285,41 @@ class Feedforward:
             raise MessageError(
                 "stamp order", f"the stamp is {-silence / SECOND:.6f} s before the last"
             )
-        if silence > self.settings.stale_after * SECOND:
-            if self._last_stamp:
-                text = f"no joint state for {silence / SECOND:.3f} s by their stamps"
-                self.stream.stop("stale input", text)
-            self._begin_anew()
-        self._last_stamp = sample.stamp
         if sample.qd is None and not self.settings.differentiate:
             raise MessageError(
                 "no velocities",
                 "the joint state has no velocity; set acceleration to differentiate",
             )
+        if silence > self.settings.stale_after * SECOND:
+            if self._last_stamp:
+                text = f"no joint state for {silence / SECOND:.3f} s by their stamps"
+                self.stream.stop("stale input", text)
+            self._begin_anew()
         try:
-            self.near_singular = as_message_error(self._continuity.step, sample.stamp, sample.q)
+            near_singular = as_message_error(self._continuity.step, sample.stamp, sample.q)
         except MessageError:
             # No derivative across a jump, nor across samples that the model has no state for.
             self._differentiator.reset()
             raise
-        self.near_singularities += self.near_singular
-        rates = self._differentiator.push(sample.stamp, sample.q, sample.qd)
+        try:
+            rates = self._differentiator.push(sample.stamp, sample.q, sample.qd)
+            if rates is not None:
+                self._reader.check_derived(*rates)
+                motion = (sample.q, *rates)
+                solved = as_message_error(inverse_dynamics, self.robot, *motion)
+                effort, saturated = _gate(self.robot, self.settings.limit_policy, solved)
+        except MessageError:
+            self._differentiator.retract()
+            self._continuity.retract()
+            raise
+        self._last_stamp = sample.stamp
+        self.near_singular = near_singular
+        self.near_singularities += near_singular
         if rates is None:
             return None
-        self._reader.check_derived(*rates)
-        motion = (sample.q, *rates)
-        effort, saturated = self._gate(as_message_error(inverse_dynamics, self.robot, *motion))
         self._last_good = sample.q
         residual = None if sample.effort is None else sample.effort - effort
         return Torques(sample.stamp, motion, effort, residual, saturated)
-
-    def _gate(self, effort: Array) -> tuple[Array, bool]:
-        """Effort limits by the declared policy, between two checks for finite values.
-
-        The first one keeps a clamp from making a limit of an infinity.
-        """
-        self._finite(effort)
-        limits: Array | None = getattr(self.robot, "limits").effort  # noqa: B009
-        saturated = limits is not None and _beyond(effort, limits)
-        if limits is not None and saturated:
-            worst = np.argmax(np.abs(effort) / limits)
-            joint = int(worst % 3)
-            if self.settings.limit_policy == "reject":
-                raise MessageError(
-                    "effort limit",
-                    f"effort of {self.robot.joint_names[joint]} is {effort.flat[worst]:g}, "
-                    f"allowed {limits[joint]:g}",
-                )
-            if self.settings.limit_policy == "clamp":
-                effort = np.clip(effort, -limits, limits)
-        self._finite(effort)
-        return effort, saturated
-
-    def _finite(self, effort: Array) -> None:
-        one = effort.ndim == 1
-        if not (all(map(math.isfinite, effort.tolist())) if one else np.isfinite(effort).all()):
-            raise MessageError("non-finite result", "the model gave a value that is not finite")
 
 
 def kernels(robot: Robot) -> tuple[Kernel, ...]:
@@ -292,9 +327,50 @@ def kernels(robot: Robot) -> tuple[Kernel, ...]:
 
     :raises ParameterError: a mechanism without masses.
     """
-    return (
-        *virtual_work.kernels(robot), robot.forward_kernel, robot.jacobian_kernel, FIT, COMPARISON,
-    )  # fmt: skip
+    return (*virtual_work.kernels(robot), robot.forward_kernel, robot.jacobian_kernel)
+
+
+def _of_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:
+    """What the model says of a trajectory's points from ``first`` on, counted from its beginning.
+
+    :raises MessageError: the model refuses.
+    """
+    try:
+        return as_message_error(call, *arguments)
+    except MessageError as error:
+        if first == 0:
+            raise
+        raise MessageError(error.reason, f"counted from point {first}: {error}") from error
+
+
+def _gate(robot: Robot, policy: LimitPolicy, effort: Array) -> tuple[Array, bool]:
+    """Effort limits by the declared policy, between two checks for finite values.
+
+    The first one keeps a clamp from making a limit of an infinity.
+    """
+    _require_finite(effort)
+    # Declared by every robot with a section of limits.
+    limits: Array | None = cast(Any, robot).limits.effort
+    saturated = limits is not None and _beyond(effort, limits)
+    if limits is not None and saturated:
+        if policy == "reject":
+            worst = np.unravel_index(np.argmax(np.abs(effort) / limits), effort.shape)
+            joint = int(worst[-1])
+            raise MessageError(
+                "effort limit",
+                f"effort of {robot.joint_names[joint]} is {effort[worst]:g}, "
+                f"allowed {limits[joint]:g}",
+            )
+        if policy == "clamp":
+            effort = np.clip(effort, -limits, limits)
+    _require_finite(effort)
+    return effort, saturated
+
+
+def _require_finite(effort: Array) -> None:
+    one = effort.ndim == 1
+    if not (all(map(math.isfinite, effort.tolist())) if one else np.isfinite(effort).all()):
+        raise MessageError("non-finite result", "the model gave a value that is not finite")
 
 
 def _beyond(effort: Array, limits: Array) -> bool:
@@ -305,7 +381,20 @@ def _beyond(effort: Array, limits: Array) -> bool:
     return bool((np.abs(effort) > limits).any())
 
 
-def _gradient(values: Array, times: Array) -> Array:
-    """Second-order differences on uneven times, shape (n, 3)."""
-    gradient: Array = np.gradient(values, times, axis=0, edge_order=2)
-    return gradient
+def _derivatives(t: Trajectory, differentiate: bool) -> tuple[Array, Array]:
+    """Rates and accelerations of a trajectory's points, shape (p, n); differentiated where set.
+
+    Second-order differences on uneven times.
+
+    :raises MessageError: some are absent and must not, or cannot, be differentiated.
+    """
+    for what, values in (("velocities", t.qd), ("accelerations", t.qdd)):
+        if values is None and not differentiate:
+            raise MessageError(
+                f"no {what}", f"the points carry no {what}; set acceleration to differentiate"
+            )
+    if (t.qd is None or t.qdd is None) and len(t.times) < 3:
+        raise MessageError("too short", f"{len(t.times)} points; 3 to differentiate")
+    qd = np.gradient(t.q, t.times, axis=0, edge_order=2) if t.qd is None else t.qd
+    qdd = np.gradient(qd, t.times, axis=0, edge_order=2) if t.qdd is None else t.qdd
+    return qd, qdd

@@ -17,11 +17,13 @@ from std_msgs.msg import Float64MultiArray
 from delta_dynamics.gate import Gate, GateSettings
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin import load
-from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
 
-PAYLOAD = {"payload.mass": "mass", "payload.com": "com"}
+PAYLOAD = {
+    "payload.mass": ("mass", "kg"),
+    "payload.com": ("com", "m, from the platform's origin"),
+}
 """What of the payload may change while the gate runs: the part that has a weight."""
 LAST_WORD = 0.5
 """How long the end waits for the controller to acknowledge the last command, s."""
@@ -40,15 +42,20 @@ class CommandGate(health.TwinNode):
         self._gate = Gate(robot, settings)
         self._closed = True
         self._commands = self.create_guarded_publisher(Float64MultiArray, "~/commands")
-        # First of all: the controller may still hold what a gate before this one has sent.
-        self._watch()
         self._declare_robot(settings)
         self._pending: Robot | None = None
         self.create_guarded_subscription(
-            JointState, "delta_dynamics/joint_torques", self._on_torques, settings.deadline
+            JointState,
+            "delta_dynamics/joint_torques",
+            self._on_torques,
+            awaited=True,
+            expires=lambda: settings.deadline,
+            expiry=settings.deadline,
         )
         if settings.on_stop == "gravity":
-            self.create_guarded_subscription(JointState, "joint_states", self._on_joint_state)
+            self.create_guarded_subscription(
+                JointState, "joint_states", self._on_joint_state, awaited=True
+            )
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
         self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._watch)
@@ -70,10 +77,26 @@ class CommandGate(health.TwinNode):
         """Whatever failed: the gate is closed."""
         self._gate.stream.stop("exception", f"{where} raised an exception")
 
-    def farewell(self) -> None:
-        """A controller holds the last command for ever, so that it must not be a torque."""
+    def activated(self) -> None:
+        """At once: the controller may still hold what a gate before this one has sent."""
         self._send(self._gate.stop_command(time.monotonic_ns()))
+
+    def deactivated(self) -> None:
+        """The last command, which the controller holds for ever, must not be a torque."""
+        self._gate.stream.stop("inactive", "the node was deactivated")
+        self._tell()
+        self._send(self._gate.stop_command(time.monotonic_ns()))
+
+    def farewell(self) -> None:
+        """As deactivated; and the controller has it before the process ends."""
+        if self.active:
+            self.deactivated()
         self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
+
+    def reset_stop(self) -> str:
+        """Open without waiting for good torques."""
+        stream = self._gate.stream
+        return f"{stream.reason}: {stream.text}" if stream.resume() else ""
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
@@ -94,24 +117,29 @@ class CommandGate(health.TwinNode):
         return level, message, values
 
     def _declare_settings(self) -> GateSettings:
-        def bounded(name: str, default: Any, text: str, low: float, high: float) -> Any:
-            value = self.declare(name, default, text, read_only=True)
-            if not low <= value <= high:
-                raise ParameterError(name, value, f"{low:g} to {high:g}")
-            return value
-
-        on_stop = self.declare(
-            "on_stop", "zeros", "zeros | gravity: sent while no torques come", read_only=True
-        )
-        if on_stop not in ("zeros", "gravity"):
-            raise UnknownNameError("on_stop", on_stop, ("zeros", "gravity"))
+        d = GateSettings()
+        counts: dict[str, Any] = {"low": 1, "high": 10**6, "read_only": True}
+        seconds: dict[str, Any] = {"unit": "s", "high": 3600.0, "read_only": True}
         return GateSettings(
-            on_stop=on_stop,
-            deadline=bounded("deadline", 0.1, "s, longest age and silence", 1e-3, 3600.0),
-            future_tolerance=bounded("future_tolerance", 0.1, "s", 0.0, 3600.0),
-            trip_count=bounded("trip_count", 1, "rejects in a row that close", 1, 10**6),
-            recovery_count=bounded("recovery_count", 5, "good ones that open", 1, 10**6),
-        )
+            on_stop=self.declare(
+                "on_stop", d.on_stop, "sent while no torques come", choices=("zeros", "gravity"),
+                read_only=True,
+            ),
+            deadline=self.declare(
+                "deadline", d.deadline, "greatest age of a torque, and longest silence",
+                low=1e-3, **seconds,
+            ),
+            future_tolerance=self.declare(
+                "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
+                low=0.0, **seconds,
+            ),
+            trip_count=self.declare(
+                "trip_count", d.trip_count, "refused torques in a row that close the gate", **counts
+            ),
+            recovery_count=self.declare(
+                "recovery_count", d.recovery_count, "good ones in a row that open it", **counts
+            ),
+        )  # fmt: skip
 
     def _declare_robot(self, settings: GateSettings) -> None:
         """Effort limits of every robot; the payload where its weight is borne."""
@@ -119,14 +147,16 @@ class CommandGate(health.TwinNode):
         limits: Any = getattr(robot, "limits").effort  # noqa: B009
         if limits is None:
             limits = np.full(len(robot.joint_names), np.inf)
-        text = "N m or N a joint; a torque beyond is not forwarded"
-        values = {"effort_limits": self.declare("effort_limits", limits.tolist(), text)}
+        text = "a torque beyond is not forwarded"
+        unit = "N m or N, one a joint"
+        values = {"effort_limits": self.declare("effort_limits", limits.tolist(), text, unit=unit)}
         if settings.on_stop == "gravity":
             payload: Any = getattr(robot, "payload")  # noqa: B009
-            for name, key in PAYLOAD.items():
+            for name, (key, unit) in PAYLOAD.items():
                 value = getattr(payload, key)
                 default = value.tolist() if isinstance(value, np.ndarray) else value
-                values[name] = self.declare(name, default, f"robot's {name}, as in its file")
+                text = f"the robot's {name}, by default its file's"
+                values[name] = self.declare(name, default, text, unit=unit)
         robot = _changed(robot, values)
         if settings.on_stop == "gravity":
             # Refused here where the robot has no masses; and compiled before it is needed.
@@ -149,6 +179,8 @@ class CommandGate(health.TwinNode):
 
     def _watch(self) -> None:
         """While the gate is closed its command is repeated: a controller may come late."""
+        if not self.active:
+            return
         steady = time.monotonic_ns()
         self._gate.watch(steady)
         self._tell()
@@ -191,7 +223,7 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
     sections: dict[str, Any] = {}
     if "effort_limits" in values:
         sections["limits"] = {"effort": list(values["effort_limits"])}
-    payload = {key: values[name] for name, key in PAYLOAD.items() if name in values}
+    payload = {key: values[name] for name, (key, _) in PAYLOAD.items() if name in values}
     if payload:
         sections["payload"] = {k: v if k == "mass" else list(v) for k, v in payload.items()}
     return robot.changed(**sections)

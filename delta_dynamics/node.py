@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
-from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
@@ -21,10 +21,15 @@ from trajectory_msgs.msg import JointTrajectory
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, kernels
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
-from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.bags.cdr import message_definition
+from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.machine.robot import MAX_MASS, Robot
 from pkm_twin.ros import node as health
+from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
+from pkm_twin.ros.messages import SECOND
 
+JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+NUMBERS: Final = "std_msgs/msg/Float64MultiArray"
 CHANGES = {
     "payload.mass": ("payload", "mass"),
     "payload.com": ("payload", "com"),
@@ -34,7 +39,31 @@ CHANGES = {
     "gravity": ("gravity", ""),
     "effort_limits": ("limits", "effort"),
 }
-"""Parameters that may change while the node runs, and the robot's section and key."""
+"""Parameters of the robot that may change while the node runs, and its section and key."""
+UNITS = {
+    "payload.mass": "kg",
+    "payload.com": "m, from the platform's origin",
+    "payload.inertia": "kg m2 about the com, 3 or 9 numbers",
+    "friction.viscous": "N m s or N s/m, one a joint",
+    "friction.coulomb": "N m or N, one a joint",
+    "gravity": "m/s2",
+    "effort_limits": "N m or N, one a joint",
+}
+SETTINGS = {
+    "acceleration": "differentiate",
+    "differentiator.order": "order",
+    "differentiator.window": "window",
+    "limit_policy": "limit_policy",
+    "stale_after": "stale_after",
+    "future_tolerance": "future_tolerance",
+    "accept_zero_stamp": "accept_zero_stamp",
+    "trip_count": "trip_count",
+    "recovery_count": "recovery_count",
+    "on_stop": "on_stop",
+    "singularity_warn": "singularity_warn",
+    "singularity_stop": "singularity_stop",
+}
+"""Parameters of the node that may, and their settings."""
 
 
 class DeltaDynamics(health.TwinNode):
@@ -65,14 +94,37 @@ class DeltaDynamics(health.TwinNode):
             else None
         )
         self._reactions = self._create_reaction_publishers(robot)
-        self._effort = JointState(name=list(robot.joint_names))
-        self._pending: Robot | None = None
-        self.create_guarded_subscription(JointTrajectory, "~/joint_trajectory", self._on_trajectory)
-        self.create_guarded_subscription(JointState, "joint_states", self._on_joint_state)
+        names = list(robot.joint_names)
+        numbers = [0.0] * len(names)
+        definition = message_definition(JOINT_STATE)
+        self._decode = JointStateDecoder(definition)
+        self._effort_message = DoublesTemplate(
+            JOINT_STATE,
+            definition,
+            {"name": names, "position": [], "velocity": [], "effort": numbers},
+            stamped=True,
+        )
+        self._numbers_message = DoublesTemplate(
+            NUMBERS, message_definition(NUMBERS), {"data": numbers}, stamped=False
+        )
+        self._pending: tuple[Robot, Settings] | None = None
+        # Long messages must not lose their parts.
+        self.create_guarded_subscription(
+            JointTrajectory, "~/joint_trajectory", self._on_trajectory, raw=True, best_effort=False
+        )
+        self.create_guarded_subscription(
+            JointState,
+            "joint_states",
+            self._on_joint_state,
+            raw=True,
+            awaited=True,
+            expires=lambda: self._feedforward.settings.stale_after,
+        )
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
         self._last_heard = 0
-        self.create_guarded_timer(min(0.25 * stale_after, 0.1), self._watch)
+        self._watchdog: Any = None
+        self._watch_every(stale_after)
         # A step after which no stamp that was good before is good now.
         self.start(leap=stale_after + self._feedforward.settings.future_tolerance)
 
@@ -93,6 +145,21 @@ class DeltaDynamics(health.TwinNode):
     def stream_broken(self, where: str) -> None:
         """Whatever failed: the stream is stopped."""
         self._stop("exception", f"{where} raised an exception")
+
+    def activated(self) -> None:
+        """A stream begins anew."""
+        self._feedforward.reset()
+        self._last_heard = 0
+
+    def deactivated(self) -> None:
+        """A stream that ran is stopped."""
+        if self._last_heard:
+            self._stop("inactive", "the node was deactivated")
+
+    def reset_stop(self) -> str:
+        """End a stop without waiting for good samples."""
+        stream = self._feedforward.stream
+        return f"{stream.reason}: {stream.text}" if stream.resume() else ""
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
@@ -127,18 +194,27 @@ class DeltaDynamics(health.TwinNode):
     def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
         """A publisher for each joint's reaction, where the parameter asks for them."""
         wanted = self.declare("publish_reactions", False, "publish ~/reactions/*", read_only=True)
-        rate = self.declare("reactions_rate", 50.0, "Hz of ~/reactions/*", read_only=True)
-        self._reactions_period = round(1e9 / _within("reactions_rate", rate, 1e-3, 1e4))
+        rate = self.declare(
+            "reactions_rate",
+            50.0,
+            "of ~/reactions/*",
+            unit="Hz",
+            low=1e-3,
+            high=1e4,
+            read_only=True,
+        )
+        self._reactions_period = round(SECOND / rate)
         self._reactions_due = 0
         frame = self.declare("base_frame", "base_link", "frame of the reactions", read_only=True)
         self._base_frame = frame
         if not wanted:
             return {}
+        rest = np.zeros((2, len(robot.joint_names)))
         return {
             name: self.create_guarded_publisher(
                 WrenchStamped, f"~/reactions/{name.replace(' ', '_')}"
             )
-            for name in reactions(robot, robot.inverse(robot.home()), *np.zeros((2, 3))).names
+            for name in reactions(robot, robot.inverse(robot.home()), *rest).names
         }
 
     def _declare_changes(self, robot: Robot) -> dict[str, Any]:
@@ -147,50 +223,72 @@ class DeltaDynamics(health.TwinNode):
             value = getattr(robot, section)
             value = getattr(value, key) if key else value
             if value is None:
-                value = np.full(3, np.inf)
+                value = np.full(len(robot.joint_names), np.inf)
             default = value.ravel().tolist() if isinstance(value, np.ndarray) else value
-            changes[name] = self.declare(name, default, f"robot's {name}, as in its file")
+            bounds: dict[str, Any] = {}
+            if name == "payload.mass":
+                bounds = {"low": 0.0, "high": MAX_MASS}
+            changes[name] = self.declare(
+                name,
+                default,
+                f"the robot's {name}, by default its file's",
+                unit=UNITS[name],
+                **bounds,
+            )
         return changes
 
     def _declare_settings(self) -> Settings:
+        d = Settings()
         acceleration = self.declare(
-            "acceleration", "trajectory", "trajectory | differentiate", read_only=True
+            "acceleration",
+            "trajectory",
+            "what to do about derivatives that are absent: refuse, or differentiate",
+            choices=("trajectory", "differentiate"),
         )
-        if acceleration not in ("trajectory", "differentiate"):
-            raise UnknownNameError("acceleration", acceleration, ("trajectory", "differentiate"))
-
-        def fixed(name: str, default: Any, text: str) -> Any:
-            return self.declare(name, default, text, read_only=True)
-
-        def fraction(name: str, default: float, text: str) -> Any:
-            return _within(name, fixed(name, default, text), 0.0, 1.0)
-
-        policy = fixed("limit_policy", "warn", "warn | reject | clamp")
-        if policy not in ("warn", "reject", "clamp"):
-            raise UnknownNameError("limit_policy", policy, ("warn", "reject", "clamp"))
-        on_stop = fixed("on_stop", "nothing", "nothing | zeros | gravity: sent once at a stop")
-        if on_stop not in ("nothing", "zeros", "gravity"):
-            raise UnknownNameError("on_stop", on_stop, ("nothing", "zeros", "gravity"))
+        counts: dict[str, Any] = {"low": 1, "high": 10**6}
+        measure: dict[str, Any] = {"low": 0.0, "high": 1.0}
+        seconds: dict[str, Any] = {"unit": "s", "high": 3600.0}
         return Settings(
             differentiate=acceleration == "differentiate",
-            order=_within("differentiator.order", fixed("differentiator.order", 2, "1 to 4"), 1, 4),
-            window=_within(
-                "differentiator.window", fixed("differentiator.window", 25, "samples"), 3, 1000
+            order=self.declare(
+                "differentiator.order", d.order, "degree of the velocity's polynomial",
+                low=1, high=4,
             ),
-            limit_policy=policy,
-            stale_after=_within("stale_after", fixed("stale_after", 0.1, "s"), 1e-3, 3600.0),
-            future_tolerance=_within(
-                "future_tolerance", fixed("future_tolerance", 0.1, "s"), 0.0, 3600.0
+            window=self.declare(
+                "differentiator.window", d.window, "samples of the fit", low=3, high=1000
             ),
-            accept_zero_stamp=fixed("accept_zero_stamp", False, "use arrival time"),
-            trip_count=_within("trip_count", fixed("trip_count", 5, "rejects to stop"), 1, 10**6),
-            recovery_count=_within(
-                "recovery_count", fixed("recovery_count", 5, "to go on"), 1, 10**6
+            limit_policy=self.declare(
+                "limit_policy", d.limit_policy, "beyond effort_limits: publish, refuse or clip",
+                choices=("warn", "reject", "clamp"),
             ),
-            on_stop=on_stop,
-            singularity_warn=fraction("singularity_warn", 0.05, "measure below which to warn"),
-            singularity_stop=fraction("singularity_stop", 0.01, "measure below which to stop"),
-        )
+            stale_after=self.declare(
+                "stale_after", d.stale_after, "age at which a joint state is refused, and silence "
+                "that stops the stream", low=1e-3, **seconds,
+            ),
+            future_tolerance=self.declare(
+                "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
+                low=0.0, **seconds,
+            ),
+            accept_zero_stamp=self.declare(
+                "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
+            ),
+            trip_count=self.declare(
+                "trip_count", d.trip_count, "rejects in a row that stop the stream", **counts
+            ),
+            recovery_count=self.declare(
+                "recovery_count", d.recovery_count, "good samples that start it again", **counts
+            ),
+            on_stop=self.declare(
+                "on_stop", d.on_stop, "sent once on a stop",
+                choices=("nothing", "zeros", "gravity"),
+            ),
+            singularity_warn=self.declare(
+                "singularity_warn", d.singularity_warn, "measure below which to warn", **measure
+            ),
+            singularity_stop=self.declare(
+                "singularity_stop", d.singularity_stop, "measure below which to stop", **measure
+            ),
+        )  # fmt: skip
 
     @contextmanager
     def _telling_stop(self) -> Iterator[None]:
@@ -203,32 +301,59 @@ class DeltaDynamics(health.TwinNode):
             if running and stream.stopped:
                 self._send_stop()
 
-    def _on_trajectory(self, message: JointTrajectory) -> None:
-        with self._telling_stop():
-            efforts = self._feedforward.trajectory(message, self.now())
-        for point, effort in zip(message.points, efforts.tolist(), strict=True):
-            point.effort = effort
-        self._trajectory.publish(message)
+    def _on_trajectory(self, data: bytes) -> None:
+        try:
+            self.defer("~/joint_trajectory", self._answer_trajectory(data))
+        except MessageError as error:
+            self._feedforward.refuse_trajectory(error)
+            raise
 
-    def _on_joint_state(self, message: JointState) -> None:
+    def _answer_trajectory(self, data: bytes) -> health.Task:
+        """In steps, so that the stream is answered meanwhile."""
+        try:
+            raw = RawTrajectory.of(data)
+        except MessageError as error:
+            self._feedforward.refuse_trajectory(error)
+            raise
+        steps = self._feedforward.trajectory_steps(raw.fields, self.now())
+        while True:
+            yield
+            try:
+                with self._telling_stop():
+                    next(steps)
+            except StopIteration as end:
+                efforts = end.value
+                break
+        yield
+        self._trajectory.publish(raw.with_effort(efforts))
+
+    def _on_joint_state(self, data: bytes) -> None:
         core = self._feedforward
         self._last_heard = time.monotonic_ns()
         with self._telling_stop():
+            try:
+                message = self._decode(data)
+            except MessageError as error:
+                core.refuse_joint_state(error)
+                raise
             torques = core.joint_state(message, self.now())
-        if torques is None:
-            return
-        stamp = message.header.stamp
+            if torques is None:
+                return
+            # The process may have stood still since.
+            core.check_age(torques, self.now())
+        header = message.header.stamp
+        stamp = header.sec, header.nanosec
         if core.settings.accept_zero_stamp:
-            stamp = Time(nanoseconds=torques.stamp).to_msg()
-        self._publish_effort(self._torques, stamp, torques.effort)
+            stamp = divmod(torques.stamp, SECOND)
+        self._torques.publish(self._effort_message.fill(torques.effort, stamp))
         if torques.residual is not None:
-            self._publish_effort(self._residual, stamp, torques.residual)
+            self._residual.publish(self._effort_message.fill(torques.residual, stamp))
         if self._commands is not None:
-            self._commands.publish(Float64MultiArray(data=array("d", torques.effort.tobytes())))
+            self._commands.publish(self._numbers_message.fill(torques.effort))
         # A dense solve a sample is too much for the stream's own rate.
         if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
             self._reactions_due = torques.stamp
-            self._publish_reactions(stamp, torques)
+            self._publish_reactions(Time(nanoseconds=torques.stamp).to_msg(), torques)
 
     def _publish_reactions(self, stamp: Any, torques: Torques) -> None:
         """Every joint's wrench that rigid bodies determine, world axes, at the joint's point."""
@@ -243,12 +368,10 @@ class DeltaDynamics(health.TwinNode):
             force.x, force.y, force.z, torque.x, torque.y, torque.z = result.wrenches[k].tolist()
             self._reactions[name].publish(message)
 
-    def _publish_effort(self, publisher: Any, stamp: Any, effort: np.ndarray[Any, Any]) -> None:
-        # One message for all: publishing copies it.
-        message = self._effort
-        message.header.stamp = stamp
-        message.effort = array("d", effort.tobytes())
-        publisher.publish(message)
+    def _watch_every(self, stale_after: float) -> None:
+        if self._watchdog is not None:
+            self.destroy_timer(self._watchdog)
+        self._watchdog = self.create_guarded_timer(min(0.25 * stale_after, 0.1), self._watch)
 
     def _watch(self) -> None:
         """Stop a stream that has gone silent; runs on the steady clock."""
@@ -268,24 +391,40 @@ class DeltaDynamics(health.TwinNode):
         effort = core.stop_effort()
         if effort is None:
             return
-        self._publish_effort(self._torques, self.get_clock().now().to_msg(), effort)
+        self._torques.publish(self._effort_message.fill(effort, divmod(self.now(), SECOND)))
         if self._commands is not None:
-            self._commands.publish(Float64MultiArray(data=array("d", effort.tobytes())))
+            self._commands.publish(self._numbers_message.fill(effort))
 
     def _on_set(self, changes: list[Parameter]) -> Any:
         values = health.values_of(changes)
+        core = self._feedforward
 
         def check() -> None:
-            self._pending = _changed(
-                self._feedforward.robot, {k: v for k, v in values.items() if k in CHANGES}
+            for name, value in values.items():
+                if self.has_parameter(name):
+                    self.check_parameter(name, value)
+            robot = {k: v for k, v in values.items() if k in CHANGES}
+            settings = {SETTINGS[k]: v for k, v in values.items() if k in SETTINGS}
+            if "differentiate" in settings:
+                settings["differentiate"] = settings["differentiate"] == "differentiate"
+            self._pending = (
+                _changed(core.robot, robot) if robot else core.robot,
+                dataclasses.replace(core.settings, **settings),
             )
 
         return health.verdict(check)
 
     def _after_set(self, changes: list[Parameter]) -> None:
-        if self._pending is not None:
-            self._feedforward.change_robot(self._pending)
-            self._pending = None
+        if self._pending is None:
+            return
+        (robot, settings), self._pending = self._pending, None
+        core = self._feedforward
+        before = core.settings
+        if robot is not core.robot:
+            core.change_robot(robot)
+        core.change_settings(settings)
+        if settings.stale_after != before.stale_after:
+            self._watch_every(settings.stale_after)
 
 
 def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
@@ -300,12 +439,6 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
         else:
             sections[section] = plain
     return robot.changed(**sections)
-
-
-def _within(name: str, value: Any, low: float, high: float) -> Any:
-    if not low <= value <= high:
-        raise ParameterError(name, value, f"{low:g} to {high:g}")
-    return value
 
 
 def main() -> None:

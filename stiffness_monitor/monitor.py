@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import (
+    SECOND,
     JointReader,
     StampRules,
     WrenchSample,
@@ -38,6 +39,16 @@ class Settings:
     max_state_age: float = 0.1
     future_tolerance: float = 0.1
     accept_zero_stamp: bool = False
+
+    @property
+    def platform_frame(self) -> str:
+        """The frame that turns with the platform, as far as the wrench tells it."""
+        return "platform" if self.wrench_frame == self.base_frame else self.wrench_frame
+
+    @property
+    def stamp_rules(self) -> StampRules:
+        """What stamps have to keep to."""
+        return StampRules(self.accept_zero_stamp, round(self.future_tolerance * SECOND))
 
 
 @dataclass(frozen=True)
@@ -64,12 +75,11 @@ class Monitor:
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
-        s = self.settings
         self.states = StreamMonitor(trip_count=2**62, recovery_count=1)
         self.wrenches = StreamMonitor(trip_count=2**62, recovery_count=1)
         self.dropped = 0
         self.last_reject = ""
-        self._rules = StampRules(s.accept_zero_stamp, round(s.future_tolerance * 1e9))
+        self._rules = self.settings.stamp_rules
         self._reader = JointReader(self.robot)
         self._recent: deque[tuple[int, Array]] = deque(maxlen=256)
 
@@ -82,23 +92,32 @@ class Monitor:
         """Forget all joint states, as when the clock jumps."""
         self._recent.clear()
 
+    def change_settings(self, settings: Settings) -> None:
+        """Answer by other settings from the next message on."""
+        self.settings = settings
+        self._rules = settings.stamp_rules
+
+    def refuse_joint_state(self, error: MessageError) -> None:
+        """Count a joint state that is refused."""
+        self.states.reject(error.reason, str(error))
+        self.last_reject = str(error)
+
     def joint_state(self, message: Any, now: int) -> None:
-        """Take a joint state; an older one than the last is dropped and counted.
+        """Take a joint state's positions; an older one than the last is dropped and counted.
 
         :raises MessageError: the message is rejected, and counted.
         """
         try:
-            sample = self._reader.joint_state(message, now, self._rules)
+            sample = self._reader.positions(message, now, self._rules)
             if self._recent and sample.stamp < self._recent[-1][0]:
                 self.dropped += 1
                 raise MessageError(
                     "stamp order",
-                    f"the stamp is {(self._recent[-1][0] - sample.stamp) / 1e9:.6f} s before "
+                    f"the stamp is {(self._recent[-1][0] - sample.stamp) / SECOND:.6f} s before "
                     "the last",
                 )
         except MessageError as error:
-            self.states.reject(error.reason, str(error))
-            self.last_reject = str(error)
+            self.refuse_joint_state(error)
             raise
         self.states.accept()
         self._recent.append((sample.stamp, sample.q))
@@ -144,10 +163,10 @@ class Monitor:
         if not self._recent:
             raise MessageError("no pose", "no pose: no joint state has arrived")
         age, q = min((abs(stamp - at), i) for i, (at, _) in enumerate(self._recent))
-        if age > self.settings.max_state_age * 1e9:
+        if age > self.settings.max_state_age * SECOND:
             raise MessageError(
                 "no pose",
-                f"no pose: the nearest joint state is {age / 1e9:.3f} s away, allowed "
+                f"no pose: the nearest joint state is {age / SECOND:.3f} s away, allowed "
                 f"{self.settings.max_state_age:g} s",
             )
         return self._recent[q][1]

@@ -6,21 +6,26 @@ Beside them the natural frequencies of the pose, which need joint states alone.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import sys
 from array import array
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TransformStamped, WrenchStamped
 from numpy.typing import NDArray
+from rclpy.parameter import Parameter
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
 from pkm_twin import load
-from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.bags.cdr import message_definition
+from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.ros import node as health
+from pkm_twin.ros.intake import JointStateDecoder
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings
@@ -35,20 +40,35 @@ class StiffnessMonitor(health.TwinNode):
         for kernel in kernels(robot):
             kernel.warm_up()
         self._monitor = Monitor(robot, self._declare_settings())
+        self._platform_frame = self.declare(
+            "platform_frame",
+            "",
+            "frame of ~/deflection; empty: wrench_frame, or platform where that is base_frame",
+            read_only=True,
+        )
+        self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self._compliance = self.create_guarded_publisher(Float64MultiArray, "~/compliance")
         self._energy = self.create_guarded_publisher(DiagnosticArray, "~/strain_energy")
         self._dominant = self.create_guarded_publisher(String, "~/dominant_element")
         self._deflection = self.create_guarded_publisher(TransformStamped, "~/deflection")
         self._known = 0
         """Stamp of the joint state whose frequencies were published last."""
-        rate = self._declare_frequencies_rate()
+        rate = self.declare(
+            "frequencies_rate", 10.0, "natural frequencies a second at most, 0: none",
+            unit="Hz", low=0.0, high=1000.0, read_only=True,
+        )  # fmt: skip
         if rate > 0.0 and has_modes(robot):
             self._frequencies = self.create_guarded_publisher(
                 Float64MultiArray, "~/natural_frequencies"
             )
             self.create_guarded_timer(1.0 / rate, self._publish_frequencies)
-        self.create_guarded_subscription(JointState, "joint_states", self._on_joint_state)
+        self.create_guarded_subscription(
+            JointState, "joint_states", self._on_joint_state, raw=True, awaited=True
+        )
         self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
+        self._pending: Settings | None = None
+        self.add_on_set_parameters_callback(self._on_set)
+        self.add_post_set_parameters_callback(self._after_set)
         self.start()
 
     def summary(self) -> str:
@@ -80,38 +100,61 @@ class StiffnessMonitor(health.TwinNode):
         values |= {f"wrenches rejected: {k}": v for k, v in core.wrenches.rejected.items()}
         return level, message, values
 
+    def activated(self) -> None:
+        """No pose from before."""
+        self._monitor.reset()
+
     def _declare_settings(self) -> Settings:
         d = Settings()
+        seconds: dict[str, Any] = {"unit": "s", "low": 0.0, "high": 3600.0}
         frame = self.declare("wrench_frame", d.wrench_frame, "frame of the wrench", read_only=True)
         base = self.declare("base_frame", d.base_frame, "name of the fixed frame", read_only=True)
-        empty = self.declare(
-            "accept_empty_frame", d.accept_empty_frame, "empty: wrench_frame", read_only=True
-        )
-        age = self.declare(
-            "max_state_age", d.max_state_age, "s between wrench and joint state", read_only=True
-        )
-        tolerance = self.declare("future_tolerance", d.future_tolerance, "s", read_only=True)
-        zero = self.declare(
-            "accept_zero_stamp", d.accept_zero_stamp, "use arrival time", read_only=True
-        )
-        for name, value in (("max_state_age", age), ("future_tolerance", tolerance)):
-            if not 0.0 <= value <= 3600.0:
-                raise ParameterError(name, value, "0 to 3600 s")
         for name, value in (("wrench_frame", frame), ("base_frame", base)):
             if not value:
                 raise ParameterError(name, value, "a frame's name")
-        return Settings(frame, base, empty, age, tolerance, zero)
-
-    def _declare_frequencies_rate(self) -> float:
-        rate: float = self.declare(
-            "frequencies_rate", 10.0, "natural frequencies a second at most, 0: none; Hz",
-            read_only=True,
+        return Settings(
+            frame,
+            base,
+            self.declare(
+                "accept_empty_frame", d.accept_empty_frame, "an empty frame means wrench_frame"
+            ),
+            self.declare(
+                "max_state_age", d.max_state_age, "from a wrench to the nearest joint state",
+                **seconds,
+            ),
+            self.declare(
+                "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
+                **seconds,
+            ),
+            self.declare(
+                "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
+            ),
         )  # fmt: skip
-        if not 0.0 <= rate <= 1000.0:
-            raise ParameterError("frequencies_rate", rate, "0 to 1000 Hz")
-        return rate
 
-    def _on_joint_state(self, message: JointState) -> None:
+    def _on_set(self, changes: list[Parameter]) -> Any:
+        values = health.values_of(changes)
+
+        def check() -> None:
+            for name, value in values.items():
+                if self.has_parameter(name):
+                    self.check_parameter(name, value)
+            fields = {field.name for field in dataclasses.fields(Settings)}
+            settings = {name: value for name, value in values.items() if name in fields}
+            self._pending = dataclasses.replace(self._monitor.settings, **settings)
+
+        return health.verdict(check)
+
+    def _after_set(self, changes: list[Parameter]) -> None:
+        if self._pending is not None:
+            self._monitor.change_settings(self._pending)
+            self._pending = None
+
+    def _on_joint_state(self, data: bytes) -> None:
+        try:
+            message = self._decode(data)
+        except MessageError as error:
+            self._monitor.refuse_joint_state(error)
+            raise
         self._monitor.joint_state(message, self.now())
 
     def _on_wrench(self, message: WrenchStamped) -> None:
@@ -125,14 +168,15 @@ class StiffnessMonitor(health.TwinNode):
         self._dominant.publish(String(data=answer.energy.dominant))
         deflection = _transform(answer)
         deflection.header.stamp = stamp
-        deflection.header.frame_id = "platform"
-        deflection.child_frame_id = "platform_deflected"
+        frame = self._platform_frame or self._monitor.settings.platform_frame
+        deflection.header.frame_id = frame
+        deflection.child_frame_id = f"{frame}_deflected"
         self._deflection.publish(deflection)
 
     def _publish_frequencies(self) -> None:
         """Of the latest joint state: a pose costs milliseconds, so not of every one."""
         latest = self._monitor.latest
-        if latest is None or latest[0] == self._known:
+        if not self.active or latest is None or latest[0] == self._known:
             return
         self._known, q = latest
         robot = self._monitor.robot

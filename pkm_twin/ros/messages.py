@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,14 @@ MAX_MOMENT: Final = 1e7
 MAX_POINTS: Final = 100_000
 MAX_DURATION: Final = 1_000_000 * SECOND
 """Bounds beyond all machines of this kind, for values that no limit of the robot bounds."""
+MAX_SHOWN: Final = 80
+"""Characters of a foreign name that an error shows."""
+COLUMNS: Final = {
+    "positions": "position",
+    "velocities": "velocity",
+    "accelerations": "acceleration",
+}
+"""What a trajectory's point may carry that is read here, and the name of one such value."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +93,57 @@ class EffortSample:
 
 
 @dataclass(frozen=True)
+class Ragged:
+    """The first point whose array is not as long as it has to be, and how long it is."""
+
+    point: int
+    length: int
+
+
+@dataclass(frozen=True)
+class TrajectoryFields:
+    """A trajectory as it came, its points as arrays: from attributes or from bytes.
+
+    ``times``: seconds and nanoseconds of ``time_from_start``, shape (2, p). ``columns``: by
+    :data:`COLUMNS` the values in the message's order, shape (p, n); None where no point has any.
+    """
+
+    header: Any
+    names: tuple[str, ...]
+    times: NDArray[np.int64]
+    columns: Mapping[str, Array | Ragged | None]
+
+    @classmethod
+    def of(cls, message: Any) -> TrajectoryFields:
+        """The fields of a trajectory_msgs/JointTrajectory, live or decoded."""
+        points = message.points
+        names = tuple(message.joint_names)
+        durations = [point.time_from_start for point in points]
+        return cls(
+            message.header,
+            names,
+            np.array([[d.sec for d in durations], [d.nanosec for d in durations]], np.int64),
+            {
+                what: _rows([getattr(point, what) for point in points], len(names))
+                for what in COLUMNS
+            },
+        )
+
+
+def _rows(rows: list[Sequence[float]], count: int) -> Array | Ragged | None:
+    if not any(map(len, rows)):
+        return None
+    for i, row in enumerate(rows):
+        if len(row) != count:
+            return Ragged(i, len(row))
+    return np.array(rows, np.float64)
+
+
+@dataclass(frozen=True)
 class Trajectory:
     """A joint trajectory in the robot's joint order.
 
-    ``stamp`` is zero where it starts on receipt. times (n,), s; q, qd, qdd (n, 3); None where
+    ``stamp`` is zero where it starts on receipt. times (p,), s; q, qd, qdd (p, n); None where
     absent. ``columns``: for every joint of the message, its place in the robot's order.
     """
 
@@ -108,33 +163,49 @@ class JointReader:
     _known: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        limits: Any = getattr(self.robot, "limits", None)
-        reach = 100.0 if self.robot.joint_unit == "m" else 2000.0 * math.pi
-        position = getattr(limits, "position", None)
-        velocity = getattr(limits, "velocity", None)
+        joints = len(self.robot.joint_names)
+        # Declared by every robot with a section of limits.
+        limits = cast(Any, self.robot).limits
+        position, velocity = limits.position, limits.velocity
+        reach = [100.0 if unit == "m" else 2000.0 * math.pi for unit in joint_units(self.robot)]
         self._limited = {"position": position is not None, "velocity": velocity is not None}
-        self._position = [(-reach, reach)] * 3 if position is None else position.tolist()
-        rates = [MAX_RATE] * 3 if velocity is None else velocity.tolist()
+        self._position = (
+            [(-r, r) for r in reach] if position is None else list(map(tuple, position.tolist()))
+        )
+        rates = [MAX_RATE] * joints if velocity is None else velocity.tolist()
         self._velocity = [(-rate, rate) for rate in rates]
         self.highest_velocity: tuple[float, ...] = tuple(rates)
         self._highest_velocity = np.array(rates)
-        self._acceleration = [(-MAX_ACCELERATION, MAX_ACCELERATION)] * 3
-        self._effort = [(-MAX_EFFORT, MAX_EFFORT)] * 3
+        self._acceleration = [(-MAX_ACCELERATION, MAX_ACCELERATION)] * joints
+        self._effort = [(-MAX_EFFORT, MAX_EFFORT)] * joints
 
     def joint_state(self, message: Any, now: int, rules: StampRules) -> JointSample:
         """A sensor_msgs/JointState, matched by name in any order; other joints are ignored.
 
-        Velocity and effort may be empty; where they are there, they are checked and used.
+        Velocity and effort may be absent: empty, or NaN for all of the robot's joints, as
+        joint_state_broadcaster sends what no interface measures. Where they are there, they are
+        checked and used.
         """
+        stamp, index, q = self._positions(message, now, rules)
+        count = len(message.name)
+        qd = self._take("velocity", message.velocity, count, index, self._velocity)
+        effort = self._take("effort", message.effort, count, index, self._effort)
+        return JointSample(stamp, q, qd, effort)
+
+    def positions(self, message: Any, now: int, rules: StampRules) -> JointSample:
+        """As :meth:`joint_state`, whatever the message carries beside positions."""
+        stamp, _, q = self._positions(message, now, rules)
+        return JointSample(stamp, q, None, None)
+
+    def _positions(self, message: Any, now: int, rules: StampRules) -> tuple[int, list[int], Array]:
         index = self._match(message.name)
         count = len(message.name)
         stamp = rules.check(stamp_of(message.header), now)
         q = self._take("position", message.position, count, index, self._position)
         if q is None:
-            raise MessageError("empty", f"no positions; {count} names are given")
-        qd = self._take("velocity", message.velocity, count, index, self._velocity)
-        effort = self._take("effort", message.effort, count, index, self._effort)
-        return JointSample(stamp, q, qd, effort)
+            what = "all positions are nan" if len(message.position) else "no positions"
+            raise MessageError("empty", f"{what}; {count} names are given")
+        return stamp, index, q
 
     def efforts(self, message: Any, now: int, rules: StampRules) -> EffortSample:
         """A sensor_msgs/JointState as a source of torques: names and efforts, nothing else."""
@@ -151,43 +222,47 @@ class JointReader:
 
         A zero stamp means that it starts on receipt, as in ros2_controllers; a later start is
         allowed, one whose end has passed is not. A derivative is all there or all absent.
+
+        :param message: the message, or its :class:`TrajectoryFields`.
         """
-        names = list(message.joint_names)
-        points = message.points
+        given = message if isinstance(message, TrajectoryFields) else None
+        names = given.names if given else tuple(message.joint_names)
+        points = given.times.shape[1] if given else len(message.points)
         if not names or not points:
-            raise MessageError("empty", f"{len(names)} joint names and {len(points)} points")
-        if len(points) > MAX_POINTS:
-            raise MessageError("bounds", f"{len(points)} points, at most {MAX_POINTS}")
+            raise MessageError("empty", f"{len(names)} joint names and {points} points")
+        if points > MAX_POINTS:
+            raise MessageError("bounds", f"{points} points, at most {MAX_POINTS}")
         unknown = [name for name in names if name not in self.robot.joint_names]
         if unknown:
             raise MessageError(
                 "unknown joint",
-                f"joint {unknown[0]!r} is not one of {', '.join(self.robot.joint_names)}",
+                f"joint {shown(unknown[0])} is not one of {', '.join(self.robot.joint_names)}",
             )
         index = self._match(names)
-        stamp = stamp_of(message.header)
-        nanoseconds = [duration_of(point.time_from_start) for point in points]
-        _check_times(nanoseconds)
-        if stamp != 0 and stamp + nanoseconds[-1] < now:
+        fields = given or TrajectoryFields.of(message)
+        stamp = stamp_of(fields.header)
+        nanoseconds = _times_from_start(fields.times)
+        end = stamp + int(nanoseconds[-1])
+        if stamp != 0 and end < now:
             raise MessageError(
                 "over",
-                f"the trajectory ended {(now - stamp - nanoseconds[-1]) / SECOND:.3f} s ago; a "
+                f"the trajectory ended {(now - end) / SECOND:.3f} s ago; a "
                 "replayed bag needs use_sim_time and a /clock",
             )
-        q = self._columns("positions", points, index, self._position)
+        q = self._columns("positions", fields, index, self._position)
         if q is None:
             raise MessageError("empty", "the points carry no positions")
         return Trajectory(
             stamp,
-            np.array(nanoseconds, np.float64) / SECOND,
+            nanoseconds / SECOND,
             q,
-            self._columns("velocities", points, index, self._velocity),
-            self._columns("accelerations", points, index, self._acceleration),
+            self._columns("velocities", fields, index, self._velocity),
+            self._columns("accelerations", fields, index, self._acceleration),
             tuple(self.robot.joint_names.index(name) for name in names),
         )
 
     def check_derived(self, qd: Array, qdd: Array) -> None:
-        """Differentiated rates and accelerations keep the bounds of measured ones, (..., 3)."""
+        """Differentiated rates and accelerations keep the bounds of measured ones, (..., n)."""
         if qd.ndim == 1:
             # A stream's sample, without numpy.
             rates = zip(qd.tolist(), self.highest_velocity, strict=True)
@@ -219,13 +294,13 @@ class JointReader:
         for joint in self.robot.joint_names:
             count = key.count(joint)
             if count == 0:
-                raise MessageError(
-                    "missing joint", f"joint {joint!r} is missing; given: {', '.join(key)[:200]}"
-                )
+                given = ", ".join(map(shown, key[:8])) + (", ..." if len(key) > 8 else "")
+                raise MessageError("missing joint", f"joint {joint!r} is missing; given: {given}")
             if count > 1:
                 raise MessageError("duplicated joint", f"joint {joint!r} stands {count} times")
         index = [key.index(joint) for joint in self.robot.joint_names]
-        if len(self._known) < 16:
+        # Few and short: what strangers send is not kept.
+        if len(self._known) < 16 and sum(map(len, key)) < 4096:
             self._known[key] = index
         return index
 
@@ -235,7 +310,7 @@ class JointReader:
         values: Sequence[float],
         count: int,
         index: list[int],
-        bounds: list[tuple[float, float]],
+        bounds: Sequence[tuple[float, ...]],
     ) -> Array | None:
         if len(values) == 0:
             return None
@@ -244,30 +319,37 @@ class JointReader:
         picked = [float(values[i]) for i in index]
         for i, (value, (low, high)) in enumerate(zip(picked, bounds, strict=True)):
             if not low <= value <= high or (-TINY < value < TINY and value != 0.0):
+                if all(map(math.isnan, picked)):
+                    return None
                 raise self._refusal(what, i, value, low, high)
         return np.array(picked)
 
     def _columns(
-        self, what: str, points: Sequence[Any], index: list[int], bounds: list[tuple[float, float]]
+        self,
+        what: str,
+        fields: TrajectoryFields,
+        index: list[int],
+        bounds: Sequence[tuple[float, ...]],
     ) -> Array | None:
-        rows = [getattr(point, what) for point in points]
-        sizes = {len(row) for row in rows}
-        if sizes == {0}:
+        given = fields.columns[what]
+        if given is None:
             return None
-        for i, row in enumerate(rows):
-            if len(row) != len(index):
-                raise MessageError(
-                    "length", f"point {i}: {len(row)} {what} for {len(index)} joint names"
-                )
-        values = np.array(rows, np.float64)[:, index]
+        if isinstance(given, Ragged) or given.shape[1] != len(index):
+            point, length = (
+                (given.point, given.length) if isinstance(given, Ragged) else (0, given.shape[1])
+            )
+            raise MessageError(
+                "length", f"point {point}: {length} {what} for {len(index)} joint names"
+            )
+        values = given[:, index]
         box = np.array(bounds)
         size = np.abs(values)
         good = (values >= box[:, 0]) & (values <= box[:, 1]) & ((size >= TINY) | (size == 0.0))
         if not good.all():
             row, column = np.argwhere(~good)[0]
-            single = {"positions": "position", "velocities": "velocity"}.get(what, "acceleration")
             low, high = bounds[column]
-            error = self._refusal(single, int(column), float(values[row, column]), low, high)
+            value = float(values[row, column])
+            error = self._refusal(COLUMNS[what], int(column), value, low, high)
             raise MessageError(error.reason, f"point {row}: {error}")
         return np.ascontiguousarray(values)
 
@@ -299,7 +381,7 @@ def read_wrench(
     given = message.header.frame_id
     if given != frame and not (given == "" and accept_empty):
         hint = "; set accept_empty_frame to allow it" if given == "" else ""
-        raise MessageError("frame", f"frame is {given!r}, expected {frame!r}{hint}")
+        raise MessageError("frame", f"frame is {shown(given)}, expected {frame!r}{hint}")
     stamp = rules.check(stamp_of(message.header), now)
     force, torque = message.wrench.force, message.wrench.torque
     values = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
@@ -311,6 +393,16 @@ def read_wrench(
         if abs(value) > bound or 0.0 < abs(value) < TINY:
             raise MessageError("bounds", f"{label} is {value:g}, allowed up to {bound:g}")
     return WrenchSample(stamp, given or frame, np.array(values, np.float64))
+
+
+def shown(name: str) -> str:
+    """A foreign name between quotes, cut where it is long."""
+    return repr(name if len(name) <= MAX_SHOWN else name[:MAX_SHOWN] + "...")
+
+
+def joint_units(robot: Robot) -> tuple[str, ...]:
+    """Unit of every actuated joint's position, rad or m."""
+    return (robot.joint_unit,) * len(robot.joint_names)
 
 
 def as_message_error(call: Callable[..., Any], *arguments: Any) -> Any:
@@ -348,7 +440,14 @@ def _nanoseconds(what: str, time: Any) -> int:
     return sec * SECOND + nanosec
 
 
-def _check_times(nanoseconds: list[int]) -> None:
+def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nanoseconds of seconds and nanoseconds (2, p), which have to rise from zero or later."""
+    bad = (times[1] < 0) | (times[1] >= SECOND)
+    if bad.any():
+        raise MessageError(
+            "time", f"nanosec is {times[1, bad.argmax()]}, allowed 0 to {SECOND - 1}"
+        )
+    nanoseconds: NDArray[np.int64] = times[0] * SECOND + times[1]
     if nanoseconds[0] < 0:
         raise MessageError("time", f"time_from_start begins at {nanoseconds[0] / SECOND:g} s")
     # Float seconds tell two nanoseconds apart up to here.
@@ -358,10 +457,12 @@ def _check_times(nanoseconds: list[int]) -> None:
             f"time_from_start ends at {nanoseconds[-1] / SECOND:g} s, "
             f"at most {MAX_DURATION / SECOND:g} s",
         )
-    for i in range(1, len(nanoseconds)):
-        if nanoseconds[i] <= nanoseconds[i - 1]:
-            raise MessageError(
-                "time",
-                f"time_from_start of point {i} is {nanoseconds[i] / SECOND:g} s, not after "
-                f"{nanoseconds[i - 1] / SECOND:g} s",
-            )
+    falls = np.diff(nanoseconds) <= 0
+    if falls.any():
+        i = int(falls.argmax()) + 1
+        raise MessageError(
+            "time",
+            f"time_from_start of point {i} is {nanoseconds[i] / SECOND:g} s, not after "
+            f"{nanoseconds[i - 1] / SECOND:g} s",
+        )
+    return nanoseconds

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.codegen.kernels import OK, Kernel
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.tracking import MAX_MOVE
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.messages import SECOND, joint_units
 
 Array = NDArray[np.float64]
 
@@ -26,10 +26,46 @@ JUMP_SLACK: Final = 5e-3
 """How far a joint may move between two samples: so many times what its velocity limit allows,
 over the time between their stamps and this slack for stamps that are off, s."""
 
-STATE: Final = 15
-"""A sample: q, the pose, and its rates per joint rate joint by joint, lengths at the rim."""
-JOINT_JUMP: Final = 1.0
-POSE_JUMP: Final = 2.0
+
+@dataclass(frozen=True)
+class _State:
+    """A sample: q (n,), the pose (m,) and its rates per joint rate (m, n), angles at the rim."""
+
+    stamp: int
+    q: Array
+    pose: Array
+    rates: Array
+    clearance: float
+    """Lower bound of the singularity measure; ``greatest``: upper bound of the rates' norm."""
+    greatest: float
+
+
+class Clearance:
+    """A lower bound of a Jacobian's reciprocal condition number, cheap along a stream.
+
+    No singular value moves farther than the matrix does (Weyl), so those of one matrix bound
+    those of all near it; they are taken anew only where the bound says too little.
+    """
+
+    def __init__(self) -> None:
+        self._near: tuple[Array, float, float] | None = None
+        self.greatest = math.inf
+        """Bound of the last matrix' greatest singular value."""
+
+    def at_least(self, rates: Array, wanted: float) -> float:
+        """A bound of the measure of ``rates`` (m, n): the measure itself where it is below."""
+        if self._near is not None and self._near[0].shape == rates.shape:
+            matrix, least, greatest = self._near
+            change = (rates - matrix).ravel()
+            moved = _length(change)
+            self.greatest = greatest + moved
+            bound = (least - moved) / self.greatest if self.greatest > 0.0 else 0.0
+            if bound >= wanted:
+                return bound
+        values = np.linalg.svd(rates, compute_uv=False)
+        least, self.greatest = values.item(-1), values.item(0)
+        self._near = rates, least, self.greatest
+        return least / self.greatest if self.greatest > 0.0 else 0.0
 
 
 class Continuity:
@@ -40,128 +76,100 @@ class Continuity:
     where the stream is stopped, and what skips over one shows as a jump of a joint or of the pose.
 
     :param warn: measure below which a sample is near a singularity; ``stop``: too near.
-    :param velocity: bounds of the joints' rates, rad/s or m/s.
+    :param velocity: bounds of the joints' rates, one a joint, rad/s or m/s.
     """
 
     def __init__(self, robot: Robot, warn: float, stop: float, velocity: Sequence[float]) -> None:
         self.robot = robot
-        self._warn, self._stop = warn, stop
-        self._velocity = velocity
-        radius = float(getattr(robot, "geometry").platform_radius)  # noqa: B009
-        scale = [1.0 if unit == "m" else radius for unit in robot.pose_units]
-        self._bounds = np.array([*scale, *velocity, MAX_MOVE * radius])
+        self.warn, self.stop = warn, stop
+        self._velocity = tuple(velocity)
+        self._scale = _scale(robot)
+        self._largest = MAX_MOVE * _size(robot)
+        self._clearance = Clearance()
         self.reset()
 
     def reset(self) -> None:
         """Forget the last sample."""
-        self._stamp = 0
-        self._state = np.zeros(STATE)
+        self._last: _State | None = None
+        self._before: _State | None = None
+
+    def retract(self) -> None:
+        """Take the newest sample back, as if it had not been there; once after a step."""
+        self._last = self._before
 
     def step(self, stamp: int, q: Array) -> bool:
-        """Take a sample, shape (3,): whether it is within the warning band of a singularity.
+        """Take a sample, shape (n,): whether it is within the warning band of a singularity.
 
-        :raises MessageError: it is too close to a singularity ("singular"), or it jumped ("jump");
-            the next sample is compared with this one all the same.
+        :raises MessageError: it is too close to a singularity ("singular"), or it jumped ("jump").
+            The next sample is then compared with the one before.
+        :raises UnreachableError: the robot has no assembly there.
         """
-        robot = self.robot
-        pose, fault = robot.forward_kernel(robot.parameters, q)
-        if fault.item(0) != OK:
-            robot.raise_fault(fault, "joint state")
-        rates, _, fault = robot.jacobian_kernel(robot.parameters, q)
-        if fault.item(0) != OK:
-            robot.raise_fault(fault, "joint state")
-        period = (stamp - self._stamp) / SECOND if self._stamp else -1.0
-        head = np.array([period, 0.0, 0.0])
-        state, verdict, _ = COMPARISON(self._bounds, head, q, pose, rates, self._state)
-        last, self._stamp, self._state = self._state, stamp, state
-        kind, index, clearance = verdict.tolist()
-        if kind != 0.0:
-            self._refuse(kind == JOINT_JUMP, int(index), period, state - last)
-        if clearance >= self._warn:
+        pose = self._scale * self.robot.forward(q)
+        rates = self._scale[:, None] * self.robot.jacobian(q)
+        clearance = self._clearance.at_least(rates, self.warn)
+        state = _State(stamp, q, pose, rates, clearance, self._clearance.greatest)
+        if self._last is not None:
+            self._check_jump(self._last, state)
+        near = self._near_singularity(state)
+        self._before, self._last = self._last, state
+        return near
+
+    def _near_singularity(self, state: _State) -> bool:
+        if state.clearance >= self.warn:
             return False
-        measure = float(robot.singularity(q))
-        if not measure >= self._stop:
+        measure = float(self.robot.singularity(state.q))
+        if not measure >= self.stop:
             raise MessageError(
                 "singular",
                 f"too close to a singularity or the edge of reach: measure {measure:.3g}, "
-                f"singularity_stop is {self._stop:g}",
+                f"singularity_stop is {self.stop:g}",
             )
-        return measure < self._warn
+        return measure < self.warn
 
-    def _refuse(self, of_joint: bool, index: int, period: float, moves: Array) -> None:
-        if of_joint:
-            allowed = self._velocity[index] * (JUMP_FACTOR * period + JUMP_SLACK)
+    def _check_jump(self, last: _State, state: _State) -> None:
+        """No joint moves farther than its velocity limit allows, no pose than its rates tell."""
+        move = state.q - last.q
+        period = (state.stamp - last.stamp) / SECOND
+        factor = JUMP_FACTOR * period + JUMP_SLACK
+        moves = move.tolist()
+        for joint, (moved, velocity) in enumerate(zip(moves, self._velocity, strict=True)):
+            if not abs(moved) <= velocity * factor:
+                unit = joint_units(self.robot)[joint]
+                raise MessageError(
+                    "jump",
+                    f"{self.robot.joint_names[joint]} moved by {moved:g} {unit} in {period:g} s, "
+                    f"allowed {velocity * factor:g}",
+                )
+        shift = state.pose - last.pose
+        greatest = max(state.greatest, last.greatest)
+        # What is predicted is no longer than the joints' move times the greatest singular value,
+        # so most samples need no more than two lengths.
+        if _length(shift) + 0.5 * greatest * _length(move) <= self._largest:
+            return
+        # What the mean of both rates predicts errs by the third power of the move; how much, the
+        # change of the rates tells. Half of what is predicted is for where they turn between.
+        predicted = 0.5 * (state.rates + last.rates) @ move
+        bend = np.abs(state.rates - last.rates) @ np.abs(move)
+        error = np.abs(shift - predicted)
+        far = ~(error - 0.5 * np.abs(predicted) - bend <= self._largest)
+        if far.any():
             raise MessageError(
                 "jump",
-                f"{self.robot.joint_names[index]} moved by {moves[index]:g} "
-                f"{self.robot.joint_unit} in {period:g} s, allowed {allowed:g}",
+                f"{self.robot.pose_names[int(far.argmax())]} of the platform jumped while the "
+                "joints did not: another assembly mode",
             )
-        raise MessageError(
-            "jump",
-            f"{self.robot.pose_names[index]} of the platform jumped while the joints did not: "
-            "another assembly mode",
-        )
 
 
-def _compare(p, head, q, pose, rates, last, state, verdict, scratch, fault):  # type: ignore[no-untyped-def]
-    """No joint moves farther than its velocity limit allows, no pose than its rates tell.
-
-    ``p``: scale of the pose, velocity limits, largest jump of the pose (m). ``head``: time since
-    the last sample (s), negative for none. ``verdict``: what jumped, which one, and a lower bound
-    of the rates' reciprocal condition number, at least a third of it, by the Frobenius norms of
-    the matrix and of its inverse: singular values would take ten times as long.
-    """
-    for i in range(3):
-        state[i] = q[i]
-        state[3 + i] = p[i] * pose[i]
-        for k in range(3):
-            state[6 + 3 * i + k] = p[k] * rates[3 * i + k]
-    verdict[0] = 0.0
-    verdict[1] = 0.0
-    period = head[0]
-    if period >= 0.0:
-        for i in range(2, -1, -1):
-            # What the mean of both rates tells errs by the third power of the move; how much, the
-            # change of the rates tells. Half of what is predicted is for where they turn between.
-            predicted = 0.0
-            bend = 0.0
-            for j in range(3):
-                move = state[j] - last[j]
-                rate = state[6 + 3 * j + i]
-                before = last[6 + 3 * j + i]
-                predicted += 0.5 * (rate + before) * move
-                bend += abs((rate - before) * move)
-            error = abs(state[3 + i] - last[3 + i] - predicted)
-            if not error - 0.5 * abs(predicted) - bend <= p[6]:
-                verdict[0] = POSE_JUMP
-                verdict[1] = i
-        for i in range(2, -1, -1):
-            if not abs(state[i] - last[i]) <= p[3 + i] * (JUMP_FACTOR * period + JUMP_SLACK):
-                verdict[0] = JOINT_JUMP
-                verdict[1] = i
-    a = state[6]
-    b = state[7]
-    c = state[8]
-    d = state[9]
-    e = state[10]
-    f = state[11]
-    g = state[12]
-    h = state[13]
-    y = state[14]
-    m = e * y - f * h
-    n = f * g - d * y
-    o = d * h - e * g
-    s = c * h - b * y
-    t = a * y - c * g
-    u = b * g - a * h
-    v = b * f - c * e
-    w = c * d - a * f
-    x = a * e - b * d
-    matrix = a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + y * y
-    adjugate = m * m + n * n + o * o + s * s + t * t + u * u + v * v + w * w + x * x
-    size = math.sqrt(matrix * adjugate)
-    verdict[2] = abs(a * m + b * n + c * o) / size if size > 0.0 else 0.0
+def _length(vector: Array) -> float:
+    return math.sqrt(float(vector @ vector))
 
 
-COMPARISON: Final = Kernel(_compare, (3, 3, 3, 9, STATE), (STATE, 3), batches=False)
-"""As a kernel, to warm up before live use."""
+def _size(robot: Robot) -> float:
+    """The robot's characteristic length, at which angles count as lengths, m."""
+    return float(getattr(robot, "geometry").platform_radius)  # noqa: B009
+
+
+def _scale(robot: Robot) -> Array:
+    """From pose units to metres at the platform's rim, shape (m,)."""
+    size = _size(robot)
+    return np.array([1.0 if unit == "m" else size for unit in robot.pose_units])

@@ -30,26 +30,28 @@ class StreamMonitor:
     stopped: bool = False
     reason: str = ""
     text: str = ""
+    """Of the stop that holds; without one, of the last reject."""
     _bad: int = 0
     _good: int = 0
 
     def reject(self, reason: str, text: str) -> bool:
         """Count a rejected sample; True where it stops the stream now."""
         self.rejected[reason] += 1
-        self.reason, self.text = reason, text
+        if not self.stopped:
+            self.reason, self.text = reason, text
         self._good = 0
         self._bad += 1
         return self._bad >= self.trip_count and self.stop(reason, text)
 
     def stop(self, reason: str, text: str) -> bool:
-        """Stop the stream; True where it ran until now."""
-        self.reason, self.text = reason, text
+        """Stop the stream; True where it ran until now. What stopped it stays its reason."""
         self._good = 0
-        entered = not self.stopped
-        if entered:
-            self.stops[reason] += 1
+        if self.stopped:
+            return False
         self.stopped = True
-        return entered
+        self.reason, self.text = reason, text
+        self.stops[reason] += 1
+        return True
 
     def accept(self) -> bool:
         """Count a good sample; True where it may be answered."""
@@ -62,6 +64,12 @@ class StreamMonitor:
         self.accepted += 1
         return True
 
+    def resume(self) -> bool:
+        """End a stop by hand, however few good samples came; True where there was one."""
+        stopped, self.stopped = self.stopped, False
+        self._bad = self._good = 0
+        return stopped
+
 
 @dataclass
 class TopicStatistics:
@@ -71,6 +79,7 @@ class TopicStatistics:
     answers that took longer than the mean time between messages.
     """
 
+    messages: int = 0
     missed: int = 0
     overruns: int = 0
     longest: float = 0.0
@@ -84,7 +93,7 @@ class TopicStatistics:
         """Take the number that the publisher gave (None: it gives none) and its time, ns.
 
         :returns: True where messages are missing before this one. They are counted by
-            :meth:`confirm`: two publishers on one topic look the same.
+            :meth:`count_missed`: two publishers on one topic look the same.
         """
         period = (sent - self._sent) / 1e9
         if self._sent and period > 0.0:
@@ -93,6 +102,7 @@ class TopicStatistics:
             longest = 2.0 * self._period if self._periods > 1 else period
             weight = max(SMOOTHING, 1.0 / self._periods)
             self._period += (min(period, longest) - self._period) * weight
+        self.messages += 1
         self._sent = sent
         last, self._number = self._number, number or 0
         self._missing = self._number - last - 1 if last else 0
@@ -103,6 +113,6 @@ class TopicStatistics:
         self.missed += self._missing
 
     def handled(self, took: float) -> None:
-        """The newest message took so long to answer, s."""
+        """The newest message took so long to handle, s."""
         self.longest = max(self.longest, took)
         self.overruns += 0.0 < self._period < took

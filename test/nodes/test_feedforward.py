@@ -14,7 +14,7 @@ from delta_dynamics import feedforward, inverse_dynamics
 from delta_dynamics.feedforward import Feedforward, Settings
 from pkm_twin import load
 from pkm_twin.errors import MessageError, ParameterError, SingularityError
-from pkm_twin.streams.continuity import COMPARISON, STATE
+from pkm_twin.streams.continuity import Clearance
 from test.nodes.harness import SECOND, Maker, Plain
 
 NOW = 1_000 * SECOND
@@ -370,16 +370,24 @@ class TestSingularities:
             assert twin.trajectory(message, NOW).shape == (6, 3)
             assert twin.near_singularities == 6
 
-    @given(rows=st.lists(st.floats(-1e3, 1e3), min_size=9, max_size=9))
-    def test_the_quick_bound_is_below_the_measure_and_not_far(self, rows):
-        values = np.linalg.svd(np.reshape(rows, (3, 3)), compute_uv=False)
-        assume(values[-1] > 1e-6 * values[0] and values[0] > 1e-3)
-        measure = values[-1] / values[0]
-        here, bounds = np.zeros(3), np.ones(7)
-        first = np.array([-1.0, 0.0, 0.0])
-        _, verdict, _ = COMPARISON(bounds, first, here, here, np.array(rows), np.zeros(STATE))
-        bound = verdict[2]
-        assert measure / 3 * (1 - 1e-6) <= bound <= measure * (1 + 1e-6)
+    @given(
+        shape=st.tuples(st.integers(1, 6), st.integers(1, 6)),
+        seed=st.integers(0, 2**32 - 1),
+        step=st.sampled_from([0.0, 1e-4, 1e-2, 0.3, 3.0]),
+        wanted=st.floats(0.0, 0.5),
+    )
+    def test_the_bound_along_a_stream_is_below_the_measure(self, shape, seed, step, wanted):
+        rng = np.random.default_rng(seed)
+        clearance = Clearance()
+        matrix = rng.normal(size=shape)
+        for _ in range(20):
+            matrix = matrix + step * rng.normal(size=shape)
+            values = np.linalg.svd(matrix, compute_uv=False)
+            measure = values[-1] / values[0]
+            bound = clearance.at_least(matrix, wanted)
+            assert bound <= measure * (1 + 1e-12)
+            assert bound >= min(wanted, measure) * (1 - 1e-12)
+            assert clearance.greatest >= values[0] * (1 - 1e-12)
 
     @pytest.mark.parametrize("name", ["delta", "delta_cu", "prru"])
     def test_the_defaults_leave_the_workspace_alone(self, name):
