@@ -120,6 +120,7 @@ class DeltaDynamics(health.TwinNode):
             awaited=True,
             expires=lambda: self._feedforward.settings.stale_after,
         )
+        self._action = self._create_action()
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
         self._last_heard = 0
@@ -190,6 +191,29 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
         return level, message, values
+
+    def _create_action(self) -> Any:
+        """The action ``~/follow_joint_trajectory``, where a controller is named."""
+        controller = self.declare(
+            "controller_action",
+            "",
+            "FollowJointTrajectory action of the controller that ~/follow_joint_trajectory "
+            "forwards to; empty: none",
+            read_only=True,
+        )
+        if not controller:
+            return None
+        try:
+            from delta_dynamics.action_node import EffortAction
+        except ImportError as error:
+            raise ParameterError(
+                "controller_action", controller, f"empty without control_msgs ({error})"
+            ) from error
+        return EffortAction(
+            self,
+            controller,
+            lambda trajectory: self._feedforward.trajectory_steps(trajectory, self.now()),
+        )
 
     def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
         """A publisher for each joint's reaction, where the parameter asks for them."""

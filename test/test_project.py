@@ -17,6 +17,7 @@ PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
 CREATORS = ("create_guarded_subscription", "create_guarded_publisher")
 MAY_IMPORT_ROS = {
+    "delta_dynamics/action_node.py",
     "delta_dynamics/gate_node.py",
     "delta_dynamics/node.py",
     "stiffness_monitor/node.py",
