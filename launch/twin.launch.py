@@ -21,6 +21,8 @@ ARGUMENTS = {
     "command_gate": ("false", "run this node: torques that end, for effort controllers"),
     "joint_states": ("joint_states", "topic of the measured joint states"),
     "wrench": ("wrench", "topic of the measured wrench"),
+    "joint_trajectory_ff": ("~/joint_trajectory_ff", "topic of the trajectories with effort"),
+    "controller_action": ("", "of delta_dynamics: the controller's action that goals go on to"),
     "commands": ("~/commands", "topic that command_gate sends to, an effort controller's"),
     "acceleration": ("", "of delta_dynamics: trajectory or differentiate"),
     "wrench_frame": ("", "of stiffness_monitor: frame of the measured wrench"),
@@ -30,11 +32,18 @@ ARGUMENTS = {
 }
 
 PARAMETERS = {
-    "delta_dynamics": ("acceleration",),
+    "delta_dynamics": ("acceleration", "controller_action"),
     "stiffness_monitor": ("wrench_frame",),
     "command_gate": (),
 }
 """Nodes, and the arguments that are parameters of each."""
+
+TOPICS = {
+    "delta_dynamics": ("joint_states", "~/joint_trajectory_ff"),
+    "stiffness_monitor": ("joint_states", "wrench"),
+    "command_gate": ("joint_states", "~/commands"),
+}
+"""Topics of each node that an argument of that name can move."""
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -73,13 +82,7 @@ def _node(name: str, given: dict[str, str]) -> Node:
         name=name,
         namespace=given["namespace"],
         parameters=[*default, *file, {**chosen, "use_sim_time": _flag(given, "use_sim_time")}],
-        remappings=[
-            ("joint_states", given["joint_states"]),
-            ("wrench", given["wrench"]),
-            ("~/commands", given["commands"]),
-        ]
-        if name == "command_gate"
-        else [("joint_states", given["joint_states"]), ("wrench", given["wrench"])],
+        remappings=[(topic, given[topic.removeprefix("~/")]) for topic in TOPICS[name]],
         ros_arguments=["--log-level", given["log_level"]],
         respawn=name == "command_gate" or _flag(given, "respawn"),
         # The gate's absence is the time that a controller holds the last torque.

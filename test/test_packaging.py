@@ -138,7 +138,7 @@ class TestColcon:
         share = prefix / "share/pkm_twin"
         assert (share / "package.xml").is_file()
         launched = {file.name for file in (share / "launch").iterdir()}
-        assert launched == {file.name for file in (REPOSITORY / "launch").glob("*.launch.py")}
+        assert launched == {name.name for name in tracked() if name.parts[0] == "launch"}
         assert {file.stem for file in (share / "config").glob("*.yaml")} == robots()
         marker = prefix / "share/ament_index/resource_index/packages/pkm_twin"
         assert marker.is_file()

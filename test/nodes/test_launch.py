@@ -20,7 +20,7 @@ import yaml
 from test.nodes.harness import REPOSITORY, end_with_parent
 
 LAUNCH = REPOSITORY / "launch"
-FILES = ("twin", "cell")
+FILES = ("twin", "cell", "control")
 NODES = {
     "delta_dynamics": "delta_dynamics/node.py",
     "stiffness_monitor": "stiffness_monitor/node.py",
