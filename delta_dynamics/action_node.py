@@ -84,8 +84,8 @@ class EffortAction:
         if not handle.accepted:
             self._abort(
                 goal,
-                f"{self._controller} refused the trajectory with efforts; a controller without "
-                "an effort command interface does",
+                f"{self._controller} refused the trajectory; its log says why (without an effort "
+                "command interface it takes no efforts)",
             )
             return
         self._handles[bytes(goal.goal_id.uuid)] = handle

@@ -12,6 +12,8 @@ from test.nodes.harness import SECOND, counts_of, one_line_refusal, values_of
 pytest.importorskip("rclpy", exc_type=ImportError)
 
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
@@ -60,6 +62,10 @@ class Gated:
 
     def diagnostics(self, condition=lambda array: True):
         return self.peer.diagnostics(f"/{self.name}", condition)
+
+    def change(self, transition):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert self.peer.call(ChangeState, f"/{self.name}/change_state", request).success
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +129,20 @@ def test_a_new_gate_takes_back_what_a_killed_one_has_left(gated):
     assert gated.commands[-1] == list(effort)
     gated.start()
     gated.until_last(ZEROS)
+
+
+def test_an_inactive_gate_has_said_zeros_and_is_silent(gated):
+    effort = (1.0, 2.0, 3.0)
+    gated.until_last(effort, lambda: gated.send(effort))
+    gated.change(Transition.TRANSITION_DEACTIVATE)
+    gated.until_last(ZEROS)
+    gated.peer.received("/gate/commands").clear()
+    gated.send(effort)
+    assert gated.diagnostics().status[0].message == "inactive"
+    assert gated.commands == []
+    gated.change(Transition.TRANSITION_ACTIVATE)
+    gated.until_last(ZEROS)
+    gated.until_last(effort, lambda: gated.send(effort))
 
 
 def test_a_killed_twin_leaves_zeros(heard, launch):

@@ -14,9 +14,11 @@ import subprocess
 import tempfile
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
 import yaml
 
+from delta_dynamics import inverse_dynamics
 from test.nodes.harness import REPOSITORY, end_with_parent
 
 LAUNCH = REPOSITORY / "launch"
@@ -83,6 +85,40 @@ def why_not():
     except PackageNotFoundError:
         return "pkm_twin is in no sourced workspace"
     return None
+
+
+def installed(package):
+    """Whether a package is in a sourced workspace."""
+    if why_not() is not None:
+        return False
+    from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+
+    try:
+        get_package_prefix(package)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def mock_hardware(names, positions):
+    """A URDF with these joints side by side, under mock hardware that stands where told."""
+    limit = '<limit lower="-3" upper="3" velocity="20" effort="50"/>'
+    links = "".join(
+        f'<link name="l{i}"/><joint name="{name}" type="revolute"><parent link="base_link"/>'
+        f'<child link="l{i}"/><axis xyz="0 1 0"/>{limit}</joint>'
+        for i, name in enumerate(names)
+    )
+    joints = "".join(
+        f'<joint name="{name}"><command_interface name="effort"/><state_interface name="position">'
+        f'<param name="initial_value">{position}</param></state_interface>'
+        '<state_interface name="velocity"/><state_interface name="effort"/></joint>'
+        for name, position in zip(names, positions, strict=True)
+    )
+    return (
+        f'<robot name="mock"><link name="base_link"/>{links}<ros2_control name="mock" '
+        'type="system"><hardware><plugin>mock_components/GenericSystem</plugin></hardware>'
+        f"{joints}</ros2_control></robot>"
+    )
 
 
 class Launched:
@@ -244,6 +280,76 @@ class TestRunning:
         assert self.parameter(peer, "/a/delta_dynamics", "mechanism") == "delta_cu"
         assert self.parameter(peer, "/b/delta_dynamics", "mechanism") == "prru"
         assert self.parameter(peer, "/b/stiffness_monitor", "mechanism") == "prru"
+
+    @pytest.mark.skipif(not installed("controller_manager"), reason="ros2_control is not installed")
+    @pytest.mark.parametrize("space", ["", "left"])
+    def test_a_controller_gets_the_efforts_of_a_goal(self, launched, peer, tmp_path, space):
+        """Through the twin's action to joint_trajectory_controller on mock hardware."""
+        from action_msgs.msg import GoalStatus
+        from control_msgs.action import FollowJointTrajectory
+        from control_msgs.msg import JointTrajectoryControllerState
+        from rclpy.action import ActionClient
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from std_msgs.msg import String
+
+        from test.nodes.twin import NAMES, ROBOT, Q, trajectory
+
+        prefix = f"/{space}".rstrip("/")
+        description = mock_hardware(NAMES, Q)
+        file = tmp_path / "robot.urdf"
+        file.write_text(description)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        publisher = peer.node.create_publisher(String, f"{prefix}/robot_description", latched)
+        publisher.publish(String(data=description))
+        state = f"{prefix}/joint_trajectory_controller/controller_state"
+        peer.hear(JointTrajectoryControllerState, state)
+        action = f"{prefix}/delta_dynamics/follow_joint_trajectory"
+        client = ActionClient(peer.node, FollowJointTrajectory, action)
+        chosen = [f"namespace:={space}"] if space else []
+        process = launched(
+            "control", f"description:={file}", "robot_state_publisher:=false", *chosen
+        )
+
+        def ready():
+            assert process.process.poll() is None, process.output
+            return client.server_is_ready() and peer.received(state)
+
+        try:
+            peer.until(ready, PATIENCE)
+            peer.received(state).clear()
+            sent = trajectory(count=5)
+            # The controller takes none that does not end at rest.
+            sent.points[-1].velocities = [0.0] * len(NAMES)
+
+            def answer():
+                goal = client.send_goal_async(FollowJointTrajectory.Goal(trajectory=sent))
+                peer.until(goal.done)
+                result = goal.result().get_result_async()
+                peer.until(result.done, PATIENCE)
+                return result.result()
+
+            last = answer()
+            # The node may see the controller later than this process does.
+            while last.result.error_string.startswith("no controller serves"):
+                last = answer()
+            assert last.status == GoalStatus.STATUS_SUCCEEDED, last.result.error_string
+            rows = [(p.positions, p.velocities, p.accelerations) for p in sent.points]
+            q, qd, qdd = (np.array(values) for values in zip(*rows, strict=True))
+            efforts = inverse_dynamics(ROBOT, q, qd, qdd)
+            least = 1e-4 * np.abs(efforts).max()
+
+            def outputs():
+                return np.array([m.output.effort for m in peer.received(state)])
+
+            # The controller runs over the points, and holds the last one's.
+            peer.until(lambda: np.abs(outputs()[-1] - efforts[-1]).max() < least)
+            moving = outputs()[np.abs(outputs()).max(1) > 0.0]
+            assert len(moving) > 5
+            assert (moving >= efforts.min(0) - least).all()
+            assert (moving <= efforts.max(0) + least).all()
+        finally:
+            client.destroy()
+            peer.node.destroy_publisher(publisher)
 
     @pytest.mark.parametrize(
         ("name", "argument", "said"),
