@@ -2,6 +2,10 @@
 # make demo, make test: all that they need is python3 (3.11 or 3.12) with venv, and make.
 PYTHON ?= python3
 VENV ?= .venv
+# Of make soak and make fuzz.
+MINUTES ?= 3
+SECONDS ?= 60
+SEED ?= 1
 BIN := $(VENV)/bin
 
 .PHONY: demo test lint types unit bags bench certificate fuzz soak scale clean help
@@ -12,8 +16,8 @@ help:
 	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
 	@echo "make certificate  torques and compliance against other engines, into docs/certificate.md"
-	@echo "make fuzz         damage every kind of byte of a bag, at length"
-	@echo "make soak         ten million poses, and minutes of both nodes, in flat memory"
+	@echo "make fuzz         damage every kind of byte of a bag, and both nodes, at length (SECONDS, SEED)"
+	@echo "make soak         ten million poses, and both nodes in all weathers, in flat memory (MINUTES)"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
 	@echo "make clean        remove .venv, out and caches"
 
@@ -54,10 +58,10 @@ certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m test.certificate
 
 fuzz: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -m long test/bags
+	FUZZ_SECONDS=$(SECONDS) FUZZ_SEED=$(SEED) $(BIN)/python -m pytest -m long test/bags test/nodes/test_fuzz.py
 
 soak: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -m long test/atlas test/nodes
+	SOAK_MINUTES=$(MINUTES) SOAK_OUT=$(CURDIR)/out $(BIN)/python -m pytest -m long test/atlas test/nodes/test_soak.py
 
 scale: $(VENV)/test.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.atlas.scale docs/scale.md

@@ -98,9 +98,9 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "delta_dynamics = delta_dynamics.node:main",
-            "command_gate = delta_dynamics.gate_node:main",
-            "stiffness_monitor = stiffness_monitor.node:main",
+            "delta_dynamics = pkm_twin.apps.nodes:delta_dynamics",
+            "command_gate = pkm_twin.apps.nodes:command_gate",
+            "stiffness_monitor = pkm_twin.apps.nodes:stiffness_monitor",
             "pkm-twin = pkm_twin.apps.cli:main",
         ],
     },

@@ -466,7 +466,7 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
 
 
 def main() -> None:
-    """Entry point of ``ros2 run pkm_twin delta_dynamics``."""
+    """Run the node until a signal ends it."""
     sys.exit(health.run(DeltaDynamics))
 
 

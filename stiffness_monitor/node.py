@@ -238,7 +238,7 @@ def _transform(answer: Answer) -> TransformStamped:
 
 
 def main() -> None:
-    """Entry point of ``ros2 run pkm_twin stiffness_monitor``."""
+    """Run the node until a signal ends it."""
     sys.exit(health.run(StiffnessMonitor))
 
 

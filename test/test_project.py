@@ -15,7 +15,6 @@ from pkm_twin import robot_names
 REPOSITORY = Path(__file__).resolve().parents[1]
 PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
-CREATORS = ("create_guarded_subscription", "create_guarded_publisher")
 MAY_IMPORT_ROS = {
     "delta_dynamics/action_node.py",
     "delta_dynamics/gate_node.py",
@@ -93,58 +92,6 @@ def first_cells(text, row):
         cells = [cell.strip() for cell in line.split("|")]
         if len(cells) > row + 1:
             yield from re.findall(r"`([^`]+)`", cells[row])
-
-
-def strings(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
-
-
-def text_of(node):
-    """A string's text, each inserted value as <>."""
-    if isinstance(node, ast.JoinedStr):
-        return "".join(text_of(part) for part in node.values)
-    return node.value if isinstance(node, ast.Constant) else "<>"
-
-
-NODES = {
-    "delta_dynamics": "delta_dynamics/node.py",
-    "command_gate": "delta_dynamics/gate_node.py",
-    "stiffness_monitor": "stiffness_monitor/node.py",
-}
-
-
-@pytest.mark.parametrize("node", NODES)
-class TestNodeTables:
-    def test_topics(self, node):
-        topics = {}
-        for line in section(node).splitlines():
-            cells = [cell.strip() for cell in line.split("|")]
-            if len(cells) > 4 and cells[1] in ("in", "out"):
-                topics[re.sub("<.*>", "<>", cells[2].strip("`"))] = cells[3]
-        calls = {}
-        for call in ast.walk(ast.parse((REPOSITORY / NODES[node]).read_text("utf-8"))):
-            if isinstance(call, ast.Call) and getattr(call.func, "attr", "") in CREATORS:
-                kind, topic = call.args[:2]
-                calls[text_of(topic)] = kind.id
-        assert {topic: kind.split("/")[1] for topic, kind in topics.items()} == calls
-
-    def test_parameters(self, node):
-        table = [line for line in section(node).splitlines() if line.startswith("|")]
-        table = table[next(i for i, line in enumerate(table) if "| parameter |" in line) :]
-        named = set(first_cells("\n".join(table), 1))
-        known = strings(REPOSITORY / NODES[node])
-        assert "mechanism" in named
-        assert named <= known
-        declared = {
-            call.args[0].value
-            for call in ast.walk(ast.parse((REPOSITORY / NODES[node]).read_text("utf-8")))
-            if isinstance(call, ast.Call)
-            and getattr(call.func, "attr", "") == "declare"
-            and isinstance(call.args[0], ast.Constant)
-        }
-        assert declared
-        assert declared <= named
 
 
 def test_commands_and_make_targets_exist():

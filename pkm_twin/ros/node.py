@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import gc
+import inspect
 import os
 import signal
 import sys
@@ -27,6 +28,7 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -72,8 +74,38 @@ MAX_TEXT: Final = 500
 MAX_TASKS: Final = 10
 """How much work may wait beside the callbacks."""
 
+SELDOM_PERIOD: Final = 0.05
+SELDOM_TURNS: Final = 3
+"""How often requests and events are looked for, s, and how many at a time at least."""
+LOOK: Final = 0.5
+"""How often the events executor looks whether the context has ended, s."""
+
 M = TypeVar("M")
 Task = Generator[None, None, None]
+
+
+class SeldomGroup(MutuallyExclusiveCallbackGroup):
+    """What is not asked for a thousand times a second: requests, and the middleware's events.
+
+    rclpy makes a wait set anew for every message, and each entity in it has its price; these are
+    in it now and then only. The events executor has no wait set and does not ask.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._turns = 0
+
+    def open(self) -> None:
+        """Let the next turns of the executor look at them."""
+        self._turns = SELDOM_TURNS
+
+    def turned(self) -> None:
+        """A turn of the executor is over."""
+        self._turns = max(0, self._turns - 1)
+
+    def can_execute(self, entity: Any) -> bool:
+        """Whether the executor looks at it."""
+        return self._turns > 0 and bool(super().can_execute(entity))
 
 
 class UnknownParametersError(PkmTwinError):
@@ -129,6 +161,7 @@ class TwinNode(LifecycleNode):
         self._incompatible = 0
         self._last_clock = 0
         self.active = False
+        self.seldom = SeldomGroup()
         super().__init__(name)
         self._autostart = self.declare(
             "autostart", True, "configure and activate at the start", read_only=True
@@ -155,10 +188,14 @@ class TwinNode(LifecycleNode):
         """
         self.refuse_unknown_parameters()
         self.add_pre_set_parameters_callback(self._with_floats)
+        self.add_on_set_parameters_callback(_refuse_nameless)
         self.create_guarded_timer(1.0, self._publish_diagnostics)
         self.create_service(Trigger, "~/reset", self._on_reset)
         for service in self.services:
             service.callback = self._guarded_service(service.srv_type, service.callback)
+            service.callback_group = self.seldom
+            self.seldom.add_entity(service)
+        self.create_guarded_timer(SELDOM_PERIOD, self.seldom.open)
         # Kept: the middleware calls the handle without holding it.
         self._jump_handle = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -328,7 +365,7 @@ class TwinNode(LifecycleNode):
         :param raw: the callback takes the message's bytes.
         :param best_effort: messages may be lost for the newest, and publishers of both kinds
             match. Otherwise none is lost, as long messages need it, until a best-effort publisher
-            comes: from there on as if true.
+            comes: from there on as if true (not with the events executor).
         :param awaited: the diagnostics warn until the first message.
         :param expires: how long a message may wait for the node, s; older ones count as lost.
         :param expiry: lifespan and deadline that publishers have to offer, s; None is any.
@@ -338,7 +375,9 @@ class TwinNode(LifecycleNode):
         if awaited:
             self._awaited.append(topic)
 
-        def guarded(message: Any, info: Any) -> None:
+        def guarded(*arguments: Any) -> None:
+            # The events executor gives both in one.
+            message, info = arguments if len(arguments) == 2 else arguments[0]
             began = time.perf_counter()
             try:
                 number, sent = info["publication_sequence_number"], info["source_timestamp"]
@@ -360,12 +399,19 @@ class TwinNode(LifecycleNode):
                 self.caught(topic, error)
             statistics.handled(time.perf_counter() - began)
 
-        given = f"qos_overrides.{name}.subscription.reliability" in self._parameter_overrides
+        # By its signature rclpy knows that the information is wanted.
+        guarded.__signature__ = inspect.signature(  # type: ignore[attr-defined]
+            lambda message, info: None
+        )
+        # The events executor does not survive the end of a subscription with events.
+        given = self.executor_kind == "events" or (
+            f"qos_overrides.{name}.subscription.reliability" in self._parameter_overrides
+        )
         relaxed = False
         subscription: Any = None
 
         def subscribe() -> Any:
-            return self.create_subscription(
+            made = self.create_subscription(
                 kind,
                 topic,
                 guarded,
@@ -376,6 +422,10 @@ class TwinNode(LifecycleNode):
                 ),
                 event_callbacks=SubscriptionEventCallbacks(incompatible_qos=misfit),
             )
+            for handler in made.event_handlers:
+                handler.callback_group = self.seldom
+                self.seldom.add_entity(handler)
+            return made
 
         def misfit(event: Any) -> None:
             if self._misfit(topic, event) == "reliability" and not (best_effort or given):
@@ -420,6 +470,7 @@ class TwinNode(LifecycleNode):
             topic,
             qos,
             qos_overriding_options=QoSOverridingOptions(overrides),
+            callback_group=self.seldom,
             event_callbacks=PublisherEventCallbacks(
                 incompatible_qos=lambda event: self._misfit(topic, event)
             ),
@@ -620,7 +671,7 @@ class TwinNode(LifecycleNode):
         troubles = self._troubles()
         if level == ERROR:
             troubles.insert(0, (level, message))
-        elif level != OK or not troubles:
+        elif level != OK or not troubles or not self.active:
             troubles.append((level, message))
         status = DiagnosticStatus(
             level=max(level for level, _ in troubles),
@@ -645,6 +696,12 @@ class TwinNode(LifecycleNode):
 def _cut(text: str) -> str:
     """A text that strangers may have made long."""
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}... ({len(text)} characters)"
+
+
+def _refuse_nameless(changes: list[Parameter]) -> SetParametersResult:
+    """Refuse what rclpy would declare by the way."""
+    good = all(change.name for change in changes)
+    return SetParametersResult(successful=good, reason="" if good else "a parameter without a name")
 
 
 def _as_float(given: Parameter, like: Any) -> Parameter:
@@ -681,11 +738,15 @@ def spin(node: TwinNode, ended: Callable[[], bool] = lambda: False) -> None:
 
     :param ended: asked between two callbacks; true ends it too.
     """
-    executor = EventsExecutor() if node.executor_kind == "events" else SingleThreadedExecutor()
+    events = node.executor_kind == "events"
+    executor = EventsExecutor() if events else SingleThreadedExecutor()
     executor.add_node(node)
+    # Without a bound the one waits for ever; with one the other makes a timer a message.
+    patience = LOOK if events else None
     while node.context.ok() and not ended():
         try:
-            executor.spin_once(timeout_sec=0.0 if node.busy else None)
+            executor.spin_once(timeout_sec=0.0 if node.busy else patience)
+            node.seldom.turned()
             node.work()
         except (KeyboardInterrupt, ExternalShutdownException):
             raise

@@ -22,6 +22,8 @@ from pkm_twin.bags.reader import Bag, TopicInfo, open_bag
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError
 
 CLOCK_TOPIC = "/clock"
+MAX_CLOCK = 2**31 - 1
+"""Seconds that a /clock can tell."""
 # A second at 1 kHz: a subscriber that the machine leaves waiting so long still gets everything.
 _MIN_DEPTH = 1000
 # How long the last messages may take to reach reliable subscribers, s.
@@ -95,6 +97,8 @@ def play(
         "wait_for_subscribers", wait_for_subscribers, wait_for_subscribers >= 0, "0 or more, s"
     )
     bag = open_bag(path)
+    if clock:
+        _require_times(bag)
     names = _selected(bag, topics, bool(clock))
     targets = _targets(bag, names, remap or {})
     stop = _Stop()
@@ -114,6 +118,18 @@ def play(
 def _require(name: str, value: float, holds: bool, bound: str) -> None:
     if not (math.isfinite(value) and holds):
         raise ParameterError(name, value, bound)
+
+
+def _require_times(bag: Bag) -> None:
+    """Refuse log times that a clock message cannot carry: they would come out as others."""
+    end = bag.report.start_time * 1e-9 + bag.report.duration
+    if not end < MAX_CLOCK:
+        raise BagError(
+            f"log times up to {end:.0f} s do not fit a /clock, which ends at {MAX_CLOCK} s; play "
+            "without a clock",
+            path=bag.report.path,
+            reason="time",
+        )
 
 
 def _selected(bag: Bag, topics: Iterable[str] | None, own_clock: bool) -> list[str]:

@@ -37,22 +37,22 @@ def main(source, target):
         count = extra["samples"]
         lines.append(f"| {extra['what']} | {count} | {median:.3g} | {median / count:.3g} |")
     if trip is not None:
-        ratios = trip["ratios"]
         lines += [
             "",
             "Round trip over DDS at 1 kHz, `joint_states` to `~/joint_torques`, beside a node that "
-            f"sends the same message back: {len(ratios)} slices of either in turn, medians.",
+            f"sends the same message back: {trip['slices']} slices of each in turn, medians. "
+            "Ratios are to the echo with the same executor. Not answered are also the samples that "
+            "fill the node's window.",
             "",
-            "| node | p50 (us) | p99 (us) |",
-            "|---|---:|---:|",
+            "| node | p50 (us) | p99 (us) | CPU a message (us) | not answered | to the echo |",
+            "|---|---:|---:|---:|---:|---|",
         ]
-        for name, p50 in trip["p50_us"].items():
-            lines.append(f"| {name} | {p50:.0f} | {trip['p99_us'][name]:.0f} |")
-        lines += [
-            "",
-            f"The node's p50 to the echo's: {ratios[len(ratios) // 2]:.2f} "
-            f"({ratios[0]:.2f} to {ratios[-1]:.2f} in single slices).",
-        ]
+        for name, f in trip["figures"].items():
+            beside = ", ".join(f"{x:.2f}" for x in trip["ratios"].get(name, {}).values())
+            lines.append(
+                f"| {name} | {f['p50_us']:.0f} | {f['p99_us']:.0f} | {f['cpu_us']:.0f} "
+                f"| {f['lost']:.0f} | {beside} |"
+            )
     Path(target).write_text("\n".join(lines) + "\n" + TARGETS)
 
 

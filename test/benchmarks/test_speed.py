@@ -8,6 +8,8 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -89,20 +91,26 @@ def test_round_trip(benchmark):
     rclpy = pytest.importorskip("rclpy")
     domain = Domain()
     os.environ.update(domain.environment())
+    twin = ["-m", "delta_dynamics.node", "--ros-args", "-p", "mechanism:=delta_cu", "-p"]
     commands = {
-        "echo": ["-m", "test.benchmarks.echo_node"],
-        "delta_dynamics": ["-m", "delta_dynamics.node", "--ros-args", "-p", "mechanism:=delta_cu"],
+        "echo": ["-m", "test.benchmarks.echo_node", "single"],
+        "echo_events": ["-m", "test.benchmarks.echo_node", "events"],
+        "delta_dynamics": [*twin, "executor:=single"],
+        "delta_dynamics_events": [*twin, "executor:=events"],
     }
     context = rclpy.Context()
     rclpy.init(context=context)
     children = {}
     try:
-        client = Client(rclpy, context)
+        client = Client(rclpy, context, commands)
         for name, command in commands.items():
             children[name] = start(domain, name, command)
         for name in commands:
             client.wait_for(name)
-        slices = [{name: client.measure(name, SECONDS) for name in commands} for _ in range(SLICES)]
+        slices = [
+            {name: client.measure(name, SECONDS, children[name].pid) for name in commands}
+            for _ in range(SLICES)
+        ]
     finally:
         for child in children.values():
             child.terminate()
@@ -110,18 +118,33 @@ def test_round_trip(benchmark):
             child.wait(10)
         rclpy.try_shutdown(context=context)
         domain.close()
+
     # The machine is elsewhere now and then: the median of slices, each beside its own echo.
-    p50, p99 = (
-        {
-            name: float(np.median([np.percentile(pair[name], k) for pair in slices])) * 1e6
-            for name in commands
+    def median(name, value, beside=None):
+        return float(
+            np.median(
+                [value(pair[name]) / (value(pair[beside]) if beside else 1) for pair in slices]
+            )
+        )
+
+    values = {
+        "p50_us": lambda m: float(np.percentile(m.times, 50)) * 1e6,
+        "p99_us": lambda m: float(np.percentile(m.times, 99)) * 1e6,
+        "cpu_us": lambda m: m.cpu / m.sent * 1e6,
+        "lost": lambda m: m.sent - m.answered,
+    }
+    figures = {
+        name: {what: median(name, value) for what, value in values.items()} for name in commands
+    }
+    ratios = {
+        name: {
+            what: median(name, values[what], name.replace("delta_dynamics", "echo"))
+            for what in ("p50_us", "p99_us", "cpu_us")
         }
-        for k in (50, 99)
-    )
-    ratios = [np.median(pair["delta_dynamics"]) / np.median(pair["echo"]) for pair in slices]
-    benchmark.extra_info.update(
-        what="round trip", p50_us=p50, p99_us=p99, ratios=sorted(map(float, ratios))
-    )
+        for name in commands
+        if "echo" not in name
+    }
+    benchmark.extra_info.update(what="round trip", figures=figures, ratios=ratios, slices=SLICES)
     benchmark.pedantic(lambda: None, rounds=1)
 
 
@@ -139,10 +162,26 @@ def start(domain, name, command):
     )
 
 
+def cpu_of(process):
+    """CPU time of a process so far, s."""
+    fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@dataclass
+class Measurement:
+    """Times to the answer, s, and what else a slice told."""
+
+    times: list[float]
+    sent: int
+    answered: int
+    cpu: float
+
+
 class Client:
     """Publishes joint states and takes the time until the answer with the same stamp."""
 
-    def __init__(self, rclpy, context):
+    def __init__(self, rclpy, context, names):
         from rclpy.executors import SingleThreadedExecutor
         from sensor_msgs.msg import JointState
 
@@ -152,13 +191,15 @@ class Client:
         self.executor.add_node(self.node)
         self.publishers, self.answered = {}, None
         self.names = list(load("delta_cu").joint_names)
-        for name in ("echo", "delta_dynamics"):
+        for name in names:
             self.publishers[name] = self.node.create_publisher(
                 JointState, f"/{name}/joint_states", 10
             )
-            self.node.create_subscription(
-                JointState, f"/{name}/{name}/joint_torques", self._answer, 10
-            )
+            self.node.create_subscription(JointState, self._topic(name), self._answer, 10)
+
+    @staticmethod
+    def _topic(name):
+        return f"/{name}/{name.removesuffix('_events')}/joint_torques"
 
     def _answer(self, message):
         self.answered = message.header.stamp.sec, message.header.stamp.nanosec
@@ -167,13 +208,14 @@ class Client:
         deadline = time.monotonic() + 60
         while not (
             self.publishers[name].get_subscription_count()
-            and self.node.count_publishers(f"/{name}/{name}/joint_torques")
+            and self.node.count_publishers(self._topic(name))
         ):
             assert time.monotonic() < deadline, f"{name} did not come up"
             self.executor.spin_once(timeout_sec=0.1)
 
-    def measure(self, name, seconds):
+    def measure(self, name, seconds, process):
         times = []
+        used = cpu_of(process)
         begin = time.perf_counter()
         for i in range(round(seconds / PERIOD)):
             due = begin + i * PERIOD
@@ -193,4 +235,5 @@ class Client:
                     break  # the node's window fills, or the machine is elsewhere
             else:
                 times.append(time.perf_counter() - sent)
-        return times[200:]
+        used = cpu_of(process) - used
+        return Measurement(times[200:], round(seconds / PERIOD), len(times), used)

@@ -149,3 +149,54 @@ def test_what_came_before_the_window_leaves_no_bit(rng, carries):
     expected = answers(0)
     for first in range(1, window + 1):
         assert answers(first).tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("window", [6, 7, 12, 25])
+@pytest.mark.parametrize("order", [2, 3])
+def test_the_middle_is_as_late_as_the_delay_says(rng, order, window):
+    stamps = stamps_of(rng, window, 0.0)
+    motion = polynomial(rng, order + 1)
+    differentiator = Differentiator(order, window, middle=True)
+    for stamp in stamps:
+        q, qd, _ = motion((stamp - stamps[0]) / SECOND)
+        result = differentiator.push(stamp, q, qd)
+    _, qd, qdd = motion((stamps[-1] - stamps[0]) / SECOND - differentiator.delay * STEP / SECOND)
+    assert np.allclose(result[0], qd, rtol=1e-9)
+    assert np.abs(result[1] - qdd).max() < 1e-11 * SECOND / STEP
+
+
+@pytest.mark.parametrize("joints", [1, 2, 6])
+def test_any_number_of_joints_is_differentiated_each_for_itself(rng, joints):
+    stamps = stamps_of(rng, 30, 0.8)
+    values = rng.normal(size=(30, joints))
+
+    def last(columns):
+        differentiator = Differentiator(2, 9)
+        for stamp, row in zip(stamps, values[:, columns], strict=True):
+            result = differentiator.push(stamp, np.zeros(len(row)), row)
+        return result[1]
+
+    whole = last(slice(None))
+    assert whole.shape == (joints,)
+    for i in range(joints):
+        assert np.allclose(last([i]), whole[i], rtol=1e-9)
+
+
+@pytest.mark.parametrize("carries", [True, False])
+def test_a_sample_that_is_taken_back_was_never_there(rng, carries):
+    window = 5
+    stamps = stamps_of(rng, 40, 0.8)
+    rows = rng.normal(size=(40, 3))
+
+    def push(differentiator, stamp, row):
+        return differentiator.push(stamp, row, row if carries else None)
+
+    plain, spoiled = Differentiator(2, window), Differentiator(2, window)
+    for i, (stamp, row) in enumerate(zip(stamps, rows, strict=True)):
+        if i % 3:
+            push(spoiled, stamp - 1000, 1e6 * row)
+            spoiled.retract()
+        expected, found = push(plain, stamp, row), push(spoiled, stamp, row)
+        assert (expected is None) == (found is None)
+        if found is not None:
+            assert np.array(found).tobytes() == np.array(expected).tobytes()

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, assume, event, example, given, settings
 from hypothesis import strategies as st
 
 from delta_dynamics import feedforward, inverse_dynamics
-from delta_dynamics.feedforward import Feedforward, Settings
+from delta_dynamics.feedforward import SLICE, Feedforward, Settings
 from pkm_twin import load
 from pkm_twin.errors import MessageError, ParameterError, SingularityError
 from pkm_twin.streams.continuity import Clearance
@@ -478,6 +478,129 @@ class TestJumps:
                 twin.joint_state(message, NOW + i * SECOND // rate)
         assert "jump" not in twin.stream.rejected
         assert "singular" not in twin.stream.rejected
+
+
+class TestRefusedSamples:
+    """What is refused moves nothing that a good sample is judged by."""
+
+    @pytest.mark.parametrize(
+        "bad",
+        [
+            {"position": (math.nan, 0.0, 0.0)},
+            {"velocity": ()},
+            {"position": UNREACHABLE},
+            {"velocity": (1e9, 0.0, 0.0)},
+            {"velocity": (14.0, -14.0, 14.0), "ahead": 1},
+            {"position": (0.4, 0.4, 0.4), "ahead": 1},
+        ],
+    )
+    def test_one_bad_sample_costs_none_but_itself(self, make, limitless, bad):
+        # As far ahead as stamps may be, but what is allowed of a move grows with its time.
+        bad = {"ahead": 99} | bad
+        ahead = bad.pop("ahead")
+        robot = ROBOT.changed(limits={"effort": 60.0})
+        robot = limitless if bad.get("position") == UNREACHABLE else robot
+        twin = core(robot, trip_count=10**6, limit_policy="reject", recovery_count=1)
+        answers(twin, make, range(10))
+        stamp = NOW + (9 + ahead) * STEP
+        for _ in range(3):
+            reject(twin.joint_state, sample(make, 9, stamp=stamp, **bad)[0], NOW + 9 * STEP)
+        # A jump ends the window, so that nothing is differentiated across it.
+        begins = WINDOW - 1 if twin.stream.rejected.keys() & {"jump", "unreachable"} else 0
+        results = answers(twin, make, range(10, 10 + WINDOW + 3))
+        assert [result is None for result in results] == [True] * begins + [False] * (
+            len(results) - begins
+        )
+        exact = inverse_dynamics(robot, *motion((10 + WINDOW + 2) / 1000))
+        assert np.abs(results[-1].effort - exact).max() < 1e-9
+        assert twin.stream.rejected.total() == 3
+
+    def test_a_reject_during_a_stop_leaves_its_reason(self, make):
+        twin = running(make)
+        for i in range(10, 14):
+            reject(twin.joint_state, *sample(make, i, position=(math.nan, 0.0, 0.0)))
+        before = twin.stream.reason, twin.stream.text
+        assert before[0] == "not finite"
+        reject(twin.joint_state, *sample(make, 14, names=("a", "b", "c")))
+        twin.time_jumped_forward()
+        assert (twin.stream.reason, twin.stream.text) == before
+        assert twin.stream.stops == {"not finite": 1}
+
+    def test_a_stop_that_is_ended_by_hand_answers_at_once(self, make):
+        twin = running(make)
+        for i in range(10, 14):
+            reject(twin.joint_state, *sample(make, i, position=(math.nan, 0.0, 0.0)))
+        assert twin.stream.resume()
+        assert not twin.stream.resume()
+        assert twin.joint_state(*sample(make, 14)) is not None
+
+    def test_a_torque_that_is_late_is_refused(self, make):
+        twin = running(make)
+        result = twin.joint_state(*sample(make, 10))
+        twin.check_age(result, result.stamp + SECOND // 10)
+        reason, _ = reject(twin.check_age, result, result.stamp + SECOND // 10 + 1)
+        assert reason == "late answer"
+        assert twin.stream.rejected == {"late answer": 1}
+
+
+class TestSettings:
+    def test_other_settings_hold_from_the_next_sample_on(self, make):
+        twin = running(make)
+        twin.change_settings(Settings(window=WINDOW, trip_count=1, singularity_warn=1.0))
+        assert twin.joint_state(*sample(make, 10)) is not None
+        assert twin.near_singular
+        reject(twin.joint_state, *sample(make, 11, position=(math.nan, 0.0, 0.0)))
+        assert twin.stream.stopped
+
+    def test_a_new_window_is_filled_anew(self, make):
+        twin = running(make)
+        twin.change_settings(Settings(window=WINDOW + 1, recovery_count=1))
+        results = answers(twin, make, range(10, 20))
+        assert [result is None for result in results] == [True] * WINDOW + [False] * (10 - WINDOW)
+
+
+class TestSlices:
+    def test_a_long_trajectory_is_that_of_its_points(self, make):
+        count = 2 * SLICE + 7
+        times = np.arange(count) / 500
+        q, qd, qdd = motion(0.1 * times)
+        message = make.trajectory(NAMES, [round(t * SECOND) for t in times], q, qd, qdd)
+        twin = core()
+        steps = twin.trajectory_steps(message, NOW)
+        turns = 0
+        while True:
+            try:
+                next(steps)
+            except StopIteration as end:
+                efforts = end.value
+                break
+            turns += 1
+            # The stream goes on between the slices.
+            assert twin.joint_state(*sample(make, turns)) is None or turns >= WINDOW
+        assert turns == 4
+        assert np.abs(efforts - inverse_dynamics(ROBOT, q, qd, qdd)).max() < 1e-12
+
+    def test_the_robot_is_that_of_the_beginning(self, make):
+        message = trajectory(make)
+        twin = core()
+        expected = core().trajectory(message, NOW)
+        steps = twin.trajectory_steps(message, NOW)
+        next(steps)
+        twin.change_robot(ROBOT.changed(payload={"mass": 2.0}))
+        with pytest.raises(StopIteration) as end:
+            for _ in range(100):
+                next(steps)
+        assert (end.value.value == expected).all()
+
+    def test_a_bad_point_is_told_by_its_number(self, make, limitless):
+        count = SLICE + 9
+        rows = [[0.3] * 3] * count
+        rows[SLICE + 4] = UNREACHABLE
+        zero = [[0.0] * 3] * count
+        message = make.trajectory(NAMES, [i * STEP for i in range(count)], rows, zero, zero)
+        reason, text = reject(core(limitless).trajectory, message, NOW)
+        assert reason == "unreachable"
+        assert f"counted from point {SLICE}: " in text and "sample 4" in text
 
 
 class TestClocks:

@@ -93,6 +93,39 @@ class TestJointState:
         assert (sample.qd is None) == (absent == "velocity")
         assert (sample.effort is None) == (absent == "effort")
 
+    @pytest.mark.parametrize("absent", ["velocity", "effort"])
+    def test_a_field_that_is_nan_for_all_of_the_robots_joints_is_absent(self, make, reader, absent):
+        nothing = (math.nan,) * 3
+        sample = reader.joint_state(state(make, **{absent: nothing}), NOW, RULES)
+        assert (sample.qd is None) == (absent == "velocity")
+        assert (sample.effort is None) == (absent == "effort")
+        foreign = state(
+            make,
+            names=("gripper", *NAMES),
+            position=(1.0, *Q),
+            velocity=(0.5, *nothing),
+            effort=(),
+        )
+        assert reader.joint_state(foreign, NOW, RULES).qd is None
+
+    def test_positions_that_are_nan_for_all_are_none(self, make, reader):
+        message = state(make, position=(math.nan,) * 3)
+        reason, text = refused(reader.joint_state, message, NOW, RULES)
+        assert (reason, "all positions are nan" in text) == ("empty", True)
+
+    def test_positions_alone_are_read_whatever_else_is_there(self, make, reader):
+        message = state(make, velocity=(math.nan, 1e300, 0.0), effort=(0.0,))
+        sample = reader.positions(message, NOW, RULES)
+        assert sample.q.tolist() == list(Q)
+        assert (sample.qd, sample.effort) == (None, None)
+
+    def test_a_long_name_is_cut_in_the_refusal(self, make, reader):
+        for names in (("x" * 10**6, *NAMES[1:]), tuple("x" * 10**4 for _ in range(3))):
+            _, text = refused(reader.joint_state, state(make, names=names), NOW, RULES)
+            assert len(text) < 1000
+        _, text = refused(reader.trajectory, trajectory(make, names=names), NOW)
+        assert len(text) < 1000
+
     def test_other_joints_are_ignored_whatever_they_carry(self, make, reader):
         message = state(
             make,

@@ -304,8 +304,7 @@ class TestProcess:
         for _ in range(10):
             monitor.send_state()
             monitor.send_wrench(frame="platform" if name == "defaults" else "base_link")
-        code, took = monitor.process.stop(number)
+        code = monitor.process.stop(number)
         assert code == 0
-        assert took < 2.0
         assert "Traceback" not in monitor.process.output
         assert "robot upr_rpu (upr_rpu)" in monitor.process.output

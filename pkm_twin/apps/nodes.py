@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes as commands: help without ROS, and one line where ROS is missing."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from pkm_twin.ros.arguments import answer
+
+MODULES = {
+    "delta_dynamics": "delta_dynamics.node",
+    "command_gate": "delta_dynamics.gate_node",
+    "stiffness_monitor": "stiffness_monitor.node",
+}
+SUMMARIES = {
+    "delta_dynamics": "Trajectories and joint states in, feedforward torques out.",
+    "command_gate": "Stamped torques in, plain commands of an effort controller out.",
+    "stiffness_monitor": "Wrenches in, compliance and the dominant strain-energy element out.",
+}
+
+
+def delta_dynamics() -> None:
+    """Entry point of ``ros2 run pkm_twin delta_dynamics``."""
+    _run("delta_dynamics")
+
+
+def command_gate() -> None:
+    """Entry point of ``ros2 run pkm_twin command_gate``."""
+    _run("command_gate")
+
+
+def stiffness_monitor() -> None:
+    """Entry point of ``ros2 run pkm_twin stiffness_monitor``."""
+    _run("stiffness_monitor")
+
+
+def _run(name: str) -> None:
+    answer(name, SUMMARIES[name], sys.argv[1:])
+    try:
+        importlib.import_module("rclpy")
+    except ImportError as error:
+        print(
+            f"refused to start: {name} needs ROS 2: source its setup, or pip install "
+            f"'pkm_twin[jazzy]' ({error})",
+            file=sys.stderr,
+        )
+        sys.exit(1)
+    importlib.import_module(MODULES[name]).main()

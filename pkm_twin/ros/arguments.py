@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node's command line may hold beside ROS arguments. May import: the standard library."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+
+USAGE = """usage: {name} [--help] [--version] [--ros-args -p PARAMETER:=VALUE -r FROM:=TO ...]
+
+{summary}
+
+Runs until SIGINT or SIGTERM. Its parameters: `ros2 param describe /{name} PARAMETER` while it runs,
+or the README's section {name}."""
+
+
+def answer(name: str, summary: str, arguments: Sequence[str]) -> None:
+    """Print help or the version and end, where the command line asks for one.
+
+    :param arguments: what stands behind the command's name.
+    :raises SystemExit: 0 when something was printed, 2 where an argument is no node's.
+    """
+    end = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
+    own = arguments[:end]
+    if not own:
+        return
+    if own[0] in ("-h", "--help"):
+        print(USAGE.format(name=name, summary=summary))
+        raise SystemExit(0)
+    if own[0] == "--version":
+        print(_version())
+        raise SystemExit(0)
+    print(
+        f"refused to start: {own[0]!r} is no argument of a node; parameters stand behind --ros-args"
+        " as -p NAME:=VALUE",
+        file=sys.stderr,
+    )
+    raise SystemExit(2)
+
+
+def _version() -> str:
+    try:
+        return version("pkm_twin")
+    except PackageNotFoundError:
+        return "pkm_twin, not installed"

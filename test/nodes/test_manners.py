@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node among others: life cycle, parameters, requests that cannot be, and drivers' messages."""
+
+import math
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from test.nodes.harness import SECOND, counts_of, stamp_of, values_of
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from test.nodes.twin import (
+    COMMON,
+    MAKE,
+    MODULE,
+    NAMES,
+    ROBOT,
+    STEP,
+    WINDOW,
+    Q,
+    Twin,
+    state,
+    trajectory,
+)
+
+STRANGE = [10, 99, 255]
+"""Types of parameter values that do not exist."""
+
+
+@pytest.fixture(scope="module", params=["single", "events"])
+def twin(request, peer, launch):
+    """A node that answers, by either executor."""
+    peer.hear(DiagnosticArray, "/diagnostics")
+    name = f"twin_{request.param}"
+    remap = ("-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states")
+    options = (*COMMON, "stale_after:=30", f"executor:={request.param}")
+    process = launch(MODULE, *options, arguments=remap)
+    return Twin(peer, process, name).ready()
+
+
+@pytest.fixture(scope="module")
+def waiting(peer, launch):
+    """A node that is not started by itself."""
+    peer.hear(DiagnosticArray, "/diagnostics")
+    remap = ("-r", "__node:=waiting", "-r", "joint_states:=/waiting/states")
+    process = launch(MODULE, *COMMON, "stale_after:=30.0", "autostart:=false", arguments=remap)
+    return Twin(peer, process, "waiting")
+
+
+def answered(twin):
+    """Whether a stream is, from its first sample on."""
+    stamps = twin.stream(WINDOW + 2)
+    return twin.since(stamps)[-1]
+
+
+def call(twin, kind, service, **fields):
+    return twin.peer.call(kind, f"/{twin.name}/{service}", kind.Request(**fields))
+
+
+def strange(kind):
+    return ParameterMessage(name="stale_after", value=ParameterValue(type=kind))
+
+
+class TestRequests:
+    @pytest.mark.parametrize("kind", STRANGE)
+    def test_a_parameter_of_no_type_is_refused_and_the_next_one_is_set(self, twin, kind):
+        good = Parameter("payload.mass", value=0.25).to_parameter_msg()
+        answer = call(twin, SetParameters, "set_parameters", parameters=[strange(kind), good])
+        assert [result.successful for result in answer.results] == [False, True]
+        assert str(kind) in answer.results[0].reason
+        answer = call(
+            twin, SetParametersAtomically, "set_parameters_atomically", parameters=[strange(kind)]
+        )
+        assert not answer.result.successful
+        assert twin.set(payload__mass=0.0).successful
+        array = twin.diagnostics(lambda a: int(values_of(a)["requests refused"]) >= 2)
+        assert values_of(array)["exceptions"] == "0"
+        answered(twin)
+
+    def test_names_that_are_none_are_answered(self, twin):
+        for names in ([""], ["no such"], ["x" * 10**5], ["\x00", "../.."]):
+            assert not call(twin, GetParameters, "get_parameters", names=names).values
+            call(twin, DescribeParameters, "describe_parameters", names=names)
+            call(twin, ListParameters, "list_parameters", prefixes=names)
+            value = [Parameter(name or "a", value=1.0).to_parameter_msg() for name in names]
+            answer = call(twin, SetParameters, "set_parameters", parameters=value)
+            assert not any(result.successful for result in answer.results)
+        answered(twin)
+
+    def test_a_transition_that_does_not_exist_is_refused(self, twin):
+        for transition in (Transition(id=77), Transition(label="fly"), Transition(id=3)):
+            answer = call(twin, ChangeState, "change_state", transition=transition)
+            if transition.id != 3:
+                assert not answer.success
+        # The last one was a deactivation.
+        activate = Transition(id=Transition.TRANSITION_ACTIVATE)
+        state_now = call(twin, GetState, "get_state").current_state.label
+        if state_now == "inactive":
+            call(twin, ChangeState, "change_state", transition=activate)
+        assert call(twin, GetState, "get_state").current_state.label == "active"
+        answered(twin)
+
+    def test_a_long_name_is_cut(self, twin):
+        names = ("x" * 30_000, *NAMES[1:])
+        twin.send_state(MAKE.joint_state(names, Q, stamp=twin.stamp()))
+        array = twin.diagnostics(lambda a: "missing joint" in counts_of(a, "joint states rejected"))
+        assert all(len(pair.value) < 1000 for pair in array.status[0].values)
+        assert len(array.status[0].message) < 1000
+        assert max(map(len, twin.process.output.splitlines())) < 2000
+        answered(twin)
+
+
+class TestDrivers:
+    """What joint_state_broadcaster sends where an interface is missing."""
+
+    def test_an_effort_that_is_nan_is_absent(self, twin):
+        stamps = twin.stream(WINDOW + 2, effort=(math.nan,) * 3)
+        assert [stamp_of(m) for m in twin.since(stamps)][-1] == stamps[-1]
+        residuals = [stamp_of(m) for m in twin.received("torque_residual")]
+        assert not set(stamps) & set(residuals)
+
+    def test_a_velocity_that_is_nan_is_absent(self, twin):
+        before = counts_of(twin.diagnostics(), "joint states rejected")
+        twin.stream(1, velocity=(math.nan,) * 3)
+        array = twin.diagnostics(lambda a: "no velocities" in counts_of(a, "joint states rejected"))
+        counts = counts_of(array, "joint states rejected")
+        assert counts["no velocities"] == 1 + before.get("no velocities", 0)
+        assert twin.set(acceleration="differentiate").successful
+        try:
+            stamps = twin.stream(WINDOW + 4, velocity=(math.nan,) * 3)
+            assert stamp_of(twin.since(stamps)[-1]) == stamps[-1]
+        finally:
+            assert twin.set(acceleration="trajectory").successful
+
+    def test_joints_of_others_are_ignored(self, twin):
+        answered(twin)
+        stamp = twin.stamp()
+        names = ["gripper", *NAMES, "camera"]
+        rest = MAKE.joint_state(
+            names, [math.nan, *Q, 1e300], [math.inf, 0.1, -0.2, 0.3, math.nan], stamp=stamp
+        )
+        twin.send_state(rest)
+        assert stamp_of(twin.since([stamp])[0]) == stamp
+
+
+class TestTuning:
+    def test_settings_change_while_the_node_runs(self, twin):
+        for values in ({"trip_count": 7}, {"recovery_count": 2}, {"on_stop": "zeros"}):
+            assert twin.set(**values).successful
+        assert twin.set(limit_policy="clamp", effort_limits=(0.2, 20.0, 20.0)).successful
+        try:
+            assert np.array(answered(twin).effort)[0] == pytest.approx(
+                np.clip(answered(twin).effort[0], -0.2, 0.2)
+            )
+        finally:
+            assert twin.set(limit_policy="warn", effort_limits=(20.0, 20.0, 20.0)).successful
+            assert twin.set(trip_count=5, on_stop="nothing").successful
+
+    def test_a_new_window_is_filled_anew(self, twin):
+        answered(twin)
+        assert twin.set(differentiator__window=WINDOW + 2).successful
+        try:
+            stamps = twin.stream(WINDOW + 3)
+            answers = [stamp_of(m) for m in twin.since(stamps)]
+            assert answers == stamps[WINDOW + 1 :]
+        finally:
+            assert twin.set(differentiator__window=WINDOW).successful
+
+    def test_whole_numbers_are_taken_for_floats(self, twin):
+        assert twin.set(stale_after=20, gravity=[0, 0, -9]).successful
+        names = ["stale_after", "gravity"]
+        values = call(twin, GetParameters, "get_parameters", names=names).values
+        assert values[0].double_value == 20.0
+        assert list(values[1].double_array_value) == [0.0, 0.0, -9.0]
+        assert twin.set(stale_after=30, gravity=[0.0, 0.0, -9.81]).successful
+
+    def test_parameters_have_descriptions_units_and_ranges(self, twin):
+        names = call(twin, ListParameters, "list_parameters").result.names
+        names = [n for n in names if not n.startswith(("qos_overrides", "use_sim_time", "start_"))]
+        described = call(twin, DescribeParameters, "describe_parameters", names=names).descriptors
+        assert len(described) == len(names) > 20
+        for descriptor in described:
+            assert descriptor.description, descriptor.name
+            number = descriptor.type in (2, 3)
+            assert number == bool(descriptor.floating_point_range or descriptor.integer_range)
+        by_name = {descriptor.name: descriptor for descriptor in described}
+        assert by_name["stale_after"].description.endswith("; s")
+        assert by_name["on_stop"].additional_constraints == "one of nothing, zeros, gravity"
+
+
+class TestReset:
+    def test_a_latched_stop_is_ended_by_a_request(self, twin):
+        answered(twin)
+        nothing = call(twin, Trigger, "reset")
+        assert (nothing.success, nothing.message) == (True, "no stop was latched")
+        twin.stream(5, position=(math.nan, 0.0, 0.0))
+        twin.diagnostics(lambda a: a.status[0].level == b"\x02")
+        assert call(twin, Trigger, "reset").message == "ended: not finite: position of arm_1 is nan"
+        # The window is still full, and nothing is held back.
+        stamps = twin.stream(1)
+        assert [stamp_of(m) for m in twin.since(stamps)] == stamps
+
+    def test_a_reject_does_not_hide_why_the_stream_stands(self, twin):
+        answered(twin)
+        twin.stream(5, position=(math.nan, 0.0, 0.0))
+        twin.send_state(MAKE.joint_state(NAMES[:2], Q[:2], stamp=twin.stamp()))
+        array = twin.diagnostics(
+            lambda a: (
+                a.status[0].level == b"\x02"
+                and "missing joint" in counts_of(a, "joint states rejected")
+            )
+        )
+        assert array.status[0].message == "stopped: not finite: position of arm_1 is nan"
+        assert call(twin, Trigger, "reset").success
+
+
+class TestLongTrajectories:
+    points = 100_000
+
+    def test_the_stream_is_answered_while_a_long_trajectory_is_worked_on(self, twin):
+        times = np.arange(self.points) * 0.001
+        waves = np.outer(times, [3.0, -4.0, 5.0])
+        rows = [
+            0.2 + 0.3 * np.sin(waves),
+            0.3 * np.cos(waves) * [3.0, -4.0, 5.0],
+            -0.3 * np.sin(waves) * [9.0, 16.0, 25.0],
+        ]
+        stamp = twin.stamp()
+        message = MAKE.trajectory(NAMES, [i * STEP for i in range(self.points)], *rows, stamp=stamp)
+        answered(twin)
+        answers = twin.received("joint_trajectory_ff")
+        torques = twin.received("joint_torques")
+        answers.clear()
+        torques.clear()
+        twin.peer.send(f"/{twin.name}/joint_trajectory", message)
+        twin.peer.until(lambda: answers, 120.0, lambda: twin.stream(1))
+        # Of the states that were sent meanwhile.
+        assert len(torques) > 3
+        picked = slice(None, None, 997)
+        efforts = np.array([p.effort for p in answers[0].points[picked]])
+        exact = inverse_dynamics(ROBOT, *(values[picked] for values in rows))
+        assert np.abs(efforts - exact).max() < 1e-9
+        assert len(answers[0].points) == self.points
+
+    def test_more_than_can_wait_is_refused_by_name(self, twin):
+        before = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0)
+        count = 40
+        for _ in range(count):
+            message = trajectory(count=2000, stamp=twin.stamp())
+            for point, time in zip(message.points, range(2000), strict=True):
+                point.time_from_start.sec, point.time_from_start.nanosec = divmod(
+                    time * STEP * 100, SECOND
+                )
+            twin.peer.send(f"/{twin.name}/joint_trajectory", message)
+        answers = twin.received("joint_trajectory_ff")
+
+        def all_told():
+            busy = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0) - before
+            return len(answers) + busy >= count
+
+        twin.peer.until(all_told, 120.0)
+        answers.clear()
+
+
+class TestLifeCycle:
+    def change(self, twin, transition):
+        assert call(twin, ChangeState, "change_state", transition=Transition(id=transition)).success
+
+    def label(self, twin):
+        return call(twin, GetState, "get_state").current_state.label
+
+    def test_a_node_answers_only_while_it_is_active(self, waiting):
+        torques = waiting.received("joint_torques")
+        assert self.label(waiting) == "unconfigured"
+        waiting.stream(WINDOW + 3)
+        array = waiting.diagnostics()
+        assert array.status[0].message == "inactive"
+        self.change(waiting, Transition.TRANSITION_CONFIGURE)
+        assert self.label(waiting) == "inactive"
+        waiting.stream(WINDOW + 3)
+        self.change(waiting, Transition.TRANSITION_ACTIVATE)
+        assert waiting.peer.until(lambda: self.label(waiting) == "active")
+        assert torques == []
+        stamps = waiting.stream(WINDOW + 3)
+        assert waiting.since(stamps)
+        self.change(waiting, Transition.TRANSITION_DEACTIVATE)
+        torques.clear()
+        waiting.stream(WINDOW + 3)
+        array = waiting.diagnostics()
+        assert "inactive" in (array.status[0].message, *values_of(array)["also"].split("; "))
+        assert torques == []
+        self.change(waiting, Transition.TRANSITION_ACTIVATE)
+        # From a stop: the window, then the recovery.
+        stamps = waiting.stream(WINDOW + 3)
+        assert [stamp_of(m) for m in waiting.since(stamps)] == stamps[WINDOW:]
+        self.change(waiting, Transition.TRANSITION_DEACTIVATE)
+        self.change(waiting, Transition.TRANSITION_CLEANUP)
+        assert self.label(waiting) == "unconfigured"
+        self.change(waiting, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+        assert self.label(waiting) == "finalized"
+        assert waiting.process.stop() == 0
+
+    def test_a_node_that_has_heard_nothing_says_so(self, peer, launch):
+        peer.hear(DiagnosticArray, "/diagnostics")
+        launch(MODULE, arguments=("-r", "__node:=alone", "-r", "joint_states:=/alone/states"))
+        array = peer.diagnostics("/alone")
+        assert array.status[0].message == "waiting for joint_states"
+        assert array.status[0].level == b"\x01"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "lines"),
+    [
+        (
+            ("stale_afer:=0.1", "trip_cont:=3"),
+            ["'stale_afer'; did you mean 'stale_after'?", "'trip_cont'; did you mean 'trip_count'"],
+        ),
+        (("executor:=many",), ["valid: events, single"]),
+        (("queue_depth:=0",), ["queue_depth: 0 is refused; allowed: 1 to 100000"]),
+        (
+            ("qos_overrides./delta_dynamics/joint_torques.publisher.lifespan:=0",),
+            ["joint_torques.publisher.lifespan: 0 is refused; allowed: 1 ns or more"],
+        ),
+        (
+            ("qos_overrides./delta_dynamics/joint_torques.publisher.deadline:=-5",),
+            ["joint_torques.publisher.deadline: -5 is refused"],
+        ),
+    ],
+)
+def test_what_is_wrong_at_the_start_is_told_one_a_line(launch, parameters, lines):
+    process = launch(MODULE, *parameters)
+    assert process.wait() == 1
+    output = process.output.strip().splitlines()
+    assert len(output) == len(lines), process.output
+    for line, expected in zip(output, lines, strict=True):
+        assert line.startswith("refused to start: ")
+        assert expected in line
+
+
+def test_a_full_stream_of_states_leaves_nothing_behind(twin):
+    """States come and go in thousands: what is counted is what was sent."""
+    before = values_of(twin.diagnostics())
+    sent = 3000
+    for _ in range(sent):
+        twin.send_state(state(twin.stamp()))
+        twin.peer.spin()
+    keys = ("messages", "lost: joint_states")
+
+    def total(values):
+        return sum(int(values[key]) for key in keys)
+
+    array = twin.diagnostics(lambda a: total(values_of(a)) >= total(before) + sent)
+    assert total(values_of(array)) == total(before) + sent

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The README's tables of topics and parameters are those of the running nodes."""
+
+import re
+
+import pytest
+
+from pkm_twin.apps.nodes import MODULES
+from test.nodes.harness import REPOSITORY
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from rcl_interfaces.srv import ListParameters
+
+README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+OTHERS = re.compile(r"/(rosout|parameter_events|diagnostics|clock)|.*/transition_event")
+MIDDLEWARE = re.compile(r"qos_overrides\..*|use_sim_time|start_type_description_service")
+
+
+def rows(node):
+    """Cells of the tables in the node's section."""
+    section = README.split(f"\n## {node}\n")[1].split("\n## ")[0]
+    for line in section.splitlines():
+        cells = [cell.strip() for cell in line.split("|")]
+        if len(cells) > 3:
+            yield cells[1:-1]
+
+
+@pytest.fixture(scope="module", params=["delta_dynamics", "command_gate", "stiffness_monitor"])
+def node(request, peer, launch):
+    """The node's name, with all topics that parameters can ask for, once it is found."""
+    name = request.param
+    options = {
+        "delta_dynamics": (
+            "publish_commands:=true",
+            "on_stop:=nothing",
+            "publish_reactions:=true",
+        ),
+        "command_gate": ("on_stop:=gravity",),
+        # The robot in whose file the masses are.
+        "stiffness_monitor": ("mechanism:=delta_cu",),
+    }
+    process = launch(MODULES[name], *options[name])
+
+    def found():
+        assert process.alive(), process.output
+        return (name, "/") in peer.node.get_node_names_and_namespaces()
+
+    peer.until(found, 90.0)
+    peer.until(lambda: "joints" in process.output, 90.0)
+    return name
+
+
+def topics(node, found):
+    """Topics by name, reactions as one."""
+    names = {}
+    for topic, kinds in found:
+        if not OTHERS.fullmatch(topic):
+            short = topic.replace(f"/{node}/", "~/").removeprefix("/")
+            names[re.sub("reactions/.*", "reactions/<joint>", short)] = kinds[0].replace(
+                "/msg/", "/"
+            )
+    return names
+
+
+def test_topics(node, peer):
+    written = {"in": {}, "out": {}}
+    for cells in rows(node):
+        if cells[0] in written:
+            written[cells[0]][cells[1].strip("`")] = cells[2]
+
+    def agree():
+        ask = peer.node
+        return written["in"] == topics(
+            node, ask.get_subscriber_names_and_types_by_node(node, "/")
+        ) and written["out"] == topics(node, ask.get_publisher_names_and_types_by_node(node, "/"))
+
+    peer.until(agree)
+
+
+def test_parameters(node, peer):
+    request = ListParameters.Request()
+    found = peer.call(ListParameters, f"/{node}/list_parameters", request).result.names
+    known = {name for name in found if not MIDDLEWARE.fullmatch(name)}
+    table = list(rows(node))
+    begin = next(i for i, cells in enumerate(table) if cells[0] == "parameter")
+    assert {name for cells in table[begin:] for name in re.findall(r"`([^`]+)`", cells[0])} == known
