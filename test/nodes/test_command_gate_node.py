@@ -206,4 +206,4 @@ def test_a_bad_configuration_is_refused_in_one_line(launch, parameters, named):
 def test_without_a_name_it_waits_for_the_node_of_the_default_name(heard, launch):
     process = launch(GATE)
     heard.until(lambda: heard.node.count_subscribers("/delta_dynamics/joint_torques") == 1, 60.0)
-    assert process.stop()[0] == 0
+    assert process.stop() == 0
