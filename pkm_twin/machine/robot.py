@@ -44,7 +44,6 @@ SINGULARITY_BOUND: Final = 1e-9
 """Least singularity measure (0 singular, 1 best) at which a Jacobian is inverted."""
 
 _NONE: Final = np.zeros(0)
-_UNKNOWN: Final = object()
 
 
 def length(**options: Any) -> Any:
@@ -261,18 +260,16 @@ class Robot:
 
     @cached_property
     def calls(self) -> dict[str, Any]:
-        """Functions for one sample that are made once a robot, by name; None: there is none."""
+        """Functions for one sample, made once a robot, by name."""
         return {}
 
     def call_one(
         self, name: str, kernel: Callable[[], Kernel], p: Array, *inputs: Any
     ) -> Array | None:
         """First output of one good sample, as fast as can be; None where it takes a batch's way."""
-        call = self.calls.get(name, _UNKNOWN)
-        if call is _UNKNOWN:
-            call = self.calls[name] = kernel().first_of_one(p)
+        call = self.calls.get(name)
         if call is None:
-            return None
+            call = self.calls[name] = kernel().first_of_one(p)
         try:
             result: Array | None = call(*inputs)
         except (TypeError, ValueError):
@@ -291,7 +288,7 @@ class Robot:
     @cached_property
     def own_inertial(self) -> Array:
         """The same without the payload."""
-        return schema.frozen(self._layout.pack(self.gravity, self.friction))
+        return schema.frozen(self._layout.pack(self.graph, self.gravity, self.friction))
 
     @property
     def _layout(self) -> Layout:

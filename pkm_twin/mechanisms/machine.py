@@ -45,6 +45,7 @@ from pkm_twin.machine.robot import (
     limits_of,
     mass,
 )
+from pkm_twin.machine.robot_urdf import robot_description
 
 Array = NDArray[np.float64]
 
@@ -323,6 +324,10 @@ class Machine(Robot):
     def make_graph(self) -> Graph:
         """The graph of the file."""
         return self.described
+
+    def parameter_sections(self) -> dict[str, Any]:
+        """The machine written out, limbs turned."""
+        return robot_description(self)
 
     def home(self) -> Array:
         """The pose at home, shape (m,)."""
