@@ -81,7 +81,9 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
         ),
     ]
     for section, value in data["parameters"].items():
-        if section not in ("mechanism", "name", "joints"):
+        if section not in ("mechanism", "name") and not (
+            section == "joints" and isinstance(value, list)
+        ):
             rows += _rows(section, value, data["parameter_units"].get(section, ""))
     return rows
 

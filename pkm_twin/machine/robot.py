@@ -345,18 +345,8 @@ class Robot:
 
     def parameter_units(self) -> dict[str, Any]:
         """Units of the same, by section; empty where a parameter has none."""
-        words = {"{joint}": self.joint_unit, "{effort}": self.effort_unit}
-
-        def told(unit: Any) -> Any:
-            if isinstance(unit, dict):
-                return {name: told(entry) for name, entry in unit.items()}
-            for word, meant in words.items():
-                unit = unit.replace(word, meant)
-            return unit
-
-        names = self.parameter_sections()
-        found: dict[str, Any] = told({n: u for n, u in schema.units(self).items() if n in names})
-        return found
+        words = {"joint": self.joint_unit, "effort": self.effort_unit}
+        return schema.units(type(self), self.parameter_sections(), words)
 
     @cached_property
     def joints_count(self) -> int:

@@ -2,8 +2,8 @@
 """Parameter files: strict YAML to frozen dataclasses, each refusal naming field and bound.
 
 A mechanism declares its schema as frozen dataclasses whose fields are made by the functions below.
-A field's metadata hold its ``check``, its ``key`` in the file, its ``unit`` (``{joint}`` and
-``{effort}`` stand for those of the actuated joints), its ``bound`` in words, its ``default``, and
+A field's metadata hold its ``check``, its ``key`` in the file, its ``unit`` (``{joint}``,
+``{effort}`` and ``{rotor}`` stand for those of the actuated joints), its ``bound`` in words, its ``default``, and
 of a nested section its ``section``. May import: numpy, yaml, the standard library.
 """
 
@@ -375,13 +375,24 @@ def plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def units(value: Any) -> dict[str, Any]:
-    """Units of a section's fields by name, of nested sections as mappings; as :func:`plain`."""
-    return {
-        f.name: units(entry) if dataclasses.is_dataclass(entry) else f.metadata.get("unit", "")
-        for f in dataclasses.fields(value)
-        for entry in [getattr(value, f.name)]
-    }
+def units(kind: type, data: Mapping[str, Any], words: Mapping[str, str]) -> dict[str, Any]:
+    """Units of a section's plain data by key, of nested sections as mappings; no unit is empty.
+
+    :param kind: the section's schema.
+    :param words: what stands for ``{joint}`` and ``{effort}`` in them.
+    """
+    fields = {}
+    for f in dataclasses.fields(kind):
+        fields |= {f.name: f.metadata, f.metadata.get("key") or f.name: f.metadata}
+    result: dict[str, Any] = {}
+    for key, value in data.items():
+        metadata = fields.get(key, {})
+        nested = metadata.get("section")
+        if nested is not None and isinstance(value, Mapping):
+            result[key] = units(nested, value, words)
+        else:
+            result[key] = metadata.get("unit", "").format_map(words)
+    return result
 
 
 def frozen(values: object) -> Array:

@@ -157,7 +157,7 @@ class JointSpec:
     home: float = schema.number(unit="{joint}", default=0.0)
     limits: LimitSpec | None = schema.section(LimitSpec, default=None)
     friction: FrictionSpec | None = schema.section(FrictionSpec, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, unit="kg m2 or kg", default=0.0)
+    rotor_inertia: float = schema.number(at_least=0.0, unit="{rotor}", default=0.0)
     drive: DriveSpec | None = schema.section(DriveSpec, default=None)
     compliance: Array | None = compliances(default=None)
 
@@ -224,6 +224,8 @@ KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "ro
 _KEYS: Final = (
     "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs",
 )  # fmt: skip
+_TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
+_SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
 _TURNED: Final = ("com", "at", "axis", "axes", "ends")
 
 
@@ -328,6 +330,18 @@ class Machine(Robot):
     def parameter_sections(self) -> dict[str, Any]:
         """The machine written out, limbs turned."""
         return robot_description(self)
+
+    def parameter_units(self) -> dict[str, Any]:
+        """Units of the same, of each joint by its own type."""
+        sections = self.parameter_sections()
+        result = schema.units(type(self), sections, {}) | {"origin": "m"}
+        for kind, spec in KINDS.items():
+            result[kind] = {}
+            for name, entry in sections.get(kind, {}).items():
+                slides = FREEDOMS.get(entry.get("type", ""), "") == "P"
+                words = _SLIDING if slides else _TURNING
+                result[kind][name] = schema.units(spec, entry, words)
+        return result
 
     def home(self) -> Array:
         """The pose at home, shape (m,)."""

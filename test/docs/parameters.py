@@ -27,6 +27,7 @@ UNITS = {
     "{joint}/s": "rad/s or m/s",
     "{joint}": "rad or m",
     "{effort}": "N m or N",
+    "{rotor}": "kg m2 or kg",
 }
 MACHINE = """## `mechanism: machine`
 
