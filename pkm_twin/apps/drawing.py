@@ -109,7 +109,7 @@ def _lines(ax: Any, places: Array, colour: str, width: float) -> None:
 
 def _platform(ax: Any, places: Array) -> None:
     """A face around the joints of the platform where they span one, and lines in any case."""
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
     origin, joints = places[-1], places[:-1]
     middle = joints.mean(0)

@@ -3,8 +3,10 @@
 
 A mechanism declares its schema as frozen dataclasses whose fields are made by the functions below.
 A field's metadata hold its ``check``, its ``key`` in the file, its ``unit`` (``{joint}``,
-``{effort}`` and ``{rotor}`` stand for those of the actuated joints), its ``bound`` in words, its ``default``, and
-of a nested section its ``section``. May import: numpy, yaml, the standard library.
+``{effort}`` and ``{rotor}`` stand for those of the actuated joints), its ``bound`` in words, its
+``default``, and of a nested section its ``section``.
+
+May import: numpy, yaml, the standard library.
 """
 
 from __future__ import annotations
@@ -381,7 +383,7 @@ def units(kind: type, data: Mapping[str, Any], words: Mapping[str, str]) -> dict
     :param kind: the section's schema.
     :param words: what stands for ``{joint}`` and ``{effort}`` in them.
     """
-    fields = {}
+    fields: dict[str, Mapping[Any, Any]] = {}
     for f in dataclasses.fields(kind):
         fields |= {f.name: f.metadata, f.metadata.get("key") or f.name: f.metadata}
     result: dict[str, Any] = {}
