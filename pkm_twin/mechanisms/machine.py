@@ -482,7 +482,7 @@ def _written_out(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
                 raise UnknownNameError(f"{path}{key}", key, ("azimuths", *KINDS))
         azimuths = schema.checked(schema.many(), f"{path}azimuths", section.get("azimuths"))
         for i, azimuth in enumerate(azimuths):
-            check_angles(azimuth, f"{path}azimuths[{i}]")
+            check_angles(float(azimuth), f"{path}azimuths[{i}]")
         own = set(_section(section, "bodies", path))
         checked: dict[str, dict[str, Any]] = {
             kind: {

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from pkm_twin import load, robot_names
-from pkm_twin.apps.recorded import why_no_torques
 from stiffness_monitor import compliance, strain_energy
 from test.commands.conftest import REPOSITORY
 
