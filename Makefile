@@ -72,6 +72,7 @@ scale: $(VENV)/test.stamp
 
 pages: $(VENV)/test.stamp
 	$(BIN)/python -m test.docs.parameters docs/parameters.md
+	$(BIN)/python -m test.docs.engine docs/engine.md
 	$(BIN)/python -m test.docs.architecture docs/architecture.png
 	$(BIN)/python -m test.docs.robots docs/gallery
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from test.docs import parameters
+from test.docs import engine, parameters
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -61,3 +61,9 @@ def test_a_new_machine_from_an_empty_file_to_torques(tmp_path):
 def test_the_parameters_page_is_that_of_the_schemas():
     """Else `make pages` writes it anew."""
     assert (DOCS / "parameters.md").read_text(encoding="utf-8") == parameters.page()
+
+
+def test_the_sizes_of_the_engine_are_todays():
+    """Else `make pages` writes them anew."""
+    page = (DOCS / "engine.md").read_text(encoding="utf-8")
+    assert engine.rewritten(page) == page
