@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from test.docs import engine, parameters
+from test.docs import architecture, engine, parameters
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -67,3 +67,12 @@ def test_the_sizes_of_the_engine_are_todays():
     """Else `make pages` writes them anew."""
     page = (DOCS / "engine.md").read_text(encoding="utf-8")
     assert engine.rewritten(page) == page
+
+
+def test_the_arrows_of_the_picture_go_down():
+    places = architecture.PLACES
+    pairs = architecture.arrows()
+    assert {name for pair in pairs for name in pair} == set(places)
+    for here, there in pairs:
+        if {here, there} != {"machine", "kinematics"}:
+            assert places[there][1] < places[here][1], f"{here} imports {there}"
