@@ -23,7 +23,7 @@ PLACES = {
     "mechanisms": (2.0, 2.0),
     "machine": (1.0, 1.0),
     "kinematics": (3.0, 1.0),
-    "ros.messages": (5.2, 0.7),
+    "ros.messages": (5.2, 1.4),
     "bags": (-1.2, 0.7),
     "codegen": (2.0, 0.0),
 }
