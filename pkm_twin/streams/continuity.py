@@ -146,10 +146,7 @@ class Continuity:
         greatest = max(state.greatest, last.greatest)
         # What is predicted is no longer than the joints' move times the greatest singular value,
         # so most samples need no more than two lengths.
-        if (
-            _length(shift) + 0.5 * greatest * _length(move * self._joints)
-            <= self._largest
-        ):
+        if _length(shift) + 0.5 * greatest * _length(move * self._joints) <= self._largest:
             return
         # What the mean of both rates predicts errs by the third power of the move; how much, the
         # change of the rates tells. Half of what is predicted is for where they turn between.
