@@ -22,7 +22,7 @@ from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
 from pkm_twin.bags.cdr import message_definition
-from pkm_twin.errors import MessageError
+from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import MAX_MASS, Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
@@ -77,6 +77,11 @@ class DeltaDynamics(health.TwinNode):
         robot = _changed(robot, self._declare_changes(robot))
         self._feedforward = Feedforward(robot, self._declare_settings())
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
+        if commands and "on_stop" not in self._parameter_overrides:
+            # A controller of plain commands holds the last one for ever.
+            raise ParameterError(
+                "on_stop", None, "nothing, zeros or gravity, by name where publish_commands is true"
+            )
         self._trajectory = self.create_guarded_publisher(JointTrajectory, "~/joint_trajectory_ff")
         # A torque is worth nothing once the stream that it answers would be stale.
         stale_after = self._feedforward.settings.stale_after
@@ -114,6 +119,7 @@ class DeltaDynamics(health.TwinNode):
             awaited=True,
             expires=lambda: self._feedforward.settings.stale_after,
         )
+        self._action = self._create_action()
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
         self._last_heard = 0
@@ -184,6 +190,29 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
         return level, message, values
+
+    def _create_action(self) -> Any:
+        """The action ``~/follow_joint_trajectory``, where a controller is named."""
+        controller = self.declare(
+            "controller_action",
+            "",
+            "FollowJointTrajectory action of the controller that ~/follow_joint_trajectory "
+            "forwards to; empty: none",
+            read_only=True,
+        )
+        if not controller:
+            return None
+        try:
+            from delta_dynamics.action_node import EffortAction
+        except ImportError as error:
+            raise ParameterError(
+                "controller_action", controller, f"empty without control_msgs ({error})"
+            ) from error
+        return EffortAction(
+            self,
+            controller,
+            lambda trajectory: self._feedforward.trajectory_steps(trajectory, self.now()),
+        )
 
     def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
         """A publisher for each joint's reaction, where the parameter asks for them."""

@@ -45,7 +45,14 @@ def inverse_dynamics(
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
     load = _NO_WRENCH if wrench is None else wrench
-    tau = robot.call_one("torques", lambda: torques(robot), robot.inertial, q, qd, qdd, load)
+    # As Robot.call_one, without its call: a stream's sample takes a microsecond or two.
+    call = robot.calls.get("torques")
+    if call is None:
+        call = robot.calls["torques"] = torques(robot).first_of_one(robot.inertial)
+    try:
+        tau: Array | None = call(q, qd, qdd, load)
+    except (TypeError, ValueError):
+        tau = None
     if tau is not None:
         return tau
     (efforts,), status = torques(robot)(robot.inertial, q, qd, qdd, load)
@@ -198,7 +205,7 @@ class Forces:
         return axis @ (m.velocity(b, joint.at) - m.speed[a] - cross(m.omega[a], lever)), second
 
     def _pair(self, joint: Joint, amount: Any) -> None:
-        """An effort along a joint's freedom on its outer body, and the opposite on its inner one."""
+        """An effort along a joint's freedom on its outer body, its opposite on the inner one."""
         m, a, b = self.motion, joint.inner, joint.outer
         load = m.direction(a, joint.axes[0]) * amount
         if FREEDOMS[joint.kind] == "R":

@@ -19,7 +19,8 @@ class ParameterError(PkmTwinError, ValueError):
     """
 
     def __init__(self, field: str, value: object, bound: str) -> None:
-        super().__init__(f"{field}: {_short(value)} is refused; allowed: {bound}")
+        text = f"{field}: {_short(value)} is refused; allowed: {bound}"
+        super().__init__(one_line(text, 2000))
         self.field = field
         self.value = value
         self.bound = bound
@@ -119,10 +120,23 @@ class BagError(PkmTwinError):
     ) -> None:
         where = f"{path}: " if path is not None else ""
         at = f" (byte {offset})" if offset is not None else ""
-        super().__init__(f"{where}{message}{at}")
+        super().__init__(f"{where}{one_line(message)}{at}")
         self.path = None if path is None else Path(path)
         self.reason = reason
         self.offset = offset
+
+
+def one_line(text: str, limit: int = 400) -> str:
+    """A text from elsewhere as part of a line: unprintable characters escaped, the middle cut.
+
+    ``limit`` is the most characters that come back.
+    """
+    # Each character may become ten: what cannot be shown is not escaped first.
+    half = limit // 2
+    if len(text) > 2 * limit:
+        text = f"{text[:limit]}{text[-limit:]}"
+    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    return shown if len(shown) <= limit else f"{shown[: half - 5]} ... {shown[5 - half :]}"
 
 
 def _short(value: object) -> str:

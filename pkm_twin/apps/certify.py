@@ -22,6 +22,7 @@ from pkm_twin.apps.certificate.description import UnfitError
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import States, random_states
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.robot_urdf import robot_description
 
 Array = NDArray[np.float64]
 
@@ -142,7 +143,7 @@ def certify(
 
     :param robot: what is judged.
     :param description: the same machine as a ``mechanism: machine`` mapping; of a robot that is
-        loaded it is ``robot.description_data``.
+        loaded it is ``robot_description(robot)``.
     :param states: how many random states inside the limits.
     :param seed: where the random numbers begin.
     :param engines: names out of ``ENGINES``; what is not installed is told, not raised.
@@ -186,7 +187,7 @@ def certify(
 
 def certificate_of(robot: Any, **options: Any) -> Certificate:
     """As :func:`certify`, with the description that the robot brings."""
-    return certify(robot, robot.description_data, **options)
+    return certify(robot, robot_description(robot), **options)
 
 
 def _own(robot: Any, states: States) -> list[Item]:

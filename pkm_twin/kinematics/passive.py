@@ -111,7 +111,10 @@ def passive_program(t: Traced) -> Program:
                 values += list(t.x[k + 4 : k + 7])
             values += _three_angles(parent.T @ motion.turned(link.body))
             continue
-        values += [t.x[step.position] for step in steps]
+        # A joint of one freedom has its own value at home.
+        single = link.joint is not None and len(steps) == 1
+        home = tree.graph.joints[str(link.joint)].home if single else 0.0
+        values += [t.x[step.position] + home for step in steps]
     for rod in t.engine.graph.rods.values():
         start, end = motion.point(rod.inner, rod.ends[0]), motion.point(rod.outer, rod.ends[1])
         along = unit(rod.ends[1] - rod.ends[0])

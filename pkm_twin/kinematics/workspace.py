@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,42 +18,99 @@ from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CLEAR: Final = 0.01
+"""Singularity measure (0 in one, 1 at best) that regular workspaces stay above."""
 
 
-def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> NDArray[np.bool_]:
+def try_inverse(robot: Robot, pose: ArrayLike) -> tuple[Array, Mask]:
+    """Joint positions of poses, shape (..., n), and where there are any, shape (...).
+
+    Where there are none, or the pose is not finite, they are those at home.
+    """
+    q, good = robot.try_inverse(pose)
+    return np.where(good[..., None], q, robot.graph.home), good
+
+
+def try_forward(robot: Robot, q: ArrayLike) -> tuple[Array, Mask]:
+    """Poses of joint positions, shape (..., m), and where there are any; zero elsewhere."""
+    pose, good = robot.try_forward(q)
+    return np.where(good[..., None], pose, 0.0), good
+
+
+def singularity_at(robot: Robot, pose: ArrayLike) -> Array:
+    """``Robot.singularity`` at poses: 0 in a singularity or where no joints reach, shape (...).
+
+    :param pose: shape (..., m), m and rad.
+    """
+    q, good = try_inverse(robot, pose)
+    rates, found = robot.try_jacobian(q)
+    good &= found
+    measure = np.zeros(good.shape)
+    measure[good] = robot.singularity_of(rates[good])
+    return measure
+
+
+def has_joint_angles(robot: Robot) -> bool:
+    """Whether the machine bounds the angles of its passive joints."""
+    return robot.limit_angles(np.zeros(len(robot.pose_names))) is not None
+
+
+def joint_angle_at(robot: Robot, pose: ArrayLike) -> Array:
+    """Largest angle of a passive joint, rad, shape (...); NaN where no joints reach the pose.
+
+    Between a limb and the vertical, or a limb and the platform's normal (2UPR-RPU paper, equation
+    40).
+
+    :raises ParameterError: a machine whose passive joints have no such angles.
+    """
+    with np.errstate(all="ignore"):
+        angles = robot.limit_angles(pose)
+    if angles is None:
+        raise ParameterError("limits", robot.name, "a machine with a bound on passive joint angles")
+    _, good = robot.try_inverse(pose)
+    return np.where(good, angles.max(-1), np.nan)
+
+
+def within_limits(robot: Robot, q: ArrayLike) -> Mask:
+    """Whether joint positions keep the limits of the actuators, shape (...); absent ones hold."""
+    values, limits = np.asarray(q, np.float64), robot.limits.position
+    if limits is None:
+        return np.ones(values.shape[:-1], bool)
+    return np.asarray(((values >= limits[:, 0]) & (values <= limits[:, 1])).all(-1))
+
+
+def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Mask:
     """Whether poses keep the limits of actuators and passive joints and limbs apart, shape (...).
 
-    A passive joint's angle is that between its limb and the vertical, and between its limb and
-    the platform's normal (2UPR-RPU paper, equation 40). A pose also has to be on the branch that
-    ``forward`` gives. Limits that are absent hold everywhere; a pose that is not finite raises.
+    A pose also has to be on the branch that ``forward`` gives. Limits that are absent hold
+    everywhere; a pose that is not finite raises.
 
-    :param pose: shape (..., 3), in the robot's pose parameters, m and rad.
+    :param pose: shape (..., m), in the robot's pose coordinates, m and rad.
     :param least_clearance: what :func:`clearance` has to be above, m; -inf lets limbs meet. It
         bounds no robot whose clearance is not known.
     """
     poses = np.asarray(pose, np.float64)
     if not np.isfinite(poses).all():
         raise ValueError("a pose is not finite")
-    q, inside = robot.try_inverse(poses)
-    back, found = robot.try_forward(np.where(inside[..., None], q, 0.0))
-    scale = 1e-6 * (1.0 + np.abs(poses))
-    inside &= found
-    inside &= (np.abs(np.where(inside[..., None], back, np.inf) - poses) < scale).all(-1)
-    limits = robot.limits.position
-    if limits is not None:
-        with np.errstate(invalid="ignore"):
-            inside &= ((q >= limits[:, 0]) & (q <= limits[:, 1])).all(-1)
+    q, inside = try_inverse(robot, poses)
+    back, good = try_forward(robot, q)
+    inside &= good & (np.abs(back - poses) < 1e-6 * (1.0 + np.abs(poses))).all(-1)
+    inside &= within_limits(robot, q)
     bound = getattr(robot.limits, "joint_angle", None)
-    angles = None if bound is None else robot.limit_angles(poses)
-    if bound is not None and angles is not None:
-        with np.errstate(invalid="ignore"):
-            inside &= (angles <= bound).all(-1)
+    if bound is not None and has_joint_angles(robot):
+        # NaN is not below.
+        inside &= joint_angle_at(robot, poses) <= bound
     if has_clearance(robot) and least_clearance > -math.inf:
         # The dearest test, so only where all others hold.
-        inside = np.asarray(inside)
-        gap = joint_clearance(robot, q[inside], refuse=False)
-        inside[inside] = gap > least_clearance
-    return np.asarray(inside)
+        inside[inside] = joint_clearance(robot, q[inside], refuse=False) > least_clearance
+    return inside
+
+
+def distance_unit(robot: Robot) -> str:
+    """Unit of the distance from the axis of a cylinder of poses: ``m`` or ``rad``."""
+    return robot.pose_units[robot.pose_names.index(robot.grid().lateral[0])]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,29 +170,32 @@ def regular_workspace(
 ) -> RegularWorkspace:
     """Largest circle of reachable tilts about the axis at each height.
 
-    2UPR-RPU paper, section 4: heights whose circle is smaller than ``least_radius`` are left out.
+    Clear of singularities by ``CLEAR``. Heights whose circle is smaller than ``least_radius`` are
+    left out (2UPR-RPU paper, section 4).
 
     :param z: heights, shape (n,), m.
     :param directions: rays a circle.
     :param step: first search along a ray, rad; a bisection refines it to 1e-9 rad.
     """
-    if robot.limit_angles(np.zeros(len(robot.pose_names))) is None:
-        raise ParameterError("mechanism", robot.mechanism, "a mechanism with two tilts (upr_rpu)")
+    grid = robot.grid()
+    if grid.kind == "box" or grid.zero_torsion or distance_unit(robot) != "rad":
+        raise ParameterError(
+            "mechanism", robot.mechanism, "a height and two tilts side by side (as upr_rpu)"
+        )
     heights = np.atleast_1d(np.asarray(z, np.float64))
     turn = np.arange(directions) * (2 * np.pi / directions)
-    rays = np.column_stack((np.cos(turn), np.sin(turn)))
     ladder = np.arange(0.0, math.pi / 2, step)
 
-    def inside(radius: Array) -> NDArray[np.bool_]:
+    def inside(radius: Array) -> Mask:
         """Of radii (n, directions, ...), whether those points are reachable."""
-        extra = radius.ndim - 2
-        poses = np.empty((*radius.shape, 3))
-        poses[..., 0] = heights.reshape(-1, *[1] * (extra + 1))
-        poses[..., 1:] = radius[..., None] * rays.reshape(1, directions, *[1] * extra, 2)
-        return reachable(robot, poses)
+        extra = [1] * (radius.ndim - 2)
+        poses = grid.polar_pose(heights.reshape(-1, 1, *extra), radius, turn.reshape(-1, *extra))
+        kept = reachable(robot, poses)
+        kept[kept] = singularity_at(robot, poses[kept]) >= CLEAR
+        return kept
 
-    grid = np.broadcast_to(ladder, (len(heights), directions, len(ladder)))
-    outside = ~inside(grid)
+    rungs = np.broadcast_to(ladder, (len(heights), directions, len(ladder)))
+    outside = ~inside(rungs)
     first = np.where(outside.any(-1), outside.argmax(-1), len(ladder))
     low = step * np.maximum(first - 1, 0)
     high = step * first

@@ -55,7 +55,8 @@ def unit(vector: ArrayLike) -> Array:
 def across(axis: Array) -> tuple[Array, Array]:
     """Two unit vectors across an axis and each other, right-handed with it."""
     first = np.zeros(3)
-    first[int(np.argmin(np.abs(axis)))] = 1.0
+    # Rounded: where two components are equal, the last bit must not choose.
+    first[int(np.argmin(np.round(np.abs(axis), 9)))] = 1.0
     first = unit(np.cross(axis, first))
     return first, np.cross(axis, first)
 

@@ -31,6 +31,8 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.graph import FREEDOMS, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.members import Beam, Structure
+from pkm_twin.machine.pose_grid import PoseGrid
+from pkm_twin.machine.reach import position_box
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,7 +44,6 @@ SINGULARITY_BOUND: Final = 1e-9
 """Least singularity measure (0 singular, 1 best) at which a Jacobian is inverted."""
 
 _NONE: Final = np.zeros(0)
-_UNKNOWN: Final = object()
 
 
 def length(**options: Any) -> Any:
@@ -258,18 +259,16 @@ class Robot:
 
     @cached_property
     def calls(self) -> dict[str, Any]:
-        """Functions for one sample that are made once a robot, by name; None: there is none."""
+        """Functions for one sample, made once a robot, by name."""
         return {}
 
     def call_one(
         self, name: str, kernel: Callable[[], Kernel], p: Array, *inputs: Any
     ) -> Array | None:
         """First output of one good sample, as fast as can be; None where it takes a batch's way."""
-        call = self.calls.get(name, _UNKNOWN)
-        if call is _UNKNOWN:
-            call = self.calls[name] = kernel().first_of_one(p)
+        call = self.calls.get(name)
         if call is None:
-            return None
+            call = self.calls[name] = kernel().first_of_one(p)
         try:
             result: Array | None = call(*inputs)
         except (TypeError, ValueError):
@@ -288,7 +287,7 @@ class Robot:
     @cached_property
     def own_inertial(self) -> Array:
         """The same without the payload."""
-        return schema.frozen(self._layout.pack(self.gravity, self.friction))
+        return schema.frozen(self._layout.pack(self.graph, self.gravity, self.friction))
 
     @property
     def _layout(self) -> Layout:
@@ -318,6 +317,30 @@ class Robot:
     def effort_units(self) -> tuple[str, ...]:
         """Units of the efforts, ``N m`` or ``N``."""
         return tuple("N" if unit == "m" else "N m" for unit in self.joint_units)
+
+    @property
+    def joint_unit(self) -> str:
+        """Unit of q where the joints are of one kind, else ``rad or m``."""
+        return _common(self.joint_units)
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of the efforts where the joints are of one kind, else ``N m or N``."""
+        return _common(self.effort_units)
+
+    @property
+    def has_masses(self) -> bool:
+        """Whether the robot's file gives what dynamics need."""
+        try:
+            self.massive()
+        except ParameterError:
+            return False
+        return True
+
+    def parameter_sections(self) -> dict[str, Any]:
+        """The parameters by section, as plain data."""
+        fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
+        return {name: schema.plain(getattr(self, name)) for name in fields}
 
     @cached_property
     def joints_count(self) -> int:
@@ -538,6 +561,25 @@ class Robot:
             self.refuse_joints(status, q)
         return flat
 
+    def grid(self) -> PoseGrid:
+        """How atlases lay out this machine's poses; without an axis of its own, as a box."""
+        return PoseGrid("box", self.pose_names)
+
+    def search_box(self) -> Array:
+        """Bounds outside of which no pose of the workspace lies, shape (m, 2), m and rad.
+
+        :raises ParameterError: what is missing that would bound the workspace.
+        """
+        place = position_box(self.graph, self.limits.position)
+        rows = []
+        for c in self.coordinates:
+            if c.axis is not None:
+                rows.append(place[c.axis])
+            else:
+                far = np.pi if len(c.entries) == 2 else np.pi / 2
+                rows.append(np.array([-far, far]))
+        return np.array(rows)
+
     def changed(self: R, **sections: Mapping[str, object] | object) -> R:
         """A copy with new values, e.g. ``payload={"mass": 0.2}, gravity=[0, 0, -9.81]``.
 
@@ -582,6 +624,10 @@ class Robot:
         if measure is not None:
             raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached)
         raise UnreachableError("joint state", part, index, miss, reached)
+
+
+def _common(units: Sequence[str]) -> str:
+    return " or ".join(sorted(set(units), reverse=True))
 
 
 def _first(codes: Array) -> tuple[int, ...] | None:

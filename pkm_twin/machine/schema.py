@@ -352,6 +352,15 @@ def replace(section_value: T, changes: Mapping[str, object], path: str) -> T:
     return result
 
 
+def plain(value: Any) -> Any:
+    """Dataclasses, arrays and tuples as mappings and lists."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return list(value) if isinstance(value, tuple) else value
+
+
 def frozen(values: object) -> Array:
     """A read-only float array."""
     array = np.array(values, dtype=np.float64)

@@ -33,6 +33,7 @@ from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, Rod, array
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
+from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import Inverse, Robot, check_azimuths, length, mass
 
 Array = NDArray[np.float64]
@@ -250,7 +251,7 @@ class Delta(Robot):
         """The limb that stands apart from the two closest elbows, of rods that do not meet."""
         g = self.geometry
         if "rcu" in g.closures:
-            return g.closures.index("rcu"), 0.0
+            return None
         centres = np.array(
             [self._elbow(i, q[i]) - g.platform_radius * self._directions(i)[0] for i in range(3)],
             float,
@@ -264,6 +265,23 @@ class Delta(Robot):
         sides = [float(np.linalg.norm(centres[i] - centres[(i + 1) % 3])) for i in range(3)]
         apart = (int(np.argmin(sides)) + 2) % 3
         return (apart, miss) if miss > 0.0 else None
+
+    def grid(self) -> PoseGrid:
+        """Places about the vertical axis."""
+        return PoseGrid("cylinder", self.pose_names, "z", ("x", "y"))
+
+    def search_box(self) -> Array:
+        """Each platform joint is within arm and forearm of its pivot, below the highest elbow."""
+        g = self.geometry
+        far = g.arm_length + g.forearm_length
+        out = g.base_radius - g.platform_radius
+        box = np.empty((3, 2))
+        for k, cosines in enumerate((np.cos(g.azimuths), np.sin(g.azimuths))):
+            box[k] = (out * cosines).max() - far, (out * cosines).min() + far
+        # An arm at a negative angle points up.
+        low = -np.pi / 2 if self.limits.position is None else float(self.limits.position.min())
+        box[2] = -far, g.arm_length * np.sin(min(max(-low, 0.0), np.pi / 2))
+        return box
 
     def make_graph(self) -> Graph:
         """Arms on the base, forearms as parallelograms or on an rcu's joints, a platform."""

@@ -45,6 +45,7 @@ from pkm_twin.machine.robot import (
     limits_of,
     mass,
 )
+from pkm_twin.machine.robot_urdf import robot_description
 
 Array = NDArray[np.float64]
 
@@ -316,6 +317,10 @@ class Machine(Robot):
         """The graph of the file."""
         return self.described
 
+    def parameter_sections(self) -> dict[str, Any]:
+        """The machine written out, limbs turned."""
+        return robot_description(self)
+
     def home(self) -> Array:
         """The pose at home, shape (m,)."""
         return self.engine.home_pose.copy()
@@ -457,7 +462,7 @@ def _written_out(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         for i, azimuth in enumerate(azimuths):
             check_angles(azimuth, f"{path}azimuths[{i}]")
         own = set(_section(section, "bodies", path))
-        checked = {
+        checked: dict[str, dict[str, Any]] = {
             kind: {
                 name: schema.build(spec, entry, f"{path}{kind}.{name}")
                 for name, entry in _section(section, kind, path).items()
@@ -488,8 +493,9 @@ def _turned(entry: Any, azimuth: float, own: set[str], number: int) -> Any:
         new["inertia"] = array(rotation @ entry.inertia @ rotation.T)
         m = entry.member
         if m is not None:
-            ends = {"start": array(rotation @ m.start), "end": array(rotation @ m.end)}
-            new["member"] = dataclasses.replace(m, **ends)
+            new["member"] = dataclasses.replace(
+                m, start=array(rotation @ m.start), end=array(rotation @ m.end)
+            )
     else:
         new["between"] = tuple(f"{b}_{number}" if b in own else b for b in entry.between)
     return dataclasses.replace(entry, **new)

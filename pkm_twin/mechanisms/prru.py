@@ -42,6 +42,7 @@ from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
+from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import Inverse, Robot, check_azimuths, length, mass
 
 Array = NDArray[np.float64]
@@ -216,6 +217,24 @@ class Prru(Robot):
         measure = determinant * float(-sign / (2 * l**3 * scale))
         # Where gamma is not told, there is no measure either.
         return Inverse(q, misses, measure * (norm / maximum(norm, 1e-9)))
+
+    def grid(self) -> PoseGrid:
+        """Tilts about the vertical axis, in tilt-and-torsion angles without torsion."""
+        return PoseGrid("cylinder", self.pose_names, "z", ("alpha", "beta"), zero_torsion=True)
+
+    def search_box(self) -> Array:
+        """Each platform joint is within a limb of its slider; tilts up to a right angle.
+
+        :raises ParameterError: sliders without limits travel without end.
+        """
+        g, travel = self.geometry, self.limits.position
+        if travel is None:
+            raise ParameterError(
+                "limits.position", None, "limits of the sliders: without them z has no end"
+            )
+        reach, right = g.limb_length + g.platform_radius, np.pi / 2
+        z = float(travel.min()) - reach, float(travel.max()) + reach
+        return np.array([z, (-right, right), (-right, right)])
 
     def make_graph(self) -> Graph:
         """Sliders, links and platform, level."""

@@ -41,6 +41,7 @@ from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.members import Beam, Section, Structure, disc
+from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import Inverse, LimbElements, Robot, length, mass
 
 Array = NDArray[np.float64]
@@ -348,6 +349,23 @@ class UprRpu(Robot):
             along = np.clip((up * normal).sum(-1), -1.0, 1.0)
             angles.append(np.arccos(along))
         return np.stack(angles, -1)
+
+    def grid(self) -> PoseGrid:
+        """Tilts about the vertical axis, in the plane of beta and gamma."""
+        return PoseGrid("cylinder", self.pose_names, "z", ("beta", "gamma"))
+
+    def search_box(self) -> Array:
+        """Limbs 1 and 2 end above and below o alike, so it is no deeper than they are long.
+
+        :raises ParameterError: limbs without limits grow without end.
+        """
+        lengths = self.limits.limb_length
+        if lengths is None:
+            raise ParameterError(
+                "limits.limb_length", None, "limits of the limbs: without them z has no end"
+            )
+        right = math.pi / 2
+        return np.array([(-float(lengths[:2].max()), 0.0), (-right, right), (-right, right)])
 
     def make_graph(self) -> Graph:
         """Telescopic limbs at home, the platform level."""

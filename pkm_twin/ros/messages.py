@@ -85,6 +85,14 @@ class JointSample:
 
 
 @dataclass(frozen=True)
+class EffortSample:
+    """One message of stamped torques in the robot's joint order, shape (n,), N m or N."""
+
+    stamp: int
+    effort: Array
+
+
+@dataclass(frozen=True)
 class Ragged:
     """The first point whose array is not as long as it has to be, and how long it is."""
 
@@ -149,15 +157,21 @@ class Trajectory:
 
 @dataclass
 class JointReader:
-    """Reads joint states and trajectories of one robot."""
+    """Reads joint states and trajectories of one robot.
+
+    ``limited``: positions and velocities beyond the robot's limits are refused, else only those
+    beyond all machines.
+    """
 
     robot: Robot
+    limited: bool = True
     _known: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         joints = len(self.robot.joint_names)
         limits = self.robot.limits
-        position, velocity = limits.position, limits.velocity
+        position = limits.position if self.limited else None
+        velocity = limits.velocity if self.limited else None
         reach = [100.0 if unit == "m" else 2000.0 * math.pi for unit in self.robot.joint_units]
         self._limited = {"position": position is not None, "velocity": velocity is not None}
         self._position = (
@@ -197,6 +211,16 @@ class JointReader:
             what = "all positions are nan" if len(message.position) else "no positions"
             raise MessageError("empty", f"{what}; {count} names are given")
         return stamp, index, q
+
+    def efforts(self, message: Any, now: int, rules: StampRules) -> EffortSample:
+        """A sensor_msgs/JointState as a source of torques: names and efforts, nothing else."""
+        index = self._match(message.name)
+        stamp = rules.check(stamp_of(message.header), now)
+        count = len(message.name)
+        effort = self._take("effort", message.effort, count, index, self._effort)
+        if effort is None:
+            raise MessageError("empty", f"no efforts; {count} names are given")
+        return EffortSample(stamp, effort)
 
     def trajectory(self, message: Any, now: int) -> Trajectory:
         """A trajectory_msgs/JointTrajectory with exactly the robot's joints, in any order.

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from random_machines import NAMES, plain, variant
 from rich.console import Console
 from rich.progress import Progress
 
@@ -23,6 +22,7 @@ from pkm_twin import load, robot_names
 from pkm_twin.apps.certify import BOUNDS, certificate_of
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.catalogue import config_folder
+from test.machine.random_machines import NAMES, plain, variant
 
 WHAT = tuple(name for name in BOUNDS if name not in ("round_trip", "batch"))
 TITLES = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machines of the folder ``machines`` with other dimensions, masses and surroundings.
+"""Machines of the folder ``machines``, and shipped ones, of other dimensions and masses.
 
 What may move without costing a machine its mobility differs: a planar machine's joints may move
 anywhere (their axes stay parallel), a spherical one's axes may turn anywhere through the centre, a
@@ -13,10 +13,15 @@ import numpy as np
 
 from pkm_twin.apps.certificate.description import expand, tensor
 from pkm_twin.apps.certificate.maximal import Maximal, rotation_of
+from pkm_twin.machine.catalogue import config_folder
 from pkm_twin.machine.schema import read_yaml
 
 MACHINES = Path(__file__).resolve().parent / "machines"
-NAMES = sorted(path.stem for path in MACHINES.glob("*.yaml"))
+SHIPPED = ("five_bar", "linear_delta", "rps3", "stewart")
+"""Machines that stand with the shipped robots."""
+FILES = {path.stem: path for path in MACHINES.glob("*.yaml")}
+FILES |= {name: config_folder() / f"{name}.yaml" for name in SHIPPED}
+NAMES = sorted(FILES)
 
 ANY, X, XZ, YZ = (1, 1, 1), (1, 0, 0), (1, 0, 1), (0, 1, 1)
 SHIFT = 0.012
@@ -117,7 +122,7 @@ FREE = {
 
 def plain(name):
     """The mapping of a machine's file."""
-    return read_yaml(MACHINES / f"{name}.yaml")
+    return read_yaml(FILES[name])
 
 
 def variant(name, rng):

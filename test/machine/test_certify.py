@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from random_machines import MACHINES, plain
 
 import pkm_twin.apps.certificate as judges
 from pkm_twin.apps import certify as certification
 from pkm_twin.apps.certify import ENGINES, Certificate, certify
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.catalogue import CATALOGUE
+from test.machine.random_machines import FILES, plain
 
 needs_machines = pytest.mark.skipif(
     "machine" not in CATALOGUE, reason="load knows no mechanism machine"
@@ -133,12 +133,12 @@ def test_a_machine_that_no_judge_can_take(echoes):
 
 
 @needs_machines
-@pytest.mark.parametrize("name", ["five_bar", "linear_delta", "rps3"])
+@pytest.mark.parametrize("name", ["five_bar", "linear_delta", "rps3", "slider_crank"])
 def test_the_command_certifies_a_file(name):
     from pkm_twin import load
     from pkm_twin.apps.certify import certificate_of
 
-    result = certificate_of(load(MACHINES / f"{name}.yaml"), states=3)
+    result = certificate_of(load(FILES[name]), states=3)
     assert result.good, [item for item in result.items if not item.good]
     assert result.robot == name
 

@@ -7,7 +7,6 @@ import os
 import numpy as np
 import pytest
 import yaml
-from random_machines import NAMES, plain, variant
 
 from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
 from pkm_twin import load
@@ -16,6 +15,7 @@ from pkm_twin.apps.certificate.states import random_states
 from pkm_twin.apps.certify import effort_differences, relative
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.catalogue import CATALOGUE
+from test.machine.random_machines import NAMES, plain, variant
 
 if "machine" not in CATALOGUE:
     pytest.skip("load knows no mechanism machine", allow_module_level=True)

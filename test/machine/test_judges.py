@@ -5,12 +5,12 @@ import importlib
 
 import numpy as np
 import pytest
-from random_machines import FREE, NAMES, plain, variant
 
 from pkm_twin.apps.certificate.description import AXES, expand, read
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import random_states
 from pkm_twin.apps.certify import ENGINES, effort_differences, relative
+from test.machine.random_machines import FREE, NAMES, plain, variant
 
 BOUNDS = {"pinocchio": 1e-11, "mujoco": 1e-8}
 """Two routes in double precision; MuJoCo's bodies all have some inertia."""

@@ -370,6 +370,7 @@ class TestParameters:
             (["singularity_stop:=0.2"], "at least singularity_stop, 0.2"),
             (["limit_policy:=clip"], "did you mean 'clamp'"),
             (["acceleration:=guess"], "acceleration: 'guess'"),
+            (["publish_commands:=true"], "on_stop: None is refused"),
             (["use_sim_time:=maybe"], "use_sim_time"),
             (["qos_overrides./joint_states.subscription.reliability:=best"], "`reliability`"),
         ],
@@ -499,6 +500,7 @@ class TestLayers:
         "pkm_twin.streams.differentiator",
         "pkm_twin.ros.intake",
         "delta_dynamics.feedforward",
+        "delta_dynamics.gate",
         "stiffness_monitor",
         "stiffness_monitor.monitor",
     )
