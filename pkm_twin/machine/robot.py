@@ -355,6 +355,11 @@ class Robot:
         return JointMap.of(self.joint_names, self.joint_map)
 
     @cached_property
+    def elastic(self) -> Structure:
+        """Elastic beams and joints; errors as :meth:`structure`."""
+        return self.structure()
+
+    @cached_property
     def joints_count(self) -> int:
         """How many joints are actuated, n."""
         return len(self.joint_names)
