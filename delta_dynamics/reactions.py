@@ -75,9 +75,9 @@ class Reactions:
 
     @property
     def efforts(self) -> Array:
-        """What reaches the bodies of the actuators' efforts, shape (..., n), N m or N, positive as q.
+        """What reaches the bodies of the actuators' efforts, shape (..., n), positive as in q.
 
-        The efforts less friction and what the rotors need.
+        N m or N; the efforts less friction and what the rotors need.
         """
         return self.values[..., [self.components.index(name) for name in self.actuated]]
 
