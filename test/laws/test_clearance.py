@@ -112,25 +112,6 @@ def test_motions_and_names_change_no_distance(rng):
         assert segments(*(3 * points)) == pytest.approx(3 * expected, abs=1e-12)
 
 
-def test_least_is_that_of_the_nearest_pair_of_different_limbs(rng):
-    """Whatever pairs it does not look at."""
-    for _ in range(200):
-        count = int(rng.integers(2, 10))
-        limbs = np.sort(rng.integers(0, 3, count))
-        radii = rng.uniform(0, 0.6, count)
-        ends = rng.normal(size=(count, 2, 3)) * rng.choice([0.3, 1, 3])
-        rows = np.zeros(BAR * count)
-        for k in range(count):
-            assert bar(rows, k, limbs[k], radii[k], ends[k, 0], ends[k, 1]) == k + 1
-        gaps = [
-            segments(*ends[i], *ends[j]) - radii[i] - radii[j]
-            for i in range(count)
-            for j in range(i)
-            if limbs[i] != limbs[j]
-        ]
-        assert least(rows, count) == pytest.approx(min(gaps, default=math.inf), abs=1e-12)
-
-
 def tube(diameter):
     """A member of another diameter whose wall is no matter of its mass."""
     return {
