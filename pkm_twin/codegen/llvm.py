@@ -349,6 +349,8 @@ class _Writer:
         if program.equations is not None:
             residual = out.run([program.equations.residual], values)[0]
             good = b.and_(good, b.fcmp_ordered("<=", residual, out.number(RESIDUAL**2)))
+            for value in out.run(list(program.equations.branch), values):
+                good = b.and_(good, b.fcmp_ordered(">", value, out.number(0.0)))
         total = None
         for row in rows.values():
             for value in row:

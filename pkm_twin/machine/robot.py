@@ -25,6 +25,7 @@ from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.kinematics.engine import Engine, Traced, engine_of
+from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.passive import passive_names, passive_program
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine import schema
@@ -166,6 +167,7 @@ class Robot:
     changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
     has_start: ClassVar[bool] = False
     has_inverse: ClassVar[bool] = False
+    has_branch: ClassVar[bool] = False
 
     @classmethod
     def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
@@ -214,9 +216,16 @@ class Robot:
         """Closed form of the inverse, where ``has_inverse``."""
         raise NotImplementedError
 
-    def unreachable_limb(self, q: Array) -> tuple[int, float] | None:
-        """Limb and miss (m) of joint positions without an assembly, shape (n,); None: unknown."""
-        del q
+    def branch(self, motion: Motion) -> Sequence[Any]:
+        """Numbers that are above zero in the branch of ``forward``, where ``has_branch``."""
+        raise NotImplementedError
+
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
+        """Limb and miss (m) of joint positions without an assembly, shape (n,); None: unknown.
+
+        :param reached: part of the straight way from home up to which there is one.
+        """
+        del q, reached
         return None
 
     @cached_property
@@ -259,7 +268,9 @@ class Robot:
     def engine(self) -> Engine:
         """The engine of the robot's geometry, shared by all robots that have the same."""
         start = self.start if self.has_start else None
-        return engine_of(self.graph, self.coordinates, start, self.mechanism)
+        branch = self.branch if self.has_branch else None
+        mark = f"{self.mechanism} {self.closed_key}"
+        return engine_of(self.graph, self.coordinates, start, branch, mark)
 
     @cached_property
     def calls(self) -> dict[str, Any]:
@@ -634,7 +645,7 @@ class Robot:
             raise _not_finite("joint state", index)
         place = np.asarray(q, float)
         sample = np.broadcast_to(place, (*batch, place.shape[-1]))[index]
-        limb = self.unreachable_limb(sample)
+        limb = self.unreachable_limb(sample, reached)
         if limb is not None:
             raise UnreachableError("joint state", self.limb_names[limb[0]], index, limb[1])
         part, miss, measure = self.engine.ending(sample, reached)
