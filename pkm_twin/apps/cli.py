@@ -13,6 +13,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
     flush_output,
@@ -400,7 +401,8 @@ def check(
     Exit code 0: nothing is bad. 1: something is, or it is no bag. 3: the file is damaged, but part
     of it can be saved with `pkm-twin recover`.
     """
-    from pkm_twin.apps.check import Bounds, Verdict, check_bag
+    from pkm_twin.apps.check import Bounds, check_bag
+    from pkm_twin.apps.verdict import Verdict
     from pkm_twin.bags.reader import DamagedBagError
 
     carried = _load(payload, load_times)
@@ -517,6 +519,7 @@ def certify(
 
 
 app.add_typer(atlases.app, name="atlas")
+app.command()(guard_check)
 app.command()(atlases.show)
 
 

@@ -9,11 +9,13 @@ system takes away with the process. Nothing is removed but what a run wrote.
 from __future__ import annotations
 
 import fcntl
+import gc
 import io
 import json
 import os
 import re
 import socket
+import sys
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -74,8 +76,7 @@ def reading(path: Path) -> Iterator[None]:
     except PkmTwinError:
         raise
     except Exception as error:
-        what = " ".join(str(error).split())[:200]
-        raise AtlasError(path, f"damaged or no atlas: {type(error).__name__}: {what}") from None
+        raise AtlasError(path, _damage(error)) from None
 
 
 class Parts:
@@ -323,6 +324,30 @@ def _write(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any)
     variable.attrs.update(attrs)
 
 
+def _opened(xarray: Any, path: Path) -> Dataset:
+    """The data set of a file.
+
+    What the library leaves half made of a damaged file complains when it goes: here, unheard.
+    """
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        try:
+            data: Dataset = xarray.open_dataset(path, engine="h5netcdf")
+        except Exception as error:
+            what = _damage(error)
+        else:
+            return data
+        gc.collect()
+        raise AtlasError(path, what)
+    finally:
+        sys.unraisablehook = hook
+
+
+def _damage(error: Exception) -> str:
+    what = " ".join(str(error).split())[:200]
+    return f"damaged or no atlas: {type(error).__name__}: {what}"
+
+
 def open_atlas(path: Path) -> Dataset:
     """A stored atlas; large fields are read when they are used.
 
@@ -335,8 +360,7 @@ def open_atlas(path: Path) -> Dataset:
             raise AtlasError(path, "no such file")
         if not path.is_file():
             raise AtlasError(path, "no regular file")
-    with reading(path):
-        data: Dataset = xarray.open_dataset(path, engine="h5netcdf")
+    data = _opened(xarray, path)
     missing = [name for name in _ATTRIBUTES if name not in data.attrs]
     if missing:
         data.close()

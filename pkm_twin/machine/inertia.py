@@ -104,8 +104,7 @@ class Layout:
     def pack(self, graph: Graph, gravity: Array, friction: Coefficients) -> Array:
         """Inputs of a graph's own masses, without a payload.
 
-        :param graph: of the tree's geometry. The tree's own has the masses of whichever machine of
-            that geometry came first.
+        :param graph: of this tree's geometry; the tree's own may be of a machine with other masses.
         :param friction: of the actuated joints; that of passive ones stands in the graph.
         """
         tree = self.tree

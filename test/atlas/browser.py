@@ -24,7 +24,7 @@ FLAGS = (
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--window-size=800,640",
+    "--window-size=600,520",
     "--remote-debugging-port=0",
 )
 PATIENCE = 120.0
@@ -129,8 +129,3 @@ class Browser:
     def move(self, x: float, y: float) -> None:
         """Put the mouse to a place, in pixels of the window."""
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-
-    def click(self, x: float, y: float) -> None:
-        """Press and release the mouse at a place."""
-        for what in ("mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=what, x=x, y=y, button="left", clickCount=1)

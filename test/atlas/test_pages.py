@@ -37,6 +37,15 @@ window.place = (trace, at) => {
   return [box.left + (0.5 + 0.5 * p[0] / p[3]) * box.width,
           box.top + (0.5 - 0.5 * p[1] / p[3]) * box.height];
 };
+// What is under the mouse is looked up, and its label drawn, within some pictures.
+window.soon = read => new Promise(found => {
+  let left = 5;
+  const look = () => {
+    const label = read();
+    if (label || --left === 0) found(label); else requestAnimationFrame(look);
+  };
+  requestAnimationFrame(look);
+});
 // Points of the traces that have labels, spread over all of them.
 window.known = count => {
   const traces = gd._fullData.filter(trace => trace.hoverinfo !== 'skip' && trace.x.length);
@@ -93,12 +102,7 @@ def labels(browser):
         # From beside it: a place that the mouse is at already tells nothing new.
         browser.move(x - 3, y)
         browser.move(x, y)
-        # Two pictures later what is under the mouse has been looked up and its label drawn.
-        browser.run(
-            "new Promise(f => requestAnimationFrame(() => requestAnimationFrame("
-            "() => requestAnimationFrame(() => f(null)))))"
-        )
-        label = browser.run(READ)
+        label = browser.run(f"window.soon(() => {READ})")
         if label:
             found.append(label)
     assert len(found) >= POINTS // 2, found
