@@ -511,13 +511,14 @@ class Robot:
         if status is not None:
             self.refuse_joints(status, q)
         n = self.joints_count
-        return [m.reshape(*m.shape[:-1], -1, n) for m in (rates, twist)]
+        return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in (rates, twist)]
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Pose rates per joint rate (..., m, n), NaN where there is no assembly; which are good."""
         (rates, _), status = self.engine.jacobian(_NONE, q)
         good = np.ones(rates.shape[:-1], bool) if status is None else status[..., 0] == 0.0
-        return rates.reshape(*rates.shape[:-1], -1, self.joints_count), np.asarray(good)
+        n = self.joints_count
+        return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), np.asarray(good)
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Second derivative of the pose in time, shape (..., m)."""
