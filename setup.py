@@ -41,13 +41,13 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
-        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py") + glob("launch/*.yaml"))),
     ],
     install_requires=[
         "matplotlib>=3.6",
         "lz4",
         "mcap>=1.6",
-        "numba>=0.58",
+        "llvmlite>=0.41",
         "numpy>=1.26",
         "PyYAML>=6",
         "rich>=13",
@@ -103,6 +103,7 @@ setup(
     entry_points={
         "console_scripts": [
             "delta_dynamics = pkm_twin.apps.nodes:delta_dynamics",
+            "command_gate = pkm_twin.apps.nodes:command_gate",
             "stiffness_monitor = pkm_twin.apps.nodes:stiffness_monitor",
             "pkm-twin = pkm_twin.apps.cli:main",
         ],

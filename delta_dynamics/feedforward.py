@@ -7,19 +7,24 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics import virtual_work
 from delta_dynamics.virtual_work import inverse_dynamics
-from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, JointReader, StampRules, Trajectory, as_message_error
+from pkm_twin.ros.messages import (
+    SECOND,
+    ExtraJoints,
+    JointReader,
+    StampRules,
+    Trajectory,
+    as_message_error,
+)
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.monitor import StreamMonitor
@@ -47,6 +52,7 @@ class Settings:
     accept_zero_stamp: bool = False
     trip_count: int = 5
     recovery_count: int = 5
+    extra_joints: ExtraJoints = "refuse"
     on_stop: OnStop = "nothing"
     singularity_warn: float = 0.05
     singularity_stop: float = 0.01
@@ -107,7 +113,7 @@ class Feedforward:
         self._last_good: Array | None = None
         self._differentiator = Differentiator(s.order, s.window)
         self._rules = s.stamp_rules
-        self._reader = JointReader(self.robot)
+        self._reader = JointReader(self.robot, extra_joints=s.extra_joints)
         self._continuity = Continuity(
             self.robot, s.singularity_warn, s.singularity_stop, self._reader.highest_velocity
         )
@@ -120,7 +126,7 @@ class Feedforward:
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity, friction or limits, between two samples."""
         self.robot = robot
-        self._reader = JointReader(robot)
+        self._reader = JointReader(robot, extra_joints=self.settings.extra_joints)
         self._continuity.robot = robot
 
     def change_settings(self, settings: Settings) -> None:
@@ -247,7 +253,16 @@ class Feedforward:
             efforts[part], beyond = _gate(robot, settings.limit_policy, solved)
             saturated |= beyond
         self.saturations += saturated
-        return efforts[:, t.columns]
+        return self._for_joints(efforts, t.columns)
+
+    def sent(self, effort: Array) -> Array:
+        """Efforts of the model, shape (..., n), in the controller's numbers."""
+        return self.robot.controller.controller_efforts(effort)
+
+    def _for_joints(self, efforts: Array, columns: Sequence[int]) -> Array:
+        """Efforts (p, n) in a message's order, zero for joints that the model lacks."""
+        padded = np.hstack([self.sent(efforts), np.zeros((len(efforts), 1))])
+        return np.ascontiguousarray(padded[:, columns])
 
     def _check_singularity(self, measures: Array, first: int) -> None:
         """Points of a trajectory from ``first`` on, shape (points,)."""
@@ -322,12 +337,18 @@ class Feedforward:
         return Torques(sample.stamp, motion, effort, residual, saturated)
 
 
-def kernels(robot: Robot) -> tuple[Kernel, ...]:
-    """The kernels to warm up before live use.
+def warm_up(robot: Robot) -> None:
+    """Compile, or load, what live use calls: single samples and batches.
 
-    :raises ParameterError: a mechanism without masses.
+    :raises ParameterError: a robot without masses.
     """
-    return (*virtual_work.kernels(robot), robot.engine.forward, robot.engine.jacobian)
+    q = robot.inverse(robot.home())
+    for batch in ((), (2,)):
+        here = np.broadcast_to(q, (*batch, len(q)))
+        rest = np.zeros_like(here)
+        robot.forward(here)
+        robot.singularity(here)
+        inverse_dynamics(robot, here, rest, rest)
 
 
 def _of_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:
@@ -349,8 +370,7 @@ def _gate(robot: Robot, policy: LimitPolicy, effort: Array) -> tuple[Array, bool
     The first one keeps a clamp from making a limit of an infinity.
     """
     _require_finite(effort)
-    # Declared by every robot with a section of limits.
-    limits: Array | None = cast(Any, robot).limits.effort
+    limits = robot.limits.effort
     saturated = limits is not None and _beyond(effort, limits)
     if limits is not None and saturated:
         if policy == "reject":

@@ -18,11 +18,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from delta_dynamics.feedforward import Feedforward, Settings, Torques, kernels
+from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
 from pkm_twin.bags.cdr import message_definition
-from pkm_twin.errors import MessageError
+from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import MAX_MASS, Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
@@ -73,11 +73,15 @@ class DeltaDynamics(health.TwinNode):
         super().__init__("delta_dynamics")
         robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
         # Before there is a topic to be found by: the first start compiles for many seconds.
-        for kernel in kernels(robot):
-            kernel.warm_up()
+        warm_up(robot)
         robot = _changed(robot, self._declare_changes(robot))
         self._feedforward = Feedforward(robot, self._declare_settings())
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
+        if commands and "on_stop" not in self._parameter_overrides:
+            # A controller of plain commands holds the last one for ever.
+            raise ParameterError(
+                "on_stop", None, "nothing, zeros or gravity, by name where publish_commands is true"
+            )
         self._trajectory = self.create_guarded_publisher(JointTrajectory, "~/joint_trajectory_ff")
         # A torque is worth nothing once the stream that it answers would be stale.
         stale_after = self._feedforward.settings.stale_after
@@ -89,7 +93,7 @@ class DeltaDynamics(health.TwinNode):
             else None
         )
         self._reactions = self._create_reaction_publishers(robot)
-        names = list(robot.joint_names)
+        names = list(robot.controller.names)
         numbers = [0.0] * len(names)
         definition = message_definition(JOINT_STATE)
         self._decode = JointStateDecoder(definition)
@@ -115,6 +119,7 @@ class DeltaDynamics(health.TwinNode):
             awaited=True,
             expires=lambda: self._feedforward.settings.stale_after,
         )
+        self._action = self._create_action()
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._after_set)
         self._last_heard = 0
@@ -186,6 +191,29 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
         return level, message, values
 
+    def _create_action(self) -> Any:
+        """The action ``~/follow_joint_trajectory``, where a controller is named."""
+        controller = self.declare(
+            "controller_action",
+            "",
+            "FollowJointTrajectory action of the controller that ~/follow_joint_trajectory "
+            "forwards to; empty: none",
+            read_only=True,
+        )
+        if not controller:
+            return None
+        try:
+            from delta_dynamics.action_node import EffortAction
+        except ImportError as error:
+            raise ParameterError(
+                "controller_action", controller, f"empty without control_msgs ({error})"
+            ) from error
+        return EffortAction(
+            self,
+            controller,
+            lambda trajectory: self._feedforward.trajectory_steps(trajectory, self.now()),
+        )
+
     def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
         """A publisher for each joint's reaction, where the parameter asks for them."""
         wanted = self.declare("publish_reactions", False, "publish ~/reactions/*", read_only=True)
@@ -213,6 +241,7 @@ class DeltaDynamics(health.TwinNode):
         }
 
     def _declare_changes(self, robot: Robot) -> dict[str, Any]:
+        """What is given beside the robot's file."""
         changes = {}
         for name, (section, key) in CHANGES.items():
             value = getattr(robot, section)
@@ -223,13 +252,15 @@ class DeltaDynamics(health.TwinNode):
             bounds: dict[str, Any] = {}
             if name == "payload.mass":
                 bounds = {"low": 0.0, "high": MAX_MASS}
-            changes[name] = self.declare(
+            given = self.declare(
                 name,
                 default,
                 f"the robot's {name}, by default its file's",
                 unit=UNITS[name],
                 **bounds,
             )
+            if name in self._parameter_overrides:
+                changes[name] = given
         return changes
 
     def _declare_settings(self) -> Settings:
@@ -272,6 +303,10 @@ class DeltaDynamics(health.TwinNode):
             ),
             recovery_count=self.declare(
                 "recovery_count", d.recovery_count, "good samples that start it again", **counts
+            ),
+            extra_joints=self.declare(
+                "extra_joints", d.extra_joints, "a trajectory's joints that the model lacks",
+                choices=("refuse", "zero"),
             ),
             on_stop=self.declare(
                 "on_stop", d.on_stop, "sent once on a stop",
@@ -340,11 +375,11 @@ class DeltaDynamics(health.TwinNode):
         stamp = header.sec, header.nanosec
         if core.settings.accept_zero_stamp:
             stamp = divmod(torques.stamp, SECOND)
-        self._torques.publish(self._effort_message.fill(torques.effort, stamp))
+        self._torques.publish(self._effort_message.fill(core.sent(torques.effort), stamp))
         if torques.residual is not None:
-            self._residual.publish(self._effort_message.fill(torques.residual, stamp))
+            self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))
         if self._commands is not None:
-            self._commands.publish(self._numbers_message.fill(torques.effort))
+            self._commands.publish(self._numbers_message.fill(core.sent(torques.effort)))
         # A dense solve a sample is too much for the stream's own rate.
         if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
             self._reactions_due = torques.stamp
@@ -386,6 +421,7 @@ class DeltaDynamics(health.TwinNode):
         effort = core.stop_effort()
         if effort is None:
             return
+        effort = core.sent(effort)
         self._torques.publish(self._effort_message.fill(effort, divmod(self.now(), SECOND)))
         if self._commands is not None:
             self._commands.publish(self._numbers_message.fill(effort))

@@ -45,7 +45,14 @@ def inverse_dynamics(
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
     load = _NO_WRENCH if wrench is None else wrench
-    tau = robot.call_one("torques", lambda: torques(robot), robot.inertial, q, qd, qdd, load)
+    # As Robot.call_one, without its call: a stream's sample takes a microsecond or two.
+    call = robot.calls.get("torques")
+    if call is None:
+        call = robot.calls["torques"] = torques(robot).first_of_one(robot.inertial)
+    try:
+        tau: Array | None = call(q, qd, qdd, load)
+    except (TypeError, ValueError):
+        tau = None
     if tau is not None:
         return tau
     (efforts,), status = torques(robot)(robot.inertial, q, qd, qdd, load)

@@ -16,11 +16,14 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
 MAY_IMPORT_ROS = {
+    "delta_dynamics/action_node.py",
+    "delta_dynamics/gate_node.py",
     "delta_dynamics/node.py",
     "stiffness_monitor/node.py",
     "pkm_twin/ros/player.py",
     "pkm_twin/ros/node.py",
     "pkm_twin/apps/demo.py",
+    "pkm_twin/apps/guard_check.py",
 }
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 

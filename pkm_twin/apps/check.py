@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -22,30 +21,13 @@ from pkm_twin.apps.recorded import (
     read_recording,
     why_no_torques,
 )
+from pkm_twin.apps.verdict import Item, Verdict
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.streams.differentiator import Differentiator
 
 Array = NDArray[np.float64]
 # Samples computed at a time, so that memory stays flat.
 _BLOCK = 4096
-
-
-class Verdict(StrEnum):
-    """Not enough evidence is a verdict of its own."""
-
-    GOOD = "good"
-    BAD = "bad"
-    UNKNOWN = "unknown"
-
-
-@dataclass(frozen=True)
-class Item:
-    """One judged property: its value against its bound, in words."""
-
-    what: str
-    value: str
-    bound: str
-    verdict: Verdict
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
     flush_output,
@@ -73,9 +74,12 @@ BeyondLimits = Annotated[
 
 def _version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version
+        from importlib.metadata import PackageNotFoundError, version
 
-        typer.echo(f"pkm-twin {version('pkm_twin')}")
+        try:
+            typer.echo(f"pkm-twin {version('pkm_twin')}")
+        except PackageNotFoundError:
+            typer.echo("pkm-twin, not installed: run from its sources")
         raise typer.Exit
 
 
@@ -149,8 +153,14 @@ def robots() -> None:
         typer.echo(f"{name:12} {summary(load(name))}")
 
 
+Platform = Annotated[
+    Optional[str],  # noqa: UP045  typer reads it
+    typer.Option(help="of a URDF, the link that carries the tool", show_default=False),
+]
+
+
 @app.command()
-def info(robot: RobotName, as_json: Json = False) -> None:
+def info(robot: RobotName, platform: Platform = None, as_json: Json = False) -> None:
     """Print all of a robot, with units.
 
     Dimensions, masses, limits, home pose, mobility, and which reactions rigid bodies do not
@@ -159,7 +169,7 @@ def info(robot: RobotName, as_json: Json = False) -> None:
     from pkm_twin import load
     from pkm_twin.apps.describe import describe, lines
 
-    data = describe(load(robot))
+    data = describe(load(robot, platform=platform))
     if as_json:
         # JSON has no infinity: a free axis is null.
         print_json(_finite(data))
@@ -168,6 +178,39 @@ def info(robot: RobotName, as_json: Json = False) -> None:
     for what, value in lines(data):
         table.add_row(what, Text(value))
     table_console().print(table)
+
+
+@app.command()
+def urdf(robot: RobotName, platform: Platform = None) -> None:
+    """Print a robot as a URDF that parsers of trees read, its cut loops as <constraint> elements.
+
+    Its joints are the actuated and the passive ones; its ground is base_link, its platform's link
+    platform. The same robot gives the same bytes.
+    """
+    from pkm_twin import load
+    from pkm_twin.machine.robot_urdf import robot_urdf
+
+    typer.echo(robot_urdf(load(robot, platform=platform)), nl=False)
+
+
+@app.command()
+def convert(robot: RobotName, platform: Platform = None) -> None:
+    """Print a robot, or a URDF with its loops, as a commented YAML of bodies, joints and rods.
+
+    That file is a robot of its own: edit it, and give its path wherever a robot's name goes.
+    """
+    from pkm_twin import load
+    from pkm_twin.machine.catalogue import TREES
+    from pkm_twin.machine.machine_yaml import describe_machine_yaml
+    from pkm_twin.machine.robot_urdf import robot_description
+    from pkm_twin.machine.urdf_read import read_urdf
+
+    path = Path(robot)
+    if path.suffix in TREES:
+        data = read_urdf(path, platform=platform)
+    else:
+        data = robot_description(load(robot, platform=platform))
+    typer.echo(describe_machine_yaml(data), nl=False)
 
 
 @app.command()
@@ -358,7 +401,8 @@ def check(
     Exit code 0: nothing is bad. 1: something is, or it is no bag. 3: the file is damaged, but part
     of it can be saved with `pkm-twin recover`.
     """
-    from pkm_twin.apps.check import Bounds, Verdict, check_bag
+    from pkm_twin.apps.check import Bounds, check_bag
+    from pkm_twin.apps.verdict import Verdict
     from pkm_twin.bags.reader import DamagedBagError
 
     carried = _load(payload, load_times)
@@ -475,6 +519,7 @@ def certify(
 
 
 app.add_typer(atlases.app, name="atlas")
+app.command()(guard_check)
 app.command()(atlases.show)
 
 

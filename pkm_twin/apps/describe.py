@@ -57,6 +57,11 @@ def describe(robot: Robot) -> dict[str, Any]:
         "overconstrained": overconstraint(robot),
         "home_pose": dict(zip(robot.pose_names, home.tolist(), strict=True)),
         "home_joints": dict(zip(robot.joint_names, q.tolist(), strict=True)),
+        "bodies": list(robot.body_names[:-1]),
+        "joint_count": len(robot.graph.joints),
+        "closures": robot.engine.mobility.closures,
+        "rank": robot.engine.mobility.rank,
+        "redundant_closures": robot.engine.mobility.redundant,
         "singularity_at_home": float(robot.singularity(q)),
         "parameters": robot.parameter_sections(),
     }
@@ -81,6 +86,12 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("robot", f"{data['name']}: {data['description']}"),
         ("mobility", data["mobility"]),
+        ("bodies and rods", ", ".join(data["bodies"])),
+        (
+            "closures",
+            f"{data['closures']} equations of rank {data['rank']}, "
+            f"{data['redundant_closures']} redundant",
+        ),
         ("pose", pose),
         ("actuated joints", ", ".join(f"{name} ({unit})" for name, unit in joint_units.items())),
         ("home pose", _pairs(data["home_pose"], data["pose"])),

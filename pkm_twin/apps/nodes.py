@@ -8,8 +8,14 @@ import sys
 
 from pkm_twin.ros.arguments import answer
 
+MODULES = {
+    "delta_dynamics": "delta_dynamics.node",
+    "command_gate": "delta_dynamics.gate_node",
+    "stiffness_monitor": "stiffness_monitor.node",
+}
 SUMMARIES = {
     "delta_dynamics": "Trajectories and joint states in, feedforward torques out.",
+    "command_gate": "Stamped torques in, plain commands of an effort controller out.",
     "stiffness_monitor": "Wrenches in, compliance and the dominant strain-energy element out.",
 }
 
@@ -17,6 +23,11 @@ SUMMARIES = {
 def delta_dynamics() -> None:
     """Entry point of ``ros2 run pkm_twin delta_dynamics``."""
     _run("delta_dynamics")
+
+
+def command_gate() -> None:
+    """Entry point of ``ros2 run pkm_twin command_gate``."""
+    _run("command_gate")
 
 
 def stiffness_monitor() -> None:
@@ -35,4 +46,4 @@ def _run(name: str) -> None:
             file=sys.stderr,
         )
         sys.exit(1)
-    importlib.import_module(f"{name}.node").main()
+    importlib.import_module(MODULES[name]).main()

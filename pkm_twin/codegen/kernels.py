@@ -90,6 +90,10 @@ class _Space:
         self.words[2] = p.ctypes.data
 
 
+def _take_none(*inputs: Any) -> Array | None:
+    raise TypeError(f"{len(inputs)} inputs go the way of a batch")
+
+
 @remembered
 def _caller(inputs: int) -> Callable[..., Any]:
     """Makes the fast call of a number of inputs, without a loop over them.
@@ -233,15 +237,15 @@ class Kernel:
                 status = None
         return [output[0] for output in outputs], None if status is None else status[0]
 
-    def first_of_one(self, p: Array) -> Callable[..., Array | None] | None:
-        """The first output of one sample, as fast as can be; None on plain Python.
+    def first_of_one(self, p: Array) -> Callable[..., Array | None]:
+        """The first output of one sample, as fast as can be; on plain Python it takes none.
 
         The function takes arrays of doubles of exactly the inputs' shapes, (size,) each, else it
         raises TypeError or ValueError; it gives None where a sample is not good at once.
         """
         code = self._loaded[2]
         if code is None:
-            return None
+            return _take_none
         sizes = self.sizes
 
         def room() -> tuple[Any, ...]:

@@ -245,24 +245,31 @@ class Engine:
     def ending(self, q: Array, reached: float) -> tuple[str, float, float | None]:
         """Why no assembly is found beyond a part of the straight way from home to q.
 
-        :returns: the part that falls short the most, by how much (m), and the closures' reciprocal
-            condition where the way ends in a singularity, else None.
+        :returns: the part that falls short the most, by how much (m), and None; or, where there is
+            an assembly behind a singularity, the closures' least reciprocal condition on the way.
         """
         home = self.graph.home
         x, done = np.array(self.tree.home, float), 0.0
-        step = 1 / 16
-        while step > 1e-6 and done < 1.0:
+        side, least = self._regularity(x, home)
+        step = 1 / 8
+        while step > 1e-4 and done < 1.0:
             way = min(1.0, done + step)
-            new = self.close(home + way * (q - home), x)
-            if new is None or way > max(reached, 1e-12) + 1 / 8:
-                step /= 4
+            there = home + way * (q - home)
+            new = self.close(there, x)
+            # Beyond a singularity is another assembly.
+            sign, measure = (0.0, 0.0) if new is None else self._regularity(new, there)
+            if new is None or sign != side or way > max(reached, 1e-12) + 1 / 8:
+                step /= 8
                 continue
-            x, done = new, way
-        ju, _ = self._scaled(self.at(x, home + done * (q - home))[1])
-        measure = _reciprocal(ju[self.kept])
-        first = _reciprocal(self._sampled[0][0][self.kept])
+            x, done, least = new, way, min(least, measure)
         part, miss = self._shortest(x, q)
-        return part, miss, measure if measure < 0.02 * first else None
+        # Where nothing falls short there is an assembly, but the way does not lead to it.
+        return part, miss, least if miss < 1e-9 * self.tree.size else None
+
+    def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
+        """Sign of the determinant of the kept closures, and their reciprocal condition."""
+        matrix = self._scaled(self.at(x.tolist(), q)[1])[0][self.kept]
+        return float(np.linalg.slogdet(matrix)[0]), _reciprocal(matrix)
 
     def _shortest(self, x: Array, q: Array) -> tuple[str, float]:
         """The closure that misses the most where all together miss the least, and by how much."""

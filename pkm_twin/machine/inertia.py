@@ -101,12 +101,13 @@ class Layout:
         parts[0] = parts[0].reshape(-1, 10)
         return parts
 
-    def pack(self, gravity: Array, friction: Coefficients) -> Array:
-        """Inputs of the graph's own masses, without a payload.
+    def pack(self, graph: Graph, gravity: Array, friction: Coefficients) -> Array:
+        """Inputs of a graph's own masses, without a payload.
 
+        :param graph: of this tree's geometry; the tree's own may be of a machine with other masses.
         :param friction: of the actuated joints; that of passive ones stands in the graph.
         """
-        tree, graph = self.tree, self.tree.graph
+        tree = self.tree
         bodies = []
         for link in tree.links.values():
             body = graph.bodies[link.body]

@@ -30,6 +30,7 @@ from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import FREEDOMS, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
+from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import position_box
@@ -44,7 +45,6 @@ SINGULARITY_BOUND: Final = 1e-9
 """Least singularity measure (0 singular, 1 best) at which a Jacobian is inverted."""
 
 _NONE: Final = np.zeros(0)
-_UNKNOWN: Final = object()
 
 
 def length(**options: Any) -> Any:
@@ -176,6 +176,7 @@ class Robot:
     friction: Coefficients = schema.section(friction_of(3), default={})
     gravity: Array = schema.vector(3, default=[0, 0, -9.81])
     limits: JointLimits = schema.section(limits_of(3), default={})
+    joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
     changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
@@ -188,7 +189,9 @@ class Robot:
 
         :raises ParameterError: by the field.
         """
-        return dataclasses.replace(schema.build(cls, data), name=name)
+        robot = dataclasses.replace(schema.build(cls, data), name=name)
+        _ = robot.controller
+        return robot
 
     # What a mechanism gives.
 
@@ -276,18 +279,16 @@ class Robot:
 
     @cached_property
     def calls(self) -> dict[str, Any]:
-        """Functions for one sample that are made once a robot, by name; None: there is none."""
+        """Functions for one sample, made once a robot, by name."""
         return {}
 
     def call_one(
         self, name: str, kernel: Callable[[], Kernel], p: Array, *inputs: Any
     ) -> Array | None:
         """First output of one good sample, as fast as can be; None where it takes a batch's way."""
-        call = self.calls.get(name, _UNKNOWN)
-        if call is _UNKNOWN:
-            call = self.calls[name] = kernel().first_of_one(p)
+        call = self.calls.get(name)
         if call is None:
-            return None
+            call = self.calls[name] = kernel().first_of_one(p)
         try:
             result: Array | None = call(*inputs)
         except (TypeError, ValueError):
@@ -306,7 +307,7 @@ class Robot:
     @cached_property
     def own_inertial(self) -> Array:
         """The same without the payload."""
-        return schema.frozen(self._layout.pack(self.gravity, self.friction))
+        return schema.frozen(self._layout.pack(self.graph, self.gravity, self.friction))
 
     @property
     def _layout(self) -> Layout:
@@ -370,6 +371,19 @@ class Robot:
         """The parameters by section, as plain data."""
         fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
         return {name: schema.plain(getattr(self, name)) for name in fields}
+
+    @cached_property
+    def controller(self) -> JointMap:
+        """Between the controller's joints and the model's.
+
+        :raises ParameterError: a map of joints that there are not.
+        """
+        return JointMap.of(self.joint_names, self.joint_map)
+
+    @cached_property
+    def elastic(self) -> Structure:
+        """Elastic beams and joints; errors as :meth:`structure`."""
+        return self.structure()
 
     @cached_property
     def joints_count(self) -> int:

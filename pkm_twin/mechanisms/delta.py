@@ -251,7 +251,7 @@ class Delta(Robot):
         """The limb that stands apart from the two closest elbows, of rods that do not meet."""
         g = self.geometry
         if "rcu" in g.closures:
-            return g.closures.index("rcu"), 0.0
+            return None
         centres = np.array(
             [self._elbow(i, q[i]) - g.platform_radius * self._directions(i)[0] for i in range(3)],
             float,

@@ -50,12 +50,13 @@ from rclpy.qos import (
     qos_policy_name_from_kind,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.ros.messages import SECOND
-from pkm_twin.ros.signals import first_signal, ignore_signals
+from pkm_twin.ros.signals import SIGNALS, first_signal, ignore_signals, noted_signals
 from pkm_twin.streams.monitor import TopicStatistics
 from pkm_twin.threads import one_blas_thread
 
@@ -126,10 +127,16 @@ def output_qos() -> QoSProfile:
     return QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
-def input_qos(depth: int, *, best_effort: bool) -> QoSProfile:
-    """Best effort takes what publishers of both kinds send; reliable only what reliable ones do."""
+def input_qos(depth: int, *, best_effort: bool, expiry: float | None = None) -> QoSProfile:
+    """Best effort takes what publishers of both kinds send; reliable only what reliable ones do.
+
+    :param expiry: lifespan and deadline that they have to offer, s; None is any.
+    """
     kind = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-    return QoSProfile(depth=depth, reliability=kind)
+    qos = QoSProfile(depth=depth, reliability=kind)
+    if expiry is not None:
+        qos.lifespan = qos.deadline = Duration(seconds=expiry)
+    return qos
 
 
 class TwinNode(LifecycleNode):
@@ -219,6 +226,9 @@ class TwinNode(LifecycleNode):
     def time_jumped_forward(self) -> None:
         """The ROS clock went forward by more than a stream's messages may be apart."""
         self.time_jumped_backward()
+
+    def farewell(self) -> None:
+        """The last thing to do while the topics are still there; see :func:`run`."""
 
     def stream_broken(self, where: str) -> None:
         """A callback failed: whatever it feeds cannot be trusted now."""
@@ -348,6 +358,7 @@ class TwinNode(LifecycleNode):
         best_effort: bool = True,
         awaited: bool = False,
         expires: Callable[[], float] | None = None,
+        expiry: float | None = None,
     ) -> None:
         """Subscribe, with QoS overrides by parameter and a callback that cannot end the node.
 
@@ -357,6 +368,7 @@ class TwinNode(LifecycleNode):
             comes: from there on as if true (not with the events executor).
         :param awaited: the diagnostics warn until the first message.
         :param expires: how long a message may wait for the node, s; older ones count as lost.
+        :param expiry: lifespan and deadline that publishers have to offer, s; None is any.
         """
         statistics = self._statistics[topic] = TopicStatistics()
         name = self.resolve_topic_name(topic)
@@ -403,7 +415,7 @@ class TwinNode(LifecycleNode):
                 kind,
                 topic,
                 guarded,
-                input_qos(self._queue_depth, best_effort=best_effort or relaxed),
+                input_qos(self._queue_depth, best_effort=best_effort or relaxed, expiry=expiry),
                 raw=raw,
                 qos_overriding_options=QoSOverridingOptions(
                     OVERRIDES[:-1] if relaxed else OVERRIDES
@@ -721,14 +733,17 @@ def verdict(check: Callable[[], object]) -> SetParametersResult:
     return SetParametersResult(successful=True)
 
 
-def spin(node: TwinNode) -> None:
-    """Run callbacks, and between them a step of what waits, until the context ends."""
+def spin(node: TwinNode, ended: Callable[[], bool] = lambda: False) -> None:
+    """Run callbacks, and between them a step of what waits, until the context ends.
+
+    :param ended: asked between two callbacks; true ends it too.
+    """
     events = node.executor_kind == "events"
     executor = EventsExecutor() if events else SingleThreadedExecutor()
     executor.add_node(node)
     # Without a bound the one waits for ever; with one the other makes a timer a message.
     patience = LOOK if events else None
-    while node.context.ok():
+    while node.context.ok() and not ended():
         try:
             executor.spin_once(timeout_sec=0.0 if node.busy else patience)
             node.seldom.turned()
@@ -740,24 +755,38 @@ def spin(node: TwinNode) -> None:
             node.caught("rclpy", error)
 
 
-def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None) -> int:
+def run(
+    factory: Callable[[], TwinNode],
+    arguments: Sequence[str] | None = None,
+    *,
+    farewell: bool = False,
+) -> int:
     """Run a node until SIGINT or SIGTERM.
 
+    :param farewell: call :meth:`TwinNode.farewell` at the end. Signals are then not the
+        middleware's, which would close the topics at once, and end the node at its next event.
     :returns: 0 after a signal, 1 where the node refuses its configuration.
     """
     node: TwinNode | None = None
     begun = False
     try:
         # The middleware's handler for SIGINT calls this one; SIGTERM is the middleware's alone.
-        with first_signal(KeyboardInterrupt, (signal.SIGINT,)):
-            rclpy.init(args=None if arguments is None else list(arguments))
+        with first_signal(KeyboardInterrupt, SIGNALS if farewell else (signal.SIGINT,)):
+            rclpy.init(
+                args=None if arguments is None else list(arguments),
+                signal_handler_options=SignalHandlerOptions.NO if farewell else None,
+            )
             begun = True
             node = factory()
             one_blas_thread()
             # What is loaded by now stays: the collector need not look at it again.
             gc.collect()
             gc.freeze()
-            spin(node)
+            if not farewell:
+                spin(node)
+                return 0
+            with noted_signals() as asked:
+                spin(node, asked)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (PkmTwinError, ParameterException, RuntimeError) as error:
@@ -773,6 +802,8 @@ def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None)
     finally:
         ignore_signals()
         if node is not None:
+            if farewell:
+                node.farewell()
             node.destroy_node()
         # rclpy.try_shutdown would bring the old signal handlers back.
         rclpy.get_default_context().try_shutdown()

@@ -70,3 +70,24 @@ def first_signal(
         elif not _Process.ending:
             for number, handler in zip(numbers, before, strict=True):
                 signal.signal(number, handler)
+
+
+@contextmanager
+def noted_signals(numbers: Sequence[signal.Signals] = SIGNALS) -> Iterator[Callable[[], bool]]:
+    """Signals are noted, and the yielded function says whether one came.
+
+    For loops with something left to do at their end: no exception can come in the middle of a
+    library that does not expect one.
+    """
+    came = False
+
+    def note(*_: object) -> None:
+        nonlocal came
+        came = True
+
+    before = [signal.signal(number, note) for number in numbers]
+    try:
+        yield lambda: came
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, signal.SIG_IGN if came else handler)

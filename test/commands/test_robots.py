@@ -93,14 +93,15 @@ class TestInfo:
         assert rows["geometry: base_radius"].endswith(" m")
         if not why_no_torques(robot):
             assert rows["inertia: platform_mass"].endswith(" kg")
-            assert rows["limits: effort"].endswith(f" {robot.effort_units[0]}")
+            if robot.limits.effort is not None:
+                assert rows["limits: effort"].endswith(f" {robot.effort_units[0]}")
             # A fraction of a length, not a length.
             com = rows.get("inertia: arm_com") or rows["inertia: link_com"]
             assert " of the " in com
 
 
 def test_overconstraint_is_named(twin):
-    assert "constraint couples" in twin("info", "upr_rpu").out
+    assert "moment along" in twin("info", "upr_rpu").out
     assert "│ no:" in twin("info", "delta_cu").out
 
 
@@ -231,4 +232,4 @@ class TestEnds:
 
     def test_version(self, twin):
         result = twin("--version")
-        assert (result.code, result.out.split()[0]) == (0, "pkm-twin")
+        assert result.code == 0 and result.out.startswith("pkm-twin")

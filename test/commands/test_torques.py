@@ -10,7 +10,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, reactions
 from pkm_twin import load
-from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
+from test.commands.conftest import DELTA, MILLING, STIFFNESS, massless, rewrite
 
 TERMS = ("gravity", "inertia", "velocity", "payload", "friction", "external")
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -351,7 +351,7 @@ def test_parquet_has_the_same_columns(twin, tmp_path):
         ("delta_cu", "absent.csv", "t.csv", "absent.csv"),
         ("delta_cu", "absent.mcap", "t.csv", "does not exist"),
         ("prru", DELTA, "t.csv", "slider_1"),
-        ("upr_rpu", STIFFNESS, "t.csv", "masses"),
+        ("massless", STIFFNESS, "t.csv", "inertia"),
     ],
 )
 def test_refusals(twin, tmp_path, sample, robot, motion_file, out, text):
@@ -359,6 +359,7 @@ def test_refusals(twin, tmp_path, sample, robot, motion_file, out, text):
         motion_file = sample
     elif motion_file == STIFFNESS:
         motion_file = rewrite(STIFFNESS, tmp_path / "stiff.mcap", seconds=0.1)
+        robot = massless(tmp_path / "light.yaml")
     result = twin("torques", robot, motion_file, "--out", tmp_path / out)
     assert (result.code, result.out) == (1, "")
     assert text in result.one_line_error()

@@ -123,10 +123,12 @@ class Domain:
         """For a node process: the wheels set their own library path anew at its start."""
         names = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE",)
         kept = {key: value for key, value in os.environ.items() if key not in names}
+        # Of a sourced workspace the path is where rclpy is.
+        path = [str(REPOSITORY), *filter(None, [kept.get("PYTHONPATH")])]
         return kept | {
             "ROS_DOMAIN_ID": str(self.number),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "PYTHONPATH": str(REPOSITORY),
+            "PYTHONPATH": os.pathsep.join(path),
             "PYTHONUNBUFFERED": "1",
         }
 

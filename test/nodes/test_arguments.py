@@ -9,7 +9,7 @@ import pytest
 
 from test.nodes.harness import REPOSITORY
 
-NODES = ("delta_dynamics", "stiffness_monitor")
+NODES = ("delta_dynamics", "command_gate", "stiffness_monitor")
 WITHOUT = "import sys; sys.modules['rclpy'] = None; "
 
 

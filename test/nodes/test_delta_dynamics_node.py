@@ -361,7 +361,6 @@ class TestParameters:
         [
             (["payload.masss:=0.1"], "did you mean 'payload.mass'"),
             (["mechanism:=delta_uc"], "did you mean 'delta_cu'"),
-            (["mechanism:=upr_rpu"], "mechanism: 'upr_rpu'"),
             (["mechanism:=/nonexistent/robot.yaml"], "/nonexistent/robot.yaml"),
             (["payload.mass:=.nan"], "payload.mass: nan"),
             (["payload.mass:=heavy"], "payload.mass: 'heavy'"),
@@ -371,6 +370,7 @@ class TestParameters:
             (["singularity_stop:=0.2"], "at least singularity_stop, 0.2"),
             (["limit_policy:=clip"], "did you mean 'clamp'"),
             (["acceleration:=guess"], "acceleration: 'guess'"),
+            (["publish_commands:=true"], "on_stop: None is refused"),
             (["use_sim_time:=maybe"], "use_sim_time"),
             (["qos_overrides./joint_states.subscription.reliability:=best"], "`reliability`"),
         ],
@@ -500,6 +500,7 @@ class TestLayers:
         "pkm_twin.streams.differentiator",
         "pkm_twin.ros.intake",
         "delta_dynamics.feedforward",
+        "delta_dynamics.gate",
         "stiffness_monitor",
         "stiffness_monitor.monitor",
     )

@@ -5,6 +5,7 @@ import re
 
 import pytest
 
+from pkm_twin.apps.nodes import MODULES
 from test.nodes.harness import REPOSITORY
 
 pytest.importorskip("rclpy", exc_type=ImportError)
@@ -25,16 +26,21 @@ def rows(node):
             yield cells[1:-1]
 
 
-@pytest.fixture(scope="module", params=["delta_dynamics", "stiffness_monitor"])
+@pytest.fixture(scope="module", params=["delta_dynamics", "command_gate", "stiffness_monitor"])
 def node(request, peer, launch):
     """The node's name, with all topics that parameters can ask for, once it is found."""
     name = request.param
     options = {
-        "delta_dynamics": ("publish_commands:=true", "publish_reactions:=true"),
+        "delta_dynamics": (
+            "publish_commands:=true",
+            "on_stop:=nothing",
+            "publish_reactions:=true",
+        ),
+        "command_gate": ("on_stop:=gravity",),
         # The robot in whose file the masses are.
         "stiffness_monitor": ("mechanism:=delta_cu",),
     }
-    process = launch(f"{name}.node", *options[name])
+    process = launch(MODULES[name], *options[name])
 
     def found():
         assert process.alive(), process.output

@@ -17,7 +17,12 @@ NAMES = ROBOT.joint_names
 STEP = SECOND // 1000
 WINDOW = 4
 MAKE = Maker(Ros())
-COMMON = (f"differentiator.window:={WINDOW}", "recovery_count:=2", "publish_commands:=true")
+COMMON = (
+    f"differentiator.window:={WINDOW}",
+    "recovery_count:=2",
+    "publish_commands:=true",
+    "on_stop:=nothing",
+)
 Q = np.array([0.1, 0.2, 0.3])
 
 

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an effort controller gets: stamped torques while they come, zeros or gravity when not.
+
+A command of plain numbers has no stamp, so a controller that takes it cannot tell a live torque
+from the last word of a dead process. This is the last place that can. Pure: times are arguments.
+
+May import: numpy, pkm_twin's core, delta_dynamics' model, the standard library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.errors import MessageError, PkmTwinError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import SECOND, JointReader, StampRules
+from pkm_twin.streams.monitor import StreamMonitor
+
+Array = NDArray[np.float64]
+
+OnStop = Literal["zeros", "gravity"]
+
+WAITING: Final = "waiting"
+"""The stop's reason before the first torque."""
+
+
+@dataclass(frozen=True)
+class GateSettings:
+    """When the gate closes, and what it sends while it is closed."""
+
+    on_stop: OnStop = "zeros"
+    deadline: float = 0.1
+    """Longest age of a torque by its stamp, and longest silence, s."""
+    future_tolerance: float = 0.1
+    """How far a stamp may be ahead of the clock, s."""
+    trip_count: int = 1
+    recovery_count: int = 5
+    """Refused messages in a row that close the gate, good ones in a row that open it."""
+
+
+@dataclass
+class Gate:
+    """Forwards the torques of one robot; closed from the start, and whenever they stop.
+
+    The controller behind it may still hold what a gate before this one has sent, so that a new
+    gate is closed and :meth:`stop_command` is due before the first torque comes.
+    """
+
+    robot: Robot
+    settings: GateSettings = field(default_factory=GateSettings)
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        self.stream = StreamMonitor(s.trip_count, s.recovery_count)
+        self.stream.stop(WAITING, "no torque yet")
+        self.last_reject = ""
+        self._rules = StampRules(
+            future_tolerance=round(s.future_tolerance * SECOND),
+            max_age=round(s.deadline * SECOND),
+        )
+        self._reader = JointReader(self.robot)
+        self._limits = _effort_limits(self.robot)
+        self._last_stamp = 0
+        self._last_arrival = 0
+        self._state: tuple[int, Array] | None = None
+
+    def change_robot(self, robot: Robot) -> None:
+        """Take a robot with another payload, gravity or limits, between two messages."""
+        self.robot = robot
+        self._reader = JointReader(robot)
+        self._limits = _effort_limits(robot)
+
+    def reset(self) -> None:
+        """The clock jumped: stamps of before say nothing about those to come."""
+        self.stream.stop("clock jump", "the clock jumped")
+        self._last_stamp = 0
+        self._state = None
+
+    def torques(self, message: Any, now: int, steady: int) -> Array | None:
+        """The command for one message of stamped torques, shape (n,), or None while closed.
+
+        :param message: sensor_msgs/JointState with an effort a joint, in any order of names.
+        :param now: the ROS clock, ns; stamps are judged by it.
+        :param steady: the steady clock, ns; silences are judged by it.
+        :raises MessageError: the message is refused, and counted.
+        """
+        self.watch(steady)
+        try:
+            sample = self._reader.efforts(message, now, self._rules)
+            self._check(sample.stamp, sample.effort)
+        except MessageError as error:
+            self.stream.reject(error.reason, str(error))
+            self.last_reject = str(error)
+            raise
+        self._last_stamp = sample.stamp
+        self._last_arrival = steady
+        return sample.effort if self.stream.accept() else None
+
+    def joint_state(self, message: Any, now: int, steady: int) -> None:
+        """Keep where the robot stands: gravity is that of a measured state, never of a guess.
+
+        :raises MessageError: the message is refused.
+        """
+        self._state = steady, self._reader.joint_state(message, now, self._rules).q
+
+    def watch(self, steady: int) -> None:
+        """Close the gate where the torques have gone silent."""
+        silent = (steady - self._last_arrival) / SECOND
+        if not self.stream.stopped and silent > self.settings.deadline:
+            self.stream.stop("stale torques", f"no torque for {silent:.3f} s")
+
+    def stop_command(self, steady: int) -> Array:
+        """What is sent while the gate is closed, shape (n,): zeros, or what bears the weight.
+
+        Gravity needs a joint state within the deadline, a pose that the model has an answer
+        for, and an answer within the effort limits; without these it is zeros.
+        """
+        zeros = np.zeros(len(self.robot.joint_names))
+        if self.settings.on_stop == "zeros" or self._state is None:
+            return zeros
+        measured, q = self._state
+        if steady - measured > self.settings.deadline * SECOND:
+            return zeros
+        try:
+            effort = inverse_dynamics(self.robot, q, zeros, zeros)
+        except (PkmTwinError, ValueError):
+            return zeros
+        return zeros if self._beyond(effort) is not None else effort
+
+    def _check(self, stamp: int, effort: Array) -> None:
+        if stamp <= self._last_stamp:
+            behind = (self._last_stamp - stamp) / SECOND
+            raise MessageError("stamp order", f"the stamp is {behind:.6f} s before the last")
+        joint = self._beyond(effort)
+        if joint is not None:
+            raise MessageError(
+                "effort limit",
+                f"effort of {self.robot.joint_names[joint]} is {effort[joint]:g}, "
+                f"allowed {self._limits[joint]:g}",
+            )
+
+    def _beyond(self, effort: Array) -> int | None:
+        """The first joint whose effort is not finite or passes its limit."""
+        bad = ~(np.isfinite(effort) & (np.abs(effort) <= self._limits))
+        return int(bad.argmax()) if bad.any() else None
+
+
+def _effort_limits(robot: Robot) -> Array:
+    """The robot's effort limits, shape (n,), infinite where it has none."""
+    efforts = getattr(getattr(robot, "limits", None), "effort", None)
+    return np.full(len(robot.joint_names), np.inf) if efforts is None else np.asarray(efforts)

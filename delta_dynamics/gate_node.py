@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node ``command_gate``: stamped torques in, plain commands of an effort controller out."""
+
+from __future__ import annotations
+
+import sys
+import time
+from array import array
+from typing import Any
+
+import numpy as np
+from rclpy.duration import Duration
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from delta_dynamics.gate import Gate, GateSettings
+from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin import load
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros import node as health
+
+PAYLOAD = {
+    "payload.mass": ("mass", "kg"),
+    "payload.com": ("com", "m, from the platform's origin"),
+}
+"""What of the payload may change while the gate runs: the part that has a weight."""
+LAST_WORD = 0.5
+"""How long the end waits for the controller to acknowledge the last command, s."""
+
+
+class CommandGate(health.TwinNode):
+    """Forwards live torques, and sends zeros or gravity from the start until they come.
+
+    A process of its own: it outlives the node whose torques it forwards.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("command_gate")
+        robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
+        settings = self._declare_settings()
+        self._gate = Gate(robot, settings)
+        self._closed = True
+        self._commands = self.create_guarded_publisher(Float64MultiArray, "~/commands")
+        self._declare_robot(settings)
+        self._pending: Robot | None = None
+        self.create_guarded_subscription(
+            JointState,
+            "delta_dynamics/joint_torques",
+            self._on_torques,
+            awaited=True,
+            expires=lambda: settings.deadline,
+            expiry=settings.deadline,
+        )
+        if settings.on_stop == "gravity":
+            self.create_guarded_subscription(
+                JointState, "joint_states", self._on_joint_state, awaited=True
+            )
+        self.add_on_set_parameters_callback(self._on_set)
+        self.add_post_set_parameters_callback(self._after_set)
+        self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._watch)
+        self.start(leap=settings.deadline + settings.future_tolerance)
+
+    def summary(self) -> str:
+        """One line that says what the node runs."""
+        robot, settings = self._gate.robot, self._gate.settings
+        return (
+            f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}, "
+            f"{settings.on_stop} after {settings.deadline:g} s without a torque"
+        )
+
+    def time_jumped_backward(self) -> None:
+        """Closed until torques by the new clock come."""
+        self._gate.reset()
+
+    def stream_broken(self, where: str) -> None:
+        """Whatever failed: the gate is closed."""
+        self._gate.stream.stop("exception", f"{where} raised an exception")
+
+    def activated(self) -> None:
+        """At once: the controller may still hold what a gate before this one has sent."""
+        self._send(self._gate.stop_command(time.monotonic_ns()))
+
+    def deactivated(self) -> None:
+        """The last command, which the controller holds for ever, must not be a torque."""
+        self._gate.stream.stop("inactive", "the node was deactivated")
+        self._tell()
+        self._send(self._gate.stop_command(time.monotonic_ns()))
+
+    def farewell(self) -> None:
+        """As deactivated; and the controller has it before the process ends."""
+        if self.active:
+            self.deactivated()
+        self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
+
+    def reset_stop(self) -> str:
+        """Open without waiting for good torques."""
+        stream = self._gate.stream
+        return f"{stream.reason}: {stream.text}" if stream.resume() else ""
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Level, message and values of the node's diagnostic status."""
+        stream = self._gate.stream
+        level, message = health.OK, "open"
+        if self._gate.last_reject:
+            level, message = health.WARN, f"last reject: {self._gate.last_reject}"
+        if stream.stopped:
+            level, message = health.ERROR, f"closed: {stream.reason}: {stream.text}"
+        values: dict[str, object] = {
+            "robot": self._gate.robot.name,
+            "open": not stream.stopped,
+            "torques forwarded": stream.accepted,
+            "controllers": self._commands.get_subscription_count(),
+        }
+        values |= {f"torques rejected: {k}": v for k, v in stream.rejected.items()}
+        values |= {f"closed: {k}": v for k, v in stream.stops.items()}
+        return level, message, values
+
+    def _declare_settings(self) -> GateSettings:
+        d = GateSettings()
+        counts: dict[str, Any] = {"low": 1, "high": 10**6, "read_only": True}
+        seconds: dict[str, Any] = {"unit": "s", "high": 3600.0, "read_only": True}
+        return GateSettings(
+            on_stop=self.declare(
+                "on_stop", d.on_stop, "sent while no torques come", choices=("zeros", "gravity"),
+                read_only=True,
+            ),
+            deadline=self.declare(
+                "deadline", d.deadline, "greatest age of a torque, and longest silence",
+                low=1e-3, **seconds,
+            ),
+            future_tolerance=self.declare(
+                "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
+                low=0.0, **seconds,
+            ),
+            trip_count=self.declare(
+                "trip_count", d.trip_count, "refused torques in a row that close the gate", **counts
+            ),
+            recovery_count=self.declare(
+                "recovery_count", d.recovery_count, "good ones in a row that open it", **counts
+            ),
+        )  # fmt: skip
+
+    def _declare_robot(self, settings: GateSettings) -> None:
+        """Effort limits of every robot; the payload where its weight is borne."""
+        robot = self._gate.robot
+        limits: Any = getattr(robot, "limits").effort  # noqa: B009
+        if limits is None:
+            limits = np.full(len(robot.joint_names), np.inf)
+        text = "a torque beyond is not forwarded"
+        unit = "N m or N, one a joint"
+        values = {"effort_limits": self.declare("effort_limits", limits.tolist(), text, unit=unit)}
+        if settings.on_stop == "gravity":
+            payload: Any = getattr(robot, "payload")  # noqa: B009
+            for name, (key, unit) in PAYLOAD.items():
+                value = getattr(payload, key)
+                default = value.tolist() if isinstance(value, np.ndarray) else value
+                text = f"the robot's {name}, by default its file's"
+                values[name] = self.declare(name, default, text, unit=unit)
+        robot = _changed(robot, values)
+        if settings.on_stop == "gravity":
+            # Refused here where the robot has no masses; and compiled before it is needed.
+            zeros = np.zeros(len(robot.joint_names))
+            inverse_dynamics(robot, robot.inverse(robot.home()), zeros, zeros)
+        self._gate.change_robot(robot)
+
+    def _on_torques(self, message: JointState) -> None:
+        running = not self._gate.stream.stopped
+        try:
+            command = self._gate.torques(message, self.now(), time.monotonic_ns())
+        finally:
+            if running and self._gate.stream.stopped:
+                self._watch()
+        if command is not None:
+            self._send(command)
+
+    def _on_joint_state(self, message: JointState) -> None:
+        self._gate.joint_state(message, self.now(), time.monotonic_ns())
+
+    def _watch(self) -> None:
+        """While the gate is closed its command is repeated: a controller may come late."""
+        if not self.active:
+            return
+        steady = time.monotonic_ns()
+        self._gate.watch(steady)
+        self._tell()
+        if self._gate.stream.stopped:
+            self._send(self._gate.stop_command(steady))
+
+    def _tell(self) -> None:
+        """One line each time that the gate opens or closes."""
+        stream = self._gate.stream
+        if stream.stopped is self._closed:
+            return
+        self._closed = stream.stopped
+        if stream.stopped:
+            self.get_logger().warning(f"closed: {stream.reason}: {stream.text}")
+        else:
+            self.get_logger().info("open: torques are forwarded")
+
+    def _send(self, command: np.ndarray[Any, Any]) -> None:
+        self._commands.publish(Float64MultiArray(data=array("d", command.tobytes())))
+
+    def _on_set(self, changes: list[Parameter]) -> Any:
+        values = health.values_of(changes)
+
+        def check() -> None:
+            self._pending = _changed(self._gate.robot, values)
+
+        return health.verdict(check)
+
+    def _after_set(self, changes: list[Parameter]) -> None:
+        if self._pending is not None:
+            self._gate.change_robot(self._pending)
+            self._pending = None
+
+
+def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
+    """The robot with the gate's parameters in place of its file's.
+
+    :raises ParameterError: a value is refused.
+    """
+    sections: dict[str, Any] = {}
+    if "effort_limits" in values:
+        sections["limits"] = {"effort": list(values["effort_limits"])}
+    payload = {key: values[name] for name, (key, _) in PAYLOAD.items() if name in values}
+    if payload:
+        sections["payload"] = {k: v if k == "mass" else list(v) for k, v in payload.items()}
+    return robot.changed(**sections)
+
+
+def main() -> None:
+    """Entry point of ``ros2 run pkm_twin command_gate``."""
+    sys.exit(health.run(CommandGate, farewell=True))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several machines of one cell, each with its robot and its topics in a namespace of its own."""
+
+from pathlib import Path
+
+from launch.actions import (
+    DeclareLaunchArgument,
+    GroupAction,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+)
+from launch.launch_context import LaunchContext
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+
+from launch import LaunchDescription
+
+TWIN = str(Path(__file__).with_name("twin.launch.py"))
+
+MACHINES = "picker=delta_cu,head=prru"
+
+ARGUMENTS = {
+    "machines": (MACHINES, "NAMESPACE=ROBOT for each machine, commas between"),
+    "params_file": ("", "parameters, a YAML file with a section /NAMESPACE/NODE a node"),
+    "command_gate": ("false", "run this node in every namespace"),
+    "use_sim_time": ("false", "true where a bag is replayed with --clock"),
+    "respawn": ("true", "start a node again that has ended"),
+    "log_level": ("info", "debug, info, warn, error or fatal"),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription(
+        [
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=text)
+                for name, (default, text) in ARGUMENTS.items()
+            ),
+            OpaqueFunction(function=machines),
+        ]
+    )
+
+
+def machines(context: LaunchContext) -> list[GroupAction]:
+    """A twin a machine, once the arguments have their values."""
+    given = {name: context.launch_configurations[name] for name in ARGUMENTS}
+    pairs = [pair.strip().partition("=") for pair in given.pop("machines").split(",")]
+    for namespace, sign, robot in pairs:
+        if not (namespace and sign and robot):
+            raise RuntimeError(f"machines: {namespace + sign + robot!r} is not NAMESPACE=ROBOT")
+    names = [namespace for namespace, _, _ in pairs]
+    if len(set(names)) < len(names):
+        raise RuntimeError(f"machines: {', '.join(names)}: two share a namespace")
+    # A group a machine: what one include sets, the next does not see.
+    return [
+        GroupAction(
+            [
+                IncludeLaunchDescription(
+                    PythonLaunchDescriptionSource(TWIN),
+                    launch_arguments={**given, "namespace": namespace, "robot": robot}.items(),
+                )
+            ]
+        )
+        for namespace, _, robot in pairs
+    ]

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin guard-check``: a subscriber that reports what a controller must notice of torques."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from pkm_twin.apps.verdict import Item, Verdict
+from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.ros.messages import stamp_of
+from pkm_twin.ros.signals import first_signal
+from pkm_twin.streams.arrivals import SECOND, Arrivals
+
+TYPE = "sensor_msgs/msg/JointState"
+DEPTH = 1000
+"""Deep enough that a stall of this process is no loss of the topic's."""
+LOOK = 0.05
+"""How often silence, signals and the end of the time are looked for, s."""
+
+
+@dataclass(frozen=True)
+class Offer:
+    """What the topic's publishers promise: how many they are, and the weakest promise, s."""
+
+    publishers: int
+    deadline: float
+    lifespan: float
+
+
+@dataclass(frozen=True)
+class GuardReport:
+    """All items; the torques are good where none is bad."""
+
+    topic: str
+    items: tuple[Item, ...]
+    arrivals: Arrivals
+
+    @property
+    def good(self) -> bool:
+        """No item is bad."""
+        return all(item.verdict is not Verdict.BAD for item in self.items)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data for a script; times in s."""
+        a = self.arrivals
+        return {
+            "topic": self.topic,
+            "good": self.good,
+            "messages": a.count,
+            "longest_silence_s": a.longest_silence / SECOND,
+            "silences_beyond_deadline": a.silences,
+            "mean_age_s": a.ages / a.count / SECOND if a.count else None,
+            "oldest_s": a.oldest / SECOND,
+            "late_messages": a.late,
+            "lost_messages": a.topic.missed,
+            "faults": dict(a.faults),
+            "items": [asdict(item) for item in self.items],
+        }
+
+
+def judge(topic: str, arrivals: Arrivals, offer: Offer) -> GuardReport:
+    """The report of what came, against what a controller needs."""
+    a = arrivals
+    least = f"at most {1e3 * a.deadline:g} ms"
+    duration = (a.last - a.first) / SECOND
+    rate = f", {a.count / duration:.1f} a second" if duration > 0.0 else ""
+    mean = a.ages / a.count / SECOND if a.count else math.nan
+    beyond = f", {a.silences} beyond it" if a.silences else ""
+    faults = ", ".join(f"{reason}: {count}" for reason, count in a.faults.items())
+
+    def item(what: str, value: str, bound: str, good: bool) -> Item:
+        # Nothing is known of torques that never came.
+        known = Verdict.GOOD if good else Verdict.BAD
+        return Item(what, value, bound, known if a.count else Verdict.UNKNOWN)
+
+    came = Verdict.GOOD if a.count else Verdict.BAD
+    items = [
+        Item("messages", f"{a.count}{rate}", "some", came),
+        item("longest silence", f"{a.longest_silence / 1e6:.1f} ms{beyond}", least, not a.silences),
+        item(
+            "age on arrival", f"mean {1e3 * mean:.1f}, most {a.oldest / 1e6:.1f} ms", least,
+            not a.late,
+        ),
+        item("lost messages", str(a.topic.missed), "0", not a.topic.missed),
+        item("faults", faults or "none", "none", not a.faults),
+        Item("publishers", str(offer.publishers), "1", _one(offer.publishers)),
+    ]  # fmt: skip
+    if offer.publishers:
+        items += [
+            Item(f"{what} offered", _seconds(value), least, _promise(value, a.deadline))
+            for what, value in (("deadline", offer.deadline), ("lifespan", offer.lifespan))
+        ]
+    return GuardReport(topic, tuple(items), arrivals)
+
+
+def watch(
+    topic: str,
+    deadline: float,
+    duration: float,
+    wait: float,
+    sim_time: bool = False,
+) -> GuardReport:
+    """Subscribe for a while, or until the first signal.
+
+    :param topic: of sensor_msgs/JointState messages with efforts.
+    :param duration: how long, s, from the first message on; ``wait``: how long for that one, s.
+    :param sim_time: stamps are by /clock.
+    :raises PkmTwinError: no ROS, or a topic of another type.
+    """
+    for name, value in (("deadline", deadline), ("duration", duration), ("wait", wait)):
+        if not 0.0 < value < math.inf:
+            raise ParameterError(name, value, "a number of seconds above 0")
+    arrivals = Arrivals(deadline)
+    offer = Offer(0, math.inf, math.inf)
+    with _node(sim_time) as (node, spin):
+        name = node.resolve_topic_name(topic)
+        now = node.get_clock().now
+
+        def take(message: Any, info: Any) -> None:
+            try:
+                stamp = stamp_of(message.header)
+            except MessageError:
+                stamp = 0
+            arrivals.arrived(
+                message.name,
+                message.effort,
+                stamp,
+                now().nanoseconds,
+                time.monotonic_ns(),
+                info["publication_sequence_number"],
+                info["source_timestamp"],
+            )
+
+        began = time.monotonic()
+        subscribed = False
+        try:
+            with first_signal(KeyboardInterrupt):
+                while time.monotonic() - began < wait or arrivals.count:
+                    if not subscribed:
+                        subscribed = _subscribe(node, name, take)
+                    spin(LOOK)
+                    offer = _offer(node, name) or offer
+                    if arrivals.count and time.monotonic_ns() > arrivals.first + duration * SECOND:
+                        break
+        except KeyboardInterrupt:
+            pass  # What was seen until then is the report.
+        arrivals.ended(time.monotonic_ns())
+    return judge(name, arrivals, offer)
+
+
+@contextmanager
+def _node(sim_time: bool) -> Iterator[tuple[Any, Any]]:
+    """A node, and a function that lets it take messages for some time, s."""
+    try:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.parameter import Parameter
+        from rclpy.signals import SignalHandlerOptions
+    except ImportError as error:
+        raise PkmTwinError(
+            f"guard-check needs ROS 2: source its setup, or pip install pkm_twin[jazzy] ({error})"
+        ) from error
+    context = rclpy.Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        clock = Parameter("use_sim_time", value=sim_time)
+        node = rclpy.create_node("guard_check", context=context, parameter_overrides=[clock])
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+
+        def spin(seconds: float) -> None:
+            until = time.monotonic() + seconds
+            while (left := until - time.monotonic()) > 0.0:
+                executor.spin_once(timeout_sec=left)
+
+        yield node, spin
+        executor.shutdown()
+        node.destroy_node()
+    finally:
+        context.try_shutdown()
+
+
+def _subscribe(node: Any, topic: str, take: Any) -> bool:
+    """Subscribe as the topic's publishers offer it; False while there are none.
+
+    :raises PkmTwinError: the topic carries something else.
+    """
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import JointState
+
+    infos = node.get_publishers_info_by_topic(topic)
+    if not infos:
+        return False
+    other = {info.topic_type for info in infos} - {TYPE}
+    if other:
+        raise PkmTwinError(
+            f"{topic} carries {', '.join(sorted(other))}, which has no stamp to judge by; give a "
+            f"topic of {TYPE}, such as delta_dynamics/joint_torques"
+        )
+    reliable = all(i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos)
+    qos = QoSProfile(
+        depth=DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+    )
+    node.create_subscription(JointState, topic, take, qos)
+    return True
+
+
+def _offer(node: Any, topic: str) -> Offer | None:
+    """What the publishers of now promise; None where there are none."""
+    profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
+    if not profiles:
+        return None
+    return Offer(
+        len(profiles),
+        max(_duration(profile.deadline) for profile in profiles),
+        max(_duration(profile.lifespan) for profile in profiles),
+    )
+
+
+def _duration(duration: Any) -> float:
+    """In s; the middleware's largest number means no promise."""
+    seconds = float(duration.nanoseconds) / SECOND
+    return seconds if 0.0 < seconds < 1e9 else math.inf
+
+
+def _seconds(value: float) -> str:
+    return f"{1e3 * value:g} ms" if math.isfinite(value) else "none"
+
+
+def _one(publishers: int) -> Verdict:
+    """Two that send torques are one too many; none at the end is a publisher that has gone."""
+    return Verdict.GOOD if publishers == 1 else Verdict.BAD
+
+
+def _promise(offered: float, deadline: float) -> Verdict:
+    # A hair for what the middleware rounds.
+    return Verdict.GOOD if offered <= deadline * (1.0 + 1e-9) else Verdict.BAD
+
+
+def guard_check(
+    topic: Annotated[
+        str, typer.Argument(help="topic of stamped torques")
+    ] = "delta_dynamics/joint_torques",
+    deadline: Annotated[
+        float, typer.Option(help="longest silence and greatest age (s) that the controller bears")
+    ] = 0.1,
+    duration: Annotated[float, typer.Option(help="how long to watch, s; Ctrl-C ends it")] = 10.0,
+    wait: Annotated[float, typer.Option(help="longest wait (s) for the first message")] = 5.0,
+    sim_time: Annotated[bool, typer.Option("--sim-time", help="stamps are by /clock")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="machine-readable output")] = False,
+) -> None:
+    """Report what a controller must notice of a running node's torques.
+
+    Subscribes as a controller would: are the torques fresh when they come, is no silence longer
+    than the deadline, is none lost, is every one finite, with one effort a joint and a stamp after
+    the last, is there one publisher, and does it promise deadline and lifespan? Needs ROS.
+
+    Exit code 0: nothing is bad. 1: something is, or no torques came.
+    """
+    report = watch(topic, deadline, duration, wait, sim_time)
+    if as_json:
+        typer.echo(json.dumps(report.as_json(), indent=2, allow_nan=False))
+    else:
+        table = Table(title=Text(report.topic))
+        for column in ("what", "value", "must be", "verdict"):
+            table.add_column(column)
+        colours = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
+        for item in report.items:
+            verdict = Text(item.verdict, style=colours[item.verdict])
+            table.add_row(item.what, Text(item.value), Text(item.bound), verdict)
+        console = Console()
+        (console if console.is_terminal else Console(width=140)).print(table)
+    if not report.good:
+        sys.exit(1)

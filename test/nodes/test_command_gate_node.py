@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node command_gate over the real middleware, beside the node whose torques it forwards."""
+
+import signal
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from test.nodes.harness import SECOND, counts_of, one_line_refusal, values_of
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from test.nodes.twin import COMMON, MODULE, NAMES, ROBOT, Q, Twin, state
+
+GATE = "delta_dynamics.gate_node"
+DEADLINE = 1.0
+"""Longer than a loaded machine keeps a process waiting."""
+SETTINGS = (f"deadline:={DEADLINE}", "recovery_count:=2")
+ZEROS = [0.0, 0.0, 0.0]
+
+
+class Gated:
+    """A running gate, its commands, and a source of torques of this process."""
+
+    def __init__(self, peer, launch, name, *parameters):
+        self.peer, self.name, self._launch = peer, name, launch
+        self._parameters = (*SETTINGS, *parameters)
+        peer.hear(Float64MultiArray, f"/{name}/commands")
+        offered = QoSProfile(depth=10)
+        offered.deadline = offered.lifespan = Duration(seconds=DEADLINE)
+        self._torques = peer.node.create_publisher(JointState, f"/{name}/torques", offered)
+        self._last = 0
+        self.start()
+
+    def start(self):
+        remap = ("-r", f"__node:={self.name}", "-r", f"joint_states:=/{self.name}/states")
+        remap += ("-r", f"delta_dynamics/joint_torques:=/{self.name}/torques")
+        self.process = self._launch(GATE, *self._parameters, arguments=remap)
+
+    @property
+    def commands(self):
+        return [list(m.data) for m in self.peer.received(f"/{self.name}/commands")]
+
+    def send(self, effort):
+        self._last = max(self.peer.now(), self._last + 1)
+        message = JointState(name=list(NAMES), effort=list(effort))
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._last, SECOND)
+        self._torques.publish(message)
+
+    def until_last(self, command, repeat=None):
+        """Wait until the newest command is this one."""
+        self.peer.until(lambda: self.commands[-1:] == [list(command)], 60.0, repeat)
+
+    def diagnostics(self, condition=lambda array: True):
+        return self.peer.diagnostics(f"/{self.name}", condition)
+
+    def change(self, transition):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert self.peer.call(ChangeState, f"/{self.name}/change_state", request).success
+
+
+@pytest.fixture(scope="module")
+def heard(peer):
+    peer.hear(DiagnosticArray, "/diagnostics")
+    return peer
+
+
+@pytest.fixture(scope="module")
+def gated(heard, launch):
+    return Gated(heard, launch, "gate")
+
+
+def test_zeros_come_before_the_first_torque(gated):
+    gated.peer.until(lambda: len(gated.commands) >= 3, 60.0)
+    assert all(command == ZEROS for command in gated.commands)
+    array = gated.diagnostics()
+    assert array.status[0].level == b"\x02"
+    assert array.status[0].message == "closed: waiting: no torque yet"
+    assert array.status[0].hardware_id == "delta_cu"
+
+
+def test_torques_are_forwarded_and_silence_makes_them_zeros(gated):
+    effort = (0.5, -0.25, 1.0)
+    gated.until_last(effort, lambda: gated.send(effort))
+    assert values_of(gated.diagnostics())["controllers"] == "1"
+    gated.until_last(ZEROS)
+    array = gated.diagnostics(lambda a: values_of(a)["open"] == "False")
+    assert counts_of(array, "closed")["stale torques"] >= 1
+
+
+def test_a_bad_torque_closes_the_gate(gated):
+    effort = (0.5, 0.5, 0.5)
+    gated.until_last(effort, lambda: gated.send(effort))
+    gated.send((np.nan, 0.0, 0.0))
+    gated.until_last(ZEROS)
+    array = gated.diagnostics(lambda a: "not finite" in counts_of(a, "closed"))
+    assert counts_of(array, "torques rejected")["not finite"] == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_last_word_of_a_gate_that_is_ended_is_not_a_torque(gated, number):
+    effort = (1.0, 2.0, 3.0)
+    gated.until_last(effort, lambda: gated.send(effort))
+    # Torques go on, so that nothing but the end itself sends the zeros.
+    gated.process.process.send_signal(number)
+    gated.peer.until(lambda: not gated.process.alive(), repeat=lambda: gated.send(effort))
+    assert gated.process.wait() == 0, gated.process.output
+    assert "Traceback" not in gated.process.output
+    gated.until_last(ZEROS)
+    gated.start()
+    gated.until_last(effort, lambda: gated.send(effort))
+
+
+def test_a_new_gate_takes_back_what_a_killed_one_has_left(gated):
+    effort = (1.0, 2.0, 3.0)
+    gated.until_last(effort, lambda: gated.send(effort))
+    gated.process.process.kill()
+    gated.process.process.wait()
+    gated.peer.until(lambda: gated.peer.node.count_publishers("/gate/commands") == 0)
+    assert gated.commands[-1] == list(effort)
+    gated.start()
+    gated.until_last(ZEROS)
+
+
+def test_an_inactive_gate_has_said_zeros_and_is_silent(gated):
+    effort = (1.0, 2.0, 3.0)
+    gated.until_last(effort, lambda: gated.send(effort))
+    gated.change(Transition.TRANSITION_DEACTIVATE)
+    gated.until_last(ZEROS)
+    gated.peer.received("/gate/commands").clear()
+    gated.send(effort)
+    assert gated.diagnostics().status[0].message == "inactive"
+    assert gated.commands == []
+    gated.change(Transition.TRANSITION_ACTIVATE)
+    gated.until_last(ZEROS)
+    gated.until_last(effort, lambda: gated.send(effort))
+
+
+def test_a_killed_twin_leaves_zeros(heard, launch):
+    """What the whole is for: kill -9 of the node whose torques move the machine."""
+    remap = ("-r", "__node:=twin", "-r", "joint_states:=/twin/states")
+    process = launch(MODULE, *COMMON, f"stale_after:={DEADLINE}", arguments=remap)
+    twin = Twin(heard, process, "twin").ready()
+    heard.hear(Float64MultiArray, "/guarded/commands")
+    remap = ("-r", "__node:=guarded", "-r", "delta_dynamics/joint_torques:=/twin/joint_torques")
+    launch(GATE, *SETTINGS, arguments=remap)
+    torques, commands = twin.received("joint_torques"), heard.received("/guarded/commands")
+
+    def moved():
+        return commands and np.abs(commands[-1].data).max() > 0.1
+
+    heard.until(moved, 60.0, lambda: twin.send_state(state(twin.stamp())))
+    # Every command is a torque that the twin has sent, bit for bit.
+    sent = {tuple(m.effort) for m in torques}
+    assert {tuple(m.data) for m in commands} <= sent | {tuple(ZEROS)}
+    process.process.kill()
+    heard.until(lambda: list(commands[-1].data) == ZEROS)
+
+
+def test_gravity_is_that_of_the_measured_state(heard, launch):
+    gated = Gated(heard, launch, "bearing", "on_stop:=gravity")
+    heard.talk(JointState, "/bearing/states")
+    held = inverse_dynamics(ROBOT, Q, np.zeros(3), np.zeros(3))
+    gated.until_last(held, lambda: heard.send("/bearing/states", state(heard.now())))
+    # Without states there is no pose whose weight could be borne.
+    gated.until_last(ZEROS)
+    gated.process.stop()
+
+
+def test_a_publisher_that_promises_no_deadline_is_told_of(heard, launch):
+    gated = Gated(heard, launch, "demanding")
+    heard.talk(JointState, "/demanding/torques")
+    also = "incompatible QoS of another node on delta_dynamics/joint_torques: deadline"
+    gated.diagnostics(lambda a: also in values_of(a)["also"])
+    assert all(command == ZEROS for command in gated.commands)
+    gated.process.stop()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "named"),
+    [
+        (["on_stop:=nothing"], "on_stop: 'nothing'"),
+        (["on_stop:=gravty"], "did you mean 'gravity'"),
+        (["deadline:=0.0"], "deadline: 0.0"),
+        (["deadline:=.nan"], "deadline: nan"),
+        (["mechanism:=delta_uc"], "did you mean 'delta_cu'"),
+        (["effort_limits:=[1.0, .nan, 1.0]"], "effort[1]: nan"),
+        (["deadlin:=0.2"], "did you mean 'deadline'"),
+    ],
+)
+def test_a_bad_configuration_is_refused_in_one_line(launch, parameters, named):
+    line = one_line_refusal(launch(GATE, *parameters))
+    assert line.startswith("refused to start: ")
+    assert named in line
+
+
+def test_without_a_name_it_waits_for_the_node_of_the_default_name(heard, launch):
+    process = launch(GATE)
+    heard.until(lambda: heard.node.count_subscribers("/delta_dynamics/joint_torques") == 1, 60.0)
+    assert process.stop() == 0

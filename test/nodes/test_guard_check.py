@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin guard-check`` over the real middleware, beside the node that it is for."""
+
+import json
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from test.nodes.harness import REPOSITORY
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from test.nodes.twin import COMMON, MODULE, Twin, state
+
+GENEROUS = 30.0
+"""Longer than a loaded machine keeps a process waiting, s."""
+
+
+@pytest.fixture
+def check(domain):
+    """Start the command: a process with its output."""
+    started = []
+
+    def run(*arguments):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pkm_twin.apps.cli", "guard-check", *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=REPOSITORY,
+            env=domain.environment(),
+            start_new_session=True,
+        )
+        started.append(process)
+        return process
+
+    yield run
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def twin(peer, launch):
+    remap = ("-r", "__node:=judged", "-r", "joint_states:=/judged/states")
+    process = launch(MODULE, *COMMON, f"stale_after:={GENEROUS}", arguments=remap)
+    return Twin(peer, process, "judged").ready()
+
+
+def stream_until_end(twin, process):
+    """Joint states until the command has ended: its exit code and its JSON."""
+    twin.peer.until(
+        lambda: process.poll() is not None,
+        90.0,
+        lambda: twin.send_state(state(twin.stamp())),
+    )
+    out, err = process.communicate()
+    return process.returncode, json.loads(out) if out else {}, err
+
+
+def test_a_running_node_is_good(twin, check):
+    process = check(
+        "judged/joint_torques", "--deadline", GENEROUS, "--duration", 1, "--wait", 60, "--json"
+    )
+    code, data, err = stream_until_end(twin, process)
+    assert (code, err) == (0, "")
+    assert data["good"]
+    assert data["messages"] > 1
+    assert data["lost_messages"] == 0
+    assert {item["verdict"] for item in data["items"]} == {"good"}
+
+
+def test_a_deadline_that_the_node_does_not_promise_is_bad(twin, check):
+    """And a signal is the end of the watch, with its report."""
+    process = check("judged/joint_torques", "--deadline", 1e-6, "--duration", 600, "--json")
+    topic = "/judged/joint_torques"
+    count = twin.peer.node.count_subscribers
+    before = count(topic)
+    twin.peer.until(lambda: count(topic) > before, 60.0)
+    for _ in range(50):
+        twin.settle()
+    process.send_signal(signal.SIGINT)
+    code, data, _ = stream_until_end(twin, process)
+    assert code == 1
+    verdicts = {item["what"]: item["verdict"] for item in data["items"]}
+    assert verdicts["longest silence"] == verdicts["age on arrival"] == "bad"
+    assert verdicts["deadline offered"] == verdicts["lifespan offered"] == "bad"
+    assert verdicts["faults"] == verdicts["lost messages"] == "good"
+
+
+def test_where_nothing_comes_it_says_so(peer, check):
+    process = check("nobody/joint_torques", "--wait", 0.5)
+    assert process.wait(60) == 1
+    out, err = process.communicate()
+    assert "0" in out
+    assert err == ""
+
+
+def test_plain_commands_cannot_be_judged(peer, check):
+    peer.talk(Float64MultiArray, "/plain/commands")
+    process = check("plain/commands", "--wait", 60)
+    assert process.wait(90) == 1
+    _, err = process.communicate()
+    (line,) = err.strip().splitlines()
+    assert "std_msgs/msg/Float64MultiArray" in line
+    assert "delta_dynamics/joint_torques" in line
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--deadline", "0"), ("--duration", "nan"), ("--wait", "inf")]
+)
+def test_a_bound_that_is_no_time_is_refused(check, option, value):
+    process = check(option, value)
+    assert process.wait(60) == 1
+    assert process.communicate()[1].startswith(f"pkm-twin: {option[2:]}: ")
+
+
+def test_it_matches_a_publisher_of_either_reliability(peer, check):
+    topic = "/best/torques"
+    qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher = peer.node.create_publisher(JointState, topic, qos)
+    process = check("best/torques", "--duration", 0.2, "--wait", 60, "--json")
+    message = JointState(name=["a"], effort=[1.0])
+
+    def repeat():
+        message.header.stamp = peer.node.get_clock().now().to_msg()
+        publisher.publish(message)
+
+    peer.until(lambda: process.poll() is not None, 90.0, repeat)
+    assert json.loads(process.communicate()[0])["messages"] > 0

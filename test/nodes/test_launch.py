@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The launch files, read everywhere and run where launch is installed.
+
+Running needs what the wheels do not bring: ``ros2 launch``, and this package in a sourced
+workspace.
+"""
+
+import ast
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import tempfile
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+import yaml
+
+from delta_dynamics import inverse_dynamics
+from test.nodes.harness import REPOSITORY, end_with_parent
+
+LAUNCH = REPOSITORY / "launch"
+FILES = ("twin", "cell", "control")
+NODES = {
+    "delta_dynamics": "delta_dynamics/node.py",
+    "stiffness_monitor": "stiffness_monitor/node.py",
+    "command_gate": "delta_dynamics/gate_node.py",
+}
+PATIENCE = 90.0
+"""How long a loaded machine may take to start several nodes, s."""
+
+
+def literal(name, variable):
+    """A top-level variable of a launch file, f-strings in it as <>."""
+    tree = ast.parse((LAUNCH / f"{name}.launch.py").read_text(encoding="utf-8"))
+    (value,) = (
+        node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and node.targets[0].id == variable
+    )
+
+    class Plain(ast.NodeTransformer):
+        def visit_JoinedStr(self, node):
+            return ast.copy_location(ast.Constant("<>"), node)
+
+        def visit_Name(self, node):
+            return ast.copy_location(ast.Constant(literal(name, node.id)), node)
+
+    return ast.literal_eval(Plain().visit(value))
+
+
+class TestText:
+    """What holds without launch."""
+
+    @pytest.mark.parametrize("name", FILES)
+    def test_the_readme_lists_every_argument_with_its_default(self, name):
+        readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+        table = readme.split(f"| `{name}.launch.py` |")[1].split("\n\n")[0]
+        rows = re.findall(r"^\| `(\w+)` \|(.*?)\|", table, re.MULTILINE)
+        listed = {argument: default.strip("` ") for argument, default in rows}
+        assert listed == {key: default for key, (default, _) in literal(name, "ARGUMENTS").items()}
+
+    def test_every_node_has_its_switch_and_knows_its_parameters(self):
+        parameters, arguments = literal("twin", "PARAMETERS"), literal("twin", "ARGUMENTS")
+        assert set(parameters) == set(NODES) <= set(arguments)
+        for node, names in parameters.items():
+            source = (REPOSITORY / NODES[node]).read_text(encoding="utf-8")
+            assert all(f'"{name}"' in source for name in names)
+            assert set(names) <= set(arguments)
+
+    def test_what_a_cell_passes_on_a_twin_takes(self):
+        assert set(literal("cell", "ARGUMENTS")) - {"machines"} <= set(literal("twin", "ARGUMENTS"))
+
+
+def why_not():
+    """Why nothing can be launched here, or None."""
+    if find_spec("launch_ros") is None or find_spec("ros2launch") is None:
+        return "ros2 launch is not installed"
+    from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+
+    try:
+        get_package_prefix("pkm_twin")
+    except PackageNotFoundError:
+        return "pkm_twin is in no sourced workspace"
+    return None
+
+
+def installed(package):
+    """Whether a package is in a sourced workspace."""
+    if why_not() is not None:
+        return False
+    from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+
+    try:
+        get_package_prefix(package)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def mock_hardware(names, positions):
+    """A URDF with these joints side by side, under mock hardware that stands where told."""
+    limit = '<limit lower="-3" upper="3" velocity="20" effort="50"/>'
+    links = "".join(
+        f'<link name="l{i}"/><joint name="{name}" type="revolute"><parent link="base_link"/>'
+        f'<child link="l{i}"/><axis xyz="0 1 0"/>{limit}</joint>'
+        for i, name in enumerate(names)
+    )
+    joints = "".join(
+        f'<joint name="{name}"><command_interface name="effort"/><state_interface name="position">'
+        f'<param name="initial_value">{position}</param></state_interface>'
+        '<state_interface name="velocity"/><state_interface name="effort"/></joint>'
+        for name, position in zip(names, positions, strict=True)
+    )
+    return (
+        f'<robot name="mock"><link name="base_link"/>{links}<ros2_control name="mock" '
+        'type="system"><hardware><plugin>mock_components/GenericSystem</plugin></hardware>'
+        f"{joints}</ros2_control></robot>"
+    )
+
+
+class Launched:
+    """``ros2 launch FILE ARGUMENTS`` in a session of its own."""
+
+    def __init__(self, domain, name, arguments):
+        self._output = tempfile.TemporaryFile("w+")  # noqa: SIM115
+        self.process = subprocess.Popen(
+            ["ros2", "launch", str(LAUNCH / f"{name}.launch.py"), *arguments],
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            cwd=tempfile.gettempdir(),
+            env=domain.environment(),
+            start_new_session=True,
+            preexec_fn=end_with_parent,
+        )
+
+    @property
+    def output(self):
+        self._output.seek(0)
+        return self._output.read()
+
+    def started(self, node):
+        """Process ids of a node, in the order of its starts."""
+        pattern = rf"\[{node}-\d+\]: process started with pid \[(\d+)\]"
+        return [int(number) for number in re.findall(pattern, self.output)]
+
+    def close(self):
+        """As Ctrl-C in a terminal; what is left after that is killed."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(30.0)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+        self._output.close()
+
+
+@pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
+class TestRunning:
+    @pytest.fixture
+    def launched(self, domain):
+        running = []
+
+        def start(name, *arguments):
+            running.append(Launched(domain, name, arguments))
+            return running[-1]
+
+        yield start
+        for process in running:
+            process.close()
+
+    def nodes(self, peer):
+        pairs = peer.node.get_node_names_and_namespaces()
+        return sorted(f"{space.rstrip('/')}/{name}" for name, space in pairs if name != "peer")
+
+    def subscribed(self, peer):
+        """Topics that a node of the launch subscribes to."""
+        return {
+            topic
+            for topic, _ in peer.node.get_topic_names_and_types()
+            if peer.node.count_subscribers(topic)
+        } - {"/parameter_events", "/rosout"}
+
+    def until_nodes(self, peer, process, *names):
+        """Wait until exactly these nodes are there."""
+
+        def so():
+            assert process.process.poll() is None, process.output
+            return self.nodes(peer) == sorted(names)
+
+        peer.until(so, PATIENCE)
+
+    def parameter(self, peer, node, name):
+        from rcl_interfaces.srv import GetParameters
+        from rclpy.parameter import parameter_value_to_python
+
+        request = GetParameters.Request(names=[name])
+        answer = peer.call(GetParameters, f"{node}/get_parameters", request)
+        return parameter_value_to_python(answer.values[0])
+
+    def test_one_robot_in_both_nodes_by_default(self, launched, peer):
+        process = launched("twin")
+        self.until_nodes(peer, process, "/delta_dynamics", "/stiffness_monitor")
+        for node in ("/delta_dynamics", "/stiffness_monitor"):
+            assert self.parameter(peer, node, "mechanism") == "delta_cu"
+            assert self.parameter(peer, node, "use_sim_time") is False
+
+    def test_a_namespace_takes_every_topic_along(self, launched, peer):
+        process = launched("twin", "namespace:=left", "command_gate:=true", "robot:=prru")
+        names = [f"/left/{node}" for node in NODES]
+        self.until_nodes(peer, process, *names)
+        peer.until(lambda: "/left/wrench" in self.subscribed(peer), PATIENCE)
+        assert {topic for topic in self.subscribed(peer) if not topic.startswith("/left/")} == set()
+        assert "/left/joint_states" in self.subscribed(peer)
+        for name in names:
+            assert self.parameter(peer, name, "mechanism") == "prru"
+
+    @pytest.mark.parametrize("space", ["", "right"])
+    @pytest.mark.parametrize("section", ["/**", "node"])
+    @pytest.mark.parametrize("robot", ["", "delta"])
+    def test_a_file_goes_before_the_default_and_an_argument_before_the_file(
+        self, launched, peer, tmp_path, space, section, robot
+    ):
+        node = f"/{space}/command_gate".replace("//", "/")
+        file = tmp_path / "parameters.yaml"
+        parameters = {"mechanism": "prru", "deadline": 0.25}
+        key = node if section == "node" else section
+        file.write_text(yaml.safe_dump({key: {"ros__parameters": parameters}}))
+        # The command line of launch takes no empty values.
+        chosen = {"namespace": space, "robot": robot}
+        process = launched(
+            "twin",
+            *(f"{key}:={value}" for key, value in chosen.items() if value),
+            f"params_file:={file}",
+            "delta_dynamics:=false",
+            "stiffness_monitor:=false",
+            "command_gate:=true",
+        )
+        self.until_nodes(peer, process, node)
+        assert self.parameter(peer, node, "mechanism") == (robot or "prru")
+        assert self.parameter(peer, node, "deadline") == 0.25
+
+    def test_a_killed_node_comes_again_and_so_does_the_gate_in_any_case(self, launched, peer):
+        process = launched(
+            "twin", "respawn:=false", "stiffness_monitor:=false", "command_gate:=true"
+        )
+        self.until_nodes(peer, process, "/delta_dynamics", "/command_gate")
+        (gate,) = process.started("command_gate")
+        os.kill(gate, signal.SIGKILL)
+        peer.until(lambda: len(process.started("command_gate")) == 2, PATIENCE)
+        (dynamics,) = process.started("delta_dynamics")
+        os.kill(dynamics, signal.SIGKILL)
+        peer.until(lambda: f"process has died [pid {dynamics}, exit code -9" in process.output)
+        self.until_nodes(peer, process, "/command_gate")
+        assert len(process.started("delta_dynamics")) == 1
+
+    def test_respawn_is_the_default(self, launched, peer):
+        process = launched("twin", "stiffness_monitor:=false")
+        self.until_nodes(peer, process, "/delta_dynamics")
+        os.kill(process.started("delta_dynamics")[0], signal.SIGKILL)
+        peer.until(lambda: len(process.started("delta_dynamics")) == 2, PATIENCE)
+
+    def test_the_log_level_is_passed_on(self, launched, peer):
+        process = launched("twin", "stiffness_monitor:=false", "log_level:=error")
+        self.until_nodes(peer, process, "/delta_dynamics")
+        peer.until(lambda: "/joint_states" in self.subscribed(peer), PATIENCE)
+        assert "robot delta_cu" not in process.output
+
+    def test_a_cell_keeps_its_machines_apart(self, launched, peer):
+        process = launched("cell", "machines:=a=delta_cu,b=prru")
+        names = [f"/{space}/{node}" for space in "ab" for node in list(NODES)[:2]]
+        self.until_nodes(peer, process, *names)
+        both = {f"/{space}/joint_states" for space in "ab"}
+        peer.until(lambda: both <= self.subscribed(peer), PATIENCE)
+        assert "/joint_states" not in self.subscribed(peer)
+        assert self.parameter(peer, "/a/delta_dynamics", "mechanism") == "delta_cu"
+        assert self.parameter(peer, "/b/delta_dynamics", "mechanism") == "prru"
+        assert self.parameter(peer, "/b/stiffness_monitor", "mechanism") == "prru"
+
+    @pytest.mark.skipif(not installed("controller_manager"), reason="ros2_control is not installed")
+    @pytest.mark.parametrize("space", ["", "left"])
+    def test_a_controller_gets_the_efforts_of_a_goal(self, launched, peer, tmp_path, space):
+        """Through the twin's action to joint_trajectory_controller on mock hardware."""
+        from action_msgs.msg import GoalStatus
+        from control_msgs.action import FollowJointTrajectory
+        from control_msgs.msg import JointTrajectoryControllerState
+        from rclpy.action import ActionClient
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from std_msgs.msg import String
+
+        from test.nodes.twin import NAMES, ROBOT, Q, trajectory
+
+        prefix = f"/{space}".rstrip("/")
+        description = mock_hardware(NAMES, Q)
+        file = tmp_path / "robot.urdf"
+        file.write_text(description)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        publisher = peer.node.create_publisher(String, f"{prefix}/robot_description", latched)
+        publisher.publish(String(data=description))
+        state = f"{prefix}/joint_trajectory_controller/controller_state"
+        peer.hear(JointTrajectoryControllerState, state)
+        action = f"{prefix}/delta_dynamics/follow_joint_trajectory"
+        client = ActionClient(peer.node, FollowJointTrajectory, action)
+        chosen = [f"namespace:={space}"] if space else []
+        process = launched(
+            "control", f"description:={file}", "robot_state_publisher:=false", *chosen
+        )
+
+        def ready():
+            assert process.process.poll() is None, process.output
+            return client.server_is_ready() and peer.received(state)
+
+        try:
+            peer.until(ready, PATIENCE)
+            peer.received(state).clear()
+            sent = trajectory(count=5)
+            # The controller takes none that does not end at rest.
+            sent.points[-1].velocities = [0.0] * len(NAMES)
+
+            def answer():
+                goal = client.send_goal_async(FollowJointTrajectory.Goal(trajectory=sent))
+                peer.until(goal.done)
+                result = goal.result().get_result_async()
+                peer.until(result.done, PATIENCE)
+                return result.result()
+
+            last = answer()
+            # The node may see the controller later than this process does.
+            while last.result.error_string.startswith("no controller serves"):
+                last = answer()
+            assert last.status == GoalStatus.STATUS_SUCCEEDED, last.result.error_string
+            rows = [(p.positions, p.velocities, p.accelerations) for p in sent.points]
+            q, qd, qdd = (np.array(values) for values in zip(*rows, strict=True))
+            efforts = inverse_dynamics(ROBOT, q, qd, qdd)
+            least = 1e-4 * np.abs(efforts).max()
+
+            def outputs():
+                return np.array([m.output.effort for m in peer.received(state)])
+
+            # The controller runs over the points, and holds the last one's.
+            peer.until(lambda: np.abs(outputs()[-1] - efforts[-1]).max() < least)
+            moving = outputs()[np.abs(outputs()).max(1) > 0.0]
+            assert len(moving) > 5
+            assert (moving >= efforts.min(0) - least).all()
+            assert (moving <= efforts.max(0) + least).all()
+        finally:
+            client.destroy()
+            peer.node.destroy_publisher(publisher)
+
+    @pytest.mark.parametrize(
+        ("name", "argument", "said"),
+        [
+            ("twin", "params_file:=/no/such.yaml", "params_file: '/no/such.yaml' is no file"),
+            ("twin", "respawn:=maybe", "respawn: 'maybe' is neither true nor false"),
+            ("cell", "machines:=a", "machines: 'a' is not NAMESPACE=ROBOT"),
+            ("cell", "machines:=a=delta,a=prru", "two share a namespace"),
+        ],
+    )
+    def test_a_bad_argument_is_refused_by_name(self, launched, name, argument, said):
+        process = launched(name, argument)
+        assert process.process.wait(PATIENCE) == 1
+        assert said in process.output
+
+    def test_ctrl_c_ends_all_of_it_cleanly(self, launched, peer):
+        process = launched("twin", "command_gate:=true")
+        self.until_nodes(peer, process, *(f"/{node}" for node in NODES))
+        process.process.send_signal(signal.SIGINT)
+        process.process.wait(PATIENCE)
+        assert process.output.count("process has finished cleanly") == 3
+        assert "Traceback" not in process.output
