@@ -91,7 +91,7 @@ def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
     field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
     entries = [(n, Array, schema.vector(joints, **field)) for n in ("viscous", "coulomb")]
-    return dataclasses.make_dataclass("Friction", entries, frozen=True, eq=False)
+    return _section("Friction", entries, joints)
 
 
 @remembered
@@ -103,7 +103,23 @@ def limits_of(joints: int) -> Any:
         ("velocity", Any, schema.vector(joints, **above)),
         ("effort", Any, schema.vector(joints, **above)),
     ]
-    return dataclasses.make_dataclass("Limits", entries, frozen=True, eq=False)
+    return _section("Limits", entries, joints)
+
+
+def _section(name: str, entries: list[tuple[str, Any, Any]], joints: int) -> Any:
+    """A section's class for so many joints; what it makes passes between processes."""
+
+    def reduce(self: Any) -> tuple[Any, ...]:
+        return _rebuilt, (name, joints, [getattr(self, entry[0]) for entry in entries])
+
+    return dataclasses.make_dataclass(
+        name, entries, frozen=True, eq=False, namespace={"__reduce__": reduce}
+    )
+
+
+def _rebuilt(name: str, joints: int, values: list[Any]) -> Any:
+    schema_of = friction_of if name == "Friction" else limits_of
+    return schema_of(joints)(*values)
 
 
 class JointLimits(Protocol):
@@ -314,6 +330,16 @@ class Robot:
         :raises ParameterError: the robot's file gives none.
         """
         return self.engine
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy in another process is made from: all but what is derived and kept."""
+        derived = {
+            name
+            for part in type(self).__mro__
+            for name, value in vars(part).items()
+            if isinstance(value, cached_property)
+        }
+        return {name: value for name, value in vars(self).items() if name not in derived}
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -536,13 +562,14 @@ class Robot:
         if status is not None:
             self.refuse_joints(status, q)
         n = self.joints_count
-        return [m.reshape(*m.shape[:-1], -1, n) for m in (rates, twist)]
+        return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in (rates, twist)]
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Pose rates per joint rate (..., m, n), NaN where there is no assembly; which are good."""
         (rates, _), status = self.engine.jacobian(_NONE, q)
         good = np.ones(rates.shape[:-1], bool) if status is None else status[..., 0] == 0.0
-        return rates.reshape(*rates.shape[:-1], -1, self.joints_count), np.asarray(good)
+        n = self.joints_count
+        return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), np.asarray(good)
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Second derivative of the pose in time, shape (..., m)."""
