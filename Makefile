@@ -15,8 +15,8 @@ help:
 	@echo "make test         lint, types and tests"
 	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
-	@echo "make certificate  torques and compliance against other engines, into docs/certificate.md"
-	@echo "make fuzz         damage every kind of byte of a bag, and both nodes, at length (SECONDS, SEED)"
+	@echo "make certificate  torques and compliance against other engines, into docs/certificate*.md"
+	@echo "make fuzz         every bit of a bag; files, command lines and both nodes at random (SECONDS, SEED)"
 	@echo "make soak         ten million poses, and both nodes in all weathers, in flat memory (MINUTES)"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
 	@echo "make clean        remove .venv, out and caches"
@@ -53,12 +53,15 @@ bench: $(VENV)/bench.stamp
 	mkdir -p out
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest test/benchmarks -m benchmark_run --benchmark-disable-gc --benchmark-json=out/benchmarks.json
 	$(BIN)/python -m test.benchmarks.report out/benchmarks.json docs/benchmarks.md
+	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.latency docs/latency.md
 
 certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m test.certificate
+	$(BIN)/python -m test.machine.certificate_page
 
 fuzz: $(VENV)/test.stamp
 	FUZZ_SECONDS=$(SECONDS) FUZZ_SEED=$(SEED) $(BIN)/python -m pytest -m long test/bags test/nodes/test_fuzz.py
+	$(BIN)/python -m test.bags.fuzz --seconds $(SECONDS) --seed $(SEED) --page docs/fuzz.md
 
 soak: $(VENV)/test.stamp
 	SOAK_MINUTES=$(MINUTES) SOAK_OUT=$(CURDIR)/out $(BIN)/python -m pytest -m long test/atlas test/nodes/test_soak.py

@@ -14,9 +14,7 @@ from typing import Any, Final, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics import virtual_work
 from delta_dynamics.virtual_work import inverse_dynamics
-from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import SECOND, JointReader, StampRules, Trajectory, as_message_error
@@ -322,12 +320,18 @@ class Feedforward:
         return Torques(sample.stamp, motion, effort, residual, saturated)
 
 
-def kernels(robot: Robot) -> tuple[Kernel, ...]:
-    """The kernels to warm up before live use.
+def warm_up(robot: Robot) -> None:
+    """Compile, or load, what live use calls: single samples and batches.
 
-    :raises ParameterError: a mechanism without masses.
+    :raises ParameterError: a robot without masses.
     """
-    return (*virtual_work.kernels(robot), robot.forward_kernel, robot.jacobian_kernel)
+    q = robot.inverse(robot.home())
+    for batch in ((), (2,)):
+        here = np.broadcast_to(q, (*batch, len(q)))
+        rest = np.zeros_like(here)
+        robot.forward(here)
+        robot.singularity(here)
+        inverse_dynamics(robot, here, rest, rest)
 
 
 def _of_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:
@@ -349,8 +353,7 @@ def _gate(robot: Robot, policy: LimitPolicy, effort: Array) -> tuple[Array, bool
     The first one keeps a clamp from making a limit of an infinity.
     """
     _require_finite(effort)
-    # Declared by every robot with a section of limits.
-    limits: Array | None = cast(Any, robot).limits.effort
+    limits = robot.limits.effort
     saturated = limits is not None and _beyond(effort, limits)
     if limits is not None and saturated:
         if policy == "reject":

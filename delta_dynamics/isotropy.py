@@ -11,19 +11,23 @@ units (m/s beside rad/s for the 3-PRRU), as in the paper; eta's extremes do not 
 that choice. Xddot = 0 is meant in the pose's own coordinates, so F_max does depend on them:
 turned by a third of a turn, the same motion has another Xddot in alpha and beta.
 
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
+May import: numpy, scipy, pkm_twin's core, the standard library; never rclpy.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eig  # type: ignore[import-untyped]
+from scipy.optimize import minimize  # type: ignore[import-untyped]
 
-from delta_dynamics.virtual_work import bodies, inverse_dynamics
+from delta_dynamics.virtual_work import body_mass_matrix, inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.machine.joints import MOVING, PAYLOAD, jointed, platform_motion
+from pkm_twin.machine.pose_grid import zero_torsion
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -35,13 +39,9 @@ STRETCHED: Final = 1e-6
 
 _NONE: Final = np.zeros(3)
 _FREE: Final = {"viscous": 0.0, "coulomb": 0.0}
-_PROBES: Final = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0]], float)
-_GRID: Final = 14
-_SPLITS: Final = 12
-_PATCHES: Final = 2000
-_PROVEN: Final = 1e-6
-_ROUNDS: Final = 60
-_LENGTHS: Final = 0.5 ** np.arange(12)
+_STARTS: Final = 256
+"""Directions that a descent begins from, best first, where no solution in closed form is known."""
+_DESCENTS: Final = 24
 
 
 class JointMotion(NamedTuple):
@@ -82,7 +82,7 @@ def joint_motion(
     """
     q, inverse = _inverse_jacobian(robot, np.asarray(pose, np.float64))
     qd = np.einsum("...ij,...j->...i", inverse, np.asarray(rates, np.float64))
-    _, bias = jointed(robot).pose_rates(platform_motion(robot, q, qd))
+    bias = robot.pose_acceleration(q, qd, np.zeros(robot.joints_count))
     rest = np.asarray(accelerations, np.float64) - bias
     qdd = np.einsum("...ij,...j->...i", inverse, rest)
     q, qd, qdd = np.broadcast_arrays(q, qd, qdd)
@@ -98,15 +98,8 @@ def energy_matrices(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
     :returns: platform with payload, and all bodies; shape (..., 3, 3) each.
     """
     q, inverse = _inverse_jacobian(robot, np.asarray(pose, np.float64))
-    # At rest a unit acceleration of joint k gives each body the inertia couple I w_k.
-    rows, _ = bodies(robot, q[..., None, :], _NONE, np.eye(3))
-    masses, couples = rows[..., 0, :, 0], rows[..., 7:10]
-    linear = rows[..., 0, :, 10:19].reshape(*rows.shape[:-3], rows.shape[-2], 3, 3)
-    angular = rows[..., 0, :, 19:28].reshape(*rows.shape[:-3], rows.shape[-2], 3, 3)
-    each = np.einsum("...b,...bji,...bki->...bjk", masses, linear, linear)
-    each += np.einsum("...bji,...kbi->...bjk", angular, couples)
-    moving = [robot.body_names.index(name) for name in (MOVING, PAYLOAD)]
-    pair = np.stack([each[..., moving, :, :].sum(-3), each.sum(-3)], -3)
+    platform = body_mass_matrix(robot, q, robot.graph.platform)
+    pair = np.stack([platform, mass_matrix(robot, q)], -3)
     turn = inverse[..., None, :, :]
     forms = turn.swapaxes(-1, -2) @ pair @ turn
     forms = (forms + forms.swapaxes(-1, -2)) / 2
@@ -120,7 +113,7 @@ def energy_transfer(robot: Robot, pose: ArrayLike, direction: ArrayLike) -> Arra
     :param direction: pose rates of any length above zero, shape (..., 3).
     :returns: shape (...), 0 to 1.
     """
-    x = _directions(direction)
+    x = _directions(direction, len(robot.pose_names))
     platform, everything = energy_matrices(robot, pose)
     return _form(platform, x) / _form(everything, x)
 
@@ -156,7 +149,7 @@ def max_driving_force(
     :param acceleration: Xddot, a number or shape (..., 3).
     :returns: shape (...).
     """
-    x = _directions(direction)
+    x = _directions(direction, len(robot.pose_names))
     platform, _ = energy_matrices(robot, pose)
     _inverse_root(robot, platform)
     rates = np.sqrt(2 * _energy(energy) / _form(platform, x))[..., None] * x
@@ -172,11 +165,11 @@ def max_driving_force_range(
 
     On the ellipsoid of Xdot with that energy, scaled to the unit sphere, every F_d is a
     quadratic form y' G y. The greatest |F_d| is an eigenvalue, exact. The least F_max is the
-    minimum of the largest of these forms: found by branch and bound over all directions, refined
-    to rounding by Newton steps on the forms that are largest there.
+    minimum of the largest of these forms. With up to three pose coordinates it is the best of all
+    points where a minimum can be (:func:`least_direction`), with more the best of many descents.
 
-    :param pose: shape (..., 3).
-    :param acceleration: Xddot, a number or shape (..., 3).
+    :param pose: shape (..., m).
+    :param acceleration: Xddot, a number or shape (..., m).
     """
     where = np.asarray(pose, np.float64)
     platform, _ = energy_matrices(robot, where)
@@ -185,25 +178,31 @@ def max_driving_force_range(
     start = joint_motion(free, where, _NONE, acceleration)
     constant = inverse_dynamics(free, *start)
     weightless = free.changed(gravity=[0.0, 0.0, 0.0])
-    probes = np.einsum("...ij,kj->...ki", back, _PROBES)
-    moved = inverse_dynamics(weightless, *joint_motion(weightless, where[..., None, :], probes))
-    forms = np.zeros((*constant.shape, 3, 3))
-    for j in range(3):
+    size, count = where.shape[-1], constant.shape[-1]
+    pairs = list(itertools.combinations(range(size), 2))
+    units = np.eye(size)
+    mixed = np.array([units[j] + units[k] for j, k in pairs]).reshape(-1, size)
+    probes = np.einsum("...ij,kj->...ki", back, np.concatenate([units, mixed]))
+    motion = joint_motion(weightless, where[..., None, :], probes, np.zeros(size))
+    moved = inverse_dynamics(weightless, *motion)
+    forms = np.zeros((*constant.shape, size, size))
+    for j in range(size):
         forms[..., j, j] = moved[..., j, :]
-        k, l = (j + 1) % 3, (j + 2) % 3  # noqa: E741
-        mixed = (moved[..., 3 + j, :] - moved[..., k, :] - moved[..., l, :]) / 2
-        forms[..., k, l] = forms[..., l, k] = mixed
-    forms += constant[..., None, None] * np.eye(3)
+    for probe, (j, k) in enumerate(pairs, start=size):
+        both = (moved[..., probe, :] - moved[..., j, :] - moved[..., k, :]) / 2
+        forms[..., j, k] = forms[..., k, j] = both
+    forms += constant[..., None, None] * np.eye(size)
 
     values, vectors = np.linalg.eigh(forms)
-    ends = np.abs(values[..., [0, 2]]).reshape(*constant.shape[:-1], 6)
+    batch = constant.shape[:-1]
+    ends = np.abs(values[..., [0, -1]]).reshape(*batch, 2 * count)
     best = ends.argmax(-1)[..., None]
-    candidates = vectors[..., [0, 2]].swapaxes(-1, -2).reshape(*constant.shape[:-1], 6, 3)
+    candidates = vectors[..., [0, -1]].swapaxes(-1, -2).reshape(*batch, 2 * count, size)
     high = np.take_along_axis(candidates, best[..., None], -2)[..., 0, :]
     greatest = np.take_along_axis(ends, best, -1)[..., 0]
-    flat = forms.reshape(-1, 3, 3, 3)
-    low = np.array([_least_direction(form) for form in flat]).reshape(high.shape)
-    least = np.abs(np.einsum("...i,...aij,...j->...a", low, forms, low)).max(-1)
+    flat = forms.reshape(-1, count, size, size)
+    low = np.array([least_direction(form) for form in flat]).reshape(high.shape)
+    least = _largest(forms, low)
     y = np.stack([low, high], -2)
     return Extremes(least, greatest, _directions(np.einsum("...ij,...kj->...ki", back, y)))
 
@@ -219,9 +218,7 @@ def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array
     The platform's axis leans by ``tilt`` towards ``azimuth`` (rad), as on the paper's atlas.
     """
     z, a, t = np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (height, azimuth, tilt)))
-    x = np.sin(t) * np.cos(a)
-    y = np.sin(t) * np.sin(a)
-    return np.stack([z, np.arctan2(-y, np.cos(t)), np.arcsin(x)], -1)
+    return np.stack([z, *zero_torsion(t, a)], -1)
 
 
 def _inverse_jacobian(robot: Robot, pose: Array) -> tuple[Array, Array]:
@@ -259,14 +256,14 @@ def _form(matrix: Array, x: Array) -> Array:
     return np.asarray(np.einsum("...i,...ij,...j->...", x, matrix, x), np.float64)
 
 
-def _directions(vectors: ArrayLike) -> Array:
+def _directions(vectors: ArrayLike, size: int | None = None) -> Array:
     """Unit vectors.
 
     :raises ValueError: a vector of length zero or not finite, or a wrong last axis.
     """
     x = np.asarray(vectors, np.float64)
-    if x.shape[-1:] != (3,):
-        raise ValueError(f"the last axis of a direction has to be 3, the shape is {x.shape}")
+    if size is not None and x.shape[-1:] != (size,):
+        raise ValueError(f"the last axis of a direction must be {size}, the shape is {x.shape}")
     norm = np.linalg.norm(x, axis=-1, keepdims=True)
     if not (np.isfinite(norm) & (norm > 0.0)).all():
         raise ValueError("a direction has to be finite and longer than zero")
@@ -279,111 +276,145 @@ def _energy(energy: float) -> float:
     return energy
 
 
-def _least_direction(forms: Array) -> Array:
-    """Unit y with the least max |y' G_a y|, forms (3, 3, 3); returns shape (3,).
+def _largest(forms: Array, y: Array) -> Array:
+    """max_a |y' G_a y|, shape (...); forms (..., n, m, m), y (..., m)."""
+    return np.asarray(np.abs(np.einsum("...i,...aij,...j->...a", y, forms, y)).max(-1), np.float64)
 
-    Branch and bound over patches of the half sphere (three faces of a cube; y and -y are alike):
-    within an angle r of a centre a form changes by at most |gradient| r + (range of its
-    eigenvalues) r^2. Patches that cannot hold less than the best so far are dropped.
+
+def least_direction(forms: Array) -> Array:
+    """Unit y, shape (m,), with the least max_a |y' G_a y| of symmetric forms G, shape (n, m, m).
+
+    At a minimum one form is stationary, or two are equal but for their sign and one of them is
+    stationary along the cone y' H y = 0 on which they are, or three are equal. For m up to 3 all
+    such points are known: eigenvectors; common points, in the projective plane, of the cone and
+    the cubic det(y, G y, H y) = 0; common points of two cones. The best of them all is the answer,
+    to rounding. For greater m it is the best of many descents, without proof.
     """
-    signed = np.concatenate([forms, -forms])
-    spans = np.ptp(np.linalg.eigvalsh(forms), axis=-1)
-    grid = (np.arange(_GRID) + 0.5) * 2 / _GRID - 1
-    face = np.repeat(np.arange(3), _GRID * _GRID)
-    u: Array = np.tile(np.repeat(grid, _GRID), 3)
-    v: Array = np.tile(grid, 3 * _GRID)
-    half = 1.0 / _GRID
-    least, value = np.array([0.0, 0.0, 1.0]), np.inf
-    for _ in range(_SPLITS):
-        corner = np.stack([np.ones_like(u), u, v], -1)
-        turned = corner[np.arange(len(u))[:, None], (np.arange(3) - face[:, None]) % 3]
-        y = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
-        pulled = np.einsum("aij,nj->nai", forms, y)
-        amounts = np.einsum("nai,ni->na", pulled, y)
-        gradients = 2 * np.linalg.norm(pulled - amounts[..., None] * y[:, None], axis=-1)
-        sizes = np.abs(amounts).max(-1)
-        if sizes.min() < value:
-            least, value = _polished(signed, y[sizes.argmin()])
-        angle = np.sqrt(2) * half
-        lowest = (np.abs(amounts) - gradients * angle - spans * angle**2).max(-1)
-        open_ = np.flatnonzero(lowest < value * (1 - _PROVEN))
-        if not open_.size:
-            break
-        # A whole curve of equal minima would never close; its most promising part is enough.
-        open_ = open_[np.argsort(lowest[open_])[:_PATCHES]]
-        half /= 2
-        face = np.repeat(face[open_], 4)
-        u = (u[open_, None] + half * np.array([-1, -1, 1, 1])).ravel()
-        v = (v[open_, None] + half * np.array([-1, 1, -1, 1])).ravel()
-    return least
+    points = _candidates(forms)
+    if forms.shape[-1] > 3:
+        start = np.random.default_rng(0).normal(size=(_STARTS, forms.shape[-1]))
+        start = np.concatenate([points, _directions(start)])
+        order = np.argsort(_largest(forms, start))[:_DESCENTS]
+        points = np.concatenate([points, [_descended(forms, y) for y in start[order]]])
+    return np.asarray(points[_largest(forms, points).argmin()], np.float64)
 
 
-def _polished(signed: Array, start: Array) -> tuple[Array, float]:
-    """Descend from a point to a local minimum, and its value."""
-    y, value = start, float(_largest(signed, start))
-    for _ in range(_ROUNDS):
-        tried = _steps(signed, y)
-        sizes = _largest(signed, tried)
-        best = sizes.argmin()
-        if not sizes[best] < value:
-            break
-        y, value = tried[best], float(sizes[best])
-    return y, value
+def _candidates(forms: Array) -> Array:
+    """Unit vectors, shape (k, m), among which the least one is if m is at most 3."""
+    count, size = forms.shape[:2]
+    pairs = list(itertools.combinations(range(count), 2))
+    cones = [(a, forms[a] - sign * forms[b]) for a, b in pairs for sign in (1.0, -1.0)]
+    found = [np.eye(size), *np.linalg.eigh(forms)[1].swapaxes(-1, -2)]
+    for cone in (*forms, *(cone for _, cone in cones)):
+        values, vectors = np.linalg.eigh(cone)
+        if values[0] < 0.0 < values[-1]:
+            # Of two coordinates both lines of the cone, of more some.
+            x = math.sqrt(values[-1]) * vectors[:, 0]
+            z = math.sqrt(-values[0]) * vectors[:, -1]
+            found.append(np.stack([x + z, x - z]))
+    if size == 3:
+        turned = [_TURN.T @ cone @ _TURN for _, cone in cones]
+        curves = [_conic(cone) for cone in turned]
+        for (a, _), cone, curve in zip(cones, turned, curves, strict=True):
+            stationary = _stationary(_TURN.T @ forms[a] @ _TURN, cone)
+            found.append(_common_points(curve, stationary) @ _TURN.T)
+        for one, other in itertools.combinations(curves, 2):
+            found.append(_common_points(one, other) @ _TURN.T)
+    points = np.concatenate(found)
+    # A point more does no harm: each is judged by the forms themselves.
+    return _directions(points[np.isfinite(points).all(-1) & points.any(-1)])
 
 
-def _largest(signed: Array, y: Array) -> Array:
-    """max_k y' A_k y, shape of y less its last axis."""
-    return np.asarray(np.einsum("...i,kij,...j->...k", y, signed, y).max(-1), np.float64)
+_TURN: Final = np.linalg.qr([[1.0, 0.3, -0.4], [0.2, 0.9, 0.7], [-0.5, 0.6, 1.1]])[0]
+"""A rotation without meaning: planes of symmetry are then no lines u = constant, and no points
+that count lie at infinity."""
+_LINES: Final = np.zeros((3, 2, 2))
+"""y = (1, u, v) as polynomials: entry (i, j) of each is the coefficient of u^i v^j."""
+_LINES[0, 0, 0] = _LINES[1, 1, 0] = _LINES[2, 0, 1] = 1.0
 
 
-def _tangent(signed: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Values, gradients and Hessians of the forms on the sphere at y, and the tangent basis."""
-    basis = np.linalg.svd(y[None, :])[2][1:]
-    values = np.einsum("i,kij,j->k", y, signed, y)
-    gradients = 2 * np.einsum("ai,kij,j->ka", basis, signed, y)
-    hessians = 2 * np.einsum("ai,kij,bj->kab", basis, signed, basis)
-    hessians -= 2 * values[:, None, None] * np.eye(2)
-    return values, gradients, hessians, basis
+def _product(p: Array, q: Array) -> Array:
+    """Product of two polynomials in u and v."""
+    result = np.zeros((p.shape[0] + q.shape[0] - 1, p.shape[1] + q.shape[1] - 1))
+    for i, j in np.ndindex(*p.shape):
+        result[i : i + q.shape[0], j : j + q.shape[1]] += p[i, j] * q
+    return result
 
 
-def _steps(signed: Array, y: Array) -> Array:
-    """Points to try from y: Newton steps on one, two and three of the largest forms."""
-    f, g, h, basis = _tangent(signed, y)
-    first, second, third = np.argsort(-f)[:3].tolist()
-    lengths = _LENGTHS[:, None]
-    moves = [lengths * _newton(g[first], h[first])]
-    for other in (second, third):
-        # Along the curve on which two forms are equal; the weight of both that descends least.
-        apart = g[first] - g[other]
-        square = apart @ apart
-        if not square > 0.0:
-            continue
-        weight = min(1.0, max(0.0, -(g[other] @ apart) / square))
-        slope = weight * g[first] + (1 - weight) * g[other]
-        bend = weight * h[first] + (1 - weight) * h[other]
-        onto = (f[other] - f[first]) / square * apart
-        along = np.array([-apart[1], apart[0]]) / np.sqrt(square)
-        curvature = along @ bend @ along
-        descent = along @ (slope + bend @ onto)
-        reach = -descent / curvature if curvature > 0.0 else -np.sign(descent)
-        step = onto + lengths * np.clip(reach, -1.0, 1.0) * along
-        # Back onto the curve, to second order: else the kink between the forms stops the steps.
-        off = np.einsum("na,ab,nb->n", step, h[first] - h[other], step) / 2
-        moves.append(step - (off / square)[:, None] * apart)
-    corner = np.array([g[first] - g[second], g[first] - g[third]])
-    if abs(np.linalg.det(corner)) > 0.0:
-        step = np.linalg.solve(corner, f[[second, third]] - f[first])
-        moves.append(np.asarray(lengths * step, np.float64))
-    tried = np.concatenate(moves)
-    tried = tried / np.maximum(1.0, np.linalg.norm(tried, axis=-1, keepdims=True))
-    points = y + tried @ basis
-    return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True), np.float64)
+def _scaled(matrix: Array) -> Array:
+    size = np.abs(matrix).max()
+    return np.asarray(matrix / size if size > 0.0 else matrix, np.float64)
 
 
-def _newton(g: Array, h: Array) -> Array:
-    """Newton's step, or the steepest descent where the form does not bend upwards."""
-    values, vectors = np.linalg.eigh(h)
-    if values[0] > 0.0:
-        return np.asarray(-vectors @ ((vectors.T @ g) / values), np.float64)
-    size = np.linalg.norm(g)
-    return np.asarray(-g / size if size > 0.0 else np.zeros(2), np.float64)
+def _conic(h: Array) -> Array:
+    """Y' H y at y = (1, u, v)."""
+    rows = np.einsum("ij,juv->iuv", _scaled(h), _LINES)
+    total = np.sum([_product(_LINES[i], rows[i]) for i in range(3)], axis=0)
+    return np.asarray(total, np.float64)
+
+
+def _stationary(g: Array, h: Array) -> Array:
+    """det(y, G y, H y) at y = (1, u, v): zero where y' G y is stationary along y' H y = 0."""
+    a, b = (np.einsum("ij,juv->iuv", _scaled(m), _LINES) for m in (g, h))
+    result = np.zeros((4, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        result += _product(_LINES[i], _product(a[j], b[k]) - _product(a[k], b[j]))
+    return result
+
+
+def _common_points(conic: Array, curve: Array) -> Array:
+    """Points (1, u, v), shape (k, 3), of a conic, all those of another curve among them.
+
+    u are the eigenvalues of the polynomial Sylvester matrix of both in v; v follows from the
+    conic.
+    """
+    d, e = conic.shape[1] - 1, curve.shape[1] - 1
+    n, degree = d + e, max(len(conic), len(curve)) - 1
+    sylvester = np.zeros((degree + 1, n, n))
+    for row in range(e):
+        sylvester[: len(conic), row, row : row + d + 1] = conic[:, ::-1]
+    for row in range(d):
+        sylvester[: len(curve), e + row, row : row + e + 1] = curve[:, ::-1]
+    first, last = np.eye(n * degree, k=n), np.eye(n * degree)
+    first[-n:] = np.hstack(list(-sylvester[:-1]))
+    last[-n:, -n:] = sylvester[-1]
+    u = eig(first, last, right=False)
+    u = u[np.isfinite(u)].real
+    c, b, a = (np.polynomial.polynomial.polyvander(u, len(conic) - 1) @ conic).T
+    with np.errstate(all="ignore"):
+        half = -(b + np.copysign(np.sqrt(np.maximum(b * b - 4 * a * c, 0.0)), b)) / 2
+        v = np.concatenate([half / a, c / half])
+    return np.stack([np.ones(len(v)), np.concatenate([u, u]), v], -1)
+
+
+def _descended(forms: Array, start: Array) -> Array:
+    """A local minimum of max_a |y' G_a y| below a point: least t with -t <= y' G_a y <= t."""
+    g = _scaled(forms)
+    size = len(start)
+
+    def room(x: Array) -> Array:
+        values = np.einsum("i,aij,j->a", x[:size], g, x[:size])
+        return np.concatenate([x[size] - values, x[size] + values])
+
+    def slope(x: Array) -> Array:
+        gradients = 2 * np.einsum("aij,j->ai", g, x[:size])
+        return np.column_stack([np.vstack([-gradients, gradients]), np.ones(2 * len(g))])
+
+    rules = (
+        {"type": "ineq", "fun": room, "jac": slope},
+        {
+            "type": "eq",
+            "fun": lambda x: x[:size] @ x[:size] - 1.0,
+            "jac": lambda x: np.append(2 * x[:size], 0.0),
+        },
+    )
+    found = minimize(
+        lambda x: x[size],
+        np.append(start, _largest(g, start)),
+        jac=lambda x: np.append(np.zeros(size), 1.0),
+        constraints=rules,
+        method="SLSQP",
+        options={"ftol": 1e-15, "maxiter": 200},
+    ).x[:size]
+    return _directions(found) if np.isfinite(found).all() and found.any() else start

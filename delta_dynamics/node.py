@@ -18,7 +18,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from delta_dynamics.feedforward import Feedforward, Settings, Torques, kernels
+from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
 from pkm_twin.bags.cdr import message_definition
@@ -73,8 +73,7 @@ class DeltaDynamics(health.TwinNode):
         super().__init__("delta_dynamics")
         robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
         # Before there is a topic to be found by: the first start compiles for many seconds.
-        for kernel in kernels(robot):
-            kernel.warm_up()
+        warm_up(robot)
         robot = _changed(robot, self._declare_changes(robot))
         self._feedforward = Feedforward(robot, self._declare_settings())
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
@@ -180,7 +179,7 @@ class DeltaDynamics(health.TwinNode):
             level, message = health.ERROR, f"stopped: {core.stream.reason}: {core.stream.text}"
         values: dict[str, object] = {
             "robot": core.robot.name,
-            "payload mass": core.robot.payload.mass,  # type: ignore[attr-defined]
+            "payload mass": core.robot.payload.mass,
             "joint states answered": core.stream.accepted,
             "trajectories answered": core.trajectories.accepted,
             "effort limit passed": core.saturations,

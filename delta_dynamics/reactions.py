@@ -9,23 +9,21 @@ May import: numpy, pkm_twin's core, the standard library; never rclpy.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delta_dynamics.virtual_work import bodies
+from delta_dynamics.virtual_work import Forces
+from pkm_twin.codegen.expressions import PARAMETERS
+from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
-from pkm_twin.machine.bodies import GRAVITY
-from pkm_twin.machine.joints import (
-    GROUND,
-    MOVING,
-    PAYLOAD,
-    Joint,
-    jointed,
-    platform_motion,
-)
+from pkm_twin.kinematics.engine import Traced
+from pkm_twin.kinematics.motion import cross, reaction_directions
+from pkm_twin.machine.graph import BASE, Graph, Joint, Rod
+from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 
 Array = NDArray[np.float64]
@@ -64,8 +62,8 @@ class Reactions:
     """Their amounts, shape (..., components), N or N m."""
     determinate_components: Mask
     """Which of ``values`` are determinate, shape (..., components)."""
-    actuated: tuple[str, str, str]
-    """Names of the three components that the actuators apply."""
+    actuated: tuple[str, ...]
+    """Names of the n components that the actuators apply."""
     residual: Array
     """Greatest imbalance of a body's force or moment over the greatest load, shape (...)."""
 
@@ -77,7 +75,7 @@ class Reactions:
 
     @property
     def efforts(self) -> Array:
-        """Actuator efforts less friction, shape (..., 3), N m or N, positive as in q."""
+        """Actuator efforts less friction, shape (..., n), N m or N, positive as in q."""
         return self.values[..., [self.components.index(name) for name in self.actuated]]
 
     def wrench(self, name: str) -> Array:
@@ -97,15 +95,15 @@ def reactions(
     Which components the mechanism's statics determines is decided by the rank of the balance;
     the others are NaN, see ``Reactions.determinate`` and ``Reactions.indeterminate``.
 
-    :param q: joint positions, shape (..., 3), rad or m.
-    :param qd: joint rates, shape (..., 3).
-    :param qdd: joint accelerations, shape (..., 3).
+    :param q: joint positions, shape (..., n), rad or m.
+    :param qd: joint rates, shape (..., n).
+    :param qdd: joint accelerations, shape (..., n).
     :param wrench: force and moment that the surroundings apply to the platform at its
         origin, world axes, shape (..., 6), N and N m; None is none.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises SingularityError: the Jacobian of the closure has no inverse, or the joints cannot
         hold the loads (a constraint singularity).
-    :raises ParameterError: a mechanism without masses or without declared joints.
+    :raises ParameterError: a robot without masses.
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
     full = least_norm_reactions(robot, q, qd, qdd, wrench)
@@ -125,26 +123,31 @@ def least_norm_reactions(
     forces at the mechanism's size (root mean square distance of the joints from their centre). In
     a real machine elasticity and tolerances decide; this is one of many possible answers.
     """
-    arrays = [np.asarray(value, np.float64) for value in (q, qd, qdd)]
-    batch = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
+    engine = robot.massive()
     load = np.zeros(6) if wrench is None else np.asarray(wrench, np.float64)
     if load.shape[-1:] != (6,) or not np.isfinite(load).all():
         raise ValueError(f"wrench has to be finite with a last axis of 6, shape {load.shape}")
-    batch = np.broadcast_shapes(batch, load.shape[:-1])
-    place, rate, change = (np.broadcast_to(a, (*batch, *a.shape[-1:])) for a in arrays)
-    rows, _ = bodies(robot, place, rate, change)
-    platform = platform_motion(robot, place, rate, change)
-    joints = jointed(robot).body_joints(place, platform)
-
+    (bodies, rods, places, platform), status = engine.kernel("loads", _loads)(
+        robot.inertial, q, qd, qdd
+    )
+    if status is not None:
+        robot.refuse_joints(status, q, (q, qd, qdd))
+    batch = np.broadcast_shapes(bodies.shape[:-1], load.shape[:-1])
+    bodies, rods, places, platform = (
+        np.broadcast_to(part, (*batch, part.shape[-1])) for part in (bodies, rods, places, platform)
+    )
+    joints = _joints(engine.graph, rods, places)
     names = tuple(dict.fromkeys(name for joint in joints for name in joint.components))
-    points = np.stack([np.broadcast_to(joint.point, (*batch, 3)) for joint in joints], -2)
+    points = np.stack([joint.point for joint in joints], -2)
     centred = points - points.mean(-2, keepdims=True)
     size = np.sqrt(np.mean(np.sum(centred**2, -1), -1))
 
-    free = [name for name in robot.body_names if name != PAYLOAD]
-    origin = {name: rows[..., robot.body_names.index(name), 1:4] for name in free}
+    origin, needed = _needs(engine.graph, list(engine.tree.links), bodies, rods)
+    moving = engine.graph.platform
+    needed[moving][..., :3] -= load[..., :3]
+    needed[moving][..., 3:] -= load[..., 3:] + np.cross(platform - origin[moving], load[..., :3])
     a = _transmission(joints, names, origin, batch)
-    b = _loads(robot, rows, origin, platform.position, load, batch)
+    b = np.concatenate([needed[body] for body in origin], -1)
     moment = _moments(joints, names)
     value, null, residual = _solve(a, b, moment, size)
 
@@ -152,7 +155,6 @@ def least_norm_reactions(
     # Moments and forces of the null space in one unit again, so that one bound holds.
     reach = np.einsum("...jik,...kn->...jin", spread, null * _unit(moment, size)[..., None])
     reach[..., 3:, :] /= size[..., None, None, None]
-    actuated = tuple(joint.actuated for joint in joints if joint.actuated is not None)
     return Reactions(
         names=tuple(joint.name for joint in joints),
         bodies=tuple((joint.inner, joint.outer) for joint in joints),
@@ -162,19 +164,195 @@ def least_norm_reactions(
         components=names,
         values=_read_only(value),
         determinate_components=_small(null),
-        actuated=(actuated[0], actuated[1], actuated[2]),
+        actuated=tuple(joint.actuated for joint in joints if joint.actuated is not None),
         residual=_read_only(residual),
     )
 
 
-def _columns(joint: Joint, names: tuple[str, ...], batch: tuple[int, ...]) -> Array:
+@dataclass(frozen=True)
+class _Joint:
+    """One joint in every sample: what its inner body can transmit to the outer one.
+
+    ``components`` names the columns of ``basis``, shape (..., 6, components): unit forces and
+    unit couples at ``point``, shape (..., 3), m. A component of the same name at two joints is
+    one unknown: a couple that passes through a body without touching its balance. ``actuated`` is
+    the component that the actuator applies, positive as q is.
+    """
+
+    name: str
+    inner: str
+    outer: str
+    point: Array
+    components: tuple[str, ...]
+    basis: Array
+    actuated: str | None = None
+
+
+def _loads(t: Traced) -> Program:
+    """Where bodies, rods and joints are, and what every body needs, without a wrench.
+
+    A body: origin, force, moment about it. A rod: both ends, the forces they need, the direction of
+    its pair. A joint: point, three directions, and the one across a universal joint's axes.
+    """
+    t.solve()
+    layout = Layout(t.tree)
+    bodies, rods, gravity, *_, passive = layout.split(t.tape.inputs(PARAMETERS, layout.size))
+    n = t.joints
+    t.set_rates(t.tape.inputs("qd", n))
+    t.set_accelerations(t.tape.inputs("qdd", n), gravity)
+    motion, graph = t.motion, t.engine.graph
+    forces = Forces(motion)
+    # Rods stand for themselves here.
+    forces.inertia(bodies, np.zeros(len(graph.rods), dtype=object))
+    forces.passive(passive)
+    body_rows: list[Any] = []
+    for name in t.tree.links:
+        body_rows += [*motion.origin[name], *forces.force[name], *forces.moment[name]]
+    rod_rows: list[Any] = []
+    for mass, rod in zip(rods, graph.rods.values(), strict=True):
+        start, end = motion.point(rod.inner, rod.ends[0]), motion.point(rod.outer, rod.ends[1])
+        a, b = (
+            motion.acceleration(body, point)
+            for body, point in ((rod.inner, rod.ends[0]), (rod.outer, rod.ends[1]))
+        )
+        pair = np.zeros(3) if rod.pair is None else motion.direction(rod.outer, rod.pair)
+        sixth = mass * (1.0 / 6.0)
+        rod_rows += [*start, *end, *(sixth * (2.0 * a + b)), *(sixth * (a + 2.0 * b)), *pair]
+    joint_rows: list[Any] = []
+    for joint in graph.joints.values():
+        joint_rows += motion.point(joint.outer, joint.at).tolist()
+        for direction in reaction_directions(joint):
+            joint_rows += motion.direction(direction.body, direction.vector).tolist()
+        if joint.kind == "universal":
+            first = motion.direction(joint.inner, joint.axes[0])
+            joint_rows += cross(motion.direction(joint.outer, joint.axes[1]), first).tolist()
+        else:
+            joint_rows += [0.0] * 3
+    outputs = {
+        "bodies": t.lift(body_rows),
+        "rods": t.lift(rod_rows),
+        "joints": t.lift(joint_rows),
+        "platform": t.lift(motion.platform()[0]),
+    }
+    return Program({"q": n, "qd": n, "qdd": n}, layout.size, outputs, t.equations())
+
+
+def _joints(graph: Graph, rods: Array, places: Array) -> list[_Joint]:
+    """All joints that transmit something, those of the graph first, then the rods' ends."""
+    result = []
+    for k, joint in enumerate(graph.joints.values()):
+        if not joint.given:
+            here = places[..., 15 * k : 15 * k + 15]
+            result.append(_graph_joint(joint, here.reshape(*here.shape[:-1], 5, 3)))
+    for k, rod in enumerate(graph.rods.values()):
+        here = rods[..., 15 * k : 15 * k + 15]
+        result += _rod_joints(rod, here.reshape(*here.shape[:-1], 5, 3))
+    return result
+
+
+def _graph_joint(joint: Joint, vectors: Array) -> _Joint:
+    """Directions across its slides hold forces, those across its turns hold moments."""
+    name = joint.label or joint.name
+    directions = reaction_directions(joint)
+    kind = joint.kind
+    forces: dict[str, Array] = {}
+    moments: dict[str, Array] = {}
+    effort: str | None = None
+    for k, direction in enumerate(directions):
+        vector = vectors[..., 1 + k, :]
+        along = float(joint.axes[0] @ direction.vector) if len(joint.axes) else 0.0
+        driven = joint.actuated and abs(along) > 0.5
+        if kind not in ("translation", "prismatic", "cylindrical") or (
+            kind != "translation" and abs(along) < 0.5
+        ):
+            forces[direction.name] = vector
+        if kind in ("fixed", "prismatic", "translation") or (
+            kind in ("revolute", "cylindrical") and abs(along) < 0.5
+        ):
+            moments[direction.name] = vector
+        if driven:
+            table, what = (forces, "force") if kind == "prismatic" else (moments, "moment")
+            table[direction.name] = vector * np.sign(along)
+            effort = f"{name}: {what} along {direction.name}"
+    if kind == "universal":
+        normal = vectors[..., 4, :]
+        moments[joint.normal] = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    return _joint(name, (joint.inner, joint.outer), vectors[..., 0, :], forces, moments, effort)
+
+
+def _rod_joints(rod: Rod, vectors: Array) -> list[_Joint]:
+    """Ball joints at both ends.
+
+    A parallelogram's two equal thin rods, side by side along t: their end forces add up to one
+    force at each end; the difference of the two axial forces is a couple along e = t x w that
+    passes from the inner to the outer body, the same at both ends, whatever the distance of the
+    rods. The rods' spin about themselves is idle.
+    """
+    start, end, pair = vectors[..., 0, :], vectors[..., 1, :], vectors[..., 4, :]
+    couple: dict[str, Array] = {}
+    if rod.pair is None:
+        forces = {c: np.broadcast_to(np.eye(3)[i], start.shape) for i, c in enumerate("xyz")}
+    else:
+        w = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
+        e = np.cross(pair, w)
+        e /= np.linalg.norm(e, axis=-1, keepdims=True)
+        forces = {"w": w, "e": e, "w x e": np.cross(w, e)}
+        couple = {f"{rod.label or rod.name}: moment along e": e}
+    inner, outer = rod.joint_names
+    return [
+        _joint(inner, (rod.inner, rod.name), start, forces, {}, None, couple),
+        _joint(outer, (rod.name, rod.outer), end, forces, {}, None, couple),
+    ]
+
+
+def _joint(
+    name: str,
+    bodies: tuple[str, str],
+    point: Array,
+    forces: Mapping[str, Array],
+    moments: Mapping[str, Array],
+    effort: str | None,
+    passed: Mapping[str, Array] | None = None,
+) -> _Joint:
+    """A joint from unit directions, shape (..., 3); ``passed``: couples shared with another."""
+    names = [f"{name}: force along {key}" for key in forces]
+    names += [f"{name}: moment along {key}" for key in moments]
+    couples = [*moments.values(), *(passed or {}).values()]
+    names += list(passed or {})
+    count = len(forces)
+    basis = np.zeros((*point.shape[:-1], 6, len(names)))
+    for k, direction in enumerate(forces.values()):
+        basis[..., :3, k] = direction
+    for k, direction in enumerate(couples):
+        basis[..., 3:, count + k] = direction
+    return _Joint(name, *bodies, point, tuple(names), basis, effort)
+
+
+def _needs(
+    graph: Graph, names: Sequence[str], bodies: Array, rods: Array
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """A point of each body and rod, and the wrench about it that joints have to apply."""
+    origin: dict[str, Array] = {}
+    needed: dict[str, Array] = {}
+    for k, name in enumerate(names):
+        origin[name] = bodies[..., 9 * k : 9 * k + 3]
+        needed[name] = bodies[..., 9 * k + 3 : 9 * k + 9].copy()
+    for k, name in enumerate(graph.rods):
+        start, end, first, second = (rods[..., 15 * k + 3 * i :][..., :3] for i in range(4))
+        origin[name] = (start + end) / 2
+        couple = np.cross((end - start) / 2, second - first)
+        needed[name] = np.concatenate([first + second, couple], -1)
+    return origin, needed
+
+
+def _columns(joint: _Joint, names: tuple[str, ...], batch: tuple[int, ...]) -> Array:
     """The joint's wrench basis over all unknowns, shape (..., 6, unknowns)."""
     result = np.zeros((*batch, 6, len(names)))
     result[..., [names.index(name) for name in joint.components]] = joint.basis
     return result
 
 
-def _moments(joints: tuple[Joint, ...], names: tuple[str, ...]) -> Mask:
+def _moments(joints: Sequence[_Joint], names: tuple[str, ...]) -> Mask:
     """Which unknowns are moments, shape (unknowns,)."""
     result = np.zeros(len(names), bool)
     for joint in joints:
@@ -185,7 +363,7 @@ def _moments(joints: tuple[Joint, ...], names: tuple[str, ...]) -> Mask:
 
 
 def _transmission(
-    joints: tuple[Joint, ...],
+    joints: Sequence[_Joint],
     names: tuple[str, ...],
     origin: dict[str, Array],
     batch: tuple[int, ...],
@@ -196,7 +374,7 @@ def _transmission(
     for joint in joints:
         columns = _columns(joint, names, batch)
         for body, sign in ((joint.inner, -1.0), (joint.outer, 1.0)):
-            if body == GROUND:
+            if body == BASE:
                 continue
             lever = joint.point - origin[body]
             shifted = np.cross(lever[..., None, :], columns[..., :3, :].swapaxes(-1, -2))
@@ -204,31 +382,6 @@ def _transmission(
             on_body += sign * columns
             on_body[..., 3:, :] += sign * shifted.swapaxes(-1, -2)
     return result.reshape(*batch, 6 * len(origin), len(names))
-
-
-def _loads(
-    robot: Robot,
-    rows: Array,
-    origin: dict[str, Array],
-    platform: Array,
-    wrench: Array,
-    batch: tuple[int, ...],
-) -> Array:
-    """What the joints have to apply to each body about its own point, shape (..., 6 bodies)."""
-    result = np.zeros((*batch, len(origin), 6))
-    order = list(origin)
-    pull = robot.parameters[GRAVITY : GRAVITY + 3]
-    for k, name in enumerate(robot.body_names):
-        body = MOVING if name == PAYLOAD else name
-        row = rows[..., k, :]
-        force = row[..., :1] * (row[..., 4:7] - pull)
-        needed = result[..., order.index(body), :]
-        needed[..., :3] += force
-        needed[..., 3:] += row[..., 7:10] + np.cross(row[..., 1:4] - origin[body], force)
-    needed = result[..., order.index(MOVING), :]
-    needed[..., :3] -= wrench[..., :3]
-    needed[..., 3:] -= wrench[..., 3:] + np.cross(platform - origin[MOVING], wrench[..., :3])
-    return result.reshape(*batch, 6 * len(origin))
 
 
 def _unit(moment: Mask, size: Array) -> Array:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid-body dynamics by virtual work, for every robot with masses.
+"""Rigid-body dynamics by virtual work, for every machine with masses.
 
 May import: numpy, pkm_twin's core, the standard library; never rclpy.
 """
@@ -7,19 +7,22 @@ May import: numpy, pkm_twin's core, the standard library; never rclpy.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.expressions import PARAMETERS, Objects, sign
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.errors import ParameterError
-from pkm_twin.machine.bodies import ROW, TWIST
+from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics.engine import Traced
+from pkm_twin.kinematics.motion import Motion, cross
+from pkm_twin.machine.graph import BASE, FREEDOMS, Joint
+from pkm_twin.machine.inertia import Layout, loaded_joints
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
-_ZERO: Final = np.zeros(3)
 _NO_WRENCH: Final = np.zeros(6)
 
 
@@ -31,44 +34,76 @@ def inverse_dynamics(
     tau = sum over bodies of Jv' m (a - g) + Jw' (I alpha + omega x I omega), less J' wrench, plus
     friction: the principle of virtual work (Delta-CU paper, step 4; 3-PRRU paper, F_d).
 
-    :param q: joint positions, shape (..., 3), rad or m.
-    :param qd: joint rates, shape (..., 3).
-    :param qdd: joint accelerations, shape (..., 3).
-    :param wrench: force and moment that the surroundings apply to the platform at its
-        origin, world axes, shape (..., 6), N and N m; None is none.
-    :returns: what the actuators must apply, shape (..., 3), N m or N.
+    :param q: joint positions, shape (..., n), rad or m.
+    :param qd: joint rates, shape (..., n).
+    :param qdd: joint accelerations, shape (..., n).
+    :param wrench: force and moment that the surroundings apply to the platform at its reference
+        point, base axes, shape (..., 6), N and N m; None is none.
+    :returns: what the actuators must apply, shape (..., n), N m or N.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
-    :raises SingularityError: the Jacobian of the closure has no inverse.
+    :raises SingularityError: a singularity on the way from home.
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
-    kernel = robot.dynamics_kernel
-    if kernel is None:
-        raise _no_masses(robot)
-    tau, fault = kernel(robot.parameters, q, qd, qdd, _NO_WRENCH if wrench is None else wrench)
-    if fault.ndim > 1 or fault.item(0) != 0.0:
-        robot.raise_fault(fault, "joint state")
-    return tau
+    load = _NO_WRENCH if wrench is None else wrench
+    # As Robot.call_one, without its call: a stream's sample takes a microsecond or two.
+    call = robot.calls.get("torques")
+    if call is None:
+        call = robot.calls["torques"] = torques(robot).first_of_one(robot.inertial)
+    try:
+        tau: Array | None = call(q, qd, qdd, load)
+    except (TypeError, ValueError):
+        tau = None
+    if tau is not None:
+        return tau
+    (efforts,), status = torques(robot)(robot.inertial, q, qd, qdd, load)
+    if status is not None:
+        robot.refuse_joints(status, q, (q, qd, qdd, load))
+    return efforts
+
+
+def torques(robot: Robot) -> Kernel:
+    """The program of :func:`inverse_dynamics`: q, qd, qdd and wrench to efforts.
+
+    :raises ParameterError: a robot whose file gives no masses.
+    """
+    return robot.massive().kernel("torques", _torques)
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
-    """Generalised mass matrix on the actuated joints, payload included, shape (..., 3, 3)."""
-    still = robot.changed(gravity=[0.0, 0.0, 0.0], friction={"viscous": 0.0, "coulomb": 0.0})
-    positions = np.asarray(q, np.float64)[..., None, :]
-    return _symmetric(inverse_dynamics(still, positions, _ZERO, np.eye(3)))
+    """Generalised mass matrix on the actuated joints, payload included, shape (..., n, n)."""
+    return _mass_matrix(robot, q, robot.inertial)
+
+
+def _mass_matrix(robot: Robot, q: ArrayLike, p: Array) -> Array:
+    (flat,), status = robot.massive().kernel("mass matrix", _masses)(p, q)
+    if status is not None:
+        robot.refuse_joints(status, q, (q,))
+    n = robot.joints_count
+    return flat.reshape(*flat.shape[:-1], n, n)
+
+
+def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
+    """The part of one body in the mass matrix, shape (..., n, n); the platform with payload."""
+    layout = Layout(robot.massive().tree)
+    p = np.zeros_like(robot.inertial)
+    where = layout.body(body)
+    p[where] = robot.inertial[where]
+    return _mass_matrix(robot, q, p)
 
 
 def forward_dynamics(
     robot: Robot, q: ArrayLike, qd: ArrayLike, tau: ArrayLike, wrench: ArrayLike | None = None
 ) -> Array:
-    """Joint accelerations that the efforts ``tau`` cause, shape (..., 3)."""
-    rest = np.asarray(tau, np.float64) - inverse_dynamics(robot, q, qd, _ZERO, wrench)
+    """Joint accelerations that the efforts ``tau`` cause, shape (..., n)."""
+    still = np.zeros(robot.joints_count)
+    rest = np.asarray(tau, np.float64) - inverse_dynamics(robot, q, qd, still, wrench)
     qdd = np.linalg.solve(mass_matrix(robot, q), rest[..., None])[..., 0]
     return np.asarray(qdd, np.float64)
 
 
 @dataclass(frozen=True)
 class Energy:
-    """Kinetic and potential energy, shape (...), J; the potential is zero at the origin."""
+    """Kinetic and potential energy, shape (...), J; the potential is zero at the base's origin."""
 
     kinetic: Array
     potential: Array
@@ -80,46 +115,211 @@ class Energy:
 
 
 def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
-    """Mechanical energy of all bodies, payload included."""
-    rates = np.asarray(qd, np.float64)
-    rows, _ = bodies(robot, q, _ZERO, _ZERO)
-    weights = rows[..., 0:1] * robot.parameters[:3]
-    potential = -np.einsum("...bi,...bi->...", weights, rows[..., 1:4])
-    momentum = np.einsum("...ij,...j->...i", mass_matrix(robot, q), rates)
-    kinetic = 0.5 * np.einsum("...i,...i->...", rates, momentum)
-    return Energy(kinetic, np.broadcast_to(potential, kinetic.shape).copy())
+    """Mechanical energy of all bodies and rotors, payload included."""
+    (both,), status = robot.massive().kernel("energy", _energy)(robot.inertial, q, qd)
+    if status is not None:
+        robot.refuse_joints(status, q, (q, qd))
+    return Energy(both[..., 0].copy(), both[..., 1].copy())
 
 
-def bodies(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[Array, Array]:
-    """Rows of all bodies, shape (..., bodies, 28), see ``pkm_twin.machine.bodies``.
+# Programs.
 
-    :returns: the rows in the order of ``robot.body_names``, and the platform's twist per
-        joint rate, shape (..., 6, 3).
-    """
-    kernel = robot.motion_kernel
-    if kernel is None:
-        raise _no_masses(robot)
-    flat, fault = kernel(robot.parameters, q, qd, qdd)
-    robot.raise_fault(fault, "joint state")
-    batch = flat.shape[:-1]
-    rows = flat[..., :-TWIST].reshape(*batch, len(robot.body_names), ROW)
-    twist = flat[..., -TWIST:].reshape(*batch, 2, 3, 3).swapaxes(-1, -2)
-    return rows, twist.reshape(*batch, 6, 3)
+
+class Forces:
+    """The wrench that every body needs at its origin, base axes; adds what acts on bodies."""
+
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion
+        names = [BASE, *motion.tree.links]
+        self.force: dict[str, Any] = {name: np.zeros(3) for name in names}
+        self.moment: dict[str, Any] = {name: np.zeros(3) for name in names}
+
+    def push(self, body: str, point: Array, force: Any) -> None:
+        """A needed force at a point of a body, given at home."""
+        self.force[body] = self.force[body] + force
+        self.moment[body] = self.moment[body] + cross(self.motion.arm(body, point), force)
+
+    def inertia(self, bodies: Objects, rods: Objects) -> None:
+        """Newton's and Euler's laws, for the accelerations that the motion has (less gravity).
+
+        A thin even rod needs m (2 a + b) / 6 at its end of acceleration a and m (a + 2 b) / 6 at
+        the other: its rotation is in it.
+        """
+        m = self.motion
+        for name, ten in zip(m.tree.links, bodies, strict=True):
+            turned = m.rotation[name]
+            first = turned @ ten[1:4]
+            matrix = _matrix(ten)
+            w, al = turned.T @ m.omega[name], turned.T @ m.alpha[name]
+            self.force[name] = self.force[name] + m.change[name] * ten[0] + m.spin(name) @ first
+            euler = turned @ (matrix @ al + cross(w, matrix @ w))
+            self.moment[name] = self.moment[name] + cross(first, m.change[name]) + euler
+        for mass, rod in zip(rods, m.graph.rods.values(), strict=True):
+            a, b = m.acceleration(rod.inner, rod.ends[0]), m.acceleration(rod.outer, rod.ends[1])
+            sixth = mass * (1.0 / 6.0)
+            self.push(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
+            self.push(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
+
+    def momenta(self, bodies: Objects, rods: Objects) -> None:
+        """The same linear part alone: momenta of the velocities that the motion has."""
+        m = self.motion
+        for name, ten in zip(m.tree.links, bodies, strict=True):
+            turned = m.rotation[name]
+            first = turned @ ten[1:4]
+            w, v = m.omega[name], m.speed[name]
+            self.force[name] = self.force[name] + v * ten[0] + cross(w, first)
+            spin = turned @ (_matrix(ten) @ (turned.T @ w))
+            self.moment[name] = self.moment[name] + cross(first, v) + spin
+        for mass, rod in zip(rods, m.graph.rods.values(), strict=True):
+            a, b = m.velocity(rod.inner, rod.ends[0]), m.velocity(rod.outer, rod.ends[1])
+            sixth = mass * (1.0 / 6.0)
+            self.push(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
+            self.push(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
+
+    def passive(self, values: Objects) -> None:
+        """What passive joints rub, and what their rotors resist: three numbers a joint."""
+        for k, joint in enumerate(loaded_joints(self.motion.graph)):
+            viscous, coulomb, rotor = values[3 * k : 3 * k + 3]
+            rate, second = self._relative(joint, accelerated=True)
+            self._pair(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
+
+    def passive_momenta(self, values: Objects) -> None:
+        """Momenta of the passive joints' rotors."""
+        for k, joint in enumerate(loaded_joints(self.motion.graph)):
+            self._pair(joint, values[3 * k + 2] * self._relative(joint, accelerated=False)[0])
+
+    def _relative(self, joint: Joint, *, accelerated: bool) -> tuple[Any, Any]:
+        """Rate and acceleration of a passive joint, of its outer body against its inner one."""
+        m, a, b = self.motion, joint.inner, joint.outer
+        axis = m.direction(a, joint.axes[0])
+        second: Any = 0.0
+        if FREEDOMS[joint.kind] == "R":
+            if accelerated:
+                second = axis @ (m.alpha[b] - m.alpha[a])
+            return axis @ (m.omega[b] - m.omega[a]), second
+        # Against the point of the inner body that is where the outer one's is.
+        lever = m.point(b, joint.at) - m.origin[a]
+        if accelerated:
+            carried = m.change[a] + m.spin(a) @ lever
+            second = axis @ (m.acceleration(b, joint.at) - carried)
+        return axis @ (m.velocity(b, joint.at) - m.speed[a] - cross(m.omega[a], lever)), second
+
+    def _pair(self, joint: Joint, amount: Any) -> None:
+        """An effort along a joint's freedom on its outer body, its opposite on the inner one."""
+        m, a, b = self.motion, joint.inner, joint.outer
+        load = m.direction(a, joint.axes[0]) * amount
+        if FREEDOMS[joint.kind] == "R":
+            self.moment[b] = self.moment[b] + load
+            self.moment[a] = self.moment[a] - load
+            return
+        at = m.point(b, joint.at)
+        for body, force in ((b, load), (a, -load)):
+            self.force[body] = self.force[body] + force
+            self.moment[body] = self.moment[body] + cross(at - m.origin[body], force)
+
+    def generalised(self) -> tuple[Objects, Objects]:
+        """Down the tree: generalised forces of the unknown rates and of the actuated joints."""
+        m, tree = self.motion, self.motion.tree
+        unknown = np.zeros(tree.unknown_rates, dtype=object)
+        driven = np.zeros(len(tree.graph.actuated), dtype=object)
+        for link in reversed(list(tree.links.values())):
+            force, moment = self.force[link.body], self.moment[link.body]
+            absolute = free = False
+            for step in link.steps:
+                if step.kind in "RP":
+                    along = m.axis[id(step)] @ (moment if step.kind == "R" else force)
+                    (driven if step.actuated else unknown)[step.rate] = step.sign * along
+                    continue
+                absolute, free = True, step.kind == "F"
+                unknown[step.rate : step.rate + 3] = moment
+                if free:
+                    unknown[step.rate + 3 : step.rate + 6] = force
+            if free:
+                continue
+            parent = link.parent
+            self.force[parent] = self.force[parent] + force
+            self.moment[parent] = self.moment[parent] + cross(m.lever[link.body], force)
+            if not absolute:
+                self.moment[parent] = self.moment[parent] + moment
+        return unknown, driven
+
+
+def _matrix(ten: Objects) -> Objects:
+    xx, yy, zz, xy, xz, yz = ten[4:]
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=object)
+
+
+def _begun(t: Traced) -> tuple[Layout, list[Objects]]:
+    t.solve()
+    layout = Layout(t.tree)
+    return layout, layout.split(t.tape.inputs(PARAMETERS, layout.size))
+
+
+def _torques(t: Traced) -> Program:
+    layout, (bodies, rods, gravity, viscous, coulomb, rotors, passive) = _begun(t)
+    n = t.joints
+    qd, qdd, wrench = t.tape.inputs("qd", n), t.tape.inputs("qdd", n), t.tape.inputs("wrench", 6)
+    t.set_rates(qd)
+    t.set_accelerations(qdd, gravity)
+    forces = Forces(t.motion)
+    forces.inertia(bodies, rods)
+    forces.passive(passive)
+    graph = t.engine.graph
+    forces.push(graph.platform, graph.origin, -wrench[:3])
+    forces.moment[graph.platform] = forces.moment[graph.platform] - wrench[3:]
+    unknown, driven = forces.generalised()
+    multipliers = t.lu.solve_transposed(unknown)
+    efforts = driven - t.jq[t.engine.kept].T @ multipliers
+    tau = [
+        efforts[k] + viscous[k] * qd[k] + coulomb[k] * sign(qd[k]) + rotors[k] * qdd[k]
+        for k in range(n)
+    ]
+    sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
+    return Program(sizes, layout.size, {"efforts": t.lift(tau)}, t.equations())
+
+
+def _masses(t: Traced) -> Program:
+    layout, (bodies, rods, *_, rotors, passive) = _begun(t)
+    columns = t.rate_columns()
+    n = t.joints
+    table: list[list[Any]] = [[0.0] * n for _ in range(n)]
+    for j in range(n):
+        t.motion.set_rates(columns[j], np.eye(n)[j])
+        forces = Forces(t.motion)
+        forces.momenta(bodies, rods)
+        forces.passive_momenta(passive)
+        unknown, driven = forces.generalised()
+        for k in range(j + 1):
+            value = driven[k] + columns[k] @ unknown
+            table[j][k] = table[k][j] = value + rotors[j] if j == k else value
+    entries = [table[j][k] for j in range(n) for k in range(n)]
+    return Program({"q": n}, layout.size, {"matrix": t.lift(entries)}, t.equations())
+
+
+def _energy(t: Traced) -> Program:
+    layout, (bodies, rods, gravity, _, _, rotors, passive) = _begun(t)
+    n = t.joints
+    qd = t.tape.inputs("qd", n)
+    u = t.set_rates(qd)
+    motion = t.motion
+    forces = Forces(motion)
+    forces.momenta(bodies, rods)
+    forces.passive_momenta(passive)
+    unknown, driven = forces.generalised()
+    double = driven @ qd + u @ unknown + sum((rotors[k] * qd[k] * qd[k] for k in range(n)), 0.0)
+    weighted: Any = np.zeros(3)
+    for name, ten in zip(t.tree.links, bodies, strict=True):
+        weighted = weighted + motion.origin[name] * ten[0] + motion.rotation[name] @ ten[1:4]
+    for mass, rod in zip(rods, t.engine.graph.rods.values(), strict=True):
+        ends = motion.point(rod.inner, rod.ends[0]) + motion.point(rod.outer, rod.ends[1])
+        weighted = weighted + ends * (mass * 0.5)
+    outputs = {"energy": t.lift([double * 0.5, -(weighted @ gravity)])}
+    return Program({"q": n, "qd": n}, layout.size, outputs, t.equations())
 
 
 def kernels(robot: Robot) -> tuple[Kernel, ...]:
     """What a live node calls, to warm up before the first sample.
 
-    :raises ParameterError: a mechanism without masses.
+    :raises ParameterError: a robot without masses.
     """
-    if robot.dynamics_kernel is None:
-        raise _no_masses(robot)
-    return (robot.dynamics_kernel,)
-
-
-def _no_masses(robot: Robot) -> ParameterError:
-    return ParameterError("mechanism", robot.mechanism, "a mechanism with masses (delta, prru)")
-
-
-def _symmetric(matrix: Array) -> Array:
-    return (matrix + matrix.swapaxes(-1, -2)) / 2
+    return (torques(robot),)

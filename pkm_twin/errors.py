@@ -19,7 +19,8 @@ class ParameterError(PkmTwinError, ValueError):
     """
 
     def __init__(self, field: str, value: object, bound: str) -> None:
-        super().__init__(f"{field}: {_short(value)} is refused; allowed: {bound}")
+        text = f"{field}: {_short(value)} is refused; allowed: {bound}"
+        super().__init__(one_line(text, 2000))
         self.field = field
         self.value = value
         self.bound = bound
@@ -40,13 +41,23 @@ class UnknownNameError(ParameterError):
 class UnreachableError(PkmTwinError, ValueError):
     """A pose or joint state that the mechanism cannot be assembled in.
 
-    ``limb`` is the limb's name, ``index`` the sample's index in the batch (``()`` for one
-    sample), ``miss`` by how much the limb falls short (m).
+    ``limb`` is the name of the limb or joint, ``index`` the sample's index in the batch (``()`` for
+    one sample), ``miss`` by how much it falls short (m), ``reached`` the part of the straight
+    way from home up to which there is an assembly, None where no way was gone.
     """
 
-    def __init__(self, what: str, limb: str, index: tuple[int, ...], miss: float) -> None:
+    def __init__(
+        self,
+        what: str,
+        limb: str,
+        index: tuple[int, ...],
+        miss: float,
+        reached: float | None = None,
+    ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
-        super().__init__(f"{what}{where} is unreachable: {limb} misses by {miss:.6g} m")
+        way = "" if reached is None else f", beyond {100 * reached:.3g} % of the way from home"
+        super().__init__(f"{what}{where} is unreachable: {limb} misses by {miss:.6g} m{way}")
+        self.reached = reached
         self.limb = limb
         self.index = index
         self.miss = miss
@@ -55,14 +66,28 @@ class UnreachableError(PkmTwinError, ValueError):
 class SingularityError(PkmTwinError, ValueError):
     """A pose in which the Jacobian has no usable inverse.
 
-    ``measure`` is the reciprocal condition number, lengths scaled out; ``bound`` the least allowed.
+    ``measure`` is the reciprocal condition number, lengths scaled out; ``bound`` the least allowed;
+    ``reached`` the part of the straight way from home at which it stands, None at the place itself.
     """
 
-    def __init__(self, what: str, index: tuple[int, ...], measure: float, bound: float) -> None:
+    def __init__(
+        self,
+        what: str,
+        index: tuple[int, ...],
+        measure: float,
+        bound: float,
+        reached: float | None = None,
+    ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
-        super().__init__(
-            f"{what}{where} is singular: reciprocal condition {measure:.3g} is below {bound:.3g}"
-        )
+        if reached is None:
+            text = f"is singular: reciprocal condition {measure:.3g} is below {bound:.3g}"
+        else:
+            text = (
+                f"lies behind a singularity, at {100 * reached:.3g} % of the way from home: "
+                f"reciprocal condition {measure:.3g} there"
+            )
+        super().__init__(f"{what}{where} {text}")
+        self.reached = reached
         self.index = index
         self.measure = measure
         self.bound = bound
@@ -95,10 +120,23 @@ class BagError(PkmTwinError):
     ) -> None:
         where = f"{path}: " if path is not None else ""
         at = f" (byte {offset})" if offset is not None else ""
-        super().__init__(f"{where}{message}{at}")
+        super().__init__(f"{where}{one_line(message)}{at}")
         self.path = None if path is None else Path(path)
         self.reason = reason
         self.offset = offset
+
+
+def one_line(text: str, limit: int = 400) -> str:
+    """A text from elsewhere as part of a line: unprintable characters escaped, the middle cut.
+
+    ``limit`` is the most characters that come back.
+    """
+    # Each character may become ten: what cannot be shown is not escaped first.
+    half = limit // 2
+    if len(text) > 2 * limit:
+        text = f"{text[:limit]}{text[-limit:]}"
+    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    return shown if len(shown) <= limit else f"{shown[: half - 5]} ... {shown[5 - half :]}"
 
 
 def _short(value: object) -> str:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Elastostatics of parallel kinematic machines: compliance, strain energy, workspace."""
 
+from pkm_twin.kinematics.clearance import clearance
 from pkm_twin.kinematics.workspace import (
     RegularWorkspace,
-    clearance,
     reachable,
     regular_workspace,
 )

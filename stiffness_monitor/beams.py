@@ -23,7 +23,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.machine.members import GROUND, MOVING, Frame, RigidBody, Section, Support
+from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.members import Section
+from stiffness_monitor.structure import Carried, RigidBody, StructuralModel, Support
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -150,12 +152,12 @@ def rigid_offset(arm: Array) -> Array:
     return offset
 
 
-def body_mass(body: RigidBody) -> Array:
-    """Mass matrix of a rigid body at the platform's origin, shape (6, 6)."""
+def body_mass(body: RigidBody, at: Array) -> Array:
+    """Mass matrix of a rigid body at a point that moves with it, shape (6, 6)."""
     about_com = np.zeros((6, 6))
     about_com[:3, :3] = body.mass * np.eye(3)
     about_com[3:, 3:] = body.inertia
-    offset = rigid_offset(body.com)
+    offset = rigid_offset(body.at - at)
     return np.asarray(offset.T @ about_com @ offset, np.float64)
 
 
@@ -217,27 +219,42 @@ class System:
         return tuple(strain), np.array(list(strain.values())), np.array(list(kinetic.values()))
 
 
-def assemble(frame: Frame, elements: int, kept: int | None = None) -> System:
-    """Stiffness and mass of a frame, each member divided into ``elements`` beams.
+@dataclass(frozen=True, eq=False)
+class _Node:
+    """A point whose displacement, shape (6,), is ``map`` times the coordinates ``own``."""
+
+    own: Indices
+    map: Array
+    at: Array
+
+
+_Nodes = dict[str, tuple[_Node, ...]]
+"""Points that others can stand on, by body: one of a rigid body, both ends of a member."""
+
+
+def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> System:
+    """Stiffness and mass of a structural model, each member divided into ``elements`` beams.
 
     :param kept: modes with held ends that a member keeps; None keeps all its nodes.
 
-    :raises ValueError: a member stands on a body that no earlier member ends in, or has no length.
+    :raises ValueError: a part stands on a body that hangs nowhere, or has no length.
     """
     parts: list[Part] = []
-    names: list[str] = [MOVING]
-    positions: list[Array] = [frame.origin[None]]
+    names: list[str] = [model.platform]
+    positions: list[Array] = [model.origin[None]]
     members: list[tuple[int, Array, Array]] = []
-    platform = np.arange(6)
-    bodies: dict[str, tuple[Indices, Array] | None] = {
-        GROUND: None,
-        MOVING: (platform, frame.origin),
+    nodes: _Nodes = {
+        BASE: (_Node(np.arange(0), np.zeros((6, 0)), np.zeros(3)),),
+        model.platform: (_Node(np.arange(6), np.eye(6), model.origin),),
     }
     size = 6
-    for body in frame.bodies:
-        parts.append(Part(body.name, platform, np.eye(6), np.zeros((6, 6)), body_mass(body)))
     springs: list[Part] = []
-    for member in frame.members:
+    for member in model.parts:
+        if isinstance(member, Carried):
+            node, spring, size = _end(member.support, member.at, nodes, size)
+            nodes[member.name] = (node,)
+            springs += [] if spring is None else [spring]
+            continue
         span = member.end - member.start
         length = math.sqrt(float(span @ span))
         if not length > 0.0:
@@ -251,30 +268,60 @@ def assemble(frame: Frame, elements: int, kept: int | None = None) -> System:
         columns: list[Indices] = [inside]
         # Inside, coordinates are along the member's own axes.
         blocks: list[Array] = [np.eye(rows)[:, 12:]]
+        ends: list[_Node] = []
         for support, point, first in (
             (member.inner, member.start, 0),
             (member.outer, member.end, 6),
         ):
-            own, block, spring, size = _end(support, point, bodies, size)
-            full = np.zeros((rows, block.shape[1]))
-            full[first : first + 6] = (axes.T @ block.reshape(2, 3, -1)).reshape(6, -1)
-            columns.append(own)
+            node, spring, size = _end(support, point, nodes, size)
+            full = np.zeros((rows, node.map.shape[1]))
+            full[first : first + 6] = (axes.T @ node.map.reshape(2, 3, -1)).reshape(6, -1)
+            columns.append(node.own)
             blocks.append(full)
-            if spring is not None:
-                springs.append(spring)
-        if member.outer is None:
-            bodies[member.name] = (columns[-1], member.end)
-        index = np.concatenate(columns)
+            ends.append(node)
+            springs += [] if spring is None else [spring]
+        nodes[member.name] = tuple(ends)
         members.append((len(parts), basis, axes))
-        # A body that holds both ends appears once.
-        own, where = np.unique(index, return_inverse=True)
-        joined = np.zeros((rows, len(own)))
-        np.add.at(joined.T, where, np.hstack(blocks).T)
+        own, joined = _joined(columns, blocks)
         parts.append(Part(member.body, own, joined, stiffness, mass))
         fractions = np.arange(elements + 1)[:, None] / elements
         positions.append(member.start + fractions * span)
         names += [f"{member.name} {k}/{elements}" for k in range(elements + 1)]
-    whole = (*parts, *springs)
+    rigid: list[Part] = []
+    for body in model.bodies:
+        node = _nearest(nodes, body.body, body.at)
+        rigid.append(
+            Part(body.name, node.own, node.map, np.zeros((6, 6)), body_mass(body, node.at))
+        )
+    held: list[tuple[Indices, Array]] = []
+    for closure in model.closures:
+        inner = _nearest(nodes, closure.inner, closure.at)
+        outer = _nearest(nodes, closure.support.body, closure.at)
+        own, apart = _joined(
+            [inner.own, outer.own],
+            [-rigid_offset(closure.at - inner.at) @ inner.map,
+             rigid_offset(closure.at - outer.at) @ outer.map],
+        )  # fmt: skip
+        turned = (closure.support.axes.T @ apart.reshape(2, 3, -1)).reshape(6, -1)
+        compliance = np.array(closure.support.compliance)
+        held.append((own, turned[compliance == 0.0]))
+        soft = (compliance > 0.0) & np.isfinite(compliance)
+        if soft.any():
+            count = int(soft.sum())
+            springs.append(
+                Part(
+                    closure.support.joint, own, turned[soft], np.diag(1.0 / compliance[soft]),
+                    np.zeros((count, count)),
+                )
+            )  # fmt: skip
+    # Rigid bodies first: the order of the energy shares.
+    shift = len(rigid)
+    whole = (*rigid, *parts, *springs)
+    members = [(index + shift, basis, axes) for index, basis, axes in members]
+    basis_of = _null_space(held, size)
+    if basis_of is not None:
+        whole = tuple(_on(part, basis_of) for part in whole)
+        size = basis_of.shape[1]
     stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
     for part in whole:
         at = np.ix_(part.own, part.own)
@@ -283,18 +330,63 @@ def assemble(frame: Frame, elements: int, kept: int | None = None) -> System:
     return System(stiffness, mass, whole, tuple(names), np.concatenate(positions), tuple(members))
 
 
+def _null_space(held: list[tuple[Indices, Array]], size: int) -> Array | None:
+    """Coordinates that keep what closures hold, shape (size, fewer); the first six are the same.
+
+    Dependent equations, of an overconstrained machine, count once.
+    """
+    count = sum(len(rows) for _, rows in held)
+    if not count:
+        return None
+    table = np.zeros((count, size))
+    at = 0
+    for own, rows in held:
+        table[at : at + len(rows), own] = rows
+        at += len(rows)
+    # The platform's six displacements stay coordinates: the others are solved for them.
+    left, right = table[:, :6], table[:, 6:]
+    u, s, vt = np.linalg.svd(right)
+    rank = int((s > 1e-10 * s[0]).sum()) if len(s) else 0
+    if np.abs(u[:, rank:].T @ left).max(initial=0.0) > 1e-9:
+        raise ValueError("closures hold the platform itself: its compliance is not positive")
+    particular = -vt[:rank].T @ ((u[:, :rank].T @ left) / s[:rank, None])
+    basis = np.zeros((size, 6 + right.shape[1] - rank))
+    basis[:6, :6] = np.eye(6)
+    basis[6:, :6] = particular
+    basis[6:, 6:] = vt[rank:].T
+    return basis
+
+
+def _on(part: Part, basis: Array) -> Part:
+    """A part on other coordinates."""
+    return Part(
+        part.name, np.arange(basis.shape[1]), part.map @ basis[part.own], part.stiffness, part.mass
+    )
+
+
+def _joined(columns: list[Indices], blocks: list[Array]) -> tuple[Indices, Array]:
+    """Coordinates and their block, each coordinate once: a body may hold both ends."""
+    index = np.concatenate(columns)
+    own, where = np.unique(index, return_inverse=True)
+    joined = np.zeros((len(blocks[0]), len(own)))
+    np.add.at(joined.T, where, np.hstack(blocks).T)
+    return own, joined
+
+
+def _nearest(nodes: _Nodes, body: str, point: Array) -> _Node:
+    """The node of a body that is nearest to a point."""
+    if body not in nodes:
+        raise ValueError(f"{body} hangs nowhere")
+    return min(nodes[body], key=lambda node: float(np.linalg.norm(node.at - point)))
+
+
 def _end(
-    support: Support | None,
-    point: Array,
-    bodies: dict[str, tuple[Indices, Array] | None],
-    size: int,
-) -> tuple[Indices, Array, Part | None, int]:
-    """Coordinates of a member's end, its displacement by them (6, k), springs, and the new size."""
+    support: Support | None, point: Array, nodes: _Nodes, size: int
+) -> tuple[_Node, Part | None, int]:
+    """A point that stands on a body or, without a support, is free; its springs, the new size."""
     if support is None:
-        return np.arange(size, size + 6), np.eye(6), None, size + 6
-    if support.body not in bodies:
-        raise ValueError(f"{support.joint} stands on {support.body}, which no earlier member has")
-    body = bodies[support.body]
+        return _Node(np.arange(size, size + 6), np.eye(6), point), None, size + 6
+    body = _nearest(nodes, support.body, point)
     compliance = np.array(support.compliance)
     loose = np.flatnonzero(compliance)
     travel = np.zeros((6, len(loose)))
@@ -308,15 +400,12 @@ def _end(
         spring = Part(
             support.joint, own, np.eye(count), np.diag(rigidity), np.zeros((count, count))
         )
-    if body is None:
-        return own, travel, spring, size + len(loose)
-    moved, at = body
-    return (
-        np.concatenate((moved, own)),
-        np.hstack((rigid_offset(point - at), travel)),
-        spring,
-        size + len(loose),
+    node = _Node(
+        np.concatenate((body.own, own)),
+        np.hstack((rigid_offset(point - body.at) @ body.map, travel)),
+        point,
     )
+    return node, spring, size + len(loose)
 
 
 def _cross(a: Array, b: Array) -> Array:

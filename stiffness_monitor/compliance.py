@@ -10,16 +10,17 @@ May import: numpy, pkm_twin's core, the standard library; never rclpy.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
-from pkm_twin.machine.members import framed
-from pkm_twin.machine.robot import Robot
-from pkm_twin.mechanisms.elements import TIE, WRENCH
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.errors import SingularityError
+from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
+from stiffness_monitor.elements import TIE, compliance_kernel, energy_kernel
 from stiffness_monitor.statics import frame_compliance, frame_energies
 
 Array = NDArray[np.float64]
@@ -31,7 +32,7 @@ def compliance(robot: Robot, pose: ArrayLike) -> Array:
     C = K^-1, K = sum over limbs of J_i C_i^-1 J_i' (2UPR-RPU paper, equations 34 and 35). Every
     matrix is exactly symmetric and positive definite.
 
-    :param pose: shape (..., 3), the mechanism's pose parameters, m and rad.
+    :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :returns: shape (..., 6, 6), order x y z rx ry rz in fixed axes: m/N, rad/N, m/(N m),
         rad/(N m).
     :raises ParameterError: a robot without elastic members.
@@ -39,13 +40,10 @@ def compliance(robot: Robot, pose: ArrayLike) -> Array:
     :raises SingularityError: a compliance that is not symmetric positive definite, by sample.
     :raises ValueError: a wrong last axis, or a value that is not finite, by sample.
     """
-    kernel = robot.elastic_kernel
-    if kernel is None:
+    if not robot.element_names:
         return frame_compliance(robot, pose)
-    flat, fault = kernel(robot.parameters, pose)
-    if fault.ndim > 1 or fault.item(0) != 0.0:
-        robot.raise_fault(fault, "pose")
-    return flat.reshape(*flat.shape[:-1], 6, 6)
+    row = _row(robot, "compliance", compliance_kernel, pose)
+    return row[..., :36].reshape(*row.shape[:-1], 6, 6)
 
 
 def stiffness(robot: Robot, pose: ArrayLike) -> Array:
@@ -83,36 +81,66 @@ class StrainEnergy:
 def strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> StrainEnergy:
     """Strain energy of a wrench, element by element (2UPR-RPU paper, equations 36 to 38).
 
-    :param pose: shape (..., 3), the mechanism's pose parameters, m and rad.
+    :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param wrench: force and moment that the surroundings apply to the platform at its origin,
         fixed axes, shape (..., 6), N and N m; broadcast against the pose.
     :raises ValueError: as :func:`compliance`, also for the wrench.
     """
-    kernel = robot.energy_kernel
-    if kernel is None:
+    if not robot.element_names:
         return _frame_strain_energy(robot, pose, wrench)
-    deflection, energies, factors, summary, fault = kernel(robot.parameters, pose, wrench)
+    row = _row(robot, "strain energy", energy_kernel, pose, wrench)
+    n = len(robot.element_names)
+    return _answer(
+        robot.element_names, row[..., :n], row[..., n : 2 * n], row[..., 2 * n + 6],
+        row[..., 2 * n : 2 * n + 6],
+    )  # fmt: skip
+
+
+def _row(
+    robot: Robot, name: str, kernel: Callable[[Robot], Kernel], pose: ArrayLike, *rest: ArrayLike
+) -> Array:
+    """What a kernel of elements answers, shape (..., size), refused by sample."""
+    result = robot.call_one(name, lambda: kernel(robot), robot.elastic_parameters, pose, *rest)
+    if result is not None and result[-2] > SINGULARITY_BOUND and result[-1] >= 0.0:
+        return result
+    (rows,), status = kernel(robot)(robot.elastic_parameters, pose, *rest)
+    low = rows[..., -2] > SINGULARITY_BOUND
+    if status is None and low.all() and (rows[..., -1] >= 0.0).all():
+        return rows
+    robot.inverse(pose)
+    codes = np.zeros(low.shape) if status is None else status[..., 0]
+    for index in np.ndindex(*low.shape):
+        if codes[index]:
+            what = "wrench, or its energy," if rest else "pose"
+            where = f" at sample {index}" if index else ""
+            raise ValueError(f"{what}{where} is not finite, or leads to a result that is not")
+        if not low[index]:
+            raise SingularityError("pose", index, float(rows[index][-2]), SINGULARITY_BOUND)
+    return rows
+
+
+def _answer(
+    names: tuple[str, ...], factors: Array, energies: Array, total: Array, deflection: Array
+) -> StrainEnergy:
+    """With the dominant element: the first of those that tie."""
     for array in (deflection, energies, factors):
         array.setflags(write=False)
-    names = robot.element_names
-    if fault.ndim == 1:
-        if fault.item(0) != 0.0:
-            _raise_fault(robot, fault)
-        total, first, tie = summary.tolist()
-        dominant = names[int(first)] if first >= 0.0 else "none"
-        return StrainEnergy(names, factors, energies, total, deflection, dominant, tie != 0.0)
-    if fault[..., 0].any():
-        _raise_fault(robot, fault)
+    if factors.ndim == 1:
+        # One sample, without numpy.
+        shares = factors.tolist()
+        bound = max(shares) * (1.0 - TIE)
+        close = [k for k, share in enumerate(shares) if share > bound]
+        dominant = names[close[0]] if close else "none"
+        return StrainEnergy(
+            names, factors, energies, float(total), deflection, dominant, len(close) > 1
+        )
+    near = factors > factors.max(-1, keepdims=True) * (1.0 - TIE)
+    # Index -1, without load, is the last name.
+    first = np.where(near.any(-1), near.argmax(-1), -1)
     return StrainEnergy(
-        names,
-        factors,
-        energies,
-        np.ascontiguousarray(summary[..., 0]),
-        deflection,
-        # Index -1, without load, is the last name.
-        _choices(names)[summary[..., 1].astype(np.intp)],
-        summary[..., 2] != 0.0,
-    )
+        names, factors, energies, np.ascontiguousarray(total), deflection, _choices(names)[first],
+        near.sum(-1) > 1,
+    )  # fmt: skip
 
 
 def kernels(robot: Robot) -> tuple[Kernel, ...]:
@@ -120,10 +148,10 @@ def kernels(robot: Robot) -> tuple[Kernel, ...]:
 
     :raises ParameterError: a robot without elastic members.
     """
-    if robot.elastic_kernel is None or robot.energy_kernel is None:
-        framed(robot).frame(robot.home())
-        return robot.forward_kernel, robot.inverse_kernel
-    return robot.forward_kernel, robot.inverse_kernel, robot.elastic_kernel, robot.energy_kernel
+    if not robot.element_names:
+        robot.structure()
+        return (robot.engine.forward,)
+    return robot.engine.forward, compliance_kernel(robot), energy_kernel(robot)
 
 
 def _frame_strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> StrainEnergy:
@@ -135,30 +163,13 @@ def _frame_strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> St
     names, deflection, energies = frame_energies(robot, pose, unit)
     whole = energies.sum(-1, keepdims=True)
     factors = energies / np.where(whole == 0.0, 1.0, whole)
-    largest = factors.max(-1, keepdims=True)
-    close = (factors > largest * (1.0 - TIE)) & (largest > 0.0)
-    first = np.where(close.any(-1), close.argmax(-1), -1)
-    tie = close.sum(-1) > 1
     with np.errstate(over="ignore"):
         deflection, energies, whole = deflection * size, energies * size**2, whole * size**2
     if not (np.isfinite(deflection).all() and np.isfinite(whole).all()):
         raise ValueError("wrench, or its energy, is not finite, or leads to a result that is not")
-    for array in (deflection, energies, factors):
-        array.setflags(write=False)
-    total = whole[..., 0].copy()
-    if total.ndim == 0:
-        dominant = names[int(first)] if first >= 0 else "none"
-        return StrainEnergy(names, factors, energies, float(total), deflection, dominant, bool(tie))
-    return StrainEnergy(names, factors, energies, total, deflection, _choices(names)[first], tie)
+    return _answer(names, factors, energies, whole[..., 0].copy(), deflection)
 
 
 @lru_cache(maxsize=8)
 def _choices(names: tuple[str, ...]) -> NDArray[np.str_]:
     return np.array([*names, "none"])
-
-
-def _raise_fault(robot: Robot, fault: Array) -> None:
-    first = fault.reshape(-1, fault.shape[-1])
-    code, source, _ = first[np.flatnonzero(first[:, 0])[0]].tolist()
-    wrong_wrench = code == NOT_FINITE and source == WRENCH
-    robot.raise_fault(fault, "wrench, or its energy," if wrong_wrench else "pose")

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh, solve_triangular  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.members import Framed, framed
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.beams import System, assemble
-from stiffness_monitor.statics import checked_frame, stiffness_root
+from stiffness_monitor.statics import checked_poses, stiffness_root
+from stiffness_monitor.structure import structural_model
 
 Array = NDArray[np.float64]
 
@@ -66,17 +66,17 @@ def natural_frequencies(
 ) -> Array:
     """Lowest natural frequencies with locked actuators, shape (..., count), Hz, lowest first.
 
-    :param pose: shape (..., 3), the mechanism's pose parameters, m and rad.
+    :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param elements: beam elements a member.
     :raises ParameterError: a robot whose file has no data for modes, by the missing section.
     :raises UnreachableError: a pose that is none of the mechanism's.
     :raises SingularityError: a pose in which the frame is a mechanism, with locked actuators.
     :raises ValueError: a wrong last axis, a value that is not finite, too many modes.
     """
-    frame, poses = checked_frame(robot, pose)
+    poses = checked_poses(robot, pose)
     result = np.empty((*poses.shape[:-1], count))
     for index in np.ndindex(*poses.shape[:-1]):
-        system = _system(frame, poses[index], elements)
+        system = _system(robot, poses[index], elements)
         result[index] = _solve(system, count, index, vectors=False)[0]
     return result
 
@@ -86,10 +86,10 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
 
     Frequencies that are equal, as a symmetric robot's, have shapes that are any basis of theirs.
 
-    :param pose: shape (..., 3), the mechanism's pose parameters, m and rad.
+    :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param elements: beam elements a member.
     """
-    frame, poses = checked_frame(robot, pose)
+    poses = checked_poses(robot, pose)
     batch = poses.shape[:-1]
     frequencies: list[Array] = []
     positions: list[Array] = []
@@ -99,7 +99,7 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     if not np.prod(batch, dtype=int):
         raise ValueError("modes of no pose")
     for index in np.ndindex(*batch):
-        system = _system(frame, poses[index], elements)
+        system = _system(robot, poses[index], elements)
         values, vectors = _solve(system, count, index, vectors=True)
         frequencies.append(values)
         positions.append(system.positions)
@@ -129,16 +129,16 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
 def has_modes(robot: Robot) -> bool:
     """Whether the robot's file has what natural frequencies need."""
     try:
-        framed(robot).frame(robot.home())
+        robot.structure()
     except ParameterError:
         return False
     return True
 
 
-def _system(frame: Framed, pose: Array, elements: int) -> System:
+def _system(robot: Robot, pose: Array, elements: int) -> System:
     if elements < 1:
         raise ParameterError("elements", elements, "1 or more")
-    return assemble(frame.frame(pose), elements, KEPT)
+    return assemble(structural_model(robot, pose), elements, KEPT)
 
 
 def _solve(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compliance and strain energy of a robot's elastic frame by finite elements, actuators locked.
 
-For every robot that declares its members as a frame (:class:`~pkm_twin.machine.members.Framed`).
+For every robot whose file gives elastic members (:mod:`stiffness_monitor.structure`).
 One beam element a member is exact, because loads act at members' ends.
 
 May import: numpy, scipy, pkm_twin's core, this package, the standard library; never rclpy.
@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky, solve_triangular  # type: ignore[import-untyped]
 
 from pkm_twin.errors import SingularityError
-from pkm_twin.machine.members import Framed, framed
 from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 from stiffness_monitor.beams import System, assemble
+from stiffness_monitor.structure import structural_model
 
 Array = NDArray[np.float64]
 
@@ -26,17 +26,17 @@ def frame_compliance(robot: Robot, pose: ArrayLike, *, elements: int = 1) -> Arr
 
     Order x y z rx ry rz in fixed axes, as :func:`stiffness_monitor.compliance`.
 
-    :param pose: shape (..., 3), the mechanism's pose parameters, m and rad.
+    :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param elements: beam elements a member.
     :raises ParameterError: a robot whose file has no elastic members, by the missing section.
     :raises UnreachableError: a pose that is none of the mechanism's.
     :raises SingularityError: a pose in which the frame is a mechanism, with locked actuators.
     :raises ValueError: a wrong last axis, a value that is not finite.
     """
-    frame, poses = checked_frame(robot, pose)
+    poses = checked_poses(robot, pose)
     result = np.empty((*poses.shape[:-1], 6, 6))
     for index in np.ndindex(*poses.shape[:-1]):
-        root = stiffness_root(assemble(frame.frame(poses[index]), elements), index)
+        root = stiffness_root(assemble(structural_model(robot, poses[index]), elements), index)
         half = _platform_columns(root)
         result[index] = half.T @ half
     return result
@@ -53,18 +53,21 @@ def frame_energies(
     :returns: names of the elements (members, and joints that have elasticity), deflection
         (..., 6), m and rad, energies (..., elements), J.
     """
-    frame, poses = checked_frame(robot, pose)
+    poses = checked_poses(robot, pose)
     loads = np.asarray(wrench, np.float64)
     if loads.ndim == 0 or loads.shape[-1] != 6:
         raise ValueError(f"a wrench has 6 entries; the shape is {loads.shape}")
     if not np.isfinite(loads).all():
         raise ValueError("wrench is not finite")
     batch = np.broadcast_shapes(poses.shape[:-1], loads.shape[:-1])
-    poses, loads = np.broadcast_to(poses, (*batch, 3)), np.broadcast_to(loads, (*batch, 6))
+    poses, loads = (
+        np.broadcast_to(poses, (*batch, poses.shape[-1])),
+        np.broadcast_to(loads, (*batch, 6)),
+    )
     names: tuple[str, ...] = ()
     deflections, energies = np.empty((*batch, 6)), []
     for index in np.ndindex(*batch):
-        system = assemble(frame.frame(poses[index]), 1)
+        system = assemble(structural_model(robot, poses[index]), 1)
         root = stiffness_root(system, index)
         shape = solve_triangular(
             root, _platform_columns(root) @ loads[index], lower=True, trans=1, check_finite=False
@@ -78,14 +81,15 @@ def frame_energies(
     return names, deflections, np.array(energies).reshape(*batch, len(names))
 
 
-def checked_frame(robot: Robot, pose: ArrayLike) -> tuple[Framed, Array]:
-    """The robot as one with a frame, and its poses, refused by sample where they are none."""
-    frame = framed(robot)
+def checked_poses(robot: Robot, pose: ArrayLike) -> Array:
+    """Poses of a robot with elastic members, refused by sample where they are none."""
+    robot.structure()
     poses = np.asarray(pose, np.float64)
-    if poses.ndim == 0 or poses.shape[-1] != 3:
-        raise ValueError(f"a pose has 3 parameters; the shape is {poses.shape}")
+    count = len(robot.pose_names)
+    if poses.ndim == 0 or poses.shape[-1] != count:
+        raise ValueError(f"a pose has {count} parameters; the shape is {poses.shape}")
     robot.inverse(poses)
-    return frame, poses
+    return poses
 
 
 def stiffness_root(system: System, index: tuple[int, ...]) -> Array:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.recorded import JOINT_STATE, WRENCH, Recording, read_recording
+from pkm_twin.apps.limits import ranges
+from pkm_twin.apps.recorded import (
+    Load,
+    Recording,
+    Topics,
+    by_load,
+    read_recording,
+    why_no_torques,
+)
 from pkm_twin.apps.verdict import Item, Verdict
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.streams.differentiator import Differentiator
 
 Array = NDArray[np.float64]
+# Samples computed at a time, so that memory stays flat.
+_BLOCK = 4096
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,8 @@ class CheckReport:
     bag: str
     robot: str
     items: tuple[Item, ...]
+    topics: Topics
+    load: Load | None
 
     @property
     def good(self) -> bool:
@@ -53,7 +65,14 @@ class CheckReport:
 
     def as_json(self) -> dict[str, Any]:
         """Plain data for a script."""
-        return {**asdict(self), "good": self.good}
+        return {
+            "bag": self.bag,
+            "robot": self.robot,
+            "topics": asdict(self.topics),
+            "payload": None if self.load is None else self.load.as_json(),
+            "items": [asdict(item) for item in self.items],
+            "good": self.good,
+        }
 
 
 def check_bag(
@@ -61,17 +80,24 @@ def check_bag(
     robot: str | None = None,
     bounds: Bounds | None = None,
     progress: Callable[[int], None] | None = None,
+    *,
+    topics: Sequence[str] = (),
+    carried: Load | None = None,
 ) -> CheckReport:
     """Judge a bag against the twin.
 
+    :param topics: joint-state and wrench topic, where names and joints do not tell.
+    :param carried: the payload, by default the one that the bag tells of.
     :raises BagError: the file is damaged or cannot be judged at all.
     """
     bounds = bounds or Bounds()
-    recording = read_recording(path, robot, progress)
+    recording = read_recording(path, robot, progress, topics=topics, carried=carried)
     items = [*_file(recording, bounds), *_timing(recording, bounds), *_limits(recording)]
     items.append(_singularity(recording, bounds))
     items += _residuals(recording, bounds)
-    return CheckReport(str(path), recording.robot.name, tuple(items))
+    return CheckReport(
+        str(path), recording.robot.name, tuple(items), recording.topics, recording.load
+    )
 
 
 def _file(r: Recording, bounds: Bounds) -> list[Item]:
@@ -85,7 +111,7 @@ def _file(r: Recording, bounds: Bounds) -> list[Item]:
         )
     ]
     refused = sum(r.rejected.values())
-    total = sum(t.count for t in report.topics.values() if t.type in (JOINT_STATE, WRENCH))
+    total = r.message_count
     reasons = ", ".join(f"{k}: {v}" for k, v in r.rejected.items())
     value = f"{refused} of {total}" + (f" ({reasons}; first: {r.first_reject})" if refused else "")
     items.append(
@@ -118,26 +144,22 @@ def _timing(r: Recording, bounds: Bounds) -> list[Item]:
 
 def _limits(r: Recording) -> list[Item]:
     """Effort limits; position and velocity limits are already a node's reason to refuse."""
-    limits: Any = getattr(r.robot, "limits", None)
+    effort = r.robot.limits.effort
+    bounds = list(ranges(r.robot))
+    if effort is not None:
+        bounds.append(("effort", -effort, effort, list(r.robot.effort_units)))
+    recorded = {"position": r.q, "velocity": r.qd, "effort": r.effort}
     items = []
-    for what, values, unit in (
-        ("position", r.q, r.robot.joint_unit),
-        ("velocity", r.qd, f"{r.robot.joint_unit}/s"),
-        ("effort", r.effort, r.robot.effort_unit),
-    ):
-        bound = getattr(limits, what, None)
-        if values is None or bound is None:
+    for what, low, high, units in bounds:
+        values = recorded[what]
+        if values is None:
             continue
-        low, high = (bound[:, 0], bound[:, 1]) if bound.ndim == 2 else (-bound, bound)
         used = np.maximum((values - high).max(0), (low - values).max(0))
-        items.append(
-            _item(
-                f"{what} limits",
-                f"least margin {-used.max():.4g} {unit}",
-                "0 or more",
-                bool((used <= 0).all()),
-            )
-        )
+        # Joints that turn and joints that slide have no common margin.
+        worst = {u: max(x for x, v in zip(used, units, strict=True) if v == u) for u in units}
+        margins = ", ".join(f"{-most:.4g} {unit}" for unit, most in worst.items())
+        good = bool((used <= 0).all())
+        items.append(_item(f"{what} limits", f"least margin {margins}", "0 or more", good))
     return items
 
 
@@ -156,51 +178,58 @@ def _singularity(r: Recording, bounds: Bounds) -> Item:
 def _residuals(r: Recording, bounds: Bounds) -> list[Item]:
     what = "torque residual"
     bound = f"RMS below {100 * bounds.residual:g} % of peak"
-    if r.robot.dynamics_kernel is None:
-        return [Item(what, "the robot's file has no masses", bound, Verdict.UNKNOWN)]
-    if r.effort is None:
-        return [Item(what, "the bag carries no efforts", bound, Verdict.UNKNOWN)]
-    residual, used = residuals(r)
+    reason = why_no_torques(r.robot) or (
+        "" if r.effort is not None else "the bag carries no efforts"
+    )
+    if reason or r.effort is None:
+        return [Item(what, reason, bound, Verdict.UNKNOWN)]
+    try:
+        residual, used = residuals(r)
+    except (UnreachableError, SingularityError):
+        raise
+    except ValueError as error:  # numbers within bounds whose result is not finite
+        return [Item(what, str(error), bound, Verdict.BAD)]
     if not used.any():
         return [Item(what, "too few joint states in a row", bound, Verdict.UNKNOWN)]
     rms = np.sqrt(np.mean(residual[used] ** 2, 0))
     peak = np.abs(r.effort).max(0)
-    unit = r.robot.effort_unit
+    units = r.robot.effort_units
+    good = rms <= bounds.residual * peak
+    hint = "" if r.load or good.all() else "; a payload that nobody told of? --payload"
     return [
         _item(
             f"{what} of {name}",
-            f"RMS {rms[i]:.4g} {unit}, {100 * rms[i] / max(peak[i], 1e-12):.2f} % of {peak[i]:.4g}",
+            f"RMS {rms[i]:.4g} {units[i]}, {100 * rms[i] / max(peak[i], 1e-12):.2f} % of "
+            f"{peak[i]:.4g}{'' if good[i] else hint}",
             bound,
-            bool(rms[i] <= bounds.residual * peak[i]),
+            bool(good[i]),
         )
         for i, name in enumerate(r.robot.joint_names)
     ]
 
 
 def residuals(r: Recording) -> tuple[Array, NDArray[np.bool_]]:
-    """Measured less predicted efforts (n, 3), and which samples are judged.
+    """Measured minus predicted efforts (samples, n), and which samples are judged.
 
     Not judged are samples until the differentiator's window is full, after gaps, and half a second
-    around a pick or release, where the payload is neither held nor gone. A payload that the bag
-    tells of is part of the model while it is held.
+    around a pick or release, where the payload is neither held nor gone. A payload that the bag or
+    the caller tells of is part of the model while it is held.
     """
     assert r.effort is not None  # noqa: S101
     qd, qdd, used = motion(r)
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
     predicted = np.zeros_like(r.q)
-    predicted[used] = inverse_dynamics(r.robot, r.q[used], qd[used], qdd[used], wrench[used])
-    if r.loaded is not None:
-        picked, released = r.loaded
-        held = used & (r.time >= picked) & (r.time <= released)
-        carrying: Any = r.robot.changed(payload={"mass": r.payload_mass})
-        predicted[held] = inverse_dynamics(carrying, r.q[held], qd[held], qdd[held], wrench[held])
-        near = (np.abs(r.time - picked) < 0.5) | (np.abs(r.time - released) < 0.5)
-        used = used & ~near
+    for robot, part in by_load(r.robot, r.load, r.time, _BLOCK):
+        rows = np.arange(part.start, part.stop)[used[part]]
+        state = (r.q[rows], qd[rows], qdd[rows], wrench[rows])
+        predicted[rows] = inverse_dynamics(robot, *state)
+    if r.load is not None:
+        used = used & ~r.load.near_change(r.time, 0.5)
     return r.effort - predicted, used
 
 
 def motion(r: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Rates and accelerations (n, 3) by the differentiator's middle, and where they are."""
+    """Rates and accelerations (samples, n) by the differentiator's middle, and where they are."""
     window = 9
     late = window // 2
     differentiator = Differentiator(order=3, window=window, middle=True)

@@ -3,28 +3,33 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any, NoReturn, Optional
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
 from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.atlas import commands as atlases
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.console import (
+    flush_output,
+    numbers,
+    print_json,
+    progress,
+    refuse_existing,
+    silence_output,
+    system_error,
+    table_console,
+)
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -39,11 +44,52 @@ OptionalRobot = Annotated[
     Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
     typer.Option("--robot", help="name or YAML file; default: the one that the bag names"),
 ]
-BagPath = Annotated[Path, typer.Argument(help="a bag: one MCAP file", show_default=False)]
+BagPath = Annotated[
+    Path, typer.Argument(help="a bag: an MCAP file or a rosbag2 folder", show_default=False)
+]
+BagTopics = Annotated[
+    list[str],
+    typer.Option(
+        "--topic", help="joint states or wrenches to read; default: by the robot's joint names"
+    ),
+]
+Payload = Annotated[
+    Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+    typer.Option(
+        help="MASS[,x,y,z] on the platform, kg and m from its reference point; default: what the "
+        "bag tells"
+    ),
+]
+LoadTimes = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        help="FROM,TO[,FROM,TO...], s since the beginning, when --payload is held; default: always"
+    ),
+]
+BeyondLimits = Annotated[
+    bool,
+    typer.Option("--beyond-limits", help="compute outside the joints' limits too, and mark it"),
+]
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            typer.echo(f"pkm-twin {version('pkm_twin')}")
+        except PackageNotFoundError:
+            typer.echo("pkm-twin, not installed: run from its sources")
+        raise typer.Exit
 
 
 @app.callback()
-def _application() -> None:
+def _application(
+    _asked: Annotated[
+        bool,
+        typer.Option("--version", help="print the version", callback=_version, is_eager=True),
+    ] = False,
+) -> None:
     """Digital twin of parallel kinematic machines, without ROS but for `play`.
 
     SI units, world z up. Begin with `pkm-twin robots`, then `pkm-twin info delta_cu`, or
@@ -107,8 +153,14 @@ def robots() -> None:
         typer.echo(f"{name:12} {summary(load(name))}")
 
 
+Platform = Annotated[
+    Optional[str],  # noqa: UP045  typer reads it
+    typer.Option(help="of a URDF, the link that carries the tool", show_default=False),
+]
+
+
 @app.command()
-def info(robot: RobotName, as_json: Json = False) -> None:
+def info(robot: RobotName, platform: Platform = None, as_json: Json = False) -> None:
     """Print all of a robot, with units.
 
     Dimensions, masses, limits, home pose, mobility, and which reactions rigid bodies do not
@@ -117,27 +169,64 @@ def info(robot: RobotName, as_json: Json = False) -> None:
     from pkm_twin import load
     from pkm_twin.apps.describe import describe, lines
 
-    data = describe(load(robot))
+    data = describe(load(robot, platform=platform))
     if as_json:
         # JSON has no infinity: a free axis is null.
-        _print_json(_finite(data))
+        print_json(_finite(data))
         return
     table = Table(show_header=False)
     for what, value in lines(data):
         table.add_row(what, Text(value))
-    _console().print(table)
+    table_console().print(table)
+
+
+@app.command()
+def urdf(robot: RobotName, platform: Platform = None) -> None:
+    """Print a robot as a URDF that parsers of trees read, its cut loops as <constraint> elements.
+
+    Its joints are the actuated and the passive ones; its ground is base_link, its platform's link
+    platform. The same robot gives the same bytes.
+    """
+    from pkm_twin import load
+    from pkm_twin.machine.robot_urdf import robot_urdf
+
+    typer.echo(robot_urdf(load(robot, platform=platform)), nl=False)
+
+
+@app.command()
+def convert(robot: RobotName, platform: Platform = None) -> None:
+    """Print a robot, or a URDF with its loops, as a commented YAML of bodies, joints and rods.
+
+    That file is a robot of its own: edit it, and give its path wherever a robot's name goes.
+    """
+    from pkm_twin import load
+    from pkm_twin.machine.catalogue import TREES
+    from pkm_twin.machine.machine_yaml import describe_machine_yaml
+    from pkm_twin.machine.robot_urdf import robot_description
+    from pkm_twin.machine.urdf_read import read_urdf
+
+    path = Path(robot)
+    if path.suffix in TREES:
+        data = read_urdf(path, platform=platform)
+    else:
+        data = robot_description(load(robot, platform=platform))
+    typer.echo(describe_machine_yaml(data), nl=False)
 
 
 @app.command()
 def torques(
     robot: RobotName,
     motion: Annotated[
-        Path, typer.Argument(help="a bag (.mcap), or a CSV with a head line", show_default=False)
+        Path, typer.Argument(help="a bag, or a CSV with a header row", show_default=False)
     ],
     out: Annotated[
         Path, typer.Option(help="table to write, .csv or .parquet; the picture goes beside it")
     ] = Path("torques.csv"),
     picture: Annotated[bool, typer.Option(help="draw efforts and terms as a PNG")] = True,
+    topic: BagTopics = [],  # noqa: B006  typer copies it
+    payload: Payload = None,
+    load_times: LoadTimes = None,
+    beyond_limits: BeyondLimits = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="replace the table and the picture")
     ] = False,
@@ -150,18 +239,30 @@ def torques(
 
     The table has, by sample, each joint's effort (N m or N) and the terms that sum to it
     (JOINT.effort_gravity, _inertia, _velocity, _payload, _friction, _external), a bag's measured
-    effort, and force and moment in every joint; empty where rigid bodies do not determine it.
+    effort, and force and moment in every joint; empty where rigid bodies do not determine it. With
+    --beyond-limits a column beyond_limits is 1 where a joint is outside its limits.
     """
+    from pkm_twin.apps.limits import beyond_limits as find_beyond
+    from pkm_twin.apps.limits import refuse_beyond
     from pkm_twin.apps.torques import check_target, motion_of_bag, motion_of_csv, table, write_table
     from pkm_twin.atlas import plots
+    from pkm_twin.bags.storage import is_bag
 
     check_target(out)
     drawing = out.with_suffix(".png")
     for target in (out, drawing) if picture else (out,):
-        _refuse_existing(target, overwrite)
-    bag = motion.suffix == ".mcap"
-    data = motion_of_bag(motion, robot) if bag else motion_of_csv(motion, robot)
-    with _progress("torques", len(data.time)) as update:
+        refuse_existing(target, overwrite)
+    carried = _load(payload, load_times)
+    if is_bag(motion):
+        data = motion_of_bag(motion, robot, topic, carried)
+    elif topic:
+        raise typer.BadParameter(f"--topic is for bags; {motion} is read as CSV")
+    else:
+        data = motion_of_csv(motion, robot, carried)
+    _, found = find_beyond(data.robot, data.q, data.qd)
+    if not beyond_limits:
+        refuse_beyond(found)
+    with progress("torques", len(data.time)) as update:
         columns = table(data, update)
     try:
         write_table(columns, out)
@@ -170,6 +271,8 @@ def torques(
             typer.echo(f"{plots.save(plots.torques(data, columns), drawing)}")
     except OSError as error:
         raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
+    for note in (*data.notes, *(f"beyond limits: {item}" for item in found)):
+        typer.echo(note)
 
 
 # A negative number is no option.
@@ -179,7 +282,7 @@ def compliance(
     pose: Annotated[
         list[float],
         typer.Argument(
-            help="the pose's three numbers, of upr_rpu z (m), beta, gamma (rad)",
+            help="the pose's numbers, of upr_rpu z (m), beta, gamma (rad)",
             show_default=False,
         ),
     ],
@@ -189,6 +292,7 @@ def compliance(
             help="load case, six numbers with commas: force (N), moment (N m), fixed axes"
         ),
     ] = "0,0,1,0,0,0",
+    beyond_limits: BeyondLimits = False,
     as_json: Json = False,
 ) -> None:
     """Platform compliance at a pose, and a wrench's strain energy.
@@ -200,6 +304,8 @@ def compliance(
     dominant one is where stiffening pays.
     """
     from pkm_twin import load
+    from pkm_twin.apps.limits import beyond_limits as find_beyond
+    from pkm_twin.apps.limits import refuse_beyond
     from stiffness_monitor import compliance as matrix
     from stiffness_monitor import strain_energy
 
@@ -208,16 +314,23 @@ def compliance(
         f"{name} ({unit})"
         for name, unit in zip(machine.pose_names, machine.pose_units, strict=True)
     )
-    if len(pose) != 3 or not np.isfinite(pose).all():
+    if len(pose) != len(machine.pose_names) or not np.isfinite(pose).all():
         given = " ".join(f"{number:g}" for number in pose)
         raise typer.BadParameter(f"a pose of {machine.name} is {names}, not {given}")
-    load_case = _numbers(wrench, 6)
+    load_case = numbers(wrench, 6)
     try:
+        _, beyond = find_beyond(machine, machine.inverse(pose))
+        if not beyond_limits:
+            refuse_beyond(beyond)
         c, energy = matrix(machine, pose), strain_energy(machine, pose, load_case)
     except PkmTwinError:
         raise
     except ValueError as error:  # finite numbers, but so large that the result is not
         raise PkmTwinError(str(error)) from None
+    # Elements that share the first place within rounding are named together, the stable one first.
+    first = np.isclose(energy.factors, energy.factors.max(), rtol=1e-6)
+    shared = zip(energy.elements, first, strict=True)
+    tied = [name for name, greatest in shared if greatest and energy.tie]
     if as_json:
         result = {
             "robot": machine.name,
@@ -228,8 +341,10 @@ def compliance(
             "total_energy": float(energy.total),
             "factors": dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
             "dominant": str(energy.dominant),
+            "tie": tied,
+            "beyond_limits": {item.joint: item.value for item in beyond},
         }
-        _print_json(result)
+        print_json(result)
         return
     axes = ("x", "y", "z", "rx", "ry", "rz")
     typer.echo(f"compliance of {machine.name} at o, fixed axes: rows m and rad, per N and N m")
@@ -247,9 +362,16 @@ def compliance(
     typer.echo(f"\nunder the wrench {wrench} (N, N m)")
     typer.echo(f"deflection (um, urad): {', '.join(moved)}")
     shares = sorted(zip(energy.factors, energy.elements, strict=True), key=lambda pair: -pair[0])
-    typer.echo(f"strain energy {energy.total:.4g} J, dominant element {energy.dominant}")
+    dominant = (
+        f"a tie of the dominant elements {', '.join(tied)}"
+        if tied
+        else f"dominant element {energy.dominant}"
+    )
+    typer.echo(f"strain energy {energy.total:.4g} J, {dominant}")
     if energy.dominant != "none":
         typer.echo("shares: " + ", ".join(f"{name} {100 * part:.1f} %" for part, name in shares))
+    for item in beyond:
+        typer.echo(f"beyond limits: {item}")
 
 
 @app.command()
@@ -257,8 +379,16 @@ def check(
     bag: BagPath,
     robot: OptionalRobot = None,
     residual: Annotated[
-        float, typer.Option(min=0.0, help="allowed RMS of the torque residual, part of the peak")
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="allowed RMS of the torque residual, part of the peak: 0.05 is 5 %",
+        ),
     ] = 0.05,
+    topic: BagTopics = [],  # noqa: B006  typer copies it
+    payload: Payload = None,
+    load_times: LoadTimes = None,
     as_json: Json = False,
 ) -> None:
     """Judge a recorded bag against the twin.
@@ -266,7 +396,7 @@ def check(
     Are the file's bytes whole, would a node take every joint state and wrench, are there gaps, are
     limits kept, is it far from singularities, and are the measured efforts what the model says? An
     item without evidence (no CRCs, no efforts, a robot without masses) is unknown, not good; it
-    does not make the bag bad.
+    does not make the bag bad. Which topics and which payload were taken is printed first.
 
     Exit code 0: nothing is bad. 1: something is, or it is no bag. 3: the file is damaged, but part
     of it can be saved with `pkm-twin recover`.
@@ -275,27 +405,32 @@ def check(
     from pkm_twin.apps.verdict import Verdict
     from pkm_twin.bags.reader import DamagedBagError
 
+    carried = _load(payload, load_times)
     try:
-        with _progress("reading", None) as update:
-            report = check_bag(bag, robot, Bounds(residual=residual), update)
+        with progress("reading", None) as update:
+            report = check_bag(
+                bag, robot, Bounds(residual=residual), update, topics=topic, carried=carried
+            )
     except PkmTwinError as error:
         salvageable = error.salvageable if isinstance(error, DamagedBagError) else 0
         if as_json:
             facts = {"bag": str(bag), "good": False, "error": str(error)}
-            _print_json({**facts, "salvageable": salvageable})
-        print(f"pkm-twin: {error}", file=sys.stderr)
+            print_json({**facts, "salvageable": salvageable})
+        _tell(str(error))
         raise typer.Exit(SALVAGED if salvageable else REFUSED) from None
     if as_json:
-        _print_json(report.as_json())
+        print_json(report.as_json())
     else:
+        typer.echo(f"{report.topics}")
+        typer.echo(f"payload: {report.load or 'the robot file alone'}")
         table = Table(title=Text(f"{report.bag}: {report.robot}"))
-        for column in ("what", "value", "has to be", "verdict"):
+        for column in ("what", "value", "limit", "verdict"):
             table.add_column(column)
         colours = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
         for item in report.items:
             verdict = Text(item.verdict, style=colours[item.verdict])
             table.add_row(item.what, Text(item.value), Text(item.bound), verdict)
-        _console().print(table)
+        table_console().print(table)
         bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
         text = f"bad: {', '.join(bad)}" if bad else "good"
         typer.echo(text + (f"; not judged: {', '.join(unknown)}" if unknown else ""))
@@ -318,11 +453,11 @@ def recover(
     """
     from dataclasses import asdict
 
-    from pkm_twin.bags.reader import recover as recover_bag
+    from pkm_twin.bags.recover import recover as recover_bag
 
     result = recover_bag(bag, out, overwrite=overwrite)
     if as_json:
-        _print_json({**asdict(result), "lossless": result.lossless})
+        print_json({**asdict(result), "lossless": result.lossless})
     else:
         lost = (
             "nothing lost"
@@ -334,58 +469,58 @@ def recover(
         raise typer.Exit(SALVAGED)
 
 
+@app.command()
+def certify(
+    robot: RobotName,
+    states: Annotated[int, typer.Option(min=1, max=100000, help="random states")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="where the random numbers begin")] = 1,
+    engine: Annotated[
+        list[str], typer.Option(help="ask only these: maximal, pinocchio, mujoco")
+    ] = [],  # noqa: B006  typer copies it
+    as_json: Json = False,
+) -> None:
+    """Compare a robot's torques and places with other engines.
+
+    Three engines compute the machine anew from its description alone, with no line of the twin's
+    mechanics: bodies free in space with every joint as equations (needs nothing more), Pinocchio
+    and MuJoCo (`pip install pkm_twin[certificate]`), each as a tree with loops. Compared are
+    torques with wrench, payload and friction, the platform's place and Jacobian, and the mass
+    matrix, over random states inside the limits; and the twin's own round trip from joints to pose
+    and back.
+
+    Exit code 0: all bounds are kept. 1: one is not, or the machine cannot be judged.
+    """
+    from pkm_twin import load
+    from pkm_twin.apps.certify import ENGINES, certificate_of
+
+    unknown = [name for name in engine if name not in ENGINES]
+    if unknown:
+        raise typer.BadParameter(f"no engine {unknown[0]!r}; there are {', '.join(ENGINES)}")
+    with progress("states", states) as update:
+        result = certificate_of(
+            load(robot), states=states, seed=seed, engines=engine or tuple(ENGINES), progress=update
+        )
+    if as_json:
+        print_json(result.as_json())
+    else:
+        table = Table(title=Text(f"{result.robot}: {result.states} states, seed {result.seed}"))
+        for column in ("engine", "what", "worst", "median", "bound", "verdict"):
+            table.add_column(column)
+        for item in result.items:
+            verdict = Text("good", "green") if item.good else Text("bad", "red")
+            values = (f"{value:.1e}" for value in (item.worst, item.median, item.bound))
+            table.add_row(item.engine, item.what, *values, verdict)
+        table_console().print(table)
+        for name, reason in result.missing.items():
+            typer.echo(f"{name} was not asked: {reason}")
+        typer.echo("good" if result.good else "bad")
+    if not result.good:
+        raise typer.Exit(REFUSED)
+
+
+app.add_typer(atlases.app, name="atlas")
 app.command()(guard_check)
-app.command()(atlases.atlas)
 app.command()(atlases.show)
-
-
-@contextmanager
-def _progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """A progress bar on stderr that a count moves."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as drawing:
-        task = drawing.add_task(what, total=total)
-
-        def update(count: int) -> None:
-            # The bar redraws ten times a second anyway.
-            if count % 256 == 0 or count == total:
-                drawing.update(task, completed=count)
-
-        yield update
-
-
-def _console() -> Console:
-    """Stdout; where it is no terminal, as wide as a table here needs."""
-    console = Console()
-    return console if console.is_terminal else Console(width=140)
-
-
-def _print_json(data: Any) -> None:
-    """JSON proper: a number that is not finite is a mistake here."""
-    typer.echo(json.dumps(data, indent=2, allow_nan=False))
-
-
-def _refuse_existing(path: Path, overwrite: bool) -> None:
-    if path.exists() and not overwrite:
-        raise PkmTwinError(f"{path} exists; give --overwrite to replace it")
-
-
-def _numbers(text: str, count: int) -> list[float]:
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != count or not np.isfinite(values).all():
-        raise typer.BadParameter(f"{text!r} is not {count} numbers with commas between")
-    return values
 
 
 def _finite(data: Any) -> Any:
@@ -396,6 +531,21 @@ def _finite(data: Any) -> Any:
     return None if isinstance(data, float) and not np.isfinite(data) else data
 
 
+def _load(payload: str | None, times: str | None) -> Any:
+    """The payload that a command line tells of, None where it tells of none."""
+    from pkm_twin.apps.recorded import Load, parse_payload, parse_times
+
+    if payload is None:
+        if times is not None:
+            raise typer.BadParameter("--load-times needs --payload")
+        return None
+    try:
+        spans = () if times is None else parse_times(times)
+        return Load(*parse_payload(payload), spans)
+    except ParameterError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
 def _pair(text: str) -> tuple[str, str]:
     source, sign, target = text.partition(":=")
     if not sign or not source or not target:
@@ -404,13 +554,35 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point: typed errors are one line on stderr and exit code 1, Ctrl-C is code 130."""
+    """Entry point: errors are one line on stderr and exit code 1, Ctrl-C is code 130."""
     try:
         with first_signal(lambda: SystemExit(INTERRUPTED)):
             app(arguments, prog_name="pkm-twin")
-    except PkmTwinError as error:
-        print(f"pkm-twin: {error}", file=sys.stderr)
+    except SystemExit:
+        failed = flush_output()
+        if failed and not isinstance(failed, BrokenPipeError):
+            _end(f"cannot write the output: {system_error(failed)}")
+        raise
+    except BrokenPipeError:
+        # Whoever read the output has seen enough.
+        silence_output()
         sys.exit(REFUSED)
+    except PkmTwinError as error:
+        _end(str(error))
+    except OSError as error:
+        flush_output()
+        # Every file that a command opens has a name, the output has none.
+        _end(f"{'' if error.filename else 'cannot write the output: '}{system_error(error)}")
+
+
+def _tell(text: str) -> None:
+    """One line on stderr, whatever names and values are in it."""
+    print(f"pkm-twin: {one_line(text, 2000)}", file=sys.stderr)
+
+
+def _end(text: str) -> NoReturn:
+    _tell(text)
+    sys.exit(REFUSED)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from pkm_twin.apps.check import motion
 from pkm_twin.apps.recorded import Recording, read_recording
 from pkm_twin.atlas import plots
 from pkm_twin.bags.reader import inspect, read_messages
+from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import stamp_of
 
 Array = NDArray[np.float64]
@@ -80,22 +81,24 @@ def report_dynamics(
 ) -> tuple[list[Finding], DynamicsSeries]:
     """Compare recorded efforts with the answered ones."""
     r = read_recording(bag)
-    robot, unit = r.robot, r.robot.effort_unit
+    robot, unit = r.robot, " or ".join(dict.fromkeys(r.robot.effort_units))
     torques = _by_stamp(recording, f"/{prefix}/delta_dynamics/joint_torques")
     residuals = _by_stamp(recording, f"/{prefix}/delta_dynamics/torque_residual")
     answered = [i for i, s in enumerate(r.stamps.tolist()) if s in torques and s in residuals]
     stamps = r.stamps[answered].tolist()
-    measured = np.zeros((len(stamps), 3)) if r.effort is None else r.effort[answered]
+    measured = (
+        np.zeros((len(stamps), len(robot.joint_names))) if r.effort is None else r.effort[answered]
+    )
     series = DynamicsSeries(
         f"{prefix}: {robot.name}",
         robot.joint_names,
         unit,
         r.time[answered],
         measured,
-        _efforts(torques, stamps),
-        _efforts(residuals, stamps),
+        _efforts(torques, stamps, robot),
+        _efforts(residuals, stamps, robot),
         _free(r)[answered],
-        r.loaded,
+        _loaded(r),
     )
     sent = sum(1 for _ in read_messages(bag, ["/delta_dynamics/joint_trajectory"]))
     filled = read_messages(recording, [f"/{prefix}/delta_dynamics/joint_trajectory_ff"])
@@ -125,10 +128,15 @@ def report_dynamics(
     return findings, series
 
 
+def _loaded(r: Recording) -> tuple[float, float] | None:
+    """From when to when a payload is held, s: one span in these recordings."""
+    return r.load.times[0] if r.load is not None and r.load.times else None
+
+
 def _free(r: Recording) -> NDArray[np.bool_]:
     """Where nothing is held and nothing cut; half a second around either counts for neither."""
-    if r.loaded is not None:
-        loaded = (r.time > r.loaded[0]) & (r.time < r.loaded[1])
+    if r.load is not None:
+        loaded = r.load.held(r.time)
     elif r.wrench is not None:
         force = np.linalg.norm(r.wrench[:, :3], axis=1)
         loaded = force > 0.1 * force.max()
@@ -147,7 +155,7 @@ def _payload(
     prefix: str, r: Recording, answered: list[int], series: DynamicsSeries
 ) -> list[Finding]:
     """The step that the payload makes in the residual, and the mass that it means."""
-    assert series.loaded is not None  # noqa: S101
+    assert series.loaded is not None and r.load is not None  # noqa: S101
     free = series.free
     held = (series.time > series.loaded[0] + 0.5) & (series.time < series.loaded[1] - 0.5)
     step = np.linalg.norm(series.residual[held].mean(0) - series.residual[free].mean(0))
@@ -170,9 +178,9 @@ def _payload(
         Finding(
             prefix,
             "payload mass seen in the residual",
-            f"{mass:.3f} kg (recorded with {r.payload_mass:.3f} kg)",
+            f"{mass:.3f} kg (recorded with {r.load.mass:.3f} kg)",
             "within 10 %",
-            abs(mass - r.payload_mass) < 0.1 * r.payload_mass,
+            abs(mass - r.load.mass) < 0.1 * r.load.mass,
         ),
     ]
 
@@ -191,7 +199,7 @@ def report_stiffness(
     values = {stamp: {v.key: v.value for v in energies[stamp].status[0].values} for stamp in common}
     pose = np.array([[float(values[s][name]) for name in robot.pose_names] for s in common])
     local = np.array([_xyz(moved[s].transform.translation) for s in common]).reshape(-1, 3)
-    fixed = np.einsum("nij,nj->ni", robot.rotation(pose.reshape(-1, 3)), local)
+    fixed = np.einsum("nij,nj->ni", robot.rotation(pose.reshape(-1, len(robot.pose_names))), local)
     elements = tuple(key for key in (values[common[0]] if common else {}) if key[0].isdigit())
     judged = [s for s in common if s in truth]
     true = np.array([_xyz(truth[s].transform.translation) for s in judged]).reshape(-1, 3)
@@ -247,7 +255,7 @@ REPORTS: dict[str, Report] = {
 def print_findings(console: Console, findings: list[Finding]) -> None:
     """The table that a person reads."""
     table = Table(title="pkm_twin on recorded bags")
-    for column in ("bag", "what", "value", "has to be", ""):
+    for column in ("bag", "what", "value", "limit", ""):
         table.add_column(column)
     last = ""
     for f in findings:
@@ -272,9 +280,10 @@ def _by_stamp(bag: Path, topic: str) -> dict[int, Any]:
     return {stamp_of(m.message.header): m.message for m in read_messages(bag, [topic])}
 
 
-def _efforts(messages: Mapping[int, Any], stamps: list[int]) -> Array:
-    """Efforts in the order that the node publishes, the robot's, shape (n, 3)."""
-    return np.array([messages[stamp].effort for stamp in stamps]).reshape(-1, 3)
+def _efforts(messages: Mapping[int, Any], stamps: list[int], robot: Robot) -> Array:
+    """Efforts in the order that the node publishes, the robot's, shape (samples, n)."""
+    efforts = [messages[stamp].effort for stamp in stamps]
+    return np.array(efforts).reshape(-1, len(robot.joint_names))
 
 
 def _share(bag: str, what: str, count: int, total: int) -> Finding:

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 
 from delta_dynamics import reactions
+from pkm_twin.apps.recorded import why_no_torques
 from pkm_twin.machine.robot import Robot
 
 UNITS = {
@@ -37,8 +37,7 @@ UNITS = {
 
 def summary(robot: Robot) -> str:
     """One line that tells a robot from its siblings."""
-    closures = getattr(getattr(robot, "geometry", None), "closures", None)
-    return robot.description + (f"; closures {', '.join(closures)}" if closures else "")
+    return robot.description
 
 
 def describe(robot: Robot) -> dict[str, Any]:
@@ -51,34 +50,50 @@ def describe(robot: Robot) -> dict[str, Any]:
         "description": summary(robot),
         "joints": list(robot.joint_names),
         "joint_unit": robot.joint_unit,
-        "effort_unit": robot.effort_unit if robot.dynamics_kernel is not None else None,
+        "joint_units": list(robot.joint_units),
+        "effort_unit": None if why_no_torques(robot) else robot.effort_unit,
         "pose": dict(zip(robot.pose_names, robot.pose_units, strict=True)),
         "mobility": robot.mobility,
         "overconstrained": overconstraint(robot),
         "home_pose": dict(zip(robot.pose_names, home.tolist(), strict=True)),
         "home_joints": dict(zip(robot.joint_names, q.tolist(), strict=True)),
+        "bodies": list(robot.body_names[:-1]),
+        "joint_count": len(robot.graph.joints),
+        "closures": robot.engine.mobility.closures,
+        "rank": robot.engine.mobility.rank,
+        "redundant_closures": robot.engine.mobility.redundant,
         "singularity_at_home": float(robot.singularity(q)),
-        "parameters": _plain(robot),
+        "parameters": robot.parameter_sections(),
     }
 
 
 def overconstraint(robot: Robot) -> list[str]:
     """What rigid-body statics cannot determine, by name; empty where it determines all."""
-    if robot.dynamics_kernel is not None:
-        zero = np.zeros(3)
+    if not why_no_torques(robot):
+        zero = np.zeros(len(robot.joint_names))
         return list(reactions(robot, robot.inverse(robot.home()), zero, zero).indeterminate)
-    return list(robot.redundant_constraints)
+    mobility = robot.engine.mobility
+    if not mobility.redundant:
+        return []
+    count = f"{mobility.redundant} of {mobility.closures} closure equations"
+    return [f"{count} are redundant, among {', '.join(mobility.parts)}"]
 
 
 def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
     """The same as pairs of words for a table."""
     pose = ", ".join(f"{name} ({unit})" for name, unit in data["pose"].items())
-    joint_units = dict.fromkeys(data["joints"], data["joint_unit"])
+    joint_units = dict(zip(data["joints"], data["joint_units"], strict=True))
     rows = [
         ("robot", f"{data['name']}: {data['description']}"),
         ("mobility", data["mobility"]),
+        ("bodies and rods", ", ".join(data["bodies"])),
+        (
+            "closures",
+            f"{data['closures']} equations of rank {data['rank']}, "
+            f"{data['redundant_closures']} redundant",
+        ),
         ("pose", pose),
-        ("actuated joints", f"{', '.join(data['joints'])} ({data['joint_unit']})"),
+        ("actuated joints", ", ".join(f"{name} ({unit})" for name, unit in joint_units.items())),
         ("home pose", _pairs(data["home_pose"], data["pose"])),
         ("home joints", _pairs(data["home_joints"], joint_units)),
         ("distance to singularity at home", f"{data['singularity_at_home']:.3f} (1 is best)"),
@@ -89,7 +104,7 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     units = UNITS | _joint_units(data["joint_unit"], data["effort_unit"])
     for section, value in data["parameters"].items():
-        if section not in ("mechanism", "joints"):
+        if section not in ("mechanism", "name", "joints"):
             rows += _rows(section, value, units)
     return rows
 
@@ -121,14 +136,6 @@ def _unit(key: str, units: dict[str, str]) -> str:
     if key in units:
         return units[key]
     return next((unit for end, unit in units.items() if key.endswith(f"_{end}")), "")
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _number(value: Any) -> str:

@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+import array
 import csv
+import importlib.util
+import io
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +20,8 @@ from numpy.typing import NDArray
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions
 from pkm_twin import load
 from pkm_twin.apps.check import motion
-from pkm_twin.apps.recorded import read_recording
+from pkm_twin.apps.limits import beyond_limits
+from pkm_twin.apps.recorded import Load, by_load, read_recording
 from pkm_twin.errors import (
     BagError,
     ParameterError,
@@ -24,6 +30,7 @@ from pkm_twin.errors import (
     UnknownNameError,
     UnreachableError,
 )
+from pkm_twin.files import open_regular
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -32,11 +39,21 @@ BLOCK = 4096
 ENDINGS = (".csv", ".parquet")
 WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 INPUTS = ("position", "velocity", "acceleration")
+BEYOND_LIMITS = "beyond_limits"
+MAX_CSV_BYTES = 1024**3
+"""Largest CSV that is read: some millions of samples."""
+MAX_CSV_LINE = 1024**2
+"""Longest line of it, characters."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion of one robot: time (n,), s; q, qd, qdd (n, 3); wrench (n, 6), fixed axes."""
+    """A motion of one robot of n joints: time (samples,), s; q, qd, qdd (samples, n), rad or m and
+    per s and s2; wrench (samples, 6), N and N m, fixed axes; measured efforts (samples, n).
+
+    ``load`` is a payload beside the robot's own. ``notes`` are for people: what was read and what
+    was left out.
+    """
 
     robot: Robot
     time: Array
@@ -45,19 +62,27 @@ class Motion:
     qdd: Array
     wrench: Array
     measured: Array | None = None
+    load: Load | None = None
+    notes: tuple[str, ...] = ()
 
 
-def motion_of_bag(path: Path, robot: str | None) -> Motion:
+def motion_of_bag(
+    path: Path, robot: str | None, topics: Sequence[str] = (), carried: Load | None = None
+) -> Motion:
     """The motion that a bag recorded, accelerations by the node's differentiator.
+
+    Messages that a node refuses are left out, but not those beyond the robot's limits: see
+    :func:`pkm_twin.apps.limits.beyond_limits`.
 
     :raises BagError: the bag is damaged, or has too few joint states in a row.
     """
-    r = read_recording(path, robot)
+    r = read_recording(path, robot, topics=topics, carried=carried, limited=False)
     qd, qdd, used = motion(r)
     if not used.any():
         text = f"too few joint states in a row to differentiate: {len(r.time)}"
         raise BagError(text, path=path, reason="too short")
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
+    refused = ", ".join(f"{reason}: {count}" for reason, count in r.rejected.items())
     return Motion(
         r.robot,
         r.time[used],
@@ -66,11 +91,17 @@ def motion_of_bag(path: Path, robot: str | None) -> Motion:
         qdd[used],
         wrench[used],
         None if r.effort is None else r.effort[used],
+        r.load,
+        (
+            str(r.topics),
+            f"payload: {r.load or 'the robot file alone'}",
+            *([f"left out as a node does: {refused}; first: {r.first_reject}"] if refused else []),
+        ),
     )
 
 
-def motion_of_csv(path: Path, robot: str) -> Motion:
-    """A motion from a CSV with a head line.
+def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion:
+    """A motion from a CSV with a header row.
 
     Columns, in any order: ``time``; for every joint NAME ``NAME.position``, and optionally
     ``NAME.velocity`` and ``NAME.acceleration`` (of all joints or of none); optionally the wrench
@@ -118,6 +149,8 @@ def motion_of_csv(path: Path, robot: str) -> Motion:
         rates,
         np.gradient(rates, time, axis=0, edge_order=2) if qdd is None else qdd,
         np.stack(wrench, -1),
+        load=carried,
+        notes=() if carried is None else (f"payload: {carried}",),
     )
 
 
@@ -125,7 +158,8 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
     """Named columns: time, the motion, efforts, their terms, and every joint's reaction.
 
     The terms ``NAME.effort_gravity``, ``NAME.effort_inertia`` ... sum to ``NAME.effort``. A
-    reaction that rigid bodies do not determine is left empty (NaN) in the table.
+    reaction that rigid bodies do not determine is left empty (NaN) in the table. Where a sample is
+    beyond the limits, there is a column :data:`BEYOND_LIMITS`, 1 for such samples, 0 for others.
 
     :raises UnreachableError: by the sample's index in the motion.
     :raises SingularityError: likewise.
@@ -136,9 +170,10 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
     def put(name: str, values: Array) -> None:
         columns.setdefault(name, []).append(values)
 
-    for begin in range(0, len(m.time), BLOCK):
-        part = slice(begin, begin + BLOCK)
-        state = (m.robot, m.q[part], m.qd[part], m.qdd[part], m.wrench[part])
+    outside, _ = beyond_limits(m.robot, m.q, m.qd)
+    for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
+        begin = part.start
+        state = (robot, m.q[part], m.qd[part], m.qdd[part], m.wrench[part])
         try:
             tau, terms, react = inverse_dynamics(*state), dynamics_terms(*state), reactions(*state)
         except UnreachableError as e:
@@ -153,6 +188,8 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
             seconds = f"{m.time[part][0]:g} to {m.time[part][-1]:g} s"
             raise PkmTwinError(f"between {seconds}: {e}") from None
         put("time", m.time[part])
+        if outside.any():
+            put(BEYOND_LIMITS, outside[part].astype(np.float64))
         for i, joint in enumerate(m.robot.joint_names):
             put(f"{joint}.position", m.q[part][:, i])
             put(f"{joint}.velocity", m.qd[part][:, i])
@@ -166,17 +203,19 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
             for i, axis in enumerate(WRENCH_AXES):
                 put(f"{name}.{axis}", react.wrenches[:, k, i])
         if progress is not None:
-            progress(min(begin + BLOCK, len(m.time)))
+            progress(part.stop)
     return {name: np.concatenate(parts) for name, parts in columns.items()}
 
 
 def check_target(path: Path) -> None:
     """Refuse a table's name before the work, not after it.
 
-    :raises ParameterError: the ending is none of :data:`ENDINGS`.
+    :raises ParameterError: the ending is none of :data:`ENDINGS`, or pyarrow is missing for it.
     """
     if path.suffix not in ENDINGS:
         raise ParameterError("out", str(path), f"a name that ends in {' or '.join(ENDINGS)}")
+    if path.suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise ParameterError("out", str(path), "CSV; Parquet needs the Python package pyarrow")
 
 
 def write_table(columns: dict[str, Array], path: Path) -> None:
@@ -205,35 +244,51 @@ def _write_csv(columns: dict[str, Array], path: Path) -> None:
 
 
 def _write_parquet(columns: dict[str, Array], path: Path) -> None:
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise ParameterError("out", str(path), "CSV; Parquet needs pyarrow") from error
+    import pyarrow
+    from pyarrow import parquet
+
     parquet.write_table(pyarrow.table(columns), path)
 
 
 def _read_columns(path: Path) -> dict[str, Array]:
     try:
-        # Spreadsheets put a byte order mark before the head line.
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > MAX_CSV_BYTES:
+                raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_CSV_BYTES}")
+            # Spreadsheets put a byte order mark before the header row.
+            with io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text:
+                return _parse_columns(path, csv.reader(_lines(text, path)))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ParameterError(str(path), str(error), "a readable CSV file") from None
-    if len(rows) < 2:
-        raise ParameterError(str(path), f"{len(rows)} lines", "a head line and rows")
-    head = [name.strip() for name in rows[0]]
-    if len(set(head)) != len(head):
-        raise ParameterError(f"{path}: head line", ", ".join(head), "different names")
-    data = []
-    for number, row in enumerate(rows[1:], 2):
-        if len(row) != len(head):
-            raise ParameterError(f"{path}: line {number}", len(row), f"{len(head)} values")
+        what = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ParameterError(str(path), what, "a readable CSV file") from None
+
+
+def _lines(text: TextIO, path: Path) -> Iterator[str]:
+    """The lines of a file, none so long that a row takes all the memory."""
+    while line := text.readline(MAX_CSV_LINE):
+        if len(line) == MAX_CSV_LINE:
+            raise ParameterError(f"{path}: a line", f"{line[:40]}...", f"below {MAX_CSV_LINE} long")
+        yield line
+
+
+def _parse_columns(path: Path, rows: Iterator[list[str]]) -> dict[str, Array]:
+    header = [name.strip() for name in next(rows, [])]
+    if len(set(header)) != len(header):
+        raise ParameterError(f"{path}: header row", ", ".join(header), "different names")
+    data = array.array("d")
+    number = 1
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
         try:
             values = [float(cell) for cell in row]
         except ValueError as error:
             raise ParameterError(f"{path}: line {number}", str(error), "numbers") from None
-        if not np.isfinite(values).all():
+        if not all(map(math.isfinite, values)):
             raise ParameterError(f"{path}: line {number}", row, "finite numbers")
-        data.append(values)
-    return dict(zip(head, np.array(data).T, strict=True))
+        data.extend(values)
+    if not data:
+        raise ParameterError(str(path), f"{number if header else 0} lines", "a header row and rows")
+    table = np.frombuffer(data, np.float64).reshape(-1, len(header))
+    return dict(zip(header, np.ascontiguousarray(table.T), strict=True))

@@ -1,30 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands ``pkm-twin atlas`` and ``pkm-twin show``."""
+"""The commands ``pkm-twin atlas ROBOT KIND``, each kind with options of its own, and ``show``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Final, Optional, get_type_hints
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
+from typer.core import TyperGroup
 
-from pkm_twin.errors import PkmTwinError, UnknownNameError
+from pkm_twin.console import numbers, progress
+from pkm_twin.errors import UnknownNameError
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
 from pkm_twin.threads import one_blas_thread
 
-KINDS = ("workspace", "strain-energy", "isotropy", "modes")
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+    from pkm_twin.atlas.sweep import Sweep
+    from pkm_twin.machine.robot import Robot
+
+WRENCH: Final = "P1, P2, P3 or six numbers with commas between"
+MOST: Final = 10**11
+"""Samples beyond which a number is a slip."""
 
 # typer of Ubuntu 24.04 reads no unions.
 _Number = Optional[int]  # noqa: UP045
@@ -35,29 +38,95 @@ _File = Optional[Path]  # noqa: UP045
 Html = Annotated[bool, typer.Option("--html", help="also one page to turn and zoom, no network")]
 
 
+class _Kinds(TyperGroup):
+    """The kinds as commands after the robot; an unknown one is a name like any other."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[0] not in self.commands:
+            raise UnknownNameError("kind", args[0], tuple(self.commands))
+        return super().resolve_command(ctx, args)
+
+
+app = typer.Typer(
+    cls=_Kinds,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    subcommand_metavar="KIND [OPTIONS]",
+)
+
+
+@app.callback()
 def atlas(
+    context: typer.Context,
     robot: Annotated[
         str, typer.Argument(help="a robot's name (see `pkm-twin robots`) or a YAML file")
     ],
-    kind: Annotated[str, typer.Argument(help=f"what to compute: {', '.join(KINDS)}")],
+) -> None:
+    """Compute a quantity over a robot's whole workspace: a NetCDF file and its pictures.
+
+    Ctrl-C stops it; finished parts stay in FILE.nc.parts, and the same command goes on from there,
+    with the same result. One run at a time works on a file. Machines and memory: docs/scale.md.
+
+    The options of a kind: `pkm-twin atlas ROBOT KIND --help`.
+    """
+    context.obj = robot
+
+
+def show(
+    file: Annotated[Path, typer.Argument(help="a file that `pkm-twin atlas` wrote")],
+    out: Annotated[
+        _File, typer.Option(help="stem of the PNGs; default the file's", show_default=False)
+    ] = None,
+    html: Html = False,
+) -> None:
+    """Draw a stored atlas again: PNGs, and with --html a page to turn and zoom."""
+    _present(file, True, html, out)
+
+
+def _kind(sweep: Callable[..., Sweep]) -> Callable[..., Sweep]:
+    """Make a function of a robot, a number of points and a kind's own options a command.
+
+    Its name is the kind; the options of :func:`_compute` come with all kinds.
+    """
+    name = sweep.__name__.replace("_", "-")
+
+    def command(**options: Any) -> None:
+        shared = {key: options.pop(key) for key in common}
+        _compute(name, functools.partial(sweep, **options), **shared)
+
+    common = _parameters(_compute, "kind", "sweep")
+    own = _parameters(sweep, "machine", "points")
+    first, *rest = common.values()
+    parameters = [first, *own.values(), *rest]
+    vars(command)["__signature__"] = inspect.Signature(parameters)
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    command.__doc__ = sweep.__doc__
+    app.command(name)(command)
+    return sweep
+
+
+def _parameters(function: Callable[..., Any], *without: str) -> dict[str, inspect.Parameter]:
+    """Parameters of a function as keywords, their annotations evaluated."""
+    # What only the checker imports is no option's type.
+    names = {**globals(), "Sweep": Any, "Robot": Any}
+    hints = get_type_hints(function, names, include_extras=True)
+    return {
+        key: parameter.replace(annotation=hints[key], kind=inspect.Parameter.KEYWORD_ONLY)
+        for key, parameter in inspect.signature(function).parameters.items()
+        if key not in without
+    }
+
+
+def _compute(
+    kind: str,
+    sweep: Callable[[Robot, int | None], Sweep],
+    *,
+    context: typer.Context,
     points: Annotated[
-        _Number, typer.Option(help="samples, about; default: the kind's own grid")
+        _Number, typer.Option(max=MOST, help="samples, about; default: the kind's own grid")
     ] = None,
-    wrench: Annotated[
-        str, typer.Option(help="strain-energy: P1, P2, P3 of the paper or six numbers, N and N m")
-    ] = "P1",
-    height: Annotated[
-        _Real, typer.Option(help="isotropy: z of the poses (m); default the home pose's")
-    ] = None,
-    energy: Annotated[
-        float, typer.Option(help="isotropy: the platform's kinetic energy for F_max (J)")
-    ] = 100.0,
-    least_singularity: Annotated[
-        float, typer.Option(help="workspace: distance to a singularity (0 to 1) that is too little")
-    ] = 0.0,
-    least_clearance: Annotated[
-        float, typer.Option(help="workspace: distance between limbs (m) that is too little")
-    ] = 0.0,
     out: Annotated[
         _File, typer.Option(help="file to write; default ROBOT_KIND.nc", show_default=False)
     ] = None,
@@ -71,37 +140,21 @@ def atlas(
     html: Html = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the target")] = False,
 ) -> None:
-    """Compute a quantity over a robot's whole workspace: a NetCDF file and its pictures.
-
-    workspace: reach, singularities, limb interference, regular part. strain-energy: where a wrench
-    stores its energy (upr_rpu). isotropy: kinetic energy and driving force over directions (prru,
-    delta). modes: the six lowest natural frequencies.
-
-    Ctrl-C stops it; finished parts stay in FILE.nc.parts, and the same command goes on from there,
-    with the same result. Machines and memory: docs/scale.md.
-    """
+    """Compute one kind of atlas of the context's robot, and draw it."""
     from pkm_twin import load
     from pkm_twin.atlas.run import run
 
-    machine = load(robot)
+    machine = load(context.obj)
     target = out or Path(f"{machine.name}_{kind}.nc")
-    options = {
-        "points": points,
-        "wrench": wrench,
-        "height": height,
-        "energy": energy,
-        "least_singularity": least_singularity,
-        "least_clearance": least_clearance,
-    }
-    sweep = sweep_of(machine, kind, options)
+    work = sweep(machine, points)
     one_blas_thread()
     with (
         first_signal(KeyboardInterrupt),
-        _progress(f"{kind} of {machine.name}", sweep.points) as update,
+        progress(f"{kind} of {machine.name}", work.points) as update,
     ):
         try:
             run(
-                sweep,
+                work,
                 target,
                 workers=workers,
                 scheduler=scheduler,
@@ -118,70 +171,92 @@ def atlas(
     _present(target, picture, html)
 
 
-def show(
-    file: Annotated[Path, typer.Argument(help="a file that `pkm-twin atlas` wrote")],
-    out: Annotated[
-        _File, typer.Option(help="stem of the PNGs; default the file's", show_default=False)
+@_kind
+def workspace(
+    machine: Robot,
+    points: int | None,
+    least_singularity: Annotated[
+        float, typer.Option(help="distance to a singularity (0 to 1) that is too little")
+    ] = 0.0,
+    least_clearance: Annotated[
+        float, typer.Option(help="distance between limbs (m) that is too little")
+    ] = 0.0,
+) -> Sweep:
+    """Reach, singularities, limb interference, regular part."""
+    from pkm_twin.atlas.workspace import workspace_sweep
+
+    return workspace_sweep(
+        machine, points, least_singularity=least_singularity, least_clearance=least_clearance
+    )
+
+
+@_kind
+def strain_energy(
+    machine: Robot,
+    points: int | None,
+    wrench: Annotated[
+        str, typer.Option(help="P1, P2, P3 of the paper or six numbers, N and N m")
+    ] = "P1",
+) -> Sweep:
+    """Where a wrench stores its energy (upr_rpu)."""
+    from pkm_twin.atlas.strain_energy import WRENCHES, strain_energy_sweep
+
+    load = wrench if wrench in WRENCHES else numbers(wrench, 6, WRENCH)
+    return strain_energy_sweep(machine, load, points)
+
+
+@_kind
+def isotropy(
+    machine: Robot,
+    points: int | None,
+    height: Annotated[
+        _Real, typer.Option(help="z of the poses (m); default the home pose's")
     ] = None,
-    html: Html = False,
-) -> None:
-    """Draw a stored atlas again: PNGs, and with --html a page to turn and zoom."""
-    _present(file, True, html, out)
+    energy: Annotated[
+        float, typer.Option(help="the platform's kinetic energy for F_max (J)")
+    ] = 100.0,
+    beyond_limits: Annotated[
+        bool, typer.Option("--beyond-limits", help="also poses beyond the limits, marked")
+    ] = False,
+) -> Sweep:
+    """Kinetic energy and driving force over directions (prru, delta)."""
+    from pkm_twin.atlas.isotropy import isotropy_sweep
+
+    return isotropy_sweep(
+        machine, points, height=height, energy=energy, beyond_limits=beyond_limits
+    )
 
 
-def sweep_of(machine: Any, kind: str, options: dict[str, Any]) -> Any:
-    """The sweep that a command line asks for.
+@_kind
+def modes(machine: Robot, points: int | None) -> Sweep:
+    """The six lowest natural frequencies and their shapes."""
+    from pkm_twin.atlas.modes import modes_sweep
 
-    :raises UnknownNameError: no such kind.
-    """
-    points = options["points"]
-    if kind == "strain-energy":
-        from pkm_twin.atlas.strain_energy import WRENCHES, strain_energy_sweep
-
-        text = options["wrench"]
-        return strain_energy_sweep(machine, text if text in WRENCHES else _numbers(text), points)
-    if kind == "isotropy":
-        from pkm_twin.atlas.isotropy import isotropy_sweep
-
-        return isotropy_sweep(machine, points, height=options["height"], energy=options["energy"])
-    if kind == "workspace":
-        from pkm_twin.atlas.workspace import workspace_sweep
-
-        return workspace_sweep(
-            machine,
-            points,
-            least_singularity=options["least_singularity"],
-            least_clearance=options["least_clearance"],
-        )
-    if kind == "modes":
-        from pkm_twin.atlas.modes import modes_sweep
-
-        return modes_sweep(machine, points)
-    raise UnknownNameError("kind", kind, KINDS)
+    return modes_sweep(machine, points)
 
 
 def _present(file: Path, picture: bool, html: bool, out: Path | None = None) -> None:
-    from pkm_twin.atlas import figures
-    from pkm_twin.atlas.store import open_atlas
+    from pkm_twin.atlas import kinds
+    from pkm_twin.atlas.store import open_atlas, reading
 
     with open_atlas(file) as data:
-        typer.echo(f"{file}: {data.attrs['title']}, {dict(data.sizes)}")
-        if data.attrs["kind"] == "strain-energy":
-            Console().print(_factors(data))
+        with reading(file):
+            about = f"{file}: {data.attrs['title']}, {dict(data.sizes)}"
+            table = _factors(data) if data.attrs["kind"] == "strain-energy" else None
+        typer.echo(about)
+        if table is not None:
+            Console().print(table)
         target = out or file
         if picture:
-            for path in figures.save_all(data, target):
+            for path in kinds.save_all(data, target):
                 typer.echo(str(path))
         if html:
-            from pkm_twin.atlas.html import write_page
-
-            typer.echo(str(write_page(data, target.with_suffix(".html"))))
+            typer.echo(str(kinds.write_page(data, target.with_suffix(".html"))))
 
 
-def _factors(data: Any) -> Table:
+def _factors(data: Dataset) -> Table:
     """Global factors beside the paper's table 2."""
-    from pkm_twin.atlas.figures import wrench_of
-    from pkm_twin.atlas.strain_energy import table_2
+    from pkm_twin.atlas.strain_energy import table_2, wrench_of
 
     printed = table_2(wrench_of(data))
     table = Table(title="global strain-energy factors")
@@ -195,55 +270,3 @@ def _factors(data: Any) -> Table:
             row += [f"{printed[k]:.3g}", f"{mean - printed[k]:+.1e}"]
         table.add_row(*row)
     return table
-
-
-def _numbers(text: str) -> list[float]:
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 6:
-        raise typer.BadParameter(f"{text!r} is not P1, P2, P3 or six numbers with commas between")
-    return values
-
-
-@contextmanager
-def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar with time left, on stderr."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as drawing:
-        task: Any = None
-
-        def update(done: int) -> None:
-            nonlocal task
-            if task is None:
-                # Begins with what an earlier run left, so that the time left is that of the rest.
-                task = drawing.add_task(what, total=total, completed=done)
-            drawing.update(task, completed=done)
-
-        yield update
-
-
-def main() -> None:
-    """Both commands alone: ``python -m pkm_twin.atlas.commands``."""
-    import sys
-
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-    app.command()(atlas)
-    app.command()(show)
-    try:
-        app()
-    except PkmTwinError as error:
-        print(f"pkm-twin: {error}", file=sys.stderr)
-        sys.exit(1)
-
-
-if __name__ == "__main__":
-    main()

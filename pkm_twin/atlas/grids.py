@@ -1,58 +1,127 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses in cylinder coordinates about a machine's axis, and where the machine reaches.
+"""Where a machine reaches: the box of all its poses, and the circles about its axis.
 
-Height and a polar place around it: for the Delta the horizontal distance and its azimuth (m,
-rad), for machines that tilt the tilt and its azimuth (rad, rad). For the 3-PRRU those are
-tilt-and-torsion angles with zero torsion, for the 2UPR-RPU the plane of beta and gamma.
+A robot tells how its poses are laid out (``robot.grid()``) and where they end
+(``robot.search_box()``); nothing here knows a mechanism.
 
-May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
+May import: numpy, scipy, pkm_twin's core; never rclpy.
 """
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import qmc  # type: ignore[import-untyped]
 
-from delta_dynamics.isotropy import tilted_pose
-from pkm_twin.codegen.kernels import OK
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.workspace import reachable
+from pkm_twin.kinematics.workspace import (
+    CLEAR,
+    reachable,
+    singularity_at,
+    try_forward,
+)
+from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 RAYS: Final = 360
 REFINEMENTS: Final = 32
 BLOCK: Final = 16
+SPARSE: Final = 4
+"""Every how many rays and rungs the distance to a singularity is looked at."""
+JOINT_STATES: Final = 2**14
+"""Joint states, evenly spread between the limits, whose poses bound a workspace."""
+COARSE: Final = 33
+"""Poses along each coordinate of the grid that bounds a workspace."""
+FULL: Final = 3
+"""Most pose coordinates of which a whole grid is made."""
 
 
-def polar_pose(robot: Robot, height: ArrayLike, distance: ArrayLike, azimuth: ArrayLike) -> Array:
-    """Poses of cylinder coordinates, shape (..., 3).
+def cylinder(robot: Robot, what: str) -> PoseGrid:
+    """The robot's layout, which has to be one about an axis.
 
-    :param height: m, shape (...).
-    :param distance: from the axis: m for a machine that translates, rad for one that tilts.
-    :param azimuth: rad.
+    :param what: what needs the axis, for the error.
+    :raises ParameterError: the poses lie in a box.
     """
-    if robot.mechanism == "prru":
-        return tilted_pose(height, azimuth, distance)
-    z, r, a = np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (height, distance, azimuth)))
-    first, second = r * np.cos(a), r * np.sin(a)
-    parts = [first, second, z] if tilts(robot) == 0 else [z, first, second]
-    return np.stack(parts, -1)
+    grid = robot.grid()
+    if grid.kind != "cylinder":
+        raise ParameterError(
+            "robot", robot.name, f"a robot whose poses lie about an axis for {what}"
+        )
+    return grid
 
 
-def tilts(robot: Robot) -> int:
-    """How many of the pose's parameters are angles: 0 or 2."""
-    return robot.pose_units.count("rad")
+def height_range(robot: Robot) -> tuple[float, float]:
+    """Heights outside of which nothing is reachable, m."""
+    low, high = robot.search_box()[robot.pose_names.index(robot.grid().height)]
+    return float(low), float(high)
 
 
-def distance_unit(robot: Robot) -> str:
-    """Unit of the distance from the axis, ``m`` or ``rad``."""
-    return "rad" if tilts(robot) else "m"
+def largest_distance(robot: Robot) -> float:
+    """Distance from the axis beyond which nothing is looked for, m or rad."""
+    lateral = [robot.pose_names.index(name) for name in robot.grid().lateral]
+    return float(np.abs(robot.search_box()[lateral]).max())
+
+
+def workspace_box(robot: Robot) -> Array:
+    """Bounds of all reachable poses, limb interference aside, a little wider; shape (m, 2).
+
+    From poses of joint states all over the limits and, for few coordinates, from a grid of poses.
+    Lateral coordinates of a cylinder are bounded alike on both sides of the axis.
+
+    :raises ParameterError: nothing bounds the workspace, or it is empty.
+    """
+    bounds = np.asarray(robot.search_box(), np.float64)
+    # With what interference takes away, which atlases show.
+    found = _from_joints(robot)
+    grid = robot.grid()
+    lateral = [robot.pose_names.index(name) for name in grid.lateral]
+    box = bounds
+    if len(bounds) > FULL:
+        if len(found):
+            box = _around(found, 0.1 * np.ptp(found, axis=0), bounds)
+        return box
+    # Twice: a machine may reach a small part of what its lengths allow.
+    for _ in range(2):
+        ticks = [np.linspace(low, high, COARSE) for low, high in box]
+        poses = np.stack(np.meshgrid(*ticks, indexing="ij"), -1).reshape(-1, len(ticks))
+        seen = np.concatenate([found, poses[reachable(robot, poses, -math.inf)]])
+        if not len(seen):
+            raise ParameterError("limits", robot.name, "limits that leave a workspace")
+        box = _around(seen, np.ptp(box, axis=1) / (COARSE - 1), bounds)
+        if lateral:
+            # The axis stays in the middle, and on the grid: workspaces end in tips there.
+            half = np.abs(box[lateral]).max(1)
+            box[lateral] = np.stack([-half, half], -1)
+    return box
+
+
+def _around(poses: Array, margin: Array, bounds: Array) -> Array:
+    low, high = poses.min(0) - margin, poses.max(0) + margin
+    return np.stack([np.maximum(low, bounds[:, 0]), np.minimum(high, bounds[:, 1])], -1)
+
+
+def _from_joints(robot: Robot) -> Array:
+    """Reachable poses of joint states between the limits, shape (k, m); none without limits."""
+    limits = robot.limits.position
+    count = len(robot.joint_names)
+    if limits is None or not np.isfinite(limits).all():
+        return np.empty((0, len(robot.pose_names)))
+    # Extremes are mostly where joints are at a limit or in the middle.
+    corners = np.stack(np.meshgrid(*[[0.0, 0.5, 1.0]] * count, indexing="ij"), -1)
+    inner = qmc.Halton(count, scramble=False).random(JOINT_STATES)
+    share = np.concatenate([corners.reshape(-1, count), inner])
+    poses, good = try_forward(robot, limits[:, 0] + share * np.ptp(limits, axis=1))
+    poses = poses[good]
+    return poses[reachable(robot, poses, -math.inf)]
 
 
 def turns(count: int) -> Array:
@@ -69,49 +138,6 @@ def nice(value: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is not above a value."""
     power = 10.0 ** math.floor(math.log10(value) + 1e-12)
     return power * max(k for k in (1, 2, 5) if k * power <= value * (1 + 1e-12))
-
-
-def size(robot: Robot) -> float:
-    """Longest reach, m: above it no platform can be."""
-    g = getattr(robot, "geometry")  # noqa: B009
-    limits = getattr(getattr(robot, "limits", None), "position", None)
-    if robot.mechanism == "delta":
-        return float(g.arm_length + g.forearm_length)
-    if limits is None:
-        raise ParameterError(
-            "limits", robot.name, "limits of the actuators: without them the workspace has no end"
-        )
-    extra = g.limb_length if robot.mechanism == "prru" else 0.0
-    return float(np.abs(limits).max() + extra)
-
-
-def height_range(robot: Robot) -> tuple[float, float]:
-    """Heights outside of which nothing is reachable, m."""
-    far = size(robot)
-    return (-far, far) if robot.mechanism == "prru" else (-far, 0.0)
-
-
-def largest_distance(robot: Robot) -> float:
-    """Distance from the axis beyond which nothing is looked for, m or rad."""
-    if tilts(robot):
-        return math.radians(85.0)
-    return size(robot)
-
-
-def singularity(robot: Robot, pose: ArrayLike) -> Array:
-    """``Robot.singularity`` at poses: 0 in a singularity or out of reach, 1 at best, shape (...).
-
-    :param pose: shape (..., 3), m and rad.
-    """
-    q, fault = robot.inverse_kernel(robot.parameters, pose)
-    good = fault[..., 0] == OK
-    # Refused poses are empty memory.
-    q = np.where(good[..., None], q, 0.0)
-    _, _, fault = robot.jacobian_kernel(robot.parameters, q)
-    good &= fault[..., 0] == OK
-    measure = np.zeros(good.shape)
-    measure[good] = robot.singularity(q[good])
-    return measure
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,41 +162,54 @@ def circles(
 
     :param heights: shape (n,), m.
     :param steps: first search along each of 360 rays; a bisection refines it.
-    :param least: singularity measure below which a pose counts as out of reach.
+    :param least: singularity measure below which a pose counts as out of reach; ``CLEAR`` at least.
     :param least_clearance: what the limbs' clearance has to be above, m.
     """
     z = np.atleast_1d(np.asarray(heights, np.float64))
+    grid = cylinder(robot, "circles about it")
     turn = turns(RAYS)
     step = largest_distance(robot) / steps
+
+    def inside(height: float, distance: Array, azimuth: Array) -> Mask:
+        return reachable(robot, grid.polar_pose(height, distance, azimuth), least_clearance)
+
+    def clear(height: float, distance: Array, azimuth: Array) -> Mask:
+        poses = grid.polar_pose(height, distance, azimuth)
+        return np.asarray(singularity_at(robot, poses) >= max(least, CLEAR))
+
     radius = np.zeros(len(z))
-
-    def inside(height: float, distance: Array, azimuth: Array) -> NDArray[np.bool_]:
-        poses = polar_pose(robot, height, distance, azimuth)
-        kept = reachable(robot, poses, least_clearance)
-        if least > 0.0:
-            kept &= singularity(robot, poses) >= least
-        return kept
-
     for k, height in enumerate(z.tolist()):
-        # The first rung that any ray leaves bounds the circle; what is beyond does not matter.
-        rung, out = 0, ~inside(height, np.zeros(1), turn)
-        while not out.any() and rung < steps:
-            block = np.arange(rung + 1, min(rung + BLOCK, steps) + 1)
-            outside = ~inside(height, np.multiply(step, block)[:, None], turn)
-            hit = outside.any(-1)
-            first = int(hit.argmax()) if hit.any() else len(block) - 1
-            rung, out = int(block[first]), outside[first]
-        if not out.any() or rung == 0:
-            radius[k] = step * rung
-            continue
-        rays = turn[out]
-        low, high = np.full(len(rays), step * (rung - 1)), np.full(len(rays), step * rung)
-        for _ in range(REFINEMENTS):
-            middle = (low + high) / 2
-            good = inside(height, middle, rays)
-            low, high = np.where(good, middle, low), np.where(good, high, middle)
-        radius[k] = low.min()
+        reach = _free(functools.partial(inside, height), turn, step, steps)
+        # The measure changes slowly, so fewer rays and rungs tell where it is too small.
+        rungs = math.ceil(reach / step / SPARSE)
+        test = functools.partial(clear, height)
+        radius[k] = min(reach, _free(test, turn[::SPARSE], reach / max(rungs, 1), rungs))
     return Reach(z, radius)
+
+
+def _free(good: Callable[[Array, Array], Mask], turn: Array, step: float, steps: int) -> float:
+    """How far a test holds from the axis on, on all rays.
+
+    :param good: the test, of distances and azimuths.
+    :param step: first search along each ray, ``steps`` of them; a bisection refines it.
+    """
+    # The first rung that any ray leaves bounds the circle; what is beyond does not matter.
+    rung, out = 0, ~good(np.zeros(1), turn)
+    while not out.any() and rung < steps:
+        block = np.arange(rung + 1, min(rung + BLOCK, steps) + 1)
+        outside = ~good(np.multiply(step, block)[:, None], turn)
+        hit = outside.any(-1)
+        first = int(hit.argmax()) if hit.any() else len(block) - 1
+        rung, out = int(block[first]), outside[first]
+    if not out.any() or rung == 0:
+        return step * rung
+    rays = turn[out]
+    low, high = np.full(len(rays), step * (rung - 1)), np.full(len(rays), step * rung)
+    for _ in range(REFINEMENTS):
+        middle = (low + high) / 2
+        kept = good(middle, rays)
+        low, high = np.where(kept, middle, low), np.where(kept, high, middle)
+    return float(low.min())
 
 
 @dataclass(frozen=True)

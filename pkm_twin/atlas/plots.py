@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from pkm_twin.atlas.store import replace_file, writing
 
 if TYPE_CHECKING:
     from pkm_twin.apps.demo_report import DynamicsSeries, StiffnessSeries
@@ -30,11 +33,17 @@ def columns(count: int, rows: int) -> tuple[Any, list[Any]]:
 
 
 def save(figure: Any, path: Path) -> Path:
-    """Write a figure as PNG and close it."""
+    """Write a figure as PNG, whole or not at all, and close it.
+
+    :raises AtlasError: the file cannot be written.
+    """
     from matplotlib import pyplot
 
-    figure.savefig(path, dpi=110)
+    data = io.BytesIO()
+    figure.savefig(data, dpi=110, format="png")
     pyplot.close(figure)
+    with writing(path):
+        replace_file(path, data.getvalue())
     return path
 
 
@@ -48,7 +57,7 @@ def efforts(axes: Sequence[Any], data: DynamicsSeries) -> None:
     close.plot(data.time[near], data.predicted[near, 0], color=COLOURS[1], lw=1, label="twin")
     close.set_title(f"{data.title}\neffort of {name}, two seconds")
     whole.set_title("feedforward efforts")
-    rest.set_title("residual: recorded less predicted")
+    rest.set_title("residual: recorded minus predicted")
     for i, joint in enumerate(data.joints):
         whole.plot(data.time, data.predicted[:, i], color=COLOURS[i], lw=0.7, label=joint)
         rest.plot(data.time, data.residual[:, i], color=COLOURS[i], lw=0.5, label=joint)
@@ -120,11 +129,11 @@ def deflections(axes: Sequence[Any], data: StiffnessSeries) -> None:
 
 
 def torques(motion: Any, table: Mapping[str, Any]) -> Any:
-    """Efforts and their terms, an axes for each actuated joint."""
-    figure, axes = columns(1, 3)
+    """Efforts and their terms, an axes for each actuated joint; grey where beyond the limits."""
     robot = motion.robot
+    figure, axes = columns(1, len(robot.joint_names))
     terms = ("gravity", "inertia", "velocity", "payload", "friction", "external")
-    for ax, joint in zip(axes[0], robot.joint_names, strict=True):
+    for ax, joint, unit in zip(axes[0], robot.joint_names, robot.effort_units, strict=True):
         if motion.measured is not None:
             ax.plot(table["time"], table[f"{joint}.measured"], color="0.7", lw=2, label="measured")
         ax.plot(table["time"], table[f"{joint}.effort"], color="black", lw=1, label="sum")
@@ -132,9 +141,19 @@ def torques(motion: Any, table: Mapping[str, Any]) -> Any:
             values = table[f"{joint}.effort_{term}"]
             if np.any(values != 0.0):
                 ax.plot(table["time"], values, color=colour, lw=0.8, label=term)
+        if "beyond_limits" in table:
+            ax.fill_between(
+                table["time"],
+                *(0, 1),
+                where=np.asarray(table["beyond_limits"]) > 0,
+                transform=ax.get_xaxis_transform(),
+                color="0.85",
+                zorder=0,
+                label="beyond limits",
+            )
         ax.set_title(f"{robot.name}: effort of {joint}")
         ax.set_xlabel("time (s)")
-        ax.set_ylabel(f"effort ({robot.effort_unit})")
+        ax.set_ylabel(f"effort ({unit})")
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
         ax.grid(alpha=0.3)
     return figure

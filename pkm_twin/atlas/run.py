@@ -8,11 +8,14 @@ does not grow with the sweep.
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
+from asyncio import CancelledError
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import CancelledError as FutureCancelled
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +23,7 @@ from typing import Any, Final
 
 import pkm_twin
 from pkm_twin.atlas.extras import require
-from pkm_twin.atlas.store import AtlasError, Parts, join, save_part
+from pkm_twin.atlas.store import AtlasError, Parts, join, save_part, writing
 from pkm_twin.atlas.sweep import Chunk, Sweep, Values
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.threads import one_blas_thread_for_children
@@ -57,7 +60,8 @@ def run(
     :param scheduler: address of a Dask scheduler, which then does the work.
     :param overwrite: replace the target, and chunks of another sweep.
     :param progress: called with the number of points done.
-    :raises AtlasError: the target exists, or the kept chunks belong to another sweep.
+    :raises AtlasError: the target exists, another process works on it, the kept chunks belong to
+        another sweep, or the system refuses to write.
     :raises ClusterError: no scheduler, or workers that keep dying.
     :raises MissingExtraError: a package that is not installed.
     """
@@ -65,14 +69,29 @@ def run(
     require("h5netcdf", "atlas")
     if workers is not None and workers < 1:
         raise PkmTwinError(f"workers is {workers}; it has to be 1 or more")
-    if out.exists() and not overwrite:
-        raise AtlasError(out, "exists; give --overwrite to replace it")
-    parts = Parts(out, sweep)
-    parts.open(overwrite)
+    with writing(out):
+        if out.exists() and not overwrite:
+            raise AtlasError(out, "exists; give --overwrite to replace it")
+        if out.exists() and not out.is_file():
+            raise AtlasError(out, "is no regular file, so it is not replaced")
+        parts = Parts(out, sweep)
+        parts.open(overwrite)
+        try:
+            _fill(sweep, parts, workers, scheduler, progress or (lambda _: None))
+            join(sweep, parts, out)
+            parts.drop()
+        finally:
+            parts.close()
+    return out
+
+
+def _fill(
+    sweep: Sweep, parts: Parts, workers: int | None, scheduler: str | None, tell: Progress
+) -> None:
+    """Compute the chunks that are not there yet."""
     chunks = sweep.chunks()
     pending = set(parts.pending())
     done = sum(sweep.count(chunk) for i, chunk in enumerate(chunks) if i not in pending)
-    tell = progress or (lambda _: None)
     tell(done)
     work = [(i, chunks[i]) for i in sorted(pending)]
     results: Iterator[tuple[int, Values | None]]
@@ -87,9 +106,6 @@ def run(
             parts.save(index, values)
         done += sweep.count(chunks[index])
         tell(done)
-    join(sweep, parts, out)
-    parts.drop()
-    return out
 
 
 def here(sweep: Sweep, work: Work) -> Iterator[tuple[int, Values]]:
@@ -153,44 +169,58 @@ def on_cluster(sweep: Sweep, work: Work, scheduler: str) -> Iterator[tuple[int, 
     :raises ClusterError: no scheduler answers, it has no workers, or chunks keep losing theirs.
     """
     distributed = require("distributed", "cluster")
+    # Its own log tells at length what one line of ours says.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(scheduler, timeout=CONNECT, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
+    except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         raise ClusterError(f"no Dask scheduler answers at {scheduler}: {error}") from None
     with client:
         threads = sum(client.nthreads().values())
         if not threads:
             raise ClusterError(f"the Dask scheduler at {scheduler} has no workers")
-        queue = iter(work)
+        try:
+            yield from _from_workers(sweep, work, distributed, client, threads)
+        except distributed.KilledWorker as error:
+            raise ClusterError(f"workers kept dying: {error}") from None
+        except (CancelledError, FutureCancelled, distributed.comm.CommClosedError):
+            raise ClusterError(f"the Dask scheduler at {scheduler} went away") from None
+        except PkmTwinError:
+            raise
+        except OSError as error:
+            raise ClusterError(f"the Dask scheduler at {scheduler}: {error}") from None
 
-        def submit() -> list[Any]:
-            return [
-                client.submit(
-                    compute,
-                    sweep,
-                    chunk,
-                    pkm_twin.__version__,
-                    key=f"atlas-{sweep.fingerprint[:16]}-{index}",
-                    pure=False,
-                )
-                for index, chunk in _some(queue, 1)
-            ]
 
-        flying: list[Any] = []
-        for _ in range(IN_FLIGHT * threads):
-            flying += submit()
-        finished = distributed.as_completed(flying, loop=client.loop)
-        del flying
-        for future in finished:
-            try:
-                values = future.result()
-            except distributed.KilledWorker as error:
-                raise ClusterError(f"workers kept dying: {error}") from None
-            index = int(future.key.rpartition("-")[2])
-            del future
-            yield index, values
-            for following in submit():
-                finished.add(following)
+def _from_workers(
+    sweep: Sweep, work: Work, distributed: Any, client: Any, threads: int
+) -> Iterator[tuple[int, Values]]:
+    queue = iter(work)
+
+    def submit() -> list[Any]:
+        return [
+            client.submit(
+                compute,
+                sweep,
+                chunk,
+                pkm_twin.__version__,
+                key=f"atlas-{sweep.fingerprint[:16]}-{index}",
+                pure=False,
+            )
+            for index, chunk in _some(queue, 1)
+        ]
+
+    flying: list[Any] = []
+    for _ in range(IN_FLIGHT * threads):
+        flying += submit()
+    finished = distributed.as_completed(flying, loop=client.loop)
+    del flying
+    for future in finished:
+        values = future.result()
+        index = int(future.key.rpartition("-")[2])
+        del future
+        yield index, values
+        for following in submit():
+            finished.add(following)
 
 
 def compute(sweep: Sweep, chunk: Chunk, version: str) -> Values:

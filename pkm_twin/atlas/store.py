@@ -1,18 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finished chunks in a folder beside the target, joined into one NetCDF file at the end.
 
-Both are written under another name and renamed, so a stop at any time leaves whole files only.
+Everything is written under another name and renamed, so a stop at any time leaves whole files
+only. One run at a time works in a folder: it holds a lock there that names its owner, and that the
+system takes away with the process. Nothing is removed but what a run wrote.
 """
 
 from __future__ import annotations
 
+import fcntl
+import gc
+import io
 import json
 import os
-import shutil
+import re
+import socket
+import sys
 import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import numpy as np
 
@@ -20,15 +28,55 @@ from pkm_twin.atlas.extras import require
 from pkm_twin.atlas.sweep import Chunk, Sweep, Values
 from pkm_twin.errors import PkmTwinError
 
+if TYPE_CHECKING:
+    from xarray import Dataset
+
 _MARK: Final = "sweep.json"
+_LOCK: Final = "lock"
+_JOINED: Final = "joined.tmp"
+_OWN: Final = re.compile(r"sweep\.json|lock|\d{8}\.npz|[\w.]+\.tmp")
+"""Names of what a run writes into its folder."""
 
 
 class AtlasError(PkmTwinError):
     """An atlas, or the chunks of one, that cannot be read or written as asked."""
 
     def __init__(self, path: Path, what: str) -> None:
-        super().__init__(f"{path}: {what}")
+        super().__init__(f"{_short(path)}: {what}")
         self.path = path
+
+
+def _short(path: Path) -> str:
+    text = str(path)
+    return text if len(text) <= 200 else f"{text[:120]}...{text[-60:]}"
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """What the system refuses (a full disk, a folder that is none) as an error with its path.
+
+    :param path: named where the system names none.
+    :raises AtlasError: instead of any ``OSError``.
+    """
+    try:
+        yield
+    except OSError as error:
+        where = Path(os.fsdecode(error.filename)) if error.filename else path
+        raise AtlasError(where, error.strerror or str(error) or type(error).__name__) from None
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Whatever a damaged file makes of its readers as one error.
+
+    :raises AtlasError: the file is not what an atlas is.
+    """
+    try:
+        yield
+    except PkmTwinError:
+        raise
+    except Exception as error:
+        raise AtlasError(path, _damage(error)) from None
 
 
 class Parts:
@@ -38,34 +86,84 @@ class Parts:
         self.folder = out.with_name(out.name + ".parts")
         self._sweep = sweep
         self._chunks = sweep.chunks()
+        self._lock = -1
 
     def open(self, overwrite: bool = False) -> None:
-        """Make the folder, or take up the one that is there.
+        """Make the folder, or take up the one that is there, and lock it.
 
         :param overwrite: drop what is there if it belongs to another sweep.
-        :raises AtlasError: the folder holds chunks of another sweep.
+        :raises AtlasError: another process works there, or the folder holds what is not this
+            sweep's; what no run wrote is never dropped.
         """
+        if self.folder.exists() and not self.folder.is_dir():
+            raise AtlasError(self.folder, "is no folder; chunks go into one of that name")
+        while self._lock < 0:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._refuse_foreign()
+            self._lock = self._locked()
         mark = self.folder / _MARK
-        if self.folder.exists():
-            try:
-                found = json.loads(mark.read_text())["fingerprint"]
-            except (OSError, ValueError, KeyError, TypeError):
-                found = None
-            if found == self._sweep.fingerprint:
-                return
-            if any(self.folder.iterdir()) and not overwrite:
+        try:
+            found = json.loads(mark.read_text())["fingerprint"]
+        except (OSError, ValueError, KeyError, TypeError):
+            found = None
+        if found != self._sweep.fingerprint:
+            chunks = [name for name in self._names() if name != _LOCK]
+            if chunks and not overwrite:
+                self.close()
                 raise AtlasError(
-                    self.folder,
-                    "holds chunks of another sweep; --overwrite drops them",
+                    self.folder, "holds chunks of another sweep; --overwrite drops them"
                 )
-            shutil.rmtree(self.folder)
-        self.folder.mkdir(parents=True)
-        about = {"fingerprint": self._sweep.fingerprint, **self._sweep.attributes}
-        _replace(mark, json.dumps(about, indent=2).encode())
+            for name in chunks:
+                (self.folder / name).unlink()
+            about = {"fingerprint": self._sweep.fingerprint, **self._sweep.attributes}
+            replace_file(mark, json.dumps(about, indent=2).encode())
+        # Of runs that were killed.
+        for path in self.folder.glob("*.tmp"):
+            path.unlink(missing_ok=True)
+
+    def _names(self) -> list[str]:
+        return [path.name for path in self.folder.iterdir()]
+
+    def _refuse_foreign(self) -> None:
+        foreign = [name for name in self._names() if not _OWN.fullmatch(name)]
+        if foreign:
+            raise AtlasError(
+                self.folder, f"holds {foreign[0]!r}, which no atlas wrote; move it elsewhere"
+            )
+
+    def _locked(self) -> int:
+        """The lock's file descriptor; below 0 if the folder went away meanwhile.
+
+        :raises AtlasError: another process has it.
+        """
+        path = self.folder / _LOCK
+        try:
+            lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        except FileNotFoundError:
+            return -1
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.read(lock, 200).decode(errors="replace").strip() or "another process"
+            os.close(lock)
+            raise AtlasError(self.folder, f"{owner} works on this atlas") from None
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(lock), os.stat(path)):
+                os.ftruncate(lock, 0)
+                os.write(lock, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+                return lock
+        os.close(lock)
+        return -1
+
+    def close(self) -> None:
+        """Let go of the folder; the chunks stay."""
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
 
     def pending(self) -> list[int]:
         """Indices of chunks that are not there yet."""
-        here = {path.name for path in self.folder.iterdir()}
+        here = set(self._names())
         return [i for i in range(len(self._chunks)) if self._path(i).name not in here]
 
     def save(self, index: int, values: Values) -> None:
@@ -83,8 +181,13 @@ class Parts:
             yield chunk, values
 
     def drop(self) -> None:
-        """Remove the folder."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove what runs wrote, and the folder if it is empty then."""
+        for name in self._names():
+            if _OWN.fullmatch(name):
+                (self.folder / name).unlink(missing_ok=True)
+        self.close()
+        with suppress(OSError):
+            self.folder.rmdir()
 
     def _path(self, index: int) -> Path:
         return _part(self.folder, index)
@@ -93,23 +196,93 @@ class Parts:
 def save_part(folder: Path, index: int, values: Values) -> None:
     """Keep a finished chunk in a folder."""
     path = _part(folder, index)
-    hidden = path.with_suffix(".tmp")
-    with hidden.open("wb") as file:
-        np.savez(file, **values)  # type: ignore[arg-type]
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(hidden, path)
+    # Of a run that was killed a worker may still be at it.
+    hidden = path.with_suffix(f".{os.getpid()}.tmp")
+    with writing(path):
+        try:
+            with hidden.open("wb") as file:
+                np.savez(file, **values)  # type: ignore[arg-type]
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(hidden, path)
+        except BaseException:
+            hidden.unlink(missing_ok=True)
+            raise
 
 
 def _part(folder: Path, index: int) -> Path:
     return folder / f"{index:08}.npz"
 
 
+class _Sink(io.RawIOBase):
+    """A file for the HDF5 library that remembers the first refusal of the system.
+
+    After it writes go nowhere: the library does not survive errors while it closes a file.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__()
+        self._file = file
+        self.error: OSError | None = None
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer)
+        got = self._file.readinto(view) if self.error is None else 0  # type: ignore[attr-defined]
+        view[got:] = bytes(len(view) - got)
+        return len(view)
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        done = 0
+        while self.error is None and done < len(view):
+            try:
+                done += self._file.write(view[done:])
+            except OSError as error:
+                self.error = error
+        return len(view)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        if self.error is None:
+            try:
+                return self._file.truncate(size)
+            except OSError as error:
+                self.error = error
+        return size or 0
+
+
 def join(sweep: Sweep, parts: Parts, out: Path) -> None:
-    """Write the NetCDF file of a finished sweep, chunk by chunk."""
+    """Write the NetCDF file of a finished sweep, chunk by chunk.
+
+    :raises AtlasError: a damaged chunk.
+    :raises OSError: the disk is full, or the target cannot be written.
+    """
+    hidden = parts.folder / _JOINED
+    try:
+        with hidden.open("w+b", buffering=0) as file:
+            sink = _Sink(file)
+            try:
+                _join(sweep, parts, sink)
+            except Exception:
+                # What the library makes of a disk that is full.
+                if sink.error is None:
+                    raise
+            if sink.error is not None:
+                raise sink.error
+            os.fsync(file.fileno())
+        os.replace(hidden, out)
+    finally:
+        hidden.unlink(missing_ok=True)
+
+
+def _join(sweep: Sweep, parts: Parts, sink: _Sink) -> None:
     h5netcdf = require("h5netcdf", "atlas")
-    hidden = out.with_name(out.name + ".tmp")
-    with h5netcdf.File(hidden, "w") as file:
+    with h5netcdf.File(sink, "w") as file:
         file.dimensions = sweep.sizes
         for key, value in sweep.attributes.items():
             file.attrs[key] = value
@@ -128,13 +301,14 @@ def join(sweep: Sweep, parts: Parts, out: Path) -> None:
 
         def written() -> Iterator[Values]:
             for chunk, values in parts:
+                if sink.error is not None:
+                    raise sink.error
                 for name, target in targets.items():
                     target[chunk.first, chunk.start : chunk.stop] = values[name]
                 yield {name: values[name] for name in values if name not in targets}
 
         for name, result in sweep.summaries(written()).items():
             _write(file, name, result.dims, result.values, result.attrs)
-    os.replace(hidden, out)
 
 
 def _write(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any) -> None:
@@ -150,24 +324,60 @@ def _write(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any)
     variable.attrs.update(attrs)
 
 
-def open_atlas(path: Path) -> Any:
-    """A stored atlas as an ``xarray.Dataset``; large fields are read when they are used.
+def _opened(xarray: Any, path: Path) -> Dataset:
+    """The data set of a file.
+
+    What the library leaves half made of a damaged file complains when it goes: here, unheard.
+    """
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        try:
+            data: Dataset = xarray.open_dataset(path, engine="h5netcdf")
+        except Exception as error:
+            what = _damage(error)
+        else:
+            return data
+        gc.collect()
+        raise AtlasError(path, what)
+    finally:
+        sys.unraisablehook = hook
+
+
+def _damage(error: Exception) -> str:
+    what = " ".join(str(error).split())[:200]
+    return f"damaged or no atlas: {type(error).__name__}: {what}"
+
+
+def open_atlas(path: Path) -> Dataset:
+    """A stored atlas; large fields are read when they are used.
 
     :raises AtlasError: no atlas.
     """
     xarray = require("xarray", "atlas")
     require("h5netcdf", "atlas")
-    try:
-        data = xarray.open_dataset(path, engine="h5netcdf")
-    except (OSError, ValueError) as error:
-        raise AtlasError(path, f"no NetCDF file ({error})") from None
-    if "kind" not in data.attrs or "settings" not in data.attrs:
+    with writing(path):
+        if not path.exists():
+            raise AtlasError(path, "no such file")
+        if not path.is_file():
+            raise AtlasError(path, "no regular file")
+    data = _opened(xarray, path)
+    missing = [name for name in _ATTRIBUTES if name not in data.attrs]
+    if missing:
         data.close()
-        raise AtlasError(path, "no atlas: it does not say its kind and settings")
+        raise AtlasError(path, f"no atlas, or one of another version: it has no {missing[0]!r}")
     return data
 
 
-def _replace(path: Path, data: bytes) -> None:
-    hidden = path.with_suffix(".tmp")
-    hidden.write_bytes(data)
-    os.replace(hidden, path)
+_ATTRIBUTES: Final = ("title", "kind", "robot", "settings", "pose", "layout", "lateral")
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a small file whole or not at all."""
+    hidden = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        hidden.write_bytes(data)
+        os.replace(hidden, path)
+    except BaseException:
+        with suppress(OSError):
+            hidden.unlink(missing_ok=True)
+        raise

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -125,13 +125,19 @@ class Sweep:
     @property
     def attributes(self) -> dict[str, str]:
         """Global attributes of the file: everything that made it."""
+        grid = self.robot.grid()
         return {
             "title": f"{self.kind} atlas of {self.robot.name}",
             "Conventions": "CF-1.10",
             "kind": self.kind,
             "robot": self.robot.name,
             "mechanism": self.robot.mechanism,
-            "robot_parameters": json.dumps(plain(self.robot), sort_keys=True),
+            "pose": " ".join(self.robot.pose_names),
+            "layout": grid.kind,
+            "height": grid.height,
+            "lateral": " ".join(grid.lateral),
+            "zero_torsion": "yes" if grid.zero_torsion else "no",
+            "robot_parameters": json.dumps(self.robot.parameter_sections(), sort_keys=True),
             "settings": json.dumps(self.settings, sort_keys=True),
             "pkm_twin_version": pkm_twin.__version__,
         }
@@ -140,11 +146,27 @@ class Sweep:
     def fingerprint(self) -> str:
         """Equal for two sweeps exactly if their results are."""
         digest = hashlib.sha256(json.dumps(self.attributes, sort_keys=True).encode())
-        digest.update(self.robot.parameters.tobytes())
+        digest.update(self.robot.graph.key.encode())
+        digest.update(self.robot.own_inertial.tobytes())
         digest.update(str(self.rows_a_chunk).encode())
         for name, variable in self.coordinates.items():
             digest.update(name.encode() + np.ascontiguousarray(variable.values).tobytes())
         return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is drawn of a stored atlas of one kind; each module of a kind ends with its own.
+
+    ``figures``: name to the function that draws it; ``page``: the plotly figure; ``title``: of
+    the page; ``help``: the line below it.
+    """
+
+    name: str
+    figures: Mapping[str, Callable[[Any], Any]]
+    page: Callable[[Any], Any]
+    title: Callable[[Any], str]
+    help: str
 
 
 def plain(value: Any) -> Any:

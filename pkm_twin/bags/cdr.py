@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import array
 import dataclasses
-import importlib
+import importlib.util
+import os
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -42,11 +43,23 @@ _CODES = {
 # What the message classes print -> what a .msg file says.
 _MSG_NAMES = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}
 
+MAX_DEFINITION_CHARACTERS = 1024**2
+"""Longest definition text; the longest of the common interfaces has some 20,000 characters."""
+MAX_FIELDS = 5_000
+"""Most fields of a message and of all that it holds."""
+MAX_NESTING = 50
+"""How deep a message may hold others."""
+MAX_BOUND = 2**32 - 1
+"""Largest array size and bound: lengths are 32-bit numbers in CDR."""
+
 _TYPE_NAME = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
 _FIELD = re.compile(
     r"(?P<base>[A-Za-z][\w/]*)(?:<=(?P<chars>\d+))?"
-    r"(?P<array>\[(?:(?P<upto><=)?(?P<size>\d+))?\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)"
+    r"(?P<array>\[(?:(?P<upto><=)?(?P<size>\d+))?\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)",
+    re.ASCII,
 )
+# package/Type, or package/msg/Type.
+_HELD_NAME = re.compile(r"[A-Za-z]\w*(?:/\w+)*/[A-Za-z]\w*", re.ASCII)
 _SPEC = re.compile(r"(?P<base>[A-Za-z][\w/]*)(?:<(?P<chars>\d+)>)?(?:\[(?P<size>\d+)\])?")
 _SEQUENCE = re.compile(r"sequence<(?P<item>.+?)(?:,\s*(?P<bound>\d+))?>")
 
@@ -95,6 +108,12 @@ def message_class(type_name: str) -> Any:
             f"{type_name!r} is not a type name; expected package/msg/Type", reason="type"
         )
     package, _, name = type_name.split("/")
+    # A bag may name any package: only one of messages is imported.
+    found = importlib.util.find_spec(package)
+    places = (found and found.submodule_search_locations) or ()
+    if not any(os.path.isdir(os.path.join(place, "msg")) for place in places):
+        text = f"message type {type_name} is not installed: no message package {package!r}"
+        raise BagError(text, reason="type")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except (ImportError, AttributeError) as error:
@@ -130,6 +149,15 @@ def _short_name(type_name: str) -> str:
     return f"{parts[0]}/{parts[-1]}"
 
 
+def _checked_name(type_name: str) -> str:
+    """The short name of a type that a file names."""
+    if not _HELD_NAME.fullmatch(type_name):
+        raise BagError(
+            f"{_brief(type_name)} is no type name; expected package/msg/Type", reason="schema"
+        )
+    return _short_name(type_name)
+
+
 def _class_field(name: str, spec: str) -> Field:
     """Turn ``sequence<double, 3>`` and its like, as the classes print them, into a field."""
     sequence = _SEQUENCE.fullmatch(spec)
@@ -152,9 +180,16 @@ def _field_text(field: Field) -> str:
 def parse_definition(type_name: str, text: str) -> Definition:
     """Parse a concatenated ``ros2msg`` definition; the first entry is the message itself.
 
-    :raises BagError: a line is not a field, a held type has no definition, or it holds itself.
+    :raises BagError: a line is not a field, a held type has no definition or holds itself, or there
+        is more than MAX_DEFINITION_CHARACTERS, MAX_FIELDS, MAX_NESTING or MAX_BOUND of it.
     """
-    own = _short_name(type_name)
+    if len(text) > MAX_DEFINITION_CHARACTERS:
+        raise BagError(
+            f"the definition of {type_name} has {len(text)} characters; "
+            f"at most {MAX_DEFINITION_CHARACTERS}",
+            reason="schema",
+        )
+    own = _checked_name(type_name)
     texts = dict(_BUILTIN)
     for index, part in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):
         name = own
@@ -163,10 +198,11 @@ def parse_definition(type_name: str, text: str) -> Definition:
             heading, _, fields = part.strip().partition("\n")
             if not heading.startswith("MSG:"):
                 raise BagError(
-                    f"definition of {type_name}: part {index} starts with {heading!r}, not 'MSG:'",
+                    f"definition of {type_name}: part {index} starts with {_brief(heading)}, "
+                    "not 'MSG:'",
                     reason="schema",
                 )
-            name = _short_name(heading[4:].strip())
+            name = _checked_name(heading[4:].strip())
         texts[name] = fields
     definition: Definition = {}
     _resolve(own, texts, definition, ())
@@ -183,7 +219,17 @@ def _resolve(
         return
     if name not in texts:
         raise BagError(f"no definition of {name}, which {holders[-1]} holds", reason="schema")
+    if len(holders) >= MAX_NESTING:
+        raise BagError(
+            f"{holders[0]} holds types {len(holders)} deep; at most {MAX_NESTING - 1}",
+            reason="schema",
+        )
     fields = tuple(_parse_fields(name, texts))
+    if len(fields) + sum(map(len, definition.values())) > MAX_FIELDS:
+        raise BagError(
+            f"{(*holders, name)[0]} has more than {MAX_FIELDS} fields with all that it holds",
+            reason="schema",
+        )
     for field in fields:
         if "/" in field.base:
             _resolve(field.base, texts, definition, (*holders, name))
@@ -197,14 +243,26 @@ def _parse_fields(name: str, texts: Mapping[str, str]) -> list[Field]:
         match = _FIELD.fullmatch(line.strip())
         if match is None or match["rest"].startswith("="):
             if match is None and line.split("#")[0].strip():
-                raise BagError(f"definition of {name}: {line!r} is not a field", reason="schema")
+                raise BagError(
+                    f"definition of {name}: {_brief(line)} is not a field", reason="schema"
+                )
             continue
         base = _base_type(match["base"], name.split("/", 1)[0], texts)
-        size = None if match["array"] is None else int(match["size"] or 0)
-        fields.append(
-            Field(match["name"], base, size, bool(match["upto"]), int(match["chars"] or 0))
-        )
+        where = f"definition of {name}: field {match['name']}"
+        size = None if match["array"] is None else _bound(match["size"], where)
+        chars = _bound(match["chars"], where)
+        fields.append(Field(match["name"], base, size, bool(match["upto"]), chars))
     return fields
+
+
+def _bound(digits: str | None, where: str) -> int:
+    """A size or bound as a definition writes it, 0 where it writes none."""
+    # Python refuses to convert thousands of digits.
+    if digits and (len(digits) > 20 or int(digits) > MAX_BOUND):
+        raise BagError(
+            f"{where} has the bound {_brief(digits)}; at most {MAX_BOUND}", reason="schema"
+        )
+    return int(digits or 0)
 
 
 def _base_type(base: str, package: str, texts: Mapping[str, str]) -> str:

@@ -5,16 +5,11 @@ from __future__ import annotations
 
 import importlib
 import io
-import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import IO, Any
-
-from pkm_twin.errors import BagError
 
 MAX_RECORD_BYTES = 256 * 1024**2
 """Largest record that is loaded; attachments and unknown records are passed through in blocks."""
@@ -24,7 +19,16 @@ MAX_RATIO = 1000
 """Largest ratio of unpacked to packed size, for chunks that unpack to more than FREE_BYTES."""
 FREE_BYTES = 8 * 1024**2
 """A chunk up to this size may have any ratio: a black image packs ten thousand to one."""
+MAX_TOTAL_BYTES = 256 * 1024**3
+"""Most that a bag's file may unpack to, and be read, altogether."""
+MAX_TOTAL_RATIO = 200
+"""Largest ratio of all that is unpacked and read to the file's size, beyond FREE_TOTAL_BYTES."""
+FREE_TOTAL_BYTES = 128 * 1024**2
+"""Every file may unpack to so much."""
+RECORD_COST = 64
+"""Bytes that a record in a chunk counts for beside its own: the time that it takes."""
 MAGIC = b"\x89MCAP0\r\n"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BLOCK_BYTES = 1024**2
 METADATA_CRC = "crc32"
 
@@ -45,17 +49,17 @@ INDEX_ENTRY = struct.Struct("<QQ")
 FOOTER_BODY = struct.Struct("<QQI")
 CRC = struct.Struct("<I")
 
+TOTAL_CAP = "total_cap"
+"""Reason of a file that is refused whole for what it would cost."""
+
 _FOREIGN = {
-    b"SQLite format 3\x00": "an SQLite file (a rosbag2 .db3 bag?), not MCAP; "
-    "`ros2 bag convert` makes an MCAP bag of it",
     b"#ROSBAG V2.0": "a ROS 1 bag, not MCAP",
-    b"\x28\xb5\x2f\xfd": "a zstd-compressed file; unpack it first",
     b"\x1f\x8b": "a gzip-compressed file; unpack it first",
 }
 
 
-class FlawError(Exception):
-    """What is wrong and where, before the path is known; never leaves this module."""
+class FormatError(Exception):
+    """What is wrong and where, before the path is known; never leaves this folder's modules."""
 
     def __init__(self, text: str, offset: int | None, reason: str = "damaged") -> None:
         super().__init__(text)
@@ -64,12 +68,36 @@ class FlawError(Exception):
         self.reason = reason
 
 
-class Tape:
+class Budget:
+    """What one file may cost, in bytes read and unpacked, whatever it says of itself.
+
+    Without it a small file of many chunks, each within its own bounds, unpacks to gigabytes.
+    """
+
+    def __init__(self, packed: int) -> None:
+        self._packed = packed
+        self.limit = min(MAX_TOTAL_BYTES, max(FREE_TOTAL_BYTES, MAX_TOTAL_RATIO * packed))
+        self._spent = 0
+
+    def spend(self, count: int, offset: int | None) -> None:
+        """Take ``count`` bytes; once they are used up the file is refused."""
+        self._spent += count
+        if self._spent > self.limit:
+            raise FormatError(
+                f"the file of {self._packed} bytes unpacks to more than {self.limit}: at most "
+                f"{MAX_TOTAL_RATIO} to 1, and {MAX_TOTAL_BYTES} in all",
+                offset,
+                TOTAL_CAP,
+            )
+
+
+class RecordReader:
     """A file read forward, with its position and the CRC of all that was read."""
 
-    def __init__(self, file: IO[bytes], size: int) -> None:
+    def __init__(self, file: IO[bytes], size: int, budget: Budget | None = None) -> None:
         self._file = file
         self.size = size
+        self.budget = budget or Budget(size)
         self.position = 0
         self.crc = 0
 
@@ -82,14 +110,15 @@ class Tape:
         """Read exactly ``count`` bytes."""
         left = self.size - self.position
         if count > left:
-            raise FlawError(
+            raise FormatError(
                 f"the {what} needs {count} bytes, the file has {left} left: it is cut short",
                 self.position,
                 "truncated",
             )
+        self.budget.spend(count, self.position)
         data = self._file.read(count)
         if len(data) != count:
-            raise FlawError("the file shrank while it was read", self.position, "truncated")
+            raise FormatError("the file shrank while it was read", self.position, "truncated")
         self.position += count
         self.crc = zlib.crc32(data, self.crc)
         return data
@@ -99,9 +128,9 @@ class Tape:
         at = self.position
         opcode, length = FRAME.unpack(self.read(FRAME.size, "next record"))
         if opcode == 0:
-            raise FlawError("a record has the opcode 0", at)
+            raise FormatError("a record has the opcode 0", at)
         if length > self.size - self.position:
-            raise FlawError(
+            raise FormatError(
                 f"the {opcode_name(opcode)} record has {length} bytes, the file has "
                 f"{self.size - self.position} left: it is cut short",
                 at,
@@ -112,7 +141,7 @@ class Tape:
     def body(self, opcode: int, length: int) -> bytes:
         """Read a record's content."""
         if length > MAX_RECORD_BYTES:
-            raise FlawError(
+            raise FormatError(
                 f"the {opcode_name(opcode)} record has {length} bytes; at most {MAX_RECORD_BYTES}",
                 self.position,
                 "size_cap",
@@ -129,21 +158,6 @@ class Tape:
         return crc
 
 
-@contextmanager
-def open_tape(path: Path) -> Iterator[Tape]:
-    """Open a file for reading; whatever the system refuses becomes a BagError."""
-    try:
-        if path.is_dir():
-            inside = ", ".join(sorted(p.name for p in path.glob("*.mcap"))) or "no .mcap file"
-            raise BagError(f"is a folder; name a file in it: {inside}", path=path, reason="folder")
-        with path.open("rb") as file:
-            yield Tape(file, os.fstat(file.fileno()).st_size)
-    except FileNotFoundError as error:
-        raise BagError("does not exist", path=path, reason="not_found") from error
-    except OSError as error:
-        raise BagError(f"cannot be read: {error.strerror}", path=path, reason="io") from error
-
-
 def opcode_name(opcode: int) -> str:
     """Return the name of a kind of record, for error texts."""
     return _NAMES[opcode] if opcode < FIRST_UNKNOWN else f"unknown (0x{opcode:02x})"
@@ -154,7 +168,7 @@ def utf8(raw: bytes, what: str, offset: int | None) -> str:
     try:
         return raw.decode()
     except UnicodeDecodeError:
-        raise FlawError(f"a text of the {what} record is not UTF-8", offset) from None
+        raise FormatError(f"a text of the {what} record is not UTF-8", offset) from None
 
 
 class Fields:
@@ -170,7 +184,7 @@ class Fields:
         """Read ``count`` bytes."""
         start = self._position
         if count > len(self._body) - start:
-            raise FlawError(
+            raise FormatError(
                 f"a field of the {self._what} record reaches past its end", self._offset
             )
         self._position += count
@@ -203,7 +217,9 @@ class Fields:
         while part.left:
             key = part.text()
             if key in result:
-                raise FlawError(f"the {self._what} record has the key {key!r} twice", self._offset)
+                raise FormatError(
+                    f"the {self._what} record has the key {key!r} twice", self._offset
+                )
             result[key] = part.text()
         return result
 
@@ -215,20 +231,26 @@ class Fields:
     def done(self) -> None:
         """Refuse bytes after the last field."""
         if self.left:
-            raise FlawError(f"the {self._what} record has {self.left} bytes too many", self._offset)
+            raise FormatError(
+                f"the {self._what} record has {self.left} bytes too many", self._offset
+            )
 
 
-def walk(data: bytes, offset: int) -> Iterator[tuple[int, int, int]]:
+def iterate_records(
+    data: bytes, offset: int, budget: Budget | None = None
+) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end of each record in unpacked data of the chunk at ``offset``."""
     position = 0
     size = len(data)
     while position < size:
+        if budget is not None:
+            budget.spend(RECORD_COST, offset)
         if size - position < FRAME.size:
-            raise FlawError(f"{size - position} stray bytes end the chunk", offset)
+            raise FormatError(f"{size - position} stray bytes end the chunk", offset)
         opcode, length = FRAME.unpack_from(data, position)
         start = position + FRAME.size
         if opcode == 0 or length > size - start:
-            raise FlawError(
+            raise FormatError(
                 f"record 0x{opcode:02x} with {length} bytes at {position} of the unpacked chunk "
                 f"does not fit its {size} bytes",
                 offset,
@@ -240,7 +262,7 @@ def walk(data: bytes, offset: int) -> Iterator[tuple[int, int, int]]:
 def message_head(data: bytes, start: int, end: int, offset: int) -> tuple[int, int, int, int]:
     """Return channel, sequence, log time and publish time of the message record."""
     if end - start < MESSAGE_HEAD.size:
-        raise FlawError(
+        raise FormatError(
             f"a message record has {end - start} bytes; at least {MESSAGE_HEAD.size}", offset
         )
     number, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(data, start)
@@ -287,18 +309,20 @@ class Records:
         schema = Schema(fields.text(), fields.text(), fields.blob("I"))
         fields.done()
         if number == 0:
-            raise FlawError("a schema has the number 0", offset)
+            raise FormatError("a schema has the number 0", offset)
         if self.schemas.setdefault(number, schema) != schema:
-            raise FlawError(f"schema {number} is defined twice, differently", offset)
+            raise FormatError(f"schema {number} is defined twice, differently", offset)
 
     def _add_channel(self, number: int, fields: Fields, offset: int) -> None:
         channel = Channel(fields.number("H"), fields.text(), fields.text(), fields.texts())
         fields.done()
         schema = self.schemas.get(channel.schema_id)
         if channel.schema_id and schema is None:
-            raise FlawError(f"channel {number} has the unknown schema {channel.schema_id}", offset)
+            raise FormatError(
+                f"channel {number} has the unknown schema {channel.schema_id}", offset
+            )
         if self.channels.setdefault(number, channel) != channel:
-            raise FlawError(f"channel {number} is defined twice, differently", offset)
+            raise FormatError(f"channel {number} is defined twice, differently", offset)
         self.types[number] = schema.name if schema else ""
 
 
@@ -314,45 +338,52 @@ class _Chunk:
     has_crc: bool
 
 
-def read_chunk(body: bytes, offset: int) -> _Chunk:
+def read_chunk(body: bytes, offset: int, budget: Budget) -> _Chunk:
     """Unpack the chunk record at ``offset`` and compare its CRC, if it has one."""
     fields = Fields(body, "chunk", offset)
     start, end, size, crc = _CHUNK_HEAD.unpack(fields.take(_CHUNK_HEAD.size))
     compression = fields.text()
     packed = fields.blob("Q")
     fields.done()
-    data = _unpack(compression, packed, size, offset)
+    data = _unpack(compression, packed, size, offset, budget)
     if crc and zlib.crc32(data) != crc:
-        raise FlawError(
+        raise FormatError(
             f"the chunk's CRC is {zlib.crc32(data):08x}; the file says {crc:08x}", offset, "crc"
         )
     return _Chunk(start, end, compression, len(packed), data, crc != 0)
 
 
-def _unpack(compression: str, packed: bytes, size: int, offset: int) -> bytes:
+def _unpack(compression: str, packed: bytes, size: int, offset: int, budget: Budget) -> bytes:
     """Unpack a chunk to exactly ``size`` bytes, having checked the size first."""
     if compression not in ("", "zstd", "lz4"):
-        raise FlawError(
+        raise FormatError(
             f"unknown compression {compression!r}; known: zstd, lz4, none", offset, "compression"
         )
+    _check_size("chunk", len(packed), size, offset)
+    if not compression:
+        if len(packed) != size:
+            raise FormatError(f"the chunk has {len(packed)} bytes; the file says {size}", offset)
+        return packed
+    budget.spend(size, offset)
+    # One byte more than declared is let out, to tell a longer content from an exact one.
+    data = _decompress(compression, packed, size + 1, offset)
+    if len(data) != size:
+        more = "more" if len(data) > size else str(len(data))
+        raise FormatError(f"the chunk unpacks to {more} bytes; the file says {size}", offset)
+    return data
+
+
+def _check_size(what: str, packed: int, size: int, offset: int) -> None:
     if size > MAX_CHUNK_BYTES:
-        raise FlawError(
-            f"the chunk unpacks to {size} bytes; at most {MAX_CHUNK_BYTES}", offset, "size_cap"
+        raise FormatError(
+            f"the {what} unpacks to {size} bytes; at most {MAX_CHUNK_BYTES}", offset, "size_cap"
         )
-    if size > FREE_BYTES and size > MAX_RATIO * len(packed):
-        raise FlawError(
-            f"the chunk unpacks from {len(packed)} to {size} bytes; at most {MAX_RATIO} to 1",
+    if size > FREE_BYTES and size > MAX_RATIO * packed:
+        raise FormatError(
+            f"the {what} unpacks from {packed} to {size} bytes; at most {MAX_RATIO} to 1",
             offset,
             "size_cap",
         )
-    data = packed
-    if compression:
-        # One byte more than declared is let out, to tell a longer content from an exact one.
-        data = _decompress(compression, packed, size + 1, offset)
-    if len(data) != size:
-        more = "more" if len(data) > size else str(len(data))
-        raise FlawError(f"the chunk unpacks to {more} bytes; the file says {size}", offset)
-    return data
 
 
 def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> bytes:
@@ -361,8 +392,8 @@ def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> byt
     try:
         library: Any = importlib.import_module(name)
     except ImportError:
-        text = f"the chunk is packed with {compression}; its Python package {name} is missing"
-        raise FlawError(text, offset, "compression") from None
+        text = f"the data are packed with {compression}; the Python package {name} is missing"
+        raise FormatError(text, offset, "compression") from None
     failures = (library.ZstdError,) if compression == "zstd" else (RuntimeError, EOFError)
     try:
         if compression == "lz4":
@@ -372,7 +403,25 @@ def _decompress(compression: str, packed: bytes, limit: int, offset: int) -> byt
         with window.stream_reader(io.BytesIO(packed)) as reader:
             return bytes(reader.read(limit))
     except failures as error:
-        raise FlawError(f"the chunk does not unpack: {error}", offset) from None
+        raise FormatError(f"the data do not unpack: {error}", offset) from None
+
+
+def message_data(
+    data: bytes, start: int, end: int, encoding: str, offset: int, budget: Budget
+) -> bytes:
+    """Return a message record's payload, unpacked where rosbag2 has packed each message.
+
+    No plain CDR begins as a zstd frame does, so the bytes tell; rosbag2 says it only beside them.
+    """
+    start += MESSAGE_HEAD.size
+    if data[start : start + len(ZSTD_MAGIC)] != ZSTD_MAGIC or encoding != "cdr":
+        return data[start:end]
+    packed = data[start:end]
+    limit = min(MAX_CHUNK_BYTES, max(FREE_BYTES, MAX_RATIO * len(packed)))
+    unpacked = _decompress("zstd", packed, limit + 1, offset)
+    budget.spend(len(unpacked), offset)
+    _check_size("message", len(packed), len(unpacked), offset)
+    return unpacked
 
 
 def metadata(body: bytes, offset: int) -> tuple[str, dict[str, str], bool]:
@@ -382,7 +431,7 @@ def metadata(body: bytes, offset: int) -> tuple[str, dict[str, str], bool]:
     fields.done()
     crc = entries.pop(METADATA_CRC, None)
     if crc is not None and crc != metadata_crc(name, entries):
-        raise FlawError(f"metadata {name!r} does not match its CRC", offset, "crc")
+        raise FormatError(f"metadata {name!r} does not match its CRC", offset, "crc")
     return name, entries, crc is not None
 
 
@@ -393,54 +442,58 @@ def metadata_crc(name: str, entries: Mapping[str, str]) -> str:
     return f"{zlib.crc32(packed):08x}"
 
 
-def read_magic(tape: Tape) -> None:
+def read_magic(reader: RecordReader) -> None:
     """Read the opening mark; say in plain words what a file without it is."""
-    if tape.size == 0:
-        raise FlawError("the file is empty", 0, "empty")
-    head = tape.read(min(tape.size, 16), "opening mark")
+    if reader.size == 0:
+        raise FormatError("the file is empty", 0, "empty")
+    head = reader.read(min(reader.size, 16), "opening mark")
     for magic, text in _FOREIGN.items():
         if head.startswith(magic):
-            raise FlawError(f"this is {text}", 0, "not_mcap")
-    if tape.size < len(MAGIC) and MAGIC.startswith(head):
-        raise FlawError(f"the file ends after {tape.size} bytes: it is cut short", 0, "truncated")
+            raise FormatError(f"this is {text}", 0, "not_mcap")
+    if reader.size < len(MAGIC) and MAGIC.startswith(head):
+        raise FormatError(
+            f"the file ends after {reader.size} bytes: it is cut short", 0, "truncated"
+        )
     if not head.startswith(MAGIC):
-        raise FlawError(
+        raise FormatError(
             "this is not an MCAP file: it does not start with the MCAP mark", 0, "not_mcap"
         )
-    tape.seek(len(MAGIC))
-    tape.crc = zlib.crc32(MAGIC)
-    if tape.size == len(MAGIC):
-        raise FlawError("the file holds the MCAP mark and nothing else", 0, "truncated")
+    reader.seek(len(MAGIC))
+    reader.crc = zlib.crc32(MAGIC)
+    if reader.size == len(MAGIC):
+        raise FormatError("the file holds the MCAP mark and nothing else", 0, "truncated")
 
 
-def read_attachment(tape: Tape, at: int, length: int) -> tuple[bytes, tuple[object, ...]]:
+def read_attachment(reader: RecordReader, at: int, length: int) -> tuple[bytes, tuple[object, ...]]:
     """Pass over an attachment in blocks; return its head and what its index must say."""
-    end = tape.position + length
+    end = reader.position + length
     if length < 16 + 4 + 4 + 8 + CRC.size:
-        raise FlawError(f"the attachment record has {length} bytes, too few for its fields", at)
-    head = tape.read(16, "attachment")
+        raise FormatError(f"the attachment record has {length} bytes, too few for its fields", at)
+    head = reader.read(16, "attachment")
     texts = []
     for _ in range(2):
-        prefix = tape.read(4, "attachment")
+        prefix = reader.read(4, "attachment")
         (count,) = struct.unpack("<I", prefix)
-        if count > end - tape.position:
-            raise FlawError("a field of the attachment record reaches past its end", at)
-        texts.append(tape.body(ATTACHMENT, count))
+        if count > end - reader.position:
+            raise FormatError("a field of the attachment record reaches past its end", at)
+        texts.append(reader.body(ATTACHMENT, count))
         head += prefix + texts[-1]
-    prefix = tape.read(8, "attachment")
+    prefix = reader.read(8, "attachment")
     (size,) = struct.unpack("<Q", prefix)
-    if size != end - tape.position - CRC.size:
-        raise FlawError(f"the attachment says {size} bytes of data; its record differs", at)
+    if size != end - reader.position - CRC.size:
+        raise FormatError(f"the attachment says {size} bytes of data; its record differs", at)
     head += prefix
     log_time, create_time = struct.unpack("<QQ", head[:16])
     crc = zlib.crc32(head)
     left = size
     while left:
-        block = tape.read(min(left, _BLOCK_BYTES), "attachment")
+        block = reader.read(min(left, _BLOCK_BYTES), "attachment")
         crc = zlib.crc32(block, crc)
         left -= len(block)
-    (stated,) = CRC.unpack(tape.read(CRC.size, "attachment"))
+    (stated,) = CRC.unpack(reader.read(CRC.size, "attachment"))
     if stated and stated != crc:
-        raise FlawError(f"the attachment's CRC is {crc:08x}; the file says {stated:08x}", at, "crc")
+        raise FormatError(
+            f"the attachment's CRC is {crc:08x}; the file says {stated:08x}", at, "crc"
+        )
     name, media = (utf8(text, "attachment", at) for text in texts)
     return head, (at, FRAME.size + length, log_time, create_time, size, name, media)

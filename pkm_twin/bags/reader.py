@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Strict reading and safe writing of MCAP bags. Imports no ROS.
 
-Reading: the whole file is checked before the first message is handed out. Each record is walked in
+Reading: the whole file is checked before the first message is handed out. Each record is read in
 file order; CRCs, lengths, counts, times and indexes must agree with what is there. Bags written
 here carry a CRC over every byte; where a foreign bag has none, the report says so in a warning.
+A bag is one MCAP file, or a folder that rosbag2 wrote with its splits, packed by message, by chunk
+or by file.
 
 Times are log times in integer nanoseconds, as in the file.
 """
@@ -11,10 +13,8 @@ Times are log times in integer nanoseconds, as in the file.
 from __future__ import annotations
 
 import heapq
-import os
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Container, Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -22,42 +22,22 @@ from typing import Any, Literal, Self
 
 from pkm_twin.bags.cdr import MessageCodec, message_definition
 from pkm_twin.bags.format import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK,
-    CHUNK_INDEX,
-    CRC,
-    DATA_END,
-    FIRST_UNKNOWN,
-    FOOTER,
-    FOOTER_BODY,
-    FRAME,
-    HEADER,
-    MAGIC,
-    MAX_RECORD_BYTES,
     MESSAGE,
-    MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    METADATA,
-    METADATA_CRC,
-    SCHEMA,
+    TOTAL_CAP,
+    Budget,
     Channel,
-    Fields,
-    FlawError,
-    Records,
+    FormatError,
+    RecordReader,
     Schema,
-    Tape,
+    iterate_records,
+    message_data,
     message_head,
-    metadata,
-    metadata_crc,
-    opcode_name,
-    open_tape,
-    read_chunk,
     utf8,
-    walk,
 )
-from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo
-from pkm_twin.bags.writer import LIBRARY, BagWriter, Sink, mcap_writer, refuse_existing, write_error
+from pkm_twin.bags.recover import RecoverResult, count_salvageable, recover
+from pkm_twin.bags.storage import METADATA_FILE, BagFile, Storage, find_storage
+from pkm_twin.bags.strict import BagReport, Check, Segment, TopicInfo, join_topic
+from pkm_twin.bags.writer import BagWriter
 from pkm_twin.errors import BagError
 
 __all__ = [
@@ -74,6 +54,12 @@ __all__ = [
     "read_messages",
     "recover",
 ]
+
+
+MAX_WAITING_BYTES = 256 * 1024**2
+"""Most that is held in memory to put messages into the order of their log times."""
+# What a message takes beside its data.
+_MESSAGE_COST = 512
 
 
 class DamagedBagError(BagError):
@@ -108,27 +94,6 @@ class BagMessage:
         return self._decode(self.data)
 
 
-@dataclass(frozen=True)
-class RecoverResult:
-    """What :func:`recover` saved and what it could not.
-
-    ``bytes_lost`` counts damaged and incomplete records of the source's data section; indexes and
-    summary are made anew. ``unverified`` messages were whole, but no CRC covered them. ``reason``
-    is the first fault found, empty for a sound bag.
-    """
-
-    messages: int
-    bytes_lost: int
-    reason: str
-    chunks_lost: int
-    unverified: int
-
-    @property
-    def lossless(self) -> bool:
-        """Whether the source was sound."""
-        return not self.reason
-
-
 def inspect(path: str | Path) -> BagReport:
     """Check a whole bag, without decoding its messages.
 
@@ -151,31 +116,86 @@ def read_messages(
 def open_bag(path: str | Path) -> Bag:
     """Check a whole bag and return it ready to be read, any number of times.
 
+    A bag is one MCAP file or a folder that rosbag2 wrote, packed or not.
+
     :raises BagError: as :func:`inspect`.
     """
     path = Path(path)
-    with open_tape(path) as tape:
-        check = Check(tape)
+    storage = find_storage(path)
+    parts = []
+    for file in storage.files:
+        with file.open() as reader:
+            check = Check(reader)
+            try:
+                check.run()
+            except FormatError as error:
+                damage = error
+            else:
+                parts.append(_Part(file, check))
+                continue
+        raise _bag_error(damage, file, storage)
+    return Bag(path, parts, storage)
+
+
+class _Part:
+    """One file of a bag, checked."""
+
+    def __init__(self, file: BagFile, check: Check) -> None:
+        self.file = file
+        self.segments = check.segments
+        self.channels = check.records.channels
+        self.types = check.records.types
+        self.report = check.report(file.path)
+        # Channels of one type share its codec, which may be long in the making.
+        schemas = check.records.schemas
+        codecs = {number: _Codec(schemas.get(number)) for number in (0, *schemas)}
+        self.decoders = {
+            number: _decoder(channel, codecs[channel.schema_id])
+            for number, channel in self.channels.items()
+        }
+
+    def numbered(self, topics: Container[str]) -> set[int]:
+        """The channels of these topics."""
+        return {number for number, channel in self.channels.items() if channel.topic in topics}
+
+    def parse(self, segment: Segment, reader: RecordReader, wanted: set[int]) -> list[BagMessage]:
+        """The messages of the wanted channels in a segment, in the order of the file."""
         try:
-            check.run()
-        except FlawError as flaw:
-            raise _bag_error(flaw, path) from None
-    return Bag(path, check)
+            data = segment.read(reader)
+            return list(self._messages(data, segment.offset, reader.budget, wanted))
+        except FormatError as error:
+            text = f"changed since it was checked: {error.text}"
+            raise BagError(
+                text, path=self.file.path, reason="changed", offset=error.offset
+            ) from None
+
+    def _messages(
+        self, data: bytes, offset: int, budget: Budget, wanted: set[int]
+    ) -> Iterator[BagMessage]:
+        for opcode, start, end in iterate_records(data, offset):
+            if opcode != MESSAGE:
+                continue
+            number, sequence, log_time, publish_time = message_head(data, start, end, offset)
+            if number in wanted:
+                channel = self.channels[number]
+                yield BagMessage(
+                    channel.topic,
+                    self.types[number],
+                    log_time,
+                    publish_time,
+                    sequence,
+                    message_data(data, start, end, channel.encoding, offset, budget),
+                    self.decoders[number],
+                )
 
 
 class Bag:
     """A bag that has been checked; ``report`` is what the check found."""
 
-    def __init__(self, path: Path, check: Check) -> None:
+    def __init__(self, path: Path, parts: list[_Part], storage: Storage) -> None:
         self._path = path
-        self._segments = check.segments
-        self._channels = check.records.channels
-        self._types = check.records.types
-        self._decoders = {
-            number: _decoder(channel, check.records.schemas.get(channel.schema_id))
-            for number, channel in self._channels.items()
-        }
-        self.report = check.report(path)
+        self._parts = parts
+        self.report = _joined(path, [part.report for part in parts], storage)
 
     def messages(
         self,
@@ -187,89 +207,148 @@ class Bag:
 
         ``log_time``: by log time; messages of one time in the order of the file. Memory holds the
         chunks that overlap in time, which is one or two in a bag recorded in order. ``file``: as
-        they stand in the file.
+        they stand in the files.
 
-        :raises BagError: a topic is not in the bag, or the file changed since it was checked.
+        :raises BagError: a topic is not in the bag, the file changed since it was checked, or more
+            than MAX_WAITING_BYTES overlap in time.
         """
         if order not in ("log_time", "file"):
             raise ValueError(f"order is {order!r}; expected 'log_time' or 'file'")
         wanted = self._wanted(topics)
         return self._ordered(wanted) if order == "log_time" else self._in_file(wanted)
 
-    def _wanted(self, topics: Iterable[str] | None) -> set[int]:
-        if topics is None:
-            return set(self._channels)
-        names = {topics} if isinstance(topics, str) else set(topics)
-        unknown = sorted(names - self.report.topics.keys())
+    def _wanted(self, topics: Iterable[str] | None) -> list[set[int]]:
+        """The channels of ``topics``, a set for each part."""
+        known = self.report.topics
+        names = (
+            known.keys() if topics is None else {topics} if isinstance(topics, str) else set(topics)
+        )
+        unknown = sorted(names - known.keys())
         if unknown:
             raise BagError(
-                f"no topic {', '.join(unknown)}; topics: {', '.join(sorted(self.report.topics))}",
+                f"no topic {', '.join(unknown)}; topics: {', '.join(sorted(known))}",
                 path=self._path,
                 reason="no_topic",
             )
-        return {number for number, channel in self._channels.items() if channel.topic in names}
+        return [part.numbered(names) for part in self._parts]
 
-    def _in_file(self, wanted: set[int]) -> Iterator[BagMessage]:
-        with open_tape(self._path) as tape:
-            for segment in self._segments:
-                yield from self._load(tape, segment, wanted)
+    def _in_file(self, wanted: list[set[int]]) -> Iterator[BagMessage]:
+        for part, numbers in zip(self._parts, wanted, strict=True):
+            with part.file.open() as reader:
+                for segment in part.segments:
+                    yield from part.parse(segment, reader, numbers)
 
-    def _ordered(self, wanted: set[int]) -> Iterator[BagMessage]:
-        waiting: list[tuple[int, int, int, BagMessage]] = []
-        by_start = sorted(self._segments, key=lambda segment: segment.start)
-        with open_tape(self._path) as tape:
-            for segment in by_start:
+    def _ordered(self, wanted: list[set[int]]) -> Iterator[BagMessage]:
+        waiting: list[tuple[int, int, int, int, BagMessage]] = []
+        held = 0
+        places = [(n, segment) for n, part in enumerate(self._parts) for segment in part.segments]
+        places.sort(key=lambda place: (place[1].start, place[0], place[1].offset))
+        with _Readers(self._parts) as readers:
+            for number, segment in places:
                 # Nothing from here on is earlier than this segment's start. A message of exactly
                 # that time stays, since the segment may stand before it in the file.
                 while waiting and waiting[0][0] < segment.start:
-                    yield heapq.heappop(waiting)[3]
-                for index, message in enumerate(self._load(tape, segment, wanted)):
-                    entry = (message.log_time, segment.offset, index, message)
+                    message = heapq.heappop(waiting)[-1]
+                    held -= len(message.data) + _MESSAGE_COST
+                    yield message
+                found = self._parts[number].parse(segment, readers.get(number), wanted[number])
+                for index, message in enumerate(found):
+                    entry = (message.log_time, number, segment.offset, index, message)
                     heapq.heappush(waiting, entry)
+                    held += len(message.data) + _MESSAGE_COST
+                if held > MAX_WAITING_BYTES:
+                    raise BagError(
+                        f"more than {MAX_WAITING_BYTES} bytes of messages overlap in time: they "
+                        "cannot be put in order; read them in the order of the file",
+                        path=self._path,
+                        reason="overlap",
+                        offset=segment.offset,
+                    )
             while waiting:
-                yield heapq.heappop(waiting)[3]
-
-    def _load(self, tape: Tape, segment: Segment, wanted: set[int]) -> Iterator[BagMessage]:
-        try:
-            yield from self._parse(segment.read(tape), wanted)
-        except FlawError as flaw:
-            text = f"changed since it was checked: {flaw.text}"
-            raise BagError(text, path=self._path, reason="changed", offset=flaw.offset) from None
-
-    def _parse(self, data: bytes, wanted: set[int]) -> Iterator[BagMessage]:
-        for opcode, start, end in walk(data, 0):
-            if opcode != MESSAGE:
-                continue
-            number, sequence, log_time, publish_time = message_head(data, start, end, 0)
-            if number in wanted:
-                yield BagMessage(
-                    self._channels[number].topic,
-                    self._types[number],
-                    log_time,
-                    publish_time,
-                    sequence,
-                    data[start + MESSAGE_HEAD.size : end],
-                    self._decoders[number],
-                )
+                yield heapq.heappop(waiting)[-1]
 
 
-def _decoder(channel: Channel, schema: Schema | None) -> Callable[[bytes], Any]:
-    """Return a function that decodes the channel's messages; the codec is made at the first."""
-    codec: MessageCodec | None = None
+class _Readers:
+    """The file that is being read; splits follow each other, so one is open at a time."""
+
+    def __init__(self, parts: list[_Part]) -> None:
+        self._parts = parts
+        self._open = ExitStack()
+        self._current: tuple[int, RecordReader] | None = None
+
+    def get(self, number: int) -> RecordReader:
+        if self._current is None or self._current[0] != number:
+            self._open.close()
+            reader = self._open.enter_context(self._parts[number].file.open())
+            self._current = (number, reader)
+        return self._current[1]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._open.close()
+
+
+def _joined(path: Path, reports: list[BagReport], storage: Storage) -> BagReport:
+    """One report of all the files of a bag."""
+    topics: dict[str, TopicInfo] = {}
+    for report in reports:
+        for name, info in report.topics.items():
+            join_topic(topics, name, info, report.path)
+    filled = [report for report in reports if report.message_count]
+    count = sum(report.message_count for report in reports)
+    warnings = list(dict.fromkeys(text for report in reports for text in report.warnings))
+    if storage.message_count is not None and storage.message_count != count:
+        warnings.append(
+            f"{METADATA_FILE} states {storage.message_count} messages, there are {count}"
+        )
+    return BagReport(
+        path=path,
+        profile=reports[0].profile,
+        library=reports[0].library,
+        topics=dict(sorted(topics.items())),
+        message_count=count,
+        start_time=min((report.start_time for report in filled), default=0),
+        end_time=max((report.end_time for report in filled), default=0),
+        has_crc=all(report.has_crc for report in reports),
+        has_index=all(report.has_index for report in reports),
+        has_summary=all(report.has_summary for report in reports),
+        warnings=tuple(warnings),
+        out_of_order=sum(report.out_of_order for report in reports),
+        metadata={name: entries for r in reports for name, entries in r.metadata.items()},
+    )
+
+
+class _Codec:
+    """A type's codec, made at its first message."""
+
+    def __init__(self, schema: Schema | None) -> None:
+        self._schema = schema
+
+    def get(self, channel: Channel) -> MessageCodec:
+        _require_encoding(channel, self._schema)
+        return self._made
+
+    @cached_property
+    def _made(self) -> MessageCodec:
+        assert self._schema is not None  # noqa: S101  asked for with the encoding
+        return MessageCodec(self._schema.name, utf8(self._schema.data, "schema", None))
+
+
+def _decoder(channel: Channel, codec: _Codec) -> Callable[[bytes], Any]:
+    """Return a function that decodes the channel's messages."""
 
     def decode(data: bytes) -> Any:
-        nonlocal codec
         try:
-            if codec is None:
-                codec = _codec(channel, schema)
-            return codec.decode(data)
-        except (BagError, FlawError) as error:
+            return codec.get(channel).decode(data)
+        except (BagError, FormatError) as error:
             raise BagError(f"topic {channel.topic}: {error}", reason=error.reason) from error
 
     return decode
 
 
-def _codec(channel: Channel, schema: Schema | None) -> MessageCodec:
+def _require_encoding(channel: Channel, schema: Schema | None) -> None:
     name = schema.name if schema else "no schema"
     if channel.encoding != "cdr":
         raise BagError(
@@ -281,273 +360,18 @@ def _codec(channel: Channel, schema: Schema | None) -> MessageCodec:
         raise BagError(
             f"type {name} has the schema encoding {found}; expected 'ros2msg'", reason="encoding"
         )
-    return MessageCodec(schema.name, utf8(schema.data, "schema", None))
 
 
-def _bag_error(flaw: FlawError, path: Path) -> BagError:
-    """Turn a flaw into the error a caller sees, with what could still be saved."""
-    if flaw.reason in ("empty", "not_mcap"):
-        return BagError(flaw.text, path=path, reason=flaw.reason, offset=flaw.offset)
-    with open_tape(path) as tape:
-        count = _Salvage(tape).run(None).messages
+def _bag_error(error: FormatError, file: BagFile, storage: Storage) -> BagError:
+    """Turn a format error into the error a caller sees, with what could still be saved."""
+    # Of a bag of several files an empty one is damage to the bag.
+    alone = len(storage.files) == 1
+    if error.reason == TOTAL_CAP or (alone and error.reason in ("empty", "not_mcap")):
+        return BagError(error.text, path=file.path, reason=error.reason, offset=error.offset)
     return DamagedBagError(
-        flaw.text, path=path, reason=flaw.reason, offset=flaw.offset, salvageable=count
+        error.text,
+        path=file.path,
+        reason=error.reason,
+        offset=error.offset,
+        salvageable=count_salvageable(storage.files),
     )
-
-
-class _Salvage:
-    """A forward scan that keeps what is whole and goes on behind what is not.
-
-    Where the summary is there and its CRC holds, its channels stand in for lost ones, and its list
-    of chunks tells where to go on after a record whose length is damaged.
-    """
-
-    def __init__(self, tape: Tape) -> None:
-        self._tape = tape
-        self._records = Records()
-        # Length of each chunk record by its offset, and the end of the data, as the summary says.
-        self._known: dict[int, int] = {}
-        self._data_end = tape.size
-        self._chunked = False
-        self._target: _Target | None = None
-        self.reason = ""
-        self.messages = self.unverified = self.chunks_lost = self.bytes_lost = 0
-
-    def run(self, target: _Target | None) -> Self:
-        """Scan the file; hand what is whole to ``target``, or only count where that is None."""
-        self._target = target
-        with suppress(FlawError):
-            self._read_trusted_summary()
-        self._tape.seek(min(len(MAGIC), self._tape.size))
-        while self._tape.position < self._data_end:
-            at = self._tape.position
-            end: int | None = None
-            opcode = 0
-            try:
-                opcode, length = self._tape.frame()
-                end = self._tape.position + length
-                if at in self._known and opcode != CHUNK:
-                    raise FlawError("a chunk's record is damaged", at)
-                if (opcode, length) in ((DATA_END, CRC.size), (FOOTER, FOOTER_BODY.size)):
-                    break
-                self._keep(at, opcode, length)
-            except FlawError as flaw:
-                self.reason = self.reason or flaw.text
-                self.chunks_lost += opcode == CHUNK or at in self._known
-                end = self._resume(at, end)
-                self.bytes_lost += end - at
-            self._tape.seek(end)
-        return self
-
-    def _resume(self, at: int, end: int | None) -> int:
-        """Return where to go on after a fault in the record at ``at``, which should stop at end."""
-        if at in self._known:
-            return at + self._known[at]
-        later = min((offset for offset in self._known if offset > at), default=self._data_end)
-        return later if end is None or end > later else end
-
-    def _keep(self, at: int, opcode: int, length: int) -> None:
-        if opcode in (ATTACHMENT, *range(FIRST_UNKNOWN, 256)):
-            raise FlawError(f"{opcode_name(opcode)} records are not carried over", at)
-        body = self._tape.body(opcode, length)
-        if opcode == CHUNK:
-            self._chunked = True
-            self._keep_chunk(at, body)
-        elif opcode == MESSAGE:
-            # What looks like one beside chunks is a damaged record of another kind.
-            if self._chunked:
-                raise FlawError("a message record stands outside the chunks", at)
-            self._deliver([self._message(body, 0, len(body), at)], verified=False)
-        elif opcode in (SCHEMA, CHANNEL):
-            self._records.add(opcode, body, at)
-        elif opcode == METADATA:
-            name, entries, verified = metadata(body, at)
-            if self._target:
-                self._target.add_metadata(name, entries, verified)
-        elif opcode in (HEADER, MESSAGE_INDEX):
-            self._pass_over(opcode, body, at)
-        else:
-            raise FlawError(f"a {opcode_name(opcode)} record stands in the data section", at)
-
-    def _pass_over(self, opcode: int, body: bytes, at: int) -> None:
-        """Read a record that is not kept, to find out whether it is what it says it is."""
-        fields = Fields(body, opcode_name(opcode), at)
-        if opcode == HEADER:
-            profile, _ = fields.text(), fields.text()
-            if self._target:
-                self._target.profile = profile
-        else:
-            fields.number("H")
-            fields.blob("I")
-        fields.done()
-
-    def _keep_chunk(self, at: int, body: bytes) -> None:
-        chunk = read_chunk(body, at)
-        found = []
-        for opcode, start, end in walk(chunk.data, at):
-            if opcode == MESSAGE:
-                found.append(self._message(chunk.data, start, end, at))
-            elif opcode in (SCHEMA, CHANNEL):
-                self._records.add(opcode, chunk.data[start:end], at)
-        self._deliver(found, verified=chunk.has_crc)
-
-    def _message(
-        self, data: bytes, start: int, end: int, at: int
-    ) -> tuple[tuple[int, int, int, int], bytes]:
-        head = message_head(data, start, end, at)
-        if head[0] not in self._records.channels:
-            raise FlawError(f"messages of the channel {head[0]}, whose record is lost", at)
-        return head, data[start + MESSAGE_HEAD.size : end]
-
-    def _deliver(
-        self, found: list[tuple[tuple[int, int, int, int], bytes]], *, verified: bool
-    ) -> None:
-        self.messages += len(found)
-        self.unverified += 0 if verified else len(found)
-        if self._target:
-            for head, data in found:
-                self._target.add_message(self._records, head, data)
-
-    def _read_trusted_summary(self) -> None:
-        size = FRAME.size + FOOTER_BODY.size + len(MAGIC)
-        at = self._tape.size - size
-        if at < len(MAGIC):
-            return
-        self._tape.seek(at)
-        tail = self._tape.read(size, "footer")
-        opcode, length = FRAME.unpack_from(tail)
-        start, _, crc = FOOTER_BODY.unpack_from(tail, FRAME.size)
-        if (opcode, length) != (FOOTER, FOOTER_BODY.size) or not crc:
-            return
-        if not len(MAGIC) < start <= at or at - start > MAX_RECORD_BYTES:
-            return
-        self._tape.seek(start)
-        summary = self._tape.read(at - start, "summary")
-        # The CRC goes as far as the footer's own CRC field.
-        if zlib.crc32(summary + tail[: -len(MAGIC) - CRC.size]) != crc:
-            return
-        for opcode, begin, end in walk(summary, start):
-            if opcode in (SCHEMA, CHANNEL):
-                self._records.add(opcode, summary[begin:end], start)
-            elif opcode == CHUNK_INDEX:
-                fields = Fields(summary[begin:end], opcode_name(opcode), start)
-                _, _, offset, length = fields.numbers("QQQQ")
-                if FRAME.size < length <= start - offset:
-                    self._known[offset] = length
-        self._data_end = start
-        self._chunked = bool(self._known)
-
-
-class _Target:
-    """The bag that recovery writes: the kept channels, messages and metadata as they were."""
-
-    def __init__(self, sink: Sink) -> None:
-        self.profile = "ros2"
-        self._open_writer = mcap_writer(sink, 256 * 1024)
-        self._schemas: dict[int, int] = {0: 0}
-        self._channels: dict[int, int] = {}
-
-    @cached_property
-    def _writer(self) -> Any:
-        """The writer, its header written at the first use, when the profile is known."""
-        self._open_writer.start(profile=self.profile, library=LIBRARY)
-        return self._open_writer
-
-    def add_metadata(self, name: str, entries: Mapping[str, str], verified: bool) -> None:
-        """Write metadata; a CRC of its own only where it had one, so doubt is not made proof."""
-        crc = {METADATA_CRC: metadata_crc(name, entries)} if verified else {}
-        self._writer.add_metadata(name, {**entries, **crc})
-
-    def add_message(self, records: Records, head: tuple[int, int, int, int], data: bytes) -> None:
-        """Write a message, before the first of a channel also what describes it."""
-        number, sequence, log_time, publish_time = head
-        if number not in self._channels:
-            self._channels[number] = self._add_channel(records, records.channels[number])
-        self._writer.add_message(
-            self._channels[number], log_time, data, publish_time, sequence=sequence
-        )
-
-    def _add_channel(self, records: Records, channel: Channel) -> int:
-        if channel.schema_id not in self._schemas:
-            schema = records.schemas[channel.schema_id]
-            self._schemas[channel.schema_id] = self._writer.register_schema(
-                schema.name, schema.encoding, schema.data
-            )
-        number: int = self._writer.register_channel(
-            channel.topic,
-            channel.encoding,
-            self._schemas[channel.schema_id],
-            dict(channel.metadata),
-        )
-        return number
-
-    def finish(self) -> None:
-        self._writer.finish()
-
-
-def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) -> RecoverResult:
-    """Save what is whole in ``source`` as a new, sound bag ``target``.
-
-    A message is saved when its chunk is complete and matches its CRC. Messages that no CRC covers
-    are saved too, and counted as unverified. The target appears only once it is complete.
-    Attachments and records of unknown kinds are not carried over.
-
-    :raises BagError: the source is not an MCAP bag or no message in it is whole, the target exists
-        and ``overwrite`` is false, or it cannot be written.
-    """
-    source, target = Path(source), Path(target)
-    refuse_existing(target, overwrite)
-    reason = _first_flaw(source)
-    if target.exists() and target.samefile(source):
-        raise BagError("the target is the source itself", path=target, reason="exists")
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        with open_tape(source) as tape, _creating(partial, target):
-            salvage = _write_salvage(tape, partial)
-            if not salvage.messages:
-                text = f"no message can be recovered: {reason or 'there are none in it'}"
-                raise BagError(text, path=source, reason="nothing")
-            refuse_existing(target, overwrite)
-            partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
-    return RecoverResult(
-        salvage.messages,
-        salvage.bytes_lost,
-        reason or salvage.reason,
-        salvage.chunks_lost,
-        salvage.unverified,
-    )
-
-
-def _first_flaw(source: Path) -> str:
-    """Return what the strict pass finds wrong, empty for a sound bag."""
-    with open_tape(source) as tape:
-        try:
-            Check(tape).run()
-        except FlawError as flaw:
-            if flaw.reason in ("empty", "not_mcap"):
-                raise BagError(flaw.text, path=source, reason=flaw.reason) from None
-            at = "" if flaw.offset is None else f" (byte {flaw.offset})"
-            return flaw.text + at
-    return ""
-
-
-def _write_salvage(tape: Tape, path: Path) -> _Salvage:
-    salvage = _Salvage(tape)
-    with path.open("xb", buffering=0) as file:
-        target = _Target(Sink(file))
-        salvage.run(target)
-        target.finish()
-        os.fsync(file.fileno())
-    return salvage
-
-
-@contextmanager
-def _creating(partial: Path, target: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise write_error(error, target) from error
-    finally:
-        partial.unlink(missing_ok=True)

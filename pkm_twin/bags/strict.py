@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pkm_twin.bags.cdr import parse_definition
 from pkm_twin.bags.format import (
     ATTACHMENT,
     ATTACHMENT_INDEX,
@@ -28,23 +29,26 @@ from pkm_twin.bags.format import (
     INDEX_ENTRY,
     MAGIC,
     MESSAGE,
+    MESSAGE_HEAD,
     MESSAGE_INDEX,
     METADATA,
     METADATA_INDEX,
     SCHEMA,
     STATISTICS,
     SUMMARY_OFFSET,
+    ZSTD_MAGIC,
     Fields,
-    FlawError,
+    FormatError,
+    RecordReader,
     Records,
-    Tape,
+    iterate_records,
+    message_data,
     message_head,
     metadata,
     opcode_name,
     read_attachment,
     read_chunk,
     read_magic,
-    walk,
 )
 from pkm_twin.errors import BagError
 
@@ -106,11 +110,13 @@ class Segment:
     end: int
     is_chunk: bool
 
-    def read(self, tape: Tape) -> bytes:
+    def read(self, reader: RecordReader) -> bytes:
         """Return the segment's records, checked once more."""
-        tape.seek(self.offset)
-        data = tape.read(self.length, "segment")
-        return read_chunk(data[FRAME.size :], self.offset).data if self.is_chunk else data
+        reader.seek(self.offset)
+        data = reader.read(self.length, "segment")
+        if not self.is_chunk:
+            return data
+        return read_chunk(data[FRAME.size :], self.offset, reader.budget).data
 
 
 @dataclass(slots=True)
@@ -130,8 +136,8 @@ class _Span:
 class Check:
     """One pass over a file, in which every statement that it makes about itself is checked."""
 
-    def __init__(self, tape: Tape) -> None:
-        self._tape = tape
+    def __init__(self, reader: RecordReader) -> None:
+        self._reader = reader
         self.records = Records()
         self.segments: list[Segment] = []
         self._spans: dict[int, _Span] = {}
@@ -139,9 +145,10 @@ class Check:
         self._out_of_order = 0
         self._profile = self._library = ""
         self._metadata: dict[str, dict[str, str]] = {}
-        self._warnings: list[str] = []
-        # Of the last chunk: (log time, position) by channel, and each index record's offset.
-        self._entries: dict[int, list[tuple[int, int]]] = {}
+        self._summary_without_crc = False
+        # Of the last chunk: log times and positions by channel, packed as its index must have them,
+        # and each index record's offset.
+        self._entries: dict[int, bytearray] = {}
         self._index_offsets: dict[int, int] = {}
         self._index_start = 0
         self._last_chunk: tuple[int, tuple[object, ...]] | None = None
@@ -149,8 +156,8 @@ class Check:
         self._chunks: dict[int, int] = {}
         self._chunks_without_crc = 0
         self._indexed: set[int] = set()
-        self._metadata_places: list[tuple[int, int, str]] = []
-        self._attachment_places: list[tuple[object, ...]] = []
+        self._metadata_places: set[tuple[int, int, str]] = set()
+        self._attachment_places: set[tuple[object, ...]] = set()
         self._unknown = 0
         self._has_data_crc = False
         self._has_summary = False
@@ -161,7 +168,7 @@ class Check:
 
     def run(self) -> None:
         """Read the file from its first byte to its last."""
-        read_magic(self._tape)
+        read_magic(self._reader)
         self._read_header()
         self._read_data()
         self._read_summary()
@@ -169,11 +176,11 @@ class Check:
         self._compare_counts()
 
     def _read_header(self) -> None:
-        at = self._tape.position
-        opcode, length = self._tape.frame()
+        at = self._reader.position
+        opcode, length = self._reader.frame()
         if opcode != HEADER:
-            raise FlawError(f"the first record is {opcode_name(opcode)}, not the header", at)
-        fields = Fields(self._tape.body(opcode, length), "header", at)
+            raise FormatError(f"the first record is {opcode_name(opcode)}, not the header", at)
+        fields = Fields(self._reader.body(opcode, length), "header", at)
         self._profile, self._library = fields.text(), fields.text()
         fields.done()
 
@@ -187,8 +194,8 @@ class Check:
             METADATA: self._read_metadata,
         }
         while True:
-            at, crc = self._tape.position, self._tape.crc
-            opcode, length = self._tape.frame()
+            at, crc = self._reader.position, self._reader.crc
+            opcode, length = self._reader.frame()
             if opcode != MESSAGE_INDEX:
                 self._close_chunk(at)
             if opcode == DATA_END:
@@ -198,15 +205,16 @@ class Check:
                 self._read_attachment(at, length)
             elif opcode >= FIRST_UNKNOWN:
                 self._unknown += 1
-                self._tape.skip(length)
+                self._reader.skip(length)
             elif opcode in readers:
-                readers[opcode](at, self._tape.body(opcode, length))
+                readers[opcode](at, self._reader.body(opcode, length))
             else:
-                raise FlawError(f"a {opcode_name(opcode)} record stands in the data section", at)
+                raise FormatError(f"a {opcode_name(opcode)} record stands in the data section", at)
 
     def _read_message(self, at: int, body: bytes) -> None:
         number, _, log_time, _ = message_head(body, 0, len(body), at)
         self._count(number, log_time, at)
+        self._prove(number, body, 0, len(body), at)
         length = FRAME.size + len(body)
         last = self.segments[-1] if self.segments else None
         if (
@@ -222,28 +230,36 @@ class Check:
 
     def _count(self, number: int, log_time: int, at: int) -> None:
         if number not in self.records.channels:
-            raise FlawError(f"a message has the unknown channel {number}", at)
+            raise FormatError(f"a message has the unknown channel {number}", at)
         self._out_of_order += self._total.count > 0 and log_time < self._total.end
         self._total.add(log_time)
         self._spans.setdefault(number, _Span()).add(log_time)
 
+    def _prove(self, number: int, data: bytes, start: int, end: int, at: int) -> None:
+        """See that a message which is packed by itself can be unpacked."""
+        if data.startswith(ZSTD_MAGIC, start + MESSAGE_HEAD.size):
+            encoding = self.records.channels[number].encoding
+            message_data(data, start, end, encoding, at, self._reader.budget)
+
     def _read_chunk(self, at: int, body: bytes) -> None:
-        chunk = read_chunk(body, at)
+        chunk = read_chunk(body, at, self._reader.budget)
         span = _Span()
-        for opcode, start, end in walk(chunk.data, at):
+        for opcode, start, end in iterate_records(chunk.data, at, self._reader.budget):
             if opcode == MESSAGE:
                 number, _, log_time, _ = message_head(chunk.data, start, end, at)
                 self._count(number, log_time, at)
+                self._prove(number, chunk.data, start, end, at)
                 span.add(log_time)
-                self._entries.setdefault(number, []).append((log_time, start - FRAME.size))
+                entry = INDEX_ENTRY.pack(log_time, start - FRAME.size)
+                self._entries.setdefault(number, bytearray()).extend(entry)
             elif opcode in (SCHEMA, CHANNEL):
                 self.records.add(opcode, chunk.data[start:end], at)
             elif opcode < FIRST_UNKNOWN:
-                raise FlawError(f"a {opcode_name(opcode)} record stands in a chunk", at)
+                raise FormatError(f"a {opcode_name(opcode)} record stands in a chunk", at)
             else:
                 self._unknown += 1
         if (chunk.start, chunk.end) != (span.start, span.end):
-            raise FlawError(
+            raise FormatError(
                 f"the chunk's messages span {span.start} to {span.end} ns; "
                 f"the file says {chunk.start} to {chunk.end}",
                 at,
@@ -251,7 +267,7 @@ class Check:
         self._chunks_without_crc += not chunk.has_crc
         length = FRAME.size + len(body)
         self.segments.append(Segment(at, length, span.start, span.end, True))
-        self._index_start = self._tape.position
+        self._index_start = self._reader.position
         facts = (chunk.start, chunk.end, length)
         sizes = (chunk.compression, chunk.packed_size, len(chunk.data))
         self._last_chunk = (at, (facts, sizes))
@@ -262,12 +278,15 @@ class Check:
         raw = fields.blob("I")
         fields.done()
         if self._last_chunk is None or number in self._index_offsets:
-            raise FlawError(f"a message index of channel {number} belongs to no chunk", at)
+            raise FormatError(f"a message index of channel {number} belongs to no chunk", at)
         if len(raw) % INDEX_ENTRY.size:
-            raise FlawError(f"a message index has {len(raw)} bytes of 16-byte entries", at)
-        entries = sorted(INDEX_ENTRY.iter_unpack(raw))
-        if entries != sorted(self._entries.get(number, [])):
-            raise FlawError(f"the message index of channel {number} differs from the chunk", at)
+            raise FormatError(f"a message index has {len(raw)} bytes of 16-byte entries", at)
+        entries = self._entries.get(number, b"")
+        # Writers differ in their order.
+        if raw != entries and sorted(INDEX_ENTRY.iter_unpack(raw)) != sorted(
+            INDEX_ENTRY.iter_unpack(entries)
+        ):
+            raise FormatError(f"the message index of channel {number} differs from the chunk", at)
         self._index_offsets[number] = at
 
     def _close_chunk(self, at: int) -> None:
@@ -276,7 +295,7 @@ class Check:
             return
         missing = self._entries.keys() - self._index_offsets.keys()
         if self._index_offsets and missing:
-            raise FlawError(f"channels {sorted(missing)} have no message index, others have", at)
+            raise FormatError(f"channels {sorted(missing)} have no message index, others have", at)
         offset, facts = self._last_chunk
         places = tuple(sorted(self._index_offsets.items()))
         self._chunks[offset] = hash((*facts, at - self._index_start, places))
@@ -288,41 +307,41 @@ class Check:
         name, entries, _ = metadata(body, at)
         # rosbag2 writes its record anew when it closes a bag: the last one holds.
         self._metadata[name] = entries
-        self._metadata_places.append((at, FRAME.size + len(body), name))
+        self._metadata_places.add((at, FRAME.size + len(body), name))
 
     def _read_attachment(self, at: int, length: int) -> None:
-        self._attachment_places.append(read_attachment(self._tape, at, length)[1])
+        self._attachment_places.add(read_attachment(self._reader, at, length)[1])
 
     def _read_data_end(self, at: int, length: int, crc: int) -> None:
-        fields = Fields(self._tape.body(DATA_END, length), "data end", at)
+        fields = Fields(self._reader.body(DATA_END, length), "data end", at)
         stated = fields.number("I")
         fields.done()
         if stated and stated != crc:
-            raise FlawError(f"the data's CRC is {crc:08x}; the file says {stated:08x}", at, "crc")
+            raise FormatError(f"the data's CRC is {crc:08x}; the file says {stated:08x}", at, "crc")
         self._has_data_crc = stated != 0
         self._in_data = (len(self.records.schemas), len(self.records.channels))
 
     def _read_summary(self) -> None:
-        begin = self._tape.position
-        self._tape.crc = 0
+        begin = self._reader.position
+        self._reader.crc = 0
         while True:
-            at, crc = self._tape.position, self._tape.crc
-            opcode, length = self._tape.frame()
-            body = b"" if opcode >= FIRST_UNKNOWN else self._tape.body(opcode, length)
+            at, crc = self._reader.position, self._reader.crc
+            opcode, length = self._reader.frame()
+            body = b"" if opcode >= FIRST_UNKNOWN else self._reader.body(opcode, length)
             if opcode == FOOTER:
                 self._read_footer(begin, at, body, crc)
                 return
             if opcode >= FIRST_UNKNOWN:
                 self._unknown += 1
-                self._tape.skip(length)
+                self._reader.skip(length)
             else:
                 self._read_summary_record(opcode, at, body)
             group = self._groups.setdefault(opcode, [at, at])
             if group[1] != at:
-                raise FlawError(
+                raise FormatError(
                     f"the {opcode_name(opcode)} records of the summary are not together", at
                 )
-            group[1] = self._tape.position
+            group[1] = self._reader.position
 
     def _read_summary_record(self, opcode: int, at: int, body: bytes) -> None:
         if opcode in (SCHEMA, CHANNEL):
@@ -336,23 +355,25 @@ class Check:
             SUMMARY_OFFSET: self._read_summary_offset,
         }
         if opcode not in readers:
-            raise FlawError(f"a {opcode_name(opcode)} record stands in the summary", at)
+            raise FormatError(f"a {opcode_name(opcode)} record stands in the summary", at)
         if SUMMARY_OFFSET in self._groups and opcode != SUMMARY_OFFSET:
-            raise FlawError(f"a {opcode_name(opcode)} record stands among the summary offsets", at)
+            raise FormatError(
+                f"a {opcode_name(opcode)} record stands among the summary offsets", at
+            )
         fields = Fields(body, opcode_name(opcode), at)
         readers[opcode](fields, at)
         fields.done()
 
     def _read_statistics(self, fields: Fields, at: int) -> None:
         if self._statistics:
-            raise FlawError("the summary has two statistics records", at)
+            raise FormatError("the summary has two statistics records", at)
         numbers = fields.numbers("QHIIIIQQ")
         part = fields.part()
         counts: dict[int, int] = {}
         while part.left:
             number, count = part.numbers("HQ")
             if number in counts:
-                raise FlawError(f"the statistics count channel {number} twice", at)
+                raise FormatError(f"the statistics count channel {number} twice", at)
             counts[number] = count
         self._statistics = (numbers, counts)
 
@@ -366,24 +387,26 @@ class Check:
         sizes = (fields.text(), *fields.numbers("QQ"))
         stated = hash(((start, end, length), sizes, index_length, tuple(sorted(places))))
         if self._chunks.get(offset) != stated or offset in self._indexed:
-            raise FlawError(f"a chunk index does not match the chunk at byte {offset}", at)
+            raise FormatError(f"a chunk index does not match the chunk at byte {offset}", at)
         self._indexed.add(offset)
 
     def _read_metadata_index(self, fields: Fields, at: int) -> None:
         offset, length = fields.numbers("QQ")
         if (offset, length, fields.text()) not in self._metadata_places:
-            raise FlawError(f"a metadata index does not match the metadata at byte {offset}", at)
+            raise FormatError(f"a metadata index does not match the metadata at byte {offset}", at)
 
     def _read_attachment_index(self, fields: Fields, at: int) -> None:
         numbers = fields.numbers("QQQQQ")
         if (*numbers, fields.text(), fields.text()) not in self._attachment_places:
-            raise FlawError(f"an attachment index does not match the one at byte {numbers[0]}", at)
+            raise FormatError(
+                f"an attachment index does not match the one at byte {numbers[0]}", at
+            )
 
     def _read_summary_offset(self, fields: Fields, at: int) -> None:
         opcode, start, length = fields.numbers("BQQ")
         # Writers may list a group that has no records.
         if length and self._groups.get(opcode) != [start, start + length]:
-            raise FlawError(
+            raise FormatError(
                 f"a summary offset does not match the {opcode_name(opcode)} records", at
             )
 
@@ -393,32 +416,31 @@ class Check:
         fields.done()
         self._has_summary = at > begin
         if start != (begin if self._has_summary else 0) and (start, at) != (begin, begin):
-            raise FlawError(f"the footer puts the summary at {start}; it is at {begin}", at)
+            raise FormatError(f"the footer puts the summary at {start}; it is at {begin}", at)
         found = self._groups.get(SUMMARY_OFFSET, [0])[0]
         if offset_start not in (found, found or at):
-            raise FlawError(
+            raise FormatError(
                 f"the footer puts the summary offsets at {offset_start}, not {found}", at
             )
         actual = zlib.crc32(FRAME.pack(FOOTER, len(body)) + body[: -CRC.size], crc)
         if stated and stated != actual:
-            raise FlawError(
+            raise FormatError(
                 f"the summary's CRC is {actual:08x}; the file says {stated:08x}", at, "crc"
             )
-        if not stated and self._has_summary:
-            self._warnings.append("the summary has no CRC")
+        self._summary_without_crc = not stated and self._has_summary
 
     def _read_end(self) -> None:
-        at = self._tape.position
-        if self._tape.read(len(MAGIC), "closing mark") != MAGIC:
-            raise FlawError("the file does not end with the MCAP mark", at)
-        if self._tape.position != self._tape.size:
-            left = self._tape.size - self._tape.position
-            raise FlawError(f"{left} bytes follow the end of the bag", self._tape.position)
+        at = self._reader.position
+        if self._reader.read(len(MAGIC), "closing mark") != MAGIC:
+            raise FormatError("the file does not end with the MCAP mark", at)
+        if self._reader.position != self._reader.size:
+            left = self._reader.size - self._reader.position
+            raise FormatError(f"{left} bytes follow the end of the bag", self._reader.position)
 
     def _compare_counts(self) -> None:
         if self._indexed and self._indexed != self._chunks.keys():
             missing = min(self._chunks.keys() - self._indexed)
-            raise FlawError("the summary does not list the chunk here, though others", missing)
+            raise FormatError("the summary does not list the chunk here, though others", missing)
         if self._statistics is None:
             return
         (count, schemas, channels, *places, start, end), counts = self._statistics
@@ -434,7 +456,7 @@ class Check:
         ]
         for what, said, found in pairs:
             if said != found:
-                raise FlawError(
+                raise FormatError(
                     f"the {what} is {found}; the statistics say {said}", None, "statistics"
                 )
         # Writers differ in whether a schema or channel that is only in the summary counts.
@@ -444,7 +466,7 @@ class Check:
         ]
         for what, said, low, high in ranges:
             if not low <= said <= high:
-                raise FlawError(
+                raise FormatError(
                     f"the bag has {low} to {high} {what}s; the statistics say {said}",
                     None,
                     "statistics",
@@ -473,15 +495,16 @@ class Check:
 
     def _all_warnings(self, covered: bool) -> Iterator[str]:
         if not covered:
+            without = f"{self._chunks_without_crc} of {len(self._chunks)} chunks have no CRC"
+            bare = not self._chunks or self._chunks_without_crc == len(self._chunks)
             yield (
-                f"{self._chunks_without_crc} of {len(self._chunks)} chunks have no CRC: a changed "
-                "value would go unseen"
-                if self._chunks
-                else "the messages have no CRC: a changed value would go unseen"
+                f"{'the messages have no CRC' if bare else without}, as rosbag2 writes by default: "
+                "lengths, counts, times and indexes agree, a changed value would go unseen"
             )
-        if not self._has_data_crc:
+        elif not self._has_data_crc:
             yield "the data section has no CRC of its own: metadata and record headers are unproven"
-        yield from self._warnings
+        if covered and self._summary_without_crc:
+            yield "the summary has no CRC"
         if not self._has_summary:
             yield "there is no summary: read by a scan, the message count is unproven"
         elif self._statistics is None:
@@ -493,11 +516,15 @@ class Check:
 
     def _topics(self, path: Path) -> dict[str, TopicInfo]:
         topics: dict[str, TopicInfo] = {}
+        # Many channels may share one long definition.
+        definitions = {
+            number: schema.data.decode(errors="replace")
+            for number, schema in self.records.schemas.items()
+        }
         for number, channel in self.records.channels.items():
             kind = self.records.types[number]
             schema = self.records.schemas.get(channel.schema_id)
             span = self._spans.get(number, _Span())
-            definition = schema.data.decode(errors="replace") if schema else ""
             qos = channel.metadata.get("offered_qos_profiles", "")
             info = TopicInfo(
                 type=kind,
@@ -505,24 +532,50 @@ class Check:
                 start=span.start,
                 end=span.end,
                 offered_qos=qos,
-                definition=definition,
+                definition=definitions.get(channel.schema_id, ""),
                 encoding=channel.encoding,
                 schema_encoding=schema.encoding if schema else "",
             )
-            known = topics.get(channel.topic)
-            if known and known.type != kind:
-                raise BagError(
-                    f"topic {channel.topic} has two types, {known.type} and {kind}",
-                    path=path,
-                    reason="type",
-                )
-            topics[channel.topic] = _join(known, info) if known else info
+            join_topic(topics, channel.topic, info, path)
         return dict(sorted(topics.items()))
 
 
-def _join(one: TopicInfo, other: TopicInfo) -> TopicInfo:
-    """Join two channels of one topic, which is how two publishers are recorded."""
-    if not (one.count and other.count):
-        return one if one.count or not other.count else other
-    start, end = min(one.start, other.start), max(one.end, other.end)
-    return replace(one, count=one.count + other.count, start=start, end=end)
+def join_topic(topics: dict[str, TopicInfo], name: str, info: TopicInfo, path: Path) -> None:
+    """Add a channel of the topic ``name``: another publisher's, or of another file of the bag.
+
+    :raises BagError: it is not of the type, with the fields, that the topic has so far.
+    """
+    known = topics.get(name)
+    if known is None:
+        topics[name] = info
+        return
+    if known.type != info.type:
+        raise BagError(
+            f"topic {name} has two types, {known.type} and {info.type}", path=path, reason="type"
+        )
+    if not _one_form(known, info):
+        raise BagError(
+            f"topic {name} has two forms of the type {info.type}: definition or encoding differ",
+            path=path,
+            reason="type",
+        )
+    if not (known.count and info.count):
+        topics[name] = known if known.count or not info.count else info
+        return
+    start, end = min(known.start, info.start), max(known.end, info.end)
+    topics[name] = replace(known, count=known.count + info.count, start=start, end=end)
+
+
+def _one_form(one: TopicInfo, other: TopicInfo) -> bool:
+    """Whether messages of both can be read alike; definitions may differ in comments."""
+    if (one.encoding, one.schema_encoding) != (other.encoding, other.schema_encoding):
+        return False
+    if one.definition == other.definition:
+        return True
+    if one.schema_encoding != "ros2msg":
+        return False
+    try:
+        fields = [parse_definition(info.type, info.definition) for info in (one, other)]
+    except BagError:
+        return False
+    return fields[0] == fields[1]

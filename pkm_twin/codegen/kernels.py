@@ -1,219 +1,296 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scalar formulas, written once in plain floats, run over any batch of samples.
+"""Programs that run over leading batch axes, by the best back end that the machine has.
 
-A mechanism writes each formula as a function of flat sequences (``p[i]``, ``q[0]`` ...) that uses
-only ``math``. With numba it is compiled, cached on disk and broadcast over leading axes;
-without numba the same function runs as Python on lists, with the same results, slower.
-
-May import: numpy, numba if present, the standard library.
+May import: numpy, llvmlite if present, this package, the standard library.
 """
 
 from __future__ import annotations
 
 import os
-import types
+import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from functools import cache as remembered
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-try:
-    if os.environ.get("PKM_TWIN_NO_NUMBA", "0") not in ("", "0"):
-        raise ImportError("numba is switched off by PKM_TWIN_NO_NUMBA")
-    import numba
-except ImportError:
-    numba = None
-
-COMPILED: Final = numba is not None
-"""True where kernels are compiled by numba; PKM_TWIN_NO_NUMBA=1 switches that off."""
-
-OK: Final = 0.0
-UNREACHABLE: Final = 1.0
-SINGULAR: Final = 2.0
-NOT_FINITE: Final = 3.0
-FAULT_SIZE: Final = 3
-"""A fault is three floats: code, limb index, and the miss (m) or the singularity measure."""
-
-
-def _drop_stale_caches() -> None:
-    """Remove compiled kernels older than any formula.
-
-    numba looks at the outermost function's file only, and kernels call into others.
-    """
-    formulas = Path(__file__).parents[1] / "mechanisms"
-    newest = max(path.stat().st_mtime for path in (*formulas.glob("*.py"), Path(__file__)))
-    for index in (formulas / "__pycache__").glob("*.nbi"):
-        with suppress(OSError):
-            if index.stat().st_mtime < newest:
-                index.unlink()
-
-
-if COMPILED:
-    _drop_stale_caches()
-
-_F8: Final = np.dtype(np.float64)
+from pkm_twin.codegen import cache
+from pkm_twin.codegen.plain import PlainCode
+from pkm_twin.codegen.program import Program
 
 Array = NDArray[np.float64]
 
+SWITCH: Final = "PKM_TWIN_PLAIN"
+"""Set to 1: plain Python, as on a machine without llvmlite."""
+STEPS: Final = (4, 16, 64, 256, 1024)
+"""Steps in which samples are tried again that one step does not reach."""
 
-def scalar(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Mark a helper that kernels call.
+GOOD: Final = 0.0
+REFUSED: Final = 1.0
+NOT_FINITE: Final = 2.0
 
-    It is not cached by itself but within each kernel that calls it: numba's cache of a function
-    with several signatures can mix them up when two processes write it at once.
+_F8: Final = np.dtype(np.float64)
+
+
+@remembered
+def _llvm() -> ModuleType | None:
+    if os.environ.get(SWITCH, "0") not in ("", "0"):
+        return None
+    try:
+        from pkm_twin.codegen import llvm
+    except ImportError:
+        return None
+    return llvm
+
+
+def compiled() -> bool:
+    """Whether programs are compiled; else they run as plain Python."""
+    return _llvm() is not None
+
+
+@remembered
+def _sources() -> str:
+    """What the package's formulas hang on: a changed file compiles anew."""
+    root = Path(__file__).resolve().parents[1]
+    folders = [root / name for name in ("codegen", "machine", "kinematics", "mechanisms")]
+    folders += [root.parent / name for name in ("delta_dynamics", "stiffness_monitor")]
+    paths = sorted(path for place in folders for path in place.glob("*.py"))
+    return cache.digest(*(path.read_text(encoding="utf-8") for path in paths))
+
+
+class _Space:
+    """Room for one sample of a kernel, with everything where the code looks for it."""
+
+    def __init__(self, inputs: Sequence[int], outputs: Sequence[int]) -> None:
+        sizes = [*inputs, *outputs, 2]
+        ends = np.cumsum([0, *sizes])
+        self.numbers = np.zeros(ends[-1])
+        views = [self.numbers[a:b] for a, b in pairwise(ends)]
+        self.inputs = views[: len(inputs)]
+        # A memory view takes doubles of exactly its length and nothing else.
+        self.takers = [memoryview(view.data) for view in self.inputs]
+        self.outputs = views[len(inputs) : -1]
+        self.status = views[-1]
+        words = [1, 1, 0]
+        for view in self.inputs:
+            words += [view.ctypes.data, 0]
+        words += [view.ctypes.data for view in [*self.outputs, self.status]]
+        self.words = np.array(words, np.int64)
+        self.address = self.words.ctypes.data
+        self.parameters: Array | None = None
+
+    def point_at(self, p: Array) -> None:
+        """Use these parameters; kept, so that their address stays theirs."""
+        self.parameters = p
+        self.words[2] = p.ctypes.data
+
+
+def _take_none(*inputs: Any) -> Array | None:
+    raise TypeError(f"{len(inputs)} inputs go the way of a batch")
+
+
+@remembered
+def _caller(inputs: int) -> Callable[..., Any]:
+    """Makes the fast call of a number of inputs, without a loop over them.
+
+    A call takes its room from those that are free, so that threads do not share one.
     """
-    if numba is None:
-        return function
-    compiled: Callable[..., Any] = numba.njit(error_model="numpy")(function)
-    return compiled
-
-
-# What guvectorize wraps, by number of arrays; each kernel gets a copy with its own ``kernel``.
-_ROWS: Final[dict[int, Any]] = {
-    5: lambda a, b, c, d, e: kernel(a, b, c, d, e),  # type: ignore[name-defined]  # noqa: F821
-    6: lambda a, b, c, d, e, f: kernel(a, b, c, d, e, f),  # type: ignore[name-defined]  # noqa: F821
-    7: lambda a, b, c, d, e, f, g: kernel(a, b, c, d, e, f, g),  # type: ignore[name-defined]  # noqa: F821
-    8: lambda a, b, c, d, e, f, g, h: kernel(a, b, c, d, e, f, g, h),  # type: ignore[name-defined]  # noqa: F821
-    9: lambda a, b, c, d, e, f, g, h, i: kernel(a, b, c, d, e, f, g, h, i),  # type: ignore[name-defined]  # noqa: F821
-    10: lambda a, b, c, d, e, f, g, h, i, j: kernel(a, b, c, d, e, f, g, h, i, j),  # type: ignore[name-defined]  # noqa: F821
-}
-
-
-def _row_of(kernel: Callable[..., None], arrays: int) -> Callable[..., None]:
-    """What guvectorize wraps to run ``kernel``; a copy of the row with its own globals."""
-    row = _ROWS[arrays]
-    return types.FunctionType(row.__code__, {"kernel": kernel}, kernel.__name__)
+    names = [f"a{k}" for k in range(inputs)]
+    takers = ", ".join(f"t{k}" for k in range(inputs))
+    lines = [
+        "def make(code, room):",
+        "    free = []",
+        "    take, give = free.pop, free.append",
+        f"    def call({', '.join(names)}):",
+        "        try:",
+        "            place = take()",
+        "        except IndexError:",
+        "            place = room()",
+        f"        {takers}, address, copy, _ = place",
+        *(f"        t{k}[:] = a{k}" for k in range(inputs)),
+        "        result = None if code(address) else copy()",
+        "        give(place)",
+        "        return result",
+        "    return call",
+    ]
+    space: dict[str, Any] = {}
+    exec("\n".join(lines), space)  # noqa: S102
+    make: Callable[..., Any] = space["make"]
+    return make
 
 
 class Kernel:
-    """One scalar formula over batches.
+    """One program over batches.
 
-    The wrapped function is called as ``f(p, *inputs, *outputs, scratch, fault)``: ``p`` the
-    robot's flat parameters, inputs and outputs flat sequences of the given sizes, ``scratch``
-    a work space, ``fault`` the three floats above, all zero on entry.
+    :param build: writes the program; called only where no compiled one is stored.
+    :param key: text that the program's content hangs on, beside the package's own sources.
     """
 
-    def __init__(
-        self,
-        function: Callable[..., None],
-        inputs: Sequence[int | None],
-        outputs: Sequence[int],
-        scratch: int = 1,
-        *,
-        batches: bool = True,
-    ) -> None:
-        """Sizes of inputs (None: any) and outputs; whether :meth:`warm_up` readies batches too."""
-        if inputs[0] != FAULT_SIZE:
-            raise ValueError(f"a kernel's first input has {FAULT_SIZE} entries, not {inputs[0]}")
-        self.function = function
-        self.inputs = tuple(inputs)
-        self.outputs = tuple(outputs)
-        self.scratch = scratch
-        self.batches = batches
-        # One sample runs with the interpreter locked, so calls can share the space.
-        self._space = np.empty(scratch)
-        self.__doc__ = function.__doc__
+    def __init__(self, build: Callable[[], Program], key: str) -> None:
+        self._build, self._key = build, key
+        self._lock = threading.Lock()
+        self._spaces: list[_Space] = []
 
     @cached_property
-    def _one(self) -> Callable[..., None]:
-        """The formula for one sample, compiled for exactly one array type.
-
-        One signature a function: two processes that fill the cache at once write the same.
-        """
-        read = numba.types.Array(numba.float64, 1, "A", readonly=True)
-        write = numba.types.Array(numba.float64, 1, "A")
-        n_in = 1 + len(self.inputs)
-        n_out = len(self.outputs) + 2
-        signature = numba.void(*[read] * n_in, *[write] * n_out)
-        compiled: Callable[..., None] = numba.njit(signature, cache=True, error_model="numpy")(
-            self.function
-        )
-        return compiled
+    def program(self) -> Program:
+        """The program itself."""
+        return self._build()
 
     @cached_property
-    def _many(self) -> Callable[..., None]:
-        """The formula as a generalised ufunc; results and scratch are arguments, written in place.
+    def _loaded(self) -> tuple[dict[str, Any], Any, Any]:
+        """Sizes, then the code for batches and for one sample."""
+        llvm = _llvm()
+        with self._lock:
+            if llvm is None:
+                return _header(self.program), PlainCode(self.program), None
+            name = cache.digest(self._key, _sources(), llvm.IDENTITY)
+            stored = cache.read(name)
+            if stored is None:
+                header, code = _header(self.program), llvm.compile_object(llvm.emit(self.program))
+                cache.write(name, header, code)
+            else:
+                header, code = stored
+            address = llvm.load_object(code)
+            return header, llvm.PROTOTYPE(address), llvm.LOCKED(address)
 
-        Cached is the formula, not the ufunc around it: numba's cached wrapper looks for its formula
-        under a symbol that another process may have replaced, and ends in a crash. numba wants the
-        size of the one formal output, the fault, from an input: it takes that of the first, which
-        has three entries too (joints or pose).
-        """
-        n_in, n_out = 1 + len(self.inputs), len(self.outputs)
-        sizes = [f"(n{i})" for i in range(n_in + n_out + 1)]
-        signature = numba.void(*[numba.float64[:]] * (n_in + n_out + 2))
-        compiled: Callable[..., None] = numba.guvectorize(
-            [signature],
-            f"{','.join(sizes)}->{sizes[1]}",
-            nopython=True,
-            writable_args=tuple(range(n_in, n_in + n_out)),
-        )(_row_of(self._one, n_in + n_out + 2))
-        return compiled
+    @cached_property
+    def sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Sizes of inputs and outputs."""
+        header = self._loaded[0]
+        return tuple(header["inputs"]), tuple(header["outputs"])
 
-    def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[Array, ...]:
-        """Evaluate over leading batch axes.
-
-        :param p: flat parameters, shape (n,).
-        :param inputs: one array per input, shape (..., size), broadcast against each other.
-        :returns: the outputs, shape (..., size) each, then the fault, shape (..., 3).
-        :raises ValueError: an input's last axis has another size.
-        """
-        first = inputs[0]
-        if COMPILED and type(first) is np.ndarray and first.ndim == 1:
-            # One sample, the fast way.
-            try:
-                sizes = tuple(map(len, inputs))  # type: ignore[arg-type]
-                if sizes == self.inputs or self._fit(sizes):
-                    results = list(map(np.empty, self.outputs))
-                    fault = np.zeros(FAULT_SIZE)
-                    self._one(p, *inputs, *results, self._space, fault)
-                    return (*results, fault)
-            except TypeError:
-                pass  # a plain number, or another type of array
-        arrays = [np.asarray(value, _F8) for value in inputs]
-        for array, size in zip(arrays, self.inputs, strict=True):
-            if array.ndim == 0 or size not in (None, array.shape[-1]):
-                raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
-        batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
-        results = [np.empty((*batch, size)) for size in self.outputs]
-        results.append(np.zeros((*batch, FAULT_SIZE)))
-        if COMPILED:
-            # What is not finite comes back as a fault, not as a warning.
-            with np.errstate(all="ignore"):
-                self._many(p, *arrays, *results[:-1], np.empty(self.scratch), results[-1])
-        else:
-            self._interpret(p, arrays, results, batch)
-        return tuple(results)
-
-    def _fit(self, sizes: tuple[int, ...]) -> bool:
-        """Whether inputs of these sizes fit, some of which may have any."""
-        return (
-            None in self.inputs
-            and len(sizes) == len(self.inputs)
-            and all(a in (None, b) for a, b in zip(self.inputs, sizes, strict=True))
-        )
-
-    def _interpret(
-        self, p: Array, arrays: list[Array], results: list[Array], batch: tuple[int, ...]
-    ) -> None:
-        parameters = p.tolist()
-        scratch = [0.0] * self.scratch
-        spread = [np.broadcast_to(a, (*batch, a.shape[-1])) for a in arrays]
-        for index in np.ndindex(batch):
-            outputs = [[0.0] * size for size in self.outputs]
-            fault = [0.0] * FAULT_SIZE
-            samples = [a[index].tolist() for a in spread]
-            self.function(parameters, *samples, *outputs, scratch, fault)
-            for result, values in zip(results, [*outputs, fault], strict=True):
-                result[index] = values
+    @cached_property
+    def _stepped(self) -> bool:
+        return bool(self._loaded[0]["stepped"])
 
     def warm_up(self) -> None:
-        """Compile, or load from the cache, before the first sample is due."""
-        if COMPILED:
-            _ = self._one
-            if self.batches:
-                _ = self._many
+        """Compile, or load what is stored, before the first sample is due."""
+        self.run_one(np.zeros(self._loaded[0]["parameters"]), [np.zeros(n) for n in self.sizes[0]])
+
+    def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
+        """Evaluate over leading batch axes.
+
+        :param p: parameters, shape (k,), contiguous.
+        :param inputs: one array an input, shape (..., size), broadcast against each other.
+        :returns: outputs, shape (..., size) each, NaN in refused samples; and the status, None
+            if all samples are good, else shape (..., 2): 0 good, 1 refused, 2 not finite; and the
+            part of the way from home that was reached.
+        :raises ValueError: an input's last axis has another size.
+        """
+        arrays = [np.asarray(value, _F8) for value in inputs]
+        for array, size in zip(arrays, self.sizes[0], strict=True):
+            if array.ndim == 0 or array.shape[-1] != size:
+                raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
+        if all(array.ndim == 1 for array in arrays):
+            return self.run_one(p, arrays)
+        batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
+        count = int(np.prod(batch, dtype=np.int64))
+        if count == 0:
+            return [np.empty((*batch, size)) for size in self.sizes[1]], None
+        rows = [
+            array.reshape(1, -1)
+            if array.size == array.shape[-1]
+            else np.ascontiguousarray(np.broadcast_to(array, (*batch, array.shape[-1]))).reshape(
+                count, -1
+            )
+            for array in arrays
+        ]
+        outputs, status = self._run(p, rows, count, 1)
+        if status is not None and self._stepped:
+            self._try_again(p, rows, outputs, status)
+            if not status[:, 0].any():
+                status = None
+        shaped = [output.reshape(*batch, output.shape[-1]) for output in outputs]
+        return shaped, None if status is None else status.reshape(*batch, 2)
+
+    def run_one(self, p: Array, inputs: Sequence[Any]) -> tuple[list[Array], Array | None]:
+        """One sample of checked shapes, (size,) each; results as the call's."""
+        code = self._loaded[2]
+        if code is None:
+            rows = [np.asarray(value, _F8).reshape(1, -1) for value in inputs]
+            outputs, status = self._run(p, rows, 1, 1)
+        else:
+            try:
+                space = self._spaces.pop()
+            except IndexError:
+                space = _Space(*self.sizes)
+            if p is not space.parameters:
+                space.point_at(p)
+            for view, value in zip(space.inputs, inputs, strict=True):
+                view[:] = value
+            if not code(space.address):
+                results = [view.copy() for view in space.outputs]
+                self._spaces.append(space)
+                return results, None
+            rows = [view.reshape(1, -1).copy() for view in space.inputs]
+            outputs = [view.reshape(1, -1).copy() for view in space.outputs]
+            status = space.status.reshape(1, 2).copy()
+            self._spaces.append(space)
+        if status is not None and self._stepped:
+            self._try_again(p, rows, outputs, status)
+            if not status[0, 0]:
+                status = None
+        return [output[0] for output in outputs], None if status is None else status[0]
+
+    def first_of_one(self, p: Array) -> Callable[..., Array | None]:
+        """The first output of one sample, as fast as can be; on plain Python it takes none.
+
+        The function takes arrays of doubles of exactly the inputs' shapes, (size,) each, else it
+        raises TypeError or ValueError; it gives None where a sample is not good at once.
+        """
+        code = self._loaded[2]
+        if code is None:
+            return _take_none
+        sizes = self.sizes
+
+        def room() -> tuple[Any, ...]:
+            space = _Space(*sizes)
+            space.point_at(p)
+            return (*space.takers, space.address, space.outputs[0].copy, space)
+
+        result: Callable[..., Array | None] = _caller(len(sizes[0]))(code, room)
+        return result
+
+    def _try_again(
+        self, p: Array, rows: Sequence[Array], outputs: Sequence[Array], status: Array
+    ) -> None:
+        """Samples that one step did not reach, in more and more steps; written in place."""
+        for steps in STEPS:
+            left = np.flatnonzero(status[:, 0] == REFUSED)
+            if not len(left):
+                return
+            picked = [row if len(row) == 1 else row[left] for row in rows]
+            found, again = self._run(p, picked, len(left), steps)
+            for output, values in zip(outputs, found, strict=True):
+                output[left] = values
+            status[left] = np.array([GOOD, 1.0]) if again is None else again
+
+    def _run(
+        self, p: Array, rows: Sequence[Array], count: int, steps: int
+    ) -> tuple[list[Array], Array | None]:
+        header, code, locked = self._loaded
+        if locked is None:
+            outputs, status = code.run(p, rows, count, steps)
+            return outputs, status if status[:, 0].any() else None
+        outputs = [np.empty((count, size)) for size in header["outputs"]]
+        status = np.empty((count, 2))
+        words = [count, steps, p.ctypes.data]
+        for row in rows:
+            words += [row.ctypes.data, 0 if len(row) == 1 else row.shape[1]]
+        words += [output.ctypes.data for output in [*outputs, status]]
+        block = np.array(words, np.int64)
+        return outputs, status if code(block.ctypes.data) else None
+
+
+def _header(program: Program) -> dict[str, Any]:
+    return {
+        "inputs": list(program.inputs.values()),
+        "outputs": [len(row) for row in program.outputs.values()],
+        "parameters": program.parameters,
+        "stepped": program.equations is not None,
+    }

@@ -2,123 +2,115 @@
 """How far members of different limbs stay apart.
 
 A member is a straight round bar, taken as a capsule: all points within its radius of the segment
-between its two joints. A mechanism writes one row a member into the scratch space with
-:func:`bar`, limb by limb, and :func:`least` compares the members of different limbs. Members of
-one limb share joints, so they are not compared. Nor is anything whose shape no parameter tells:
-platform and base (rings of joints, no bodies), sliders and their guides, joints' housings, the
-crosspieces that carry a parallelogram's two rods.
+between its two joints. Members of one limb share joints, so they are not compared. Nor is anything
+whose shape no parameter tells: platform and base (rings of joints, no bodies), sliders and their
+guides, joints' housings, the crosspieces that carry a parallelogram's two rods.
 
-=========== ===========================================================================
-offset      entry of a row
-=========== ===========================================================================
-0:3         start, m
-3:6         vector from start to end, m
-6           radius, m
-7           half the length, m
-8           limb
-=========== ===========================================================================
-
-May import: pkm_twin's kernels, the standard library.
+May import: numpy, pkm_twin's core, the standard library.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Final
+from itertools import combinations
+from typing import Any
 
-from pkm_twin.codegen.kernels import scalar
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-BAR: Final = 9
-"""Size of a row."""
+from pkm_twin.codegen.expressions import maximum, minimum, sqrt
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import Program
+from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.engine import Traced
+from pkm_twin.kinematics.motion import cross
+from pkm_twin.machine.robot import Robot
 
+Array = NDArray[np.float64]
 
-@scalar
-def bar(s, k, limb, radius, start, end):  # type: ignore[no-untyped-def]
-    """Write member k between two points (x, y, z); returns k + 1."""
-    o = BAR * k
-    x = end[0] - start[0]
-    y = end[1] - start[1]
-    z = end[2] - start[2]
-    s[o] = start[0]
-    s[o + 1] = start[1]
-    s[o + 2] = start[2]
-    s[o + 3] = x
-    s[o + 4] = y
-    s[o + 5] = z
-    s[o + 6] = radius
-    s[o + 7] = 0.5 * math.sqrt(x * x + y * y + z * z)
-    s[o + 8] = limb
-    return k + 1
+_TINY = 1e-300
 
 
-@scalar
-def _clamp(value):  # type: ignore[no-untyped-def]
-    return min(1.0, max(0.0, value))
-
-
-@scalar
-def distance(ax, ay, az, ux, uy, uz, bx, by, bz, vx, vy, vz):  # type: ignore[no-untyped-def]
-    """Distance (m) of the segments from a along u and from b along v; either may be a point.
+def distance(start: Any, span: Any, other: Any, other_span: Any) -> Any:
+    """Distance (m) of two segments, each from a point along a vector; either may be a point.
 
     The lines' nearest points, clamped to the first segment, then to the second, then to the
     first again (Ericson, Real-Time Collision Detection, 5.1.9); on parallel lines any first guess
     will do. The lines' common normal comes from a cross product, which stays accurate for
     directions that are nearly parallel.
     """
-    wx = bx - ax
-    wy = by - ay
-    wz = bz - az
-    uu = ux * ux + uy * uy + uz * uz
-    vv = vx * vx + vy * vy + vz * vz
-    nx = uy * vz - uz * vy
-    ny = uz * vx - ux * vz
-    nz = ux * vy - uy * vx
-    nn = nx * nx + ny * ny + nz * nz
-    s = 0.0
-    if nn > 0.0:
-        # (w x v) . n / n . n
-        s = (wy * vz - wz * vy) * nx + (wz * vx - wx * vz) * ny + (wx * vy - wy * vx) * nz
-        s = _clamp(s / nn)
-    t = 0.0
-    free = 0.0
-    if vv > 0.0:
-        free = ((s * ux - wx) * vx + (s * uy - wy) * vy + (s * uz - wz) * vz) / vv
-        t = _clamp(free)
-    if uu > 0.0 and (t != free or nn == 0.0):
-        s = _clamp(((t * vx + wx) * ux + (t * vy + wy) * uy + (t * vz + wz) * uz) / uu)
-    dx = wx + t * vx - s * ux
-    dy = wy + t * vy - s * uy
-    dz = wz + t * vz - s * uz
-    return math.sqrt(dx * dx + dy * dy + dz * dz)
+    w = other - start
+    uu, vv = span @ span, other_span @ other_span
+    n = cross(span, other_span)
+    s = _clamped((cross(w, other_span) @ n) / maximum(n @ n, _TINY))
+    t = _clamped(((s * span - w) @ other_span) / maximum(vv, _TINY))
+    s = _clamped(((t * other_span + w) @ span) / maximum(uu, _TINY))
+    gap = w + t * other_span - s * span
+    return sqrt(gap @ gap)
 
 
-@scalar
-def least(s, count):  # type: ignore[no-untyped-def]
-    """Least distance (m) between the surfaces of members of different limbs, below 0 inside.
+def _clamped(value: Any) -> Any:
+    return minimum(1.0, maximum(0.0, value))
 
-    Below zero it is the distance of the axes less the radii: how deep bars are in each other.
+
+def clearance(robot: Robot, pose: ArrayLike) -> Array:
+    """Least distance between the surfaces of members of different limbs, shape (...), m.
+
+    Members are round bars between their joints, of the outer diameters in the robot's file:
+    the bars of the 2UPR-RPU, the limbs of the 3-PRRU, arms and rods of a Delta. Zero where two
+    touch; below zero they are in each other, by the axes' distance less the radii. Of platform,
+    base, drives and joints the files tell no shape, so they are not counted.
+
+    :param pose: shape (..., m), in the robot's pose coordinates.
+    :raises ParameterError: the file does not tell the members' diameters.
+    :raises UnreachableError: a pose that is none of the mechanism's, by limb, sample and miss.
+    :raises SingularityError: a pose where the mechanism is singular.
+    :raises ValueError: a pose that is not finite.
     """
-    result = math.inf
-    for i in range(count - 1):
-        a = BAR * i
-        # The middle, for a bound that most pairs never come below.
-        mx = s[a] + 0.5 * s[a + 3]
-        my = s[a + 1] + 0.5 * s[a + 4]
-        mz = s[a + 2] + 0.5 * s[a + 5]
-        for j in range(i + 1, count):
-            b = BAR * j
-            if s[a + 8] == s[b + 8]:
+    return joint_clearance(robot, robot.inverse(pose))
+
+
+def has_clearance(robot: Robot) -> bool:
+    """Whether :func:`clearance` is known: the robot's file tells the members' diameters."""
+    return len({beam.limb for beam in robot.beams}) > 1
+
+
+def joint_clearance(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
+    """The same by joint positions, shape (..., n).
+
+    :param refuse: False gives NaN where there is no assembly, instead of an error.
+    """
+    (gap,), status = _kernel(robot)(_radii(robot), q)
+    if status is not None and refuse:
+        robot.refuse_joints(status, q)
+    return np.asarray(gap[..., 0], np.float64)
+
+
+def _radii(robot: Robot) -> Array:
+    return np.array([beam.radius for beam in robot.beams])
+
+
+def _kernel(robot: Robot) -> Kernel:
+    if not has_clearance(robot):
+        raise ParameterError("members", None, "a section that gives the members' outer diameters")
+    ends = [
+        (beam.limb, *((body, point.tolist()) for body, point in (beam.inner, beam.outer)))
+        for beam in robot.beams
+    ]
+
+    def write(t: Traced) -> Program:
+        t.solve()
+        segments = []
+        for beam in robot.beams:
+            start, end = (t.motion.point(body, point) for body, point in (beam.inner, beam.outer))
+            segments.append((start, end - start))
+        radii = t.tape.inputs("p", len(segments))
+        least: Any = None
+        for i, j in combinations(range(len(segments)), 2):
+            if robot.beams[i].limb == robot.beams[j].limb:
                 continue
-            radii = s[a + 6] + s[b + 6]
-            x = s[b] + 0.5 * s[b + 3] - mx
-            y = s[b + 1] + 0.5 * s[b + 4] - my
-            z = s[b + 2] + 0.5 * s[b + 5] - mz
-            near = result + radii + s[a + 7] + s[b + 7]
-            if near > 0.0 and x * x + y * y + z * z >= near * near:
-                continue
-            gap = distance(
-                s[a], s[a + 1], s[a + 2], s[a + 3], s[a + 4], s[a + 5],
-                s[b], s[b + 1], s[b + 2], s[b + 3], s[b + 4], s[b + 5],
-            )  # fmt: skip
-            result = min(result, gap - radii)
-    return result
+            gap = distance(*segments[i], *segments[j]) - (radii[i] + radii[j])
+            least = gap if least is None else minimum(least, gap)
+        outputs = {"clearance": t.lift([least])}
+        return Program({"q": t.joints}, len(segments), outputs, t.equations())
+
+    return robot.engine.kernel(f"clearance {ends!r}", write)

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.errors import SingularityError, UnreachableError
+from pkm_twin.errors import SingularityError
 from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ MAX_MOVE: Final = 0.25
 
 
 def follow(robot: Robot, q: ArrayLike, previous: ArrayLike) -> Array:
-    """Pose of joint positions q, shape (3,), next to the previous pose, shape (3,).
+    """Pose of joint positions q, shape (m,), next to the previous pose, shape (m,).
 
     Newton on inverse(pose) = q from the previous pose: the assembly mode that the stream is in,
     also where the closed form of :meth:`Robot.forward` would take another one.
@@ -37,22 +37,25 @@ def follow(robot: Robot, q: ArrayLike, previous: ArrayLike) -> Array:
     """
     goal = np.asarray(q, np.float64)
     start = np.asarray(previous, np.float64)
+    m = len(start)
     pose = start.copy()
-    shifts = STEP * np.concatenate([np.eye(3), -np.eye(3)])
+    shifts = STEP * np.concatenate([np.eye(m), -np.eye(m)])
     error = robot.inverse(pose) - goal
-    scale = _scale(robot)
+    scale = robot.pose_scales
     for _ in range(MAX_TURNS):
-        columns = robot.inverse(pose + shifts)
-        slope = ((columns[:3] - columns[3:]) / (2 * STEP)).T
+        columns, good = robot.try_inverse(pose + shifts)
+        if not good.all():
+            break
+        slope = ((columns[:m] - columns[m:]) / (2 * STEP)).T
         values = np.linalg.svd(slope / scale, compute_uv=False)
         if not values[-1] > SINGULARITY_BOUND * values[0]:
             break
         step = np.linalg.solve(slope, error)
         for _ in range(MAX_TURNS):
             trial = pose - step
-            try:
-                remaining = robot.inverse(trial) - goal
-            except (UnreachableError, SingularityError):
+            there, found = robot.try_inverse(trial)
+            remaining = there - goal
+            if not found.all():
                 step /= 2
                 continue
             if np.abs(remaining).max() <= np.abs(error).max() or np.abs(step).max() < CLOSE:
@@ -61,7 +64,7 @@ def follow(robot: Robot, q: ArrayLike, previous: ArrayLike) -> Array:
         else:
             break
         pose, error = trial, remaining
-        if np.abs((pose - start) * scale).max() > MAX_MOVE * _radius(robot):
+        if np.abs((pose - start) * scale).max() > MAX_MOVE * robot.size:
             break
         if np.abs(step).max() < CLOSE:
             return pose
@@ -69,7 +72,7 @@ def follow(robot: Robot, q: ArrayLike, previous: ArrayLike) -> Array:
 
 
 def track(robot: Robot, q: ArrayLike, start: ArrayLike | None = None) -> Array:
-    """Poses along a stream of joint positions, shape (n, 3), each next to the one before.
+    """Poses along a stream of joint positions, shape (n, m), each next to the one before.
 
     :param start: pose before the first sample; None takes :meth:`Robot.forward` of the first.
     """
@@ -97,7 +100,7 @@ def boundary_distance(
     rim. Zero outside the workspace, at most ``farthest``.
     """
     poses = np.asarray(pose, np.float64)
-    unit = sphere_directions(directions) / _scale(robot)
+    unit = directions_of(len(robot.pose_names), directions) / robot.pose_scales
     low = np.zeros((*poses.shape[:-1], directions))
     high = np.full_like(low, farthest)
     # March, then bisect: a way out and in again must not be stepped over.
@@ -113,6 +116,22 @@ def boundary_distance(
     return np.where(_inside(robot, poses, singularity), low.min(-1), 0.0)
 
 
+def directions_of(size: int, count: int) -> Array:
+    """Unit vectors spread over the sphere of a dimension, shape (count, size).
+
+    A Fibonacci lattice in three dimensions, even angles in two, else fixed random ones.
+    """
+    if size == 3:
+        return sphere_directions(count)
+    if size == 1:
+        return np.array([[1.0], [-1.0]])
+    if size == 2:
+        angle = 2 * np.pi * np.arange(count) / count
+        return np.stack([np.cos(angle), np.sin(angle)], -1)
+    vectors = np.random.default_rng(0).normal(size=(count, size))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True), np.float64)
+
+
 def sphere_directions(count: int) -> Array:
     """Unit vectors spread evenly over the sphere (Fibonacci lattice), shape (count, 3)."""
     if count < 1:
@@ -125,27 +144,15 @@ def sphere_directions(count: int) -> Array:
 
 
 def _inside(robot: Robot, poses: Array, singularity: float) -> NDArray[np.bool_]:
-    """Whether poses (..., 3) can be assembled within the limits and clear of singularities."""
-    q, fault = robot.inverse_kernel(robot.parameters, poses)
-    good = np.asarray(fault[..., 0] == 0.0)
-    limits: Array | None = getattr(robot, "limits").position  # noqa: B009
+    """Whether poses (..., m) can be assembled within the limits and clear of singularities."""
+    q, good = robot.try_inverse(poses)
+    limits = robot.limits.position
     if limits is not None:
         with np.errstate(invalid="ignore"):
             good &= ((q >= limits[:, 0]) & (q <= limits[:, 1])).all(-1)
     if good.any():
-        rates, _, fault = robot.jacobian_kernel(robot.parameters, q[good])
-        turned = rates.reshape(-1, 3, 3).swapaxes(-1, -2)
-        usable = (fault[..., 0] == 0.0) & np.isfinite(turned).all((-1, -2))
-        scaled = np.where(usable[:, None, None], _scale(robot)[:, None] * turned, 0.0)
-        values = np.linalg.svd(scaled, compute_uv=False)
-        good[good] = usable & (values[:, -1] >= singularity * values[:, 0])
+        rates, usable = robot.try_jacobian(q[good])
+        measure = np.zeros(len(rates))
+        measure[usable] = robot.singularity_of(rates[usable])
+        good[good] = usable & (measure >= singularity)
     return good
-
-
-def _scale(robot: Robot) -> Array:
-    """From pose units to metres at the platform's rim, shape (3,)."""
-    return np.array([1.0 if unit == "m" else _radius(robot) for unit in robot.pose_units])
-
-
-def _radius(robot: Robot) -> float:
-    return float(getattr(robot, "geometry").platform_radius)  # noqa: B009

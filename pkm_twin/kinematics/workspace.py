@@ -8,90 +8,109 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.kernels import OK, Kernel
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CLEAR: Final = 0.01
+"""Singularity measure (0 in one, 1 at best) that regular workspaces stay above."""
 
 
-def clearance(robot: Robot, pose: ArrayLike) -> Array:
-    """Least distance between the surfaces of members of different limbs, shape (...), m.
+def try_inverse(robot: Robot, pose: ArrayLike) -> tuple[Array, Mask]:
+    """Joint positions of poses, shape (..., n), and where there are any, shape (...).
 
-    Members are round bars between their joints, of the outer diameters in the robot's file:
-    the bars of the 2UPR-RPU, the limbs of the 3-PRRU, arms and rods of a Delta. Zero where two
-    touch; below zero they are in each other, by the axes' distance less the radii. Of platform,
-    base, drives and joints the files tell no shape, so they are not counted.
-
-    :param pose: shape (..., 3), in the robot's pose parameters.
-    :raises ParameterError: the file does not tell the members' diameters.
-    :raises UnreachableError: a pose that is none of the mechanism's, by limb, sample and miss.
-    :raises SingularityError: a pose where the mechanism is singular.
-    :raises ValueError: a pose that is not finite.
+    Where there are none, or the pose is not finite, they are those at home.
     """
-    kernel = _clearance_kernel(robot)
-    if kernel is None:
-        raise ParameterError("members", None, "a section that gives the members' outer diameters")
-    poses = np.asarray(pose, np.float64)
-    gap, fault = kernel(robot.parameters, poses, robot.inverse(poses))
-    robot.raise_fault(fault, "pose")
-    return np.asarray(gap[..., 0])
+    q, good = robot.try_inverse(pose)
+    return np.where(good[..., None], q, robot.graph.home), good
 
 
-def has_clearance(robot: Robot) -> bool:
-    """Whether :func:`clearance` is known: the robot's file tells the members' diameters."""
-    return _clearance_kernel(robot) is not None
+def try_forward(robot: Robot, q: ArrayLike) -> tuple[Array, Mask]:
+    """Poses of joint positions, shape (..., m), and where there are any; zero elsewhere."""
+    pose, good = robot.try_forward(q)
+    return np.where(good[..., None], pose, 0.0), good
 
 
-def _clearance_kernel(robot: Robot) -> Kernel | None:
-    return None if robot.radii is None else robot.clearance_kernel
+def singularity_at(robot: Robot, pose: ArrayLike) -> Array:
+    """``Robot.singularity`` at poses: 0 in a singularity or where no joints reach, shape (...).
+
+    :param pose: shape (..., m), m and rad.
+    """
+    q, good = try_inverse(robot, pose)
+    rates, found = robot.try_jacobian(q)
+    good &= found
+    measure = np.zeros(good.shape)
+    measure[good] = robot.singularity_of(rates[good])
+    return measure
 
 
-def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> NDArray[np.bool_]:
+def has_joint_angles(robot: Robot) -> bool:
+    """Whether the machine bounds the angles of its passive joints."""
+    return robot.limit_angles(np.zeros(len(robot.pose_names))) is not None
+
+
+def joint_angle_at(robot: Robot, pose: ArrayLike) -> Array:
+    """Largest angle of a passive joint, rad, shape (...); NaN where no joints reach the pose.
+
+    Between a limb and the vertical, or a limb and the platform's normal (2UPR-RPU paper, equation
+    40).
+
+    :raises ParameterError: a machine whose passive joints have no such angles.
+    """
+    with np.errstate(all="ignore"):
+        angles = robot.limit_angles(pose)
+    if angles is None:
+        raise ParameterError("limits", robot.name, "a machine with a bound on passive joint angles")
+    _, good = robot.try_inverse(pose)
+    return np.where(good, angles.max(-1), np.nan)
+
+
+def within_limits(robot: Robot, q: ArrayLike) -> Mask:
+    """Whether joint positions keep the limits of the actuators, shape (...); absent ones hold."""
+    values, limits = np.asarray(q, np.float64), robot.limits.position
+    if limits is None:
+        return np.ones(values.shape[:-1], bool)
+    return np.asarray(((values >= limits[:, 0]) & (values <= limits[:, 1])).all(-1))
+
+
+def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Mask:
     """Whether poses keep the limits of actuators and passive joints and limbs apart, shape (...).
 
-    A passive joint's angle is that between its limb and the vertical, and between its limb and
-    the platform's normal (2UPR-RPU paper, equation 40). A pose also has to be on the branch that
-    ``forward`` gives. Limits that are absent hold everywhere; a pose that is not finite raises.
+    A pose also has to be on the branch that ``forward`` gives. Limits that are absent hold
+    everywhere; a pose that is not finite raises.
 
-    :param pose: shape (..., 3), in the robot's pose parameters, m and rad.
+    :param pose: shape (..., m), in the robot's pose coordinates, m and rad.
     :param least_clearance: what :func:`clearance` has to be above, m; -inf lets limbs meet. It
         bounds no robot whose clearance is not known.
     """
     poses = np.asarray(pose, np.float64)
     if not np.isfinite(poses).all():
         raise ValueError("a pose is not finite")
-    p = robot.parameters
-    q, fault = robot.inverse_kernel(p, poses)
-    inside = fault[..., 0] == OK
-    # Lengths of refused poses are empty memory.
-    q = np.where(inside[..., None], q, 0.0)
-    back, fault = robot.forward_kernel(p, q)
-    scale = 1e-6 * (1.0 + np.abs(poses))
-    inside &= fault[..., 0] == OK
-    inside &= (np.abs(np.where(inside[..., None], back, np.inf) - poses) < scale).all(-1)
-    limits: Any = getattr(robot, "limits", None)
-    if limits is not None and limits.position is not None:
-        low, high = limits.position[:, 0], limits.position[:, 1]
-        inside &= ((q >= low) & (q <= high)).all(-1)
-    bound = getattr(limits, "joint_angle", None)
-    if bound is not None and robot.angles_kernel is not None:
-        angles, fault = robot.angles_kernel(p, poses)
-        inside &= (fault[..., 0] == OK) & (np.where(inside[..., None], angles, 0.0) <= bound).all(
-            -1
-        )
-    kernel = _clearance_kernel(robot)
-    if kernel is not None and least_clearance > -math.inf:
+    q, inside = try_inverse(robot, poses)
+    back, good = try_forward(robot, q)
+    inside &= good & (np.abs(back - poses) < 1e-6 * (1.0 + np.abs(poses))).all(-1)
+    inside &= within_limits(robot, q)
+    bound = getattr(robot.limits, "joint_angle", None)
+    if bound is not None and has_joint_angles(robot):
+        # NaN is not below.
+        inside &= joint_angle_at(robot, poses) <= bound
+    if has_clearance(robot) and least_clearance > -math.inf:
         # The dearest test, so only where all others hold.
-        inside = np.asarray(inside)
-        gap, fault = kernel(p, poses[inside], q[inside])
-        inside[inside] = (fault[:, 0] == OK) & (gap[:, 0] > least_clearance)
-    return np.asarray(inside)
+        inside[inside] = joint_clearance(robot, q[inside], refuse=False) > least_clearance
+    return inside
+
+
+def distance_unit(robot: Robot) -> str:
+    """Unit of the distance from the axis of a cylinder of poses: ``m`` or ``rad``."""
+    return robot.pose_units[robot.pose_names.index(robot.grid().lateral[0])]
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,29 +170,32 @@ def regular_workspace(
 ) -> RegularWorkspace:
     """Largest circle of reachable tilts about the axis at each height.
 
-    2UPR-RPU paper, section 4: heights whose circle is smaller than ``least_radius`` are left out.
+    Clear of singularities by ``CLEAR``. Heights whose circle is smaller than ``least_radius`` are
+    left out (2UPR-RPU paper, section 4).
 
     :param z: heights, shape (n,), m.
     :param directions: rays a circle.
     :param step: first search along a ray, rad; a bisection refines it to 1e-9 rad.
     """
-    if robot.angles_kernel is None:
-        raise ParameterError("mechanism", robot.mechanism, "a mechanism with two tilts (upr_rpu)")
+    grid = robot.grid()
+    if grid.kind == "box" or grid.zero_torsion or distance_unit(robot) != "rad":
+        raise ParameterError(
+            "mechanism", robot.mechanism, "a height and two tilts side by side (as upr_rpu)"
+        )
     heights = np.atleast_1d(np.asarray(z, np.float64))
     turn = np.arange(directions) * (2 * np.pi / directions)
-    rays = np.column_stack((np.cos(turn), np.sin(turn)))
     ladder = np.arange(0.0, math.pi / 2, step)
 
-    def inside(radius: Array) -> NDArray[np.bool_]:
+    def inside(radius: Array) -> Mask:
         """Of radii (n, directions, ...), whether those points are reachable."""
-        extra = radius.ndim - 2
-        poses = np.empty((*radius.shape, 3))
-        poses[..., 0] = heights.reshape(-1, *[1] * (extra + 1))
-        poses[..., 1:] = radius[..., None] * rays.reshape(1, directions, *[1] * extra, 2)
-        return reachable(robot, poses)
+        extra = [1] * (radius.ndim - 2)
+        poses = grid.polar_pose(heights.reshape(-1, 1, *extra), radius, turn.reshape(-1, *extra))
+        kept = reachable(robot, poses)
+        kept[kept] = singularity_at(robot, poses[kept]) >= CLEAR
+        return kept
 
-    grid = np.broadcast_to(ladder, (len(heights), directions, len(ladder)))
-    outside = ~inside(grid)
+    rungs = np.broadcast_to(ladder, (len(heights), directions, len(ladder)))
+    outside = ~inside(rungs)
     first = np.where(outside.any(-1), outside.argmax(-1), len(ladder))
     low = step * np.maximum(first - 1, 0)
     high = step * first

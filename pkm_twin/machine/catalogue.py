@@ -10,13 +10,17 @@ from typing import Final
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.urdf_read import read_urdf
 
 CATALOGUE: Final = {
     "delta": "pkm_twin.mechanisms.delta:Delta",
+    "machine": "pkm_twin.mechanisms.machine:Machine",
     "prru": "pkm_twin.mechanisms.prru:Prru",
     "upr_rpu": "pkm_twin.mechanisms.upr_rpu:UprRpu",
 }
 """Mechanism name to class: one line a mechanism."""
+TREES: Final = (".urdf", ".xml", ".mjcf")
+"""Endings of files that give a tree of links and its loop closures."""
 
 
 def config_folder() -> Path:
@@ -30,27 +34,32 @@ def robot_names() -> list[str]:
     return sorted(path.stem for path in config_folder().glob("*.yaml"))
 
 
-def load(robot: str | Path) -> Robot:
-    """A robot by its name in ``config/``, or from a parameter file of the same schema.
+def load(robot: str | Path, *, platform: str | None = None) -> Robot:
+    """A robot by its name in ``config/``, from a parameter file, or from a URDF with its loops.
 
-    :param robot: a name such as ``"delta_cu"``, or a path to a YAML file.
+    :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF or MJCF file.
+    :param platform: of a URDF the link that carries the tool; default by its name.
     :raises UnknownNameError: no such name; the closest one is named.
     :raises ParameterError: a file, key, type or value that is refused, by its dotted name.
     """
     text = str(robot)
-    if isinstance(robot, Path) or text.endswith((".yaml", ".yml")) or "/" in text:
+    if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
         path = Path(robot)
     elif text in robot_names():
         path = config_folder() / f"{text}.yaml"
     else:
         raise UnknownNameError("robot", text, robot_names())
-    data = schema.read_yaml(path)
+    if path.suffix in TREES:
+        data = read_urdf(path, platform=platform)
+    elif platform is not None:
+        raise ParameterError("platform", platform, "none: the file names its own platform")
+    else:
+        data = schema.read_yaml(path)
     mechanism = data.get("mechanism")
     if mechanism is None:
         raise ParameterError("mechanism", None, f"one of {', '.join(sorted(CATALOGUE))}")
     if not isinstance(mechanism, str) or mechanism not in CATALOGUE:
         raise UnknownNameError("mechanism", mechanism, CATALOGUE)
     module, kind = CATALOGUE[mechanism].split(":")
-    result: Robot = schema.build(getattr(importlib.import_module(module), kind), data)
-    result.__dict__["_name"] = path.stem
-    return result
+    made: type[Robot] = getattr(importlib.import_module(module), kind)
+    return made.from_data(data, path.stem)

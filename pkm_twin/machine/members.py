@@ -1,31 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a mechanism declares its elastic frame: beams, the joints at their ends, a rigid platform.
+"""Elastic members of a machine: round bars between points of its bodies, and their sections.
 
-A member is a straight round bar or tube. Each of its ends stands on a body through a joint, or is
-free, so that other members can stand on it. A joint is six compliances along its own axes: zero
-is rigid, infinite is free. World axes, SI units, one pose. Actuators are locked.
-
-May import: numpy, the mechanisms' core, the standard library.
+May import: numpy, this package, the standard library.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
-from pkm_twin.machine.joints import GROUND, MOVING
-from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
-RIGID: Final = (0.0,) * 6
-"""Compliance of a joint that holds all six directions."""
+Place = tuple[str, Array]
+"""A point of a body, given at home."""
 
 
 @dataclass(frozen=True)
@@ -126,101 +121,37 @@ class Tube:
 
 
 @dataclass(frozen=True, eq=False)
-class Support:
-    """How one end of a member stands on a body.
+class Beam:
+    """A straight round bar between two points, ``limb`` the number of the limb that it is in.
 
-    ``joint``: its name; joints of one name are one element of the energy shares. ``body``:
-    ``GROUND``, ``MOVING`` or the name of a member, whose free end is meant. ``axes``: the joint's
-    axes as columns, shape (3, 3). ``compliance``: along them three m/N, about them three
-    rad/(N m); 0 rigid, infinite free.
-    """
-
-    joint: str
-    body: str
-    axes: Array
-    compliance: tuple[float, ...] = RIGID
-
-
-@dataclass(frozen=True, eq=False)
-class Member:
-    """A straight beam from ``start`` to ``end``, shape (3,), m.
-
-    ``body`` is the name that it has in the energy shares: two rods can be one forearm. A member
-    whose ``outer`` is None ends free, and others can stand there.
+    ``element``: the name that it has in the energy shares: two rods can be one forearm. ``parts``:
+    the bodies, or the rod, that it is; a telescope's are two. ``carries``: other bodies whose mass
+    it has. ``radius``: outer, m.
     """
 
     name: str
-    body: str
-    section: Section
-    start: Array
-    end: Array
-    inner: Support
-    outer: Support | None
+    element: str
+    limb: int
+    inner: Place
+    outer: Place
+    parts: tuple[str, ...]
+    radius: float
+    carries: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class RigidBody:
-    """A body fixed to the platform: mass (kg), centre of mass from the platform's origin (m).
+class Structure:
+    """Beams with their sections, and the compliance of joints, all by name.
 
-    ``inertia`` about its centre of mass, shape (3, 3), kg m2; both along the fixed axes.
+    A joint's six compliances are along and about the directions of its reactions: m/N, rad/(N m);
+    what is not named is rigid. Freedoms of passive joints are free whatever stands here.
     """
 
-    name: str
-    mass: float
-    com: Array
-    inertia: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """The elastic frame of a robot in one pose; ``origin``: the platform's origin, shape (3,)."""
-
-    origin: Array
-    members: tuple[Member, ...]
-    bodies: tuple[RigidBody, ...]
-
-
-@runtime_checkable
-class Framed(Protocol):
-    """A mechanism that can declare its elastic frame."""
-
-    def frame(self, pose: Array) -> Frame:
-        """The frame in a pose, shape (3,).
-
-        :raises ParameterError: the parameter file has no section that modes need.
-        :raises UnreachableError: no pose of the mechanism.
-        """
-        ...
-
-
-def framed(robot: Robot) -> Framed:
-    """The robot as one that declares its elastic frame.
-
-    :raises ParameterError: the mechanism declares none.
-    """
-    if not isinstance(robot, Framed):
-        raise ParameterError("mechanism", robot.mechanism, "a mechanism with an elastic frame")
-    return robot
+    beams: tuple[Beam, ...]
+    sections: Mapping[str, Section]
+    compliances: Mapping[str, Sequence[float]]
 
 
 def disc(mass: float, radius: float) -> Array:
     """Inertia of a thin disc about its centre, axis z, shape (3, 3), kg m2."""
     return mass * radius**2 / 4 * np.diag([1.0, 1.0, 2.0])
-
-
-__all__ = [
-    "GROUND",
-    "MOVING",
-    "RIGID",
-    "Frame",
-    "Framed",
-    "Member",
-    "RigidBody",
-    "Section",
-    "Support",
-    "Tube",
-    "cowper",
-    "disc",
-    "framed",
-    "modulus",
-]

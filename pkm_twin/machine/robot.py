@@ -1,30 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all robots share: sections of their parameter files and the kinematic interface."""
+"""What every robot has: sections of its parameter file, and kinematics by the engine.
+
+A mechanism is a schema, a function from its parameters to a graph, and, where they exist, closed
+forms of the start and of the inverse with the branch rules.
+
+May import: numpy, pkm_twin's machine, kinematics and codegen, the standard library.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache as remembered
 from functools import cached_property
-from typing import Any, ClassVar, Final, TypeVar
+from typing import Any, ClassVar, Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen import kernels
-from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.expressions import Objects
+from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
+from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
+from pkm_twin.kinematics.engine import Engine, Traced, engine_of
+from pkm_twin.kinematics.passive import passive_names, passive_program
+from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine import schema
+from pkm_twin.machine.graph import FREEDOMS, Graph
+from pkm_twin.machine.inertia import Coefficients, Layout
+from pkm_twin.machine.members import Beam, Structure
+from pkm_twin.machine.pose_grid import PoseGrid
+from pkm_twin.machine.reach import position_box
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 R = TypeVar("R", bound="Robot")
 
 MAX_LENGTH: Final = 100.0
 MAX_MASS: Final = 1e5
 SINGULARITY_BOUND: Final = 1e-9
 """Least singularity measure (0 singular, 1 best) at which a Jacobian is inverted."""
+
+_NONE: Final = np.zeros(0)
 
 
 def length(**options: Any) -> Any:
@@ -39,7 +58,8 @@ def mass(**options: Any) -> Any:
 
 def check_azimuths(azimuths: Array, path: str) -> None:
     """Refuse limbs that stand in one place."""
-    for i in range(3):
+    for i in range(len(azimuths)):
+        check_angles(float(azimuths[i]), f"{path}[{i}]")
         apart = math.remainder(float(azimuths[i] - azimuths[i - 1]), 2 * math.pi)
         if abs(apart) < 1e-3:
             raise ParameterError(path, azimuths.tolist(), "limbs at least 0.001 rad apart")
@@ -47,141 +67,472 @@ def check_azimuths(azimuths: Array, path: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """A body fixed to the platform: com from the platform's origin, inertia about the com."""
+    """A body fixed to the platform: com from its reference point, inertia about the com."""
 
     mass: float = mass(default=0.0)
     com: Array = schema.vector(3, default=[0, 0, 0])
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
 
 
-@dataclass(frozen=True, eq=False)
-class Friction:
-    """Friction at the actuated joints: viscous per rate, Coulomb by the rate's sign."""
+def check_angles(angle: float, path: str) -> None:
+    """Refuse an angle that was meant in degrees."""
+    if abs(angle) > 4 * math.pi:
+        raise ParameterError(
+            path,
+            angle,
+            f"an angle in rad; degrees? {angle:g} degrees are {math.radians(angle):.6g}",
+        )
 
-    viscous: Array = schema.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
-    coulomb: Array = schema.vector(3, at_least=0.0, spread=True, default=[0, 0, 0])
+
+@remembered
+def friction_of(joints: int) -> Any:
+    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
+    field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
+    entries = [(n, Array, schema.vector(joints, **field)) for n in ("viscous", "coulomb")]
+    return dataclasses.make_dataclass("Friction", entries, frozen=True, eq=False)
 
 
-def dynamic_head(robot: Any) -> list[float]:
-    """The head of the flat parameters of a robot with masses, as bodies.py numbers it."""
-    return [
-        *robot.gravity,
-        *robot.friction.viscous,
-        *robot.friction.coulomb,
-        robot.payload.mass,
-        *robot.payload.com,
-        *robot.payload.inertia.ravel(),
+@remembered
+def limits_of(joints: int) -> Any:
+    """Schema of limits of so many actuated joints; absent is None, one value stands for all."""
+    above: dict[str, Any] = {"above": 0.0, "infinite": True, "spread": True, "default": None}
+    entries = [
+        ("position", Any, schema.interval(count=joints, default=None)),
+        ("velocity", Any, schema.vector(joints, **above)),
+        ("effort", Any, schema.vector(joints, **above)),
     ]
+    return dataclasses.make_dataclass("Limits", entries, frozen=True, eq=False)
 
 
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Limits of the actuated joints; absent is None. One value stands for all joints."""
+class JointLimits(Protocol):
+    """Limits of the actuated joints, as every mechanism's section has them."""
 
-    position: Array | None = schema.interval(count=3, default=None)
-    velocity: Array | None = schema.vector(3, above=0.0, spread=True, default=None)
-    effort: Array | None = schema.vector(3, above=0.0, infinite=True, spread=True, default=None)
+    @property
+    def position(self) -> Array | None:
+        """Least and greatest, shape (n, 2), rad or m."""
+
+    @property
+    def velocity(self) -> Array | None:
+        """Greatest rates, shape (n,), rad/s or m/s."""
+
+    @property
+    def effort(self) -> Array | None:
+        """Greatest efforts, shape (n,), N m or N."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
+class Inverse:
+    """A mechanism's closed form of q by pose, as expressions.
+
+    ``q``: shape (n,), finite for every finite pose. ``misses``: by how much each limb falls short,
+    m, above zero where it does. ``measure``: the singularity's, above SINGULARITY_BOUND on the side
+    of the home pose; None where every pose that is reached is good.
+    """
+
+    q: Sequence[Any]
+    misses: Sequence[Any]
+    measure: Any | None = None
+
+
+@dataclass(frozen=True)
+class LimbElements:
+    """A limb's three unit wrenches at the platform's reference point, base axes, and its elements.
+
+    An element's compliance on their amplitudes (f1, f2, m): c11, c22, c23, c33; the rest is zero.
+    """
+
+    wrenches: Sequence[Sequence[Any]]
+    elements: Sequence[tuple[Any, Any, Any, Any]]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Robot:
-    """A parallel kinematic machine with three actuated joints and a three-parameter pose.
+    """A parallel kinematic machine of n actuated joints and m pose coordinates.
 
     Frozen; :meth:`changed` gives a copy with other parameters.
     """
 
     mechanism: str
+    name: str = ""
+    """The name that the robot was loaded by."""
+    payload: Payload = schema.section(Payload, default={})
+    friction: Coefficients = schema.section(friction_of(3), default={})
+    gravity: Array = schema.vector(3, default=[0, 0, -9.81])
+    limits: JointLimits = schema.section(limits_of(3), default={})
 
-    description: ClassVar[str]
-    mobility: ClassVar[str]
-    redundant_constraints: ClassVar[tuple[str, ...]] = ()
-    """What rigid-body statics cannot tell; for robots with masses it follows from reactions."""
-    limb_names: ClassVar[tuple[str, str, str]] = ("limb I", "limb II", "limb III")
-    pose_names: ClassVar[tuple[str, str, str]]
-    pose_units: ClassVar[tuple[str, str, str]]
-    joint_unit: ClassVar[str]
-    effort_unit: ClassVar[str]
-    inverse_kernel: ClassVar[Kernel]
-    forward_kernel: ClassVar[Kernel]
-    jacobian_kernel: ClassVar[Kernel]
-    motion_kernel: ClassVar[Kernel | None] = None
-    dynamics_kernel: ClassVar[Kernel | None] = None
-    body_names: ClassVar[tuple[str, ...]] = ()
-    angles_kernel: ClassVar[Kernel | None] = None
-    clearance_kernel: ClassVar[Kernel | None] = None
-    """Least distance (m) of different limbs' members, of a pose and its q; needs ``radii``."""
-    elastic_kernel: ClassVar[Kernel | None] = None
-    energy_kernel: ClassVar[Kernel | None] = None
-    element_names: ClassVar[tuple[str, ...]] = ()
-    changeable: ClassVar[tuple[str, ...]] = ()
+    coordinates: ClassVar[tuple[Coordinate, ...]]
+    changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
+    has_start: ClassVar[bool] = False
+    has_inverse: ClassVar[bool] = False
+
+    @classmethod
+    def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
+        """A robot of a parameter file's data.
+
+        :raises ParameterError: by the field.
+        """
+        return dataclasses.replace(schema.build(cls, data), name=name)
+
+    # What a mechanism gives.
 
     @property
-    def name(self) -> str:
-        """The name that the robot was loaded by."""
-        return str(self.__dict__.get("_name", self.mechanism))
-
-    @property
-    def radii(self) -> tuple[float, ...] | None:
-        """Outer radii of the members that limb interference is about, m; None: not known."""
-        return None
-
-    @cached_property
-    def parameters(self) -> Array:
-        """Flat parameters for the kernels, read-only."""
-        return schema.frozen(self._pack())
-
-    def _pack(self) -> list[float]:
+    def description(self) -> str:
+        """What machine it is, in words."""
         raise NotImplementedError
 
     @property
-    def joint_names(self) -> tuple[str, str, str]:
+    def mobility(self) -> str:
+        """Number and kind of the platform's freedoms, in words."""
+        raise NotImplementedError
+
+    @property
+    def size(self) -> float:
+        """The platform's radius, m: what makes a length of an angle of it."""
+        raise NotImplementedError
+
+    @property
+    def limb_names(self) -> tuple[str, ...]:
+        """Names of the limbs, one an actuated joint."""
+        raise NotImplementedError
+
+    def make_graph(self) -> Graph:
+        """Bodies, joints and rods at home."""
+        raise NotImplementedError
+
+    def start(self, q: Objects) -> Mapping[str, Sequence[Any]]:
+        """Values of passive tree joints by q in closed form, where ``has_start``.
+
+        By joint, from its inner to its outer body, beside those at home.
+        """
+        raise NotImplementedError
+
+    def solved(self, pose: Objects) -> Inverse:
+        """Closed form of the inverse, where ``has_inverse``."""
+        raise NotImplementedError
+
+    def unreachable_limb(self, q: Array) -> tuple[int, float] | None:
+        """Limb and miss (m) of joint positions without an assembly, shape (n,); None: unknown."""
+        del q
+        return None
+
+    @cached_property
+    def beams(self) -> tuple[Beam, ...]:
+        """The bars that limb interference and elasticity are about; none: not known."""
+        return ()
+
+    element_names: ClassVar[tuple[str, ...]] = ()
+    """Elements that :meth:`limb_elements` tells in closed form, limb by limb; else none."""
+
+    @property
+    def elastic_parameters(self) -> Array:
+        """Run-time inputs of :meth:`limb_elements`."""
+        raise NotImplementedError
+
+    def limb_elements(self, pose: Any, p: Any) -> Sequence[LimbElements]:
+        """Limbs in closed form, of the pose and the elastic parameters, where there are names."""
+        raise NotImplementedError
+
+    def limit_angles(self, pose: ArrayLike) -> Array | None:
+        """Angles that ``limits.joint_angle`` bounds, shape (..., k), rad; None where it is none."""
+        del pose
+        return None
+
+    def structure(self) -> Structure:
+        """Elastic beams and joints.
+
+        :raises ParameterError: the robot's file lacks a section that elasticity needs.
+        """
+        raise ParameterError("members", None, "a section with the elastic members")
+
+    # What follows for all.
+
+    @cached_property
+    def graph(self) -> Graph:
+        """Bodies, joints and rods at home."""
+        return self.make_graph()
+
+    @cached_property
+    def engine(self) -> Engine:
+        """The engine of the robot's geometry, shared by all robots that have the same."""
+        start = self.start if self.has_start else None
+        return engine_of(self.graph, self.coordinates, start, self.mechanism)
+
+    @cached_property
+    def calls(self) -> dict[str, Any]:
+        """Functions for one sample, made once a robot, by name."""
+        return {}
+
+    def call_one(
+        self, name: str, kernel: Callable[[], Kernel], p: Array, *inputs: Any
+    ) -> Array | None:
+        """First output of one good sample, as fast as can be; None where it takes a batch's way."""
+        call = self.calls.get(name)
+        if call is None:
+            call = self.calls[name] = kernel().first_of_one(p)
+        try:
+            result: Array | None = call(*inputs)
+        except (TypeError, ValueError):
+            # A batch, a list, numbers of another kind, or a wrong length.
+            return None
+        return result
+
+    @cached_property
+    def inertial(self) -> Array:
+        """Run-time inputs of the dynamics, payload included, see ``machine.inertia``."""
+        load = self.payload
+        return schema.frozen(
+            self.own_inertial + self._layout.payload(load.mass, load.com, load.inertia)
+        )
+
+    @cached_property
+    def own_inertial(self) -> Array:
+        """The same without the payload."""
+        return schema.frozen(self._layout.pack(self.graph, self.gravity, self.friction))
+
+    @property
+    def _layout(self) -> Layout:
+        return Layout(self.engine.tree)
+
+    def massive(self) -> Engine:
+        """The engine of a robot with masses.
+
+        :raises ParameterError: the robot's file gives none.
+        """
+        return self.engine
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
         """Names of the actuated joints, in the order of q."""
-        joints: tuple[str, str, str] = getattr(self, "joints")  # noqa: B009
-        return joints
+        return self.graph.actuated
+
+    @cached_property
+    def joint_units(self) -> tuple[str, ...]:
+        """Units of q, ``rad`` or ``m``."""
+        graph = self.graph
+        return tuple(
+            "m" if FREEDOMS[graph.joints[name].kind] == "P" else "rad" for name in graph.actuated
+        )
+
+    @property
+    def effort_units(self) -> tuple[str, ...]:
+        """Units of the efforts, ``N m`` or ``N``."""
+        return tuple("N" if unit == "m" else "N m" for unit in self.joint_units)
+
+    @property
+    def joint_unit(self) -> str:
+        """Unit of q where the joints are of one kind, else ``rad or m``."""
+        return _common(self.joint_units)
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of the efforts where the joints are of one kind, else ``N m or N``."""
+        return _common(self.effort_units)
+
+    @property
+    def has_masses(self) -> bool:
+        """Whether the robot's file gives what dynamics need."""
+        try:
+            self.massive()
+        except ParameterError:
+            return False
+        return True
+
+    def parameter_sections(self) -> dict[str, Any]:
+        """The parameters by section, as plain data."""
+        fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
+        return {name: schema.plain(getattr(self, name)) for name in fields}
+
+    @cached_property
+    def joints_count(self) -> int:
+        """How many joints are actuated, n."""
+        return len(self.joint_names)
+
+    @property
+    def pose_names(self) -> tuple[str, ...]:
+        """Names of the pose coordinates."""
+        return tuple(c.name for c in self.coordinates)
+
+    @property
+    def pose_units(self) -> tuple[str, ...]:
+        """Their units, ``m`` or ``rad``."""
+        return tuple(c.unit for c in self.coordinates)
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Bodies and rods, and the payload last."""
+        return (*self.graph.bodies, *self.graph.rods, "payload")
 
     def inverse(self, pose: ArrayLike) -> Array:
-        """Joint positions q of a pose, shape (..., 3).
+        """Joint positions q of a pose, shape (..., n).
 
         :raises UnreachableError: naming limb, sample and miss.
+        :raises SingularityError: a pose on the far side of a singularity.
         """
-        q, fault = self.inverse_kernel(self.parameters, pose)
-        self.raise_fault(fault, "pose")
+        q, codes = self._inverse(pose)
+        if codes is not None:
+            self._refuse_pose(codes, pose)
         return q
 
+    def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
+        """Joint positions (..., n), NaN where a pose is none of the machine's; which are good."""
+        q, codes = self._inverse(pose)
+        good = np.ones(q.shape[:-1], bool) if codes is None else np.asarray(codes[..., 0] == 0.0)
+        return np.where(good[..., None], q, np.nan), good
+
+    @cached_property
+    def _inverse_kernel(self) -> Kernel:
+        if not self.has_inverse:
+            return self.engine.inverse
+
+        def write(t: Traced) -> Program:
+            m = len(self.coordinates)
+            result = self.solved(t.tape.inputs("pose", m))
+            measure = 1.0 if result.measure is None else result.measure
+            outputs = {"q": t.lift(result.q), "faults": t.lift([*result.misses, measure])}
+            return Program({"pose": m}, 0, outputs)
+
+        return self.engine.kernel(f"{self.mechanism} inverse {self.closed_key}", write)
+
+    @property
+    def closed_key(self) -> str:
+        """Text of what closed forms hang on, beside the graph."""
+        return ""
+
+    def _inverse(self, pose: ArrayLike) -> tuple[Array, Array | None]:
+        """Joints; and None or codes (1 unreachable, 2 not finite, 3 singular), limb, amount."""
+        outputs, status = self._inverse_kernel(_NONE, pose)
+        q = outputs[0]
+        if len(outputs) == 1:
+            if status is None:
+                return q, None
+            extra = np.zeros((*status.shape[:-1], 1))
+            return q, np.concatenate([status[..., :1], extra, status[..., 1:]], -1)
+        faults = outputs[1]
+        with np.errstate(invalid="ignore"):
+            missed = faults[..., :-1] > 0.0
+            singular = ~(faults[..., -1] > SINGULARITY_BOUND)
+        if status is None and not missed.any() and not singular.any():
+            return q, None
+        limb = missed.argmax(-1)
+        amount = np.take_along_axis(faults[..., :-1], limb[..., None], -1)[..., 0]
+        code = np.where(missed.any(-1), 1.0, np.where(singular, 3.0, 0.0))
+        amount = np.where(code == 3.0, faults[..., -1], amount)
+        if status is not None:
+            code = np.where(status[..., 0] != 0.0, status[..., 0], code)
+        return q, np.stack([code, limb.astype(float), amount], -1)
+
+    def _refuse_pose(self, codes: Array, pose: ArrayLike) -> None:
+        index = _first(codes[..., 0])
+        if index is None:
+            return
+        code, limb, amount = codes[index].tolist()
+        one = np.broadcast_to(np.asarray(pose, float), (*codes.shape[:-1], len(self.coordinates)))
+        if code == NOT_FINITE or not np.isfinite(one[index]).all():
+            raise _not_finite("pose", index)
+        if code == 3.0:
+            raise SingularityError("pose", index, amount, SINGULARITY_BOUND)
+        if self.has_inverse:
+            raise UnreachableError("pose", self.limb_names[int(limb)], index, amount)
+        part, miss = self.engine.shortest_pose(one[index])
+        raise UnreachableError("pose", part, index, miss, amount)
+
     def forward(self, q: ArrayLike) -> Array:
-        """Pose of joint positions q, shape (..., 3), in the mechanism's documented assembly.
+        """Pose of joint positions q, shape (..., m), in the mechanism's documented assembly.
 
         :raises UnreachableError: naming limb, sample and miss.
+        :raises SingularityError: a singularity on the way from home.
         """
-        pose, fault = self.forward_kernel(self.parameters, q)
-        self.raise_fault(fault, "joint state")
-        return pose
+        pose = self.call_one("forward", self._forward_kernel, _NONE, q)
+        return self._placed(q)[0] if pose is None else pose
+
+    def _forward_kernel(self) -> Kernel:
+        return self.engine.forward
+
+    def try_forward(self, q: ArrayLike) -> tuple[Array, Mask]:
+        """Poses (..., m), NaN where there is no assembly; which are good."""
+        (pose, _, _), status = self.engine.forward(_NONE, q)
+        good = np.ones(pose.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+        return pose, np.asarray(good)
+
+    def platform(self, q: ArrayLike) -> tuple[Array, Array]:
+        """Position (..., 3) of the platform's reference point, and its rotation (..., 3, 3).
+
+        Base axes; the rotation is relative to home. Errors as :meth:`forward`.
+        """
+        _, position, rotation = self._placed(q)
+        return position, rotation.reshape(*rotation.shape[:-1], 3, 3)
+
+    def _placed(self, q: ArrayLike) -> list[Array]:
+        outputs, status = self.engine.forward(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        return outputs
+
+    def placements(self, q: ArrayLike) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Rotation from home (..., 3, 3), and place of the frame's origin (..., 3), of every body.
+
+        A body's origin at home is that of ``engine.tree.at``. Errors as :meth:`forward`.
+        """
+        (flat,), status = self.engine.placement(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        rows = flat.reshape(*flat.shape[:-1], len(self.graph.bodies), 12)
+        rotations, origins = {}, {}
+        for k, name in enumerate(self.graph.bodies):
+            rotations[name] = rows[..., k, :9].reshape(*flat.shape[:-1], 3, 3)
+            origins[name] = rows[..., k, 9:]
+        return rotations, origins
+
+    def rotation(self, pose: ArrayLike) -> Array:
+        """Platform axes as columns in base axes, shape (..., 3, 3), of a pose.
+
+        Errors as :meth:`inverse`.
+        """
+        return self.platform(self.inverse(pose))[1]
 
     def home(self) -> Array:
-        """The pose in the middle of the actuated joints' limits, shape (3,)."""
-        limits: Array | None = getattr(self, "limits").position  # noqa: B009
-        return self.forward(self._home_joints() if limits is None else limits.mean(1))
-
-    def _home_joints(self) -> Array:
-        """Joint positions to begin from where the file has no limits, shape (3,)."""
-        return np.zeros(3)
+        """The pose in the middle of the actuated joints' limits, shape (m,)."""
+        limits = self.limits.position
+        return self.engine.home_pose.copy() if limits is None else self.forward(limits.mean(1))
 
     def jacobian(self, q: ArrayLike) -> Array:
-        """Pose rates per joint rate, shape (..., 3, 3)."""
+        """Pose rates per joint rate, shape (..., m, n)."""
         return self._jacobians(q)[0]
 
     def platform_jacobian(self, q: ArrayLike) -> Array:
-        """Platform twist (v at its origin, omega; world axes) per joint rate, shape (..., 6, 3)."""
+        """Platform twist (v at its reference point, omega; base axes) per rate, (..., 6, n)."""
         return self._jacobians(q)[1]
 
-    def _jacobians(self, q: ArrayLike) -> tuple[Array, Array]:
-        rates, twist, fault = self.jacobian_kernel(self.parameters, q)
-        self.raise_fault(fault, "joint state")
-        batch = rates.shape[:-1]
-        return (
-            rates.reshape(*batch, 3, 3).swapaxes(-1, -2),
-            twist.reshape(*batch, 2, 3, 3).swapaxes(-1, -2).reshape(*batch, 6, 3),
-        )
+    def _jacobians(self, q: ArrayLike) -> list[Array]:
+        (rates, twist), status = self.engine.jacobian(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        n = self.joints_count
+        return [m.reshape(*m.shape[:-1], -1, n) for m in (rates, twist)]
+
+    def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
+        """Pose rates per joint rate (..., m, n), NaN where there is no assembly; which are good."""
+        (rates, _), status = self.engine.jacobian(_NONE, q)
+        good = np.ones(rates.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+        return rates.reshape(*rates.shape[:-1], -1, self.joints_count), np.asarray(good)
+
+    def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
+        """Second derivative of the pose in time, shape (..., m)."""
+        (second,), status = self.engine.acceleration(_NONE, q, qd, qdd)
+        if status is not None:
+            self.refuse_joints(status, q, (q, qd, qdd))
+        return second
+
+    @cached_property
+    def pose_scales(self) -> Array:
+        """What makes lengths of pose coordinates, shape (m,): 1, or the platform's radius."""
+        return np.array([1.0 if unit == "m" else self.size for unit in self.pose_units])
+
+    @cached_property
+    def joint_scales(self) -> Array:
+        """The same of q, shape (n,); all 1 where the joints are of one kind."""
+        mixed = len(set(self.joint_units)) > 1
+        return np.array([self.size if mixed and u == "rad" else 1.0 for u in self.joint_units])
 
     def singularity(self, q: ArrayLike) -> Array:
         """How far a joint state is from a singularity: 0 in one, 1 at best, shape (...).
@@ -190,14 +541,44 @@ class Robot:
         radius, so that units do not count. Goes to zero at singularities of either kind: where
         the actuators lose the platform and where they lose a direction.
         """
-        radius = float(getattr(self, "geometry").platform_radius)  # noqa: B009
-        scale = np.array([1.0 if unit == "m" else radius for unit in self.pose_units])
-        values = np.linalg.svd(scale[:, None] * self.jacobian(q), compute_uv=False)
+        return self.singularity_of(self.jacobian(q))
+
+    def singularity_of(self, jacobian: Array) -> Array:
+        """The same of Jacobians, shape (..., m, n)."""
+        scaled = self.pose_scales[:, None] * jacobian / self.joint_scales
+        values = np.linalg.svd(scaled, compute_uv=False)
         return np.asarray(values[..., -1] / values[..., 0], np.float64)
 
-    def rotation(self, pose: ArrayLike) -> Array:
-        """Platform axes as columns in fixed axes, shape (..., 3, 3)."""
-        raise NotImplementedError(f"{self.mechanism} has no rotation of its platform yet")
+    @cached_property
+    def passive_joints(self) -> tuple[str, ...]:
+        """Names of the passive joints' numbers, one a revolute or prismatic axis."""
+        return passive_names(self.engine)
+
+    def passive(self, q: ArrayLike) -> Array:
+        """Values of the passive joints, shape (..., k), rad or m, in a URDF's convention."""
+        (flat,), status = self.engine.kernel("passive", passive_program)(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        return flat
+
+    def grid(self) -> PoseGrid:
+        """How atlases lay out this machine's poses; without an axis of its own, as a box."""
+        return PoseGrid("box", self.pose_names)
+
+    def search_box(self) -> Array:
+        """Bounds outside of which no pose of the workspace lies, shape (m, 2), m and rad.
+
+        :raises ParameterError: what is missing that would bound the workspace.
+        """
+        place = position_box(self.graph, self.limits.position)
+        rows = []
+        for c in self.coordinates:
+            if c.axis is not None:
+                rows.append(place[c.axis])
+            else:
+                far = np.pi if len(c.entries) == 2 else np.pi / 2
+                rows.append(np.array([-far, far]))
+        return np.array(rows)
 
     def changed(self: R, **sections: Mapping[str, object] | object) -> R:
         """A copy with new values, e.g. ``payload={"mass": 0.2}, gravity=[0, 0, -9.81]``.
@@ -215,26 +596,48 @@ class Robot:
             else:
                 fields = {f.name: f for f in dataclasses.fields(self)}
                 new[key] = fields[key].metadata["check"](key, value)
-        robot = dataclasses.replace(self, **new)
-        robot.__dict__["_name"] = self.name
-        return robot
+        return dataclasses.replace(self, **new)
 
-    def raise_fault(self, fault: Array, what: str) -> None:
-        """Raise the typed error of the first faulty sample, if there is one; fault (..., 3)."""
-        if fault.ndim == 1:
-            code, detail, amount = fault.tolist()
-            if code == kernels.OK:
-                return
-            index: tuple[int, ...] = ()
-        else:
-            bad = fault[..., 0] != kernels.OK
-            if not bad.any():
-                return
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            code, detail, amount = fault[index].tolist()
-        if code == kernels.NOT_FINITE:
-            where = f" at sample {index}" if index else ""
-            raise ValueError(f"{what}{where} is not finite, or leads to a result that is not")
-        if code == kernels.SINGULAR:
-            raise SingularityError(what, index, amount, SINGULARITY_BOUND)
-        raise UnreachableError(what, self.limb_names[int(detail)], index, amount)
+    def refuse_joints(self, status: Array, q: ArrayLike, inputs: Sequence[ArrayLike] = ()) -> None:
+        """Raise the typed error of the first refused sample, if there is one.
+
+        :param status: of a kernel, shape (..., 2).
+        :param inputs: everything that the kernel was given.
+        """
+        index = _first(status[..., 0])
+        if index is None:
+            return
+        batch = status.shape[:-1]
+        for value in (q, *inputs):
+            array = np.asarray(value, float)
+            if not np.isfinite(np.broadcast_to(array, (*batch, array.shape[-1]))[index]).all():
+                raise _not_finite("joint state", index)
+        code, reached = status[index].tolist()
+        if code == NOT_FINITE:
+            raise _not_finite("joint state", index)
+        place = np.asarray(q, float)
+        sample = np.broadcast_to(place, (*batch, place.shape[-1]))[index]
+        limb = self.unreachable_limb(sample)
+        if limb is not None:
+            raise UnreachableError("joint state", self.limb_names[limb[0]], index, limb[1])
+        part, miss, measure = self.engine.ending(sample, reached)
+        if measure is not None:
+            raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached)
+        raise UnreachableError("joint state", part, index, miss, reached)
+
+
+def _common(units: Sequence[str]) -> str:
+    return " or ".join(sorted(set(units), reverse=True))
+
+
+def _first(codes: Array) -> tuple[int, ...] | None:
+    """Index of the first sample whose code is not zero."""
+    if codes.ndim == 0:
+        return () if codes != 0.0 else None
+    bad = codes != 0.0
+    return tuple(int(i) for i in np.argwhere(bad)[0]) if bad.any() else None
+
+
+def _not_finite(what: str, index: tuple[int, ...]) -> ValueError:
+    where = f" at sample {index}" if index else ""
+    return ValueError(f"{what}{where} is not finite, or leads to a result that is not")

@@ -116,9 +116,13 @@ def vector(
     at_least: float = -math.inf,
     infinite: bool = False,
     spread: bool = False,
+    key: str | None = None,
     default: Any = dataclasses.MISSING,
 ) -> Any:
-    """Field: ``size`` numbers, read-only array; with ``spread`` one number stands for all."""
+    """Field: ``size`` numbers, read-only array; with ``spread`` one number stands for all.
+
+    ``key``: its name in the file, where that is no name in Python.
+    """
 
     def check(field: str, value: Any) -> Array:
         if spread and isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -131,7 +135,67 @@ def vector(
             ]
         )
 
+    return _field(check, default, key)
+
+
+def many(*, default: Any = dataclasses.MISSING) -> Any:
+    """Field: one number or more, read-only array."""
+
+    def check(field: str, value: Any) -> Array:
+        if not isinstance(value, (list, tuple)) or not value:
+            raise ParameterError(field, value, "a list of numbers")
+        return frozen([_number(f"{field}[{i}]", item) for i, item in enumerate(value)])
+
     return _field(check, default)
+
+
+def matrix(rows: int, columns: int, *, default: Any = dataclasses.MISSING) -> Any:
+    """Field: ``rows`` lists of ``columns`` numbers, read-only array."""
+
+    def check(field: str, value: Any) -> Array:
+        return frozen(
+            [
+                [
+                    _number(f"{field}[{i}][{j}]", v)
+                    for j, v in enumerate(_sequence(f"{field}[{i}]", row, columns))
+                ]
+                for i, row in enumerate(_sequence(field, value, rows))
+            ]
+        )
+
+    return _field(check, default)
+
+
+def flag(*, default: Any = dataclasses.MISSING) -> Any:
+    """Field: true or false."""
+
+    def check(field: str, value: Any) -> bool:
+        if not isinstance(value, bool):
+            raise ParameterError(field, value, "true or false")
+        return value
+
+    return _field(check, default)
+
+
+def words(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
+    """Field: one or more different words of the allowed."""
+
+    def check(field: str, value: Any) -> tuple[str, ...]:
+        if not isinstance(value, (list, tuple)) or not value:
+            raise ParameterError(field, value, f"a list of {', '.join(allowed)}")
+        for i, item in enumerate(value):
+            if item not in allowed:
+                raise UnknownNameError(f"{field}[{i}]", item, allowed)
+        if len(set(value)) != len(value):
+            raise ParameterError(field, list(value), "different names")
+        return tuple(value)
+
+    return _field(check, default)
+
+
+def checked(field: Any, path: str, value: Any) -> Any:
+    """A value checked as the field of a schema is, by its path."""
+    return field.metadata["check"](path, value)
 
 
 def interval(
@@ -250,7 +314,12 @@ def build(kind: type[T], data: object, path: str = "") -> T:
     """
     if not isinstance(data, Mapping):
         raise ParameterError(path or "parameters", data, "a mapping of keys to values")
-    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    # A field without a check is no key of the file.
+    fields = {
+        f.metadata["key"] or f.name: f
+        for f in dataclasses.fields(kind)  # type: ignore[arg-type]
+        if "check" in f.metadata
+    }
     for key in data:
         if key not in fields:
             raise UnknownNameError(_join(path, str(key)), key, fields)
@@ -258,7 +327,7 @@ def build(kind: type[T], data: object, path: str = "") -> T:
     for name, field in fields.items():
         dotted = _join(path, name)
         if name in data:
-            values[name] = field.metadata["check"](dotted, data[name])
+            values[field.name] = field.metadata["check"](dotted, data[name])
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             raise ParameterError(dotted, None, "required, and missing")
     result = kind(**values)
@@ -283,6 +352,15 @@ def replace(section_value: T, changes: Mapping[str, object], path: str) -> T:
     return result
 
 
+def plain(value: Any) -> Any:
+    """Dataclasses, arrays and tuples as mappings and lists."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return list(value) if isinstance(value, tuple) else value
+
+
 def frozen(values: object) -> Array:
     """A read-only float array."""
     array = np.array(values, dtype=np.float64)
@@ -290,8 +368,8 @@ def frozen(values: object) -> Array:
     return array
 
 
-def _field(check: Check, default: Any) -> Any:
-    metadata = {"check": check}
+def _field(check: Check, default: Any, key: str | None = None) -> Any:
+    metadata = {"check": check, "key": key}
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata=metadata)
     if isinstance(default, (list, dict)):

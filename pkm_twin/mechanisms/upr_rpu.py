@@ -26,47 +26,27 @@ they matter only in the product of a limb's couple with its bending.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from functools import cached_property
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.kernels import NOT_FINITE, SINGULAR, UNREACHABLE, Kernel, scalar
+from pkm_twin.codegen.expressions import Objects, absolute, atan2, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.clearance import BAR, bar, least
+from pkm_twin.kinematics.engine import Engine
+from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
-from pkm_twin.machine.members import (
-    GROUND,
-    MOVING,
-    Frame,
-    Member,
-    RigidBody,
-    Section,
-    Support,
-    disc,
-)
-from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot, length, mass
-from pkm_twin.mechanisms.elements import BLOCK, SCRATCH, divide, factorise, invert
+from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
+from pkm_twin.machine.members import Beam, Section, Structure, disc
+from pkm_twin.machine.pose_grid import PoseGrid
+from pkm_twin.machine.robot import Inverse, LimbElements, Robot, length, mass
 
 Array = NDArray[np.float64]
 
-BASE: Final = 0
-PLATFORM: Final = 1
-AXIAL: Final = 2
-"""1 / (E A) of the three bars, 1/N."""
-SHEAR: Final = 5
-"""1 / (G A_shear), 1/N."""
-BENDING: Final = 8
-"""1 / (E I), 1/(N m2)."""
-TORSION: Final = 11
-"""1 / (G Ip), 1/(N m2)."""
-UPR_R: Final = 14
-UPR_U: Final = 20
-RPU_U: Final = 26
-RPU_R: Final = 32
-RADIUS: Final = 38
-
+PLATFORM: Final = "platform"
 FAR: Final = 1e5
 """Longest limb over the machine's size; beyond, rounding would lose the pose, or overflow."""
 FREE: Final = {
@@ -77,6 +57,9 @@ FREE: Final = {
 }
 """Entries of each joint's compliance that are free axes."""
 _ENTRIES: Final = ("along u", "along v", "along w", "about u", "about v", "about w")
+_PATTERN: Final = array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_X: Final = array([1.0, 0.0, 0.0])
+_Y: Final = array([0.0, 1.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +114,11 @@ class JointsCompliance:
 
 @dataclass(frozen=True, eq=False)
 class Inertia:
-    """Masses for modes: density of the bars (kg/m3), and the platform with what it carries.
+    """Density of the bars (kg/m3), and the platform with what it carries.
 
+    As rigid bodies a limb is two equal round bars, each half as long as the limb at home: the
+    lower from B, the upper from A; they meet at home. For modes it is one bar from B to A.
+    ``rotor_inertia``: of the drives, reflected to the limbs, kg, inertia without weight.
     ``platform_com`` (m) and ``platform_inertia`` (about the com, kg m2) in platform axes; default
     a thin disc of the platform's radius about its origin.
     """
@@ -141,6 +127,7 @@ class Inertia:
     platform_mass: float = mass()
     platform_com: Array = schema.vector(3, default=[0, 0, 0])
     platform_inertia: Array | None = schema.inertia(positive=False, default=None)
+    rotor_inertia: float = schema.number(at_least=0.0, default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +156,7 @@ class Limits:
         return None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class UprRpu(Robot):
     """A 2UPR-RPU machine with elastic bars and joints."""
 
@@ -183,505 +170,396 @@ class UprRpu(Robot):
 
     description: ClassVar[str] = "2UPR-RPU head, three actuated telescopic limbs"
     mobility: ClassVar[str] = "3: translation along Oo, rotations beta, gamma"
-    # Five wrenches of rank 2 (two parallel forces make one force and the same couple), so three.
-    redundant_constraints: ClassVar[tuple[str, ...]] = (
-        "constraint couples of limbs 1, 2, 3 along tau",
-        "constraint forces of limbs 1, 2 along y",
-    )
-    limb_names: ClassVar[tuple[str, str, str]] = ("limb 1", "limb 2", "limb 3")
-    pose_names: ClassVar[tuple[str, str, str]] = ("z", "beta", "gamma")
-    pose_units: ClassVar[tuple[str, str, str]] = ("m", "rad", "rad")
-    joint_unit: ClassVar[str] = "m"
-    effort_unit: ClassVar[str] = "N"
-    changeable: ClassVar[tuple[str, ...]] = ("members", "joints_compliance", "limits")
+    limb_names: ClassVar[tuple[str, ...]] = ("limb 1", "limb 2", "limb 3")
+    coordinates: ClassVar[tuple[Coordinate, ...]] = (
+        COORDINATES["z"], about_x("beta"), about_y("gamma"),
+    )  # fmt: skip
+    changeable: ClassVar[tuple[str, ...]] = (
+        "members", "joints_compliance", "limits", "payload", "friction", "gravity",
+    )  # fmt: skip
+    has_start: ClassVar[bool] = True
+    has_inverse: ClassVar[bool] = True
     element_names: ClassVar[tuple[str, ...]] = tuple(
         f"{limb}{element}" for limb in (1, 2, 3) for element in "RBU"
     )
 
-    def _home_joints(self) -> Array:
-        return np.full(3, 1.5 * self.geometry.base_radius)
+    @property
+    def size(self) -> float:
+        """The platform's radius, m."""
+        return self.geometry.platform_radius
 
-    def rotation(self, pose: ArrayLike) -> Array:
-        """R = Rx(beta) Ry(gamma): platform axes as columns in fixed axes, shape (..., 3, 3)."""
-        angles = np.asarray(pose, np.float64)[..., 1:]
-        (cb, cg), (sb, sg) = np.moveaxis(np.cos(angles), -1, 0), np.moveaxis(np.sin(angles), -1, 0)
-        zero = np.zeros_like(cb)
-        rows = [[cg, zero, sg], [sb * sg, cb, -sb * cg], [-cb * sg, sb, cb * cg]]
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    @property
+    def closed_key(self) -> str:
+        """The geometry that the closed forms hang on."""
+        return repr((self.geometry.base_radius, self.geometry.platform_radius))
 
-    def frame(self, pose: Array) -> Frame:
+    @property
+    def _radii(self) -> tuple[float, float]:
+        return self.geometry.platform_radius, self.geometry.base_radius
+
+    @property
+    def _height(self) -> float:
+        """The platform's height at home, where limb 3 and the others are 1.5 b or more."""
+        a, b = self._radii
+        return -math.sqrt((1.5 * b) ** 2 + 1e-12) if a <= b else -1.5 * a
+
+    def massive(self) -> Engine:
+        """The engine of a robot with masses.
+
+        :raises ParameterError: the file has no inertia.
+        """
+        if self.inertia is None:
+            raise ParameterError("inertia", None, "a section with density, platform_mass and more")
+        return self.engine
+
+    def _limb(self, i: int, rho: Any, beta: Any, gamma: Any) -> tuple[Any, Any]:
+        """Limb 0 or 1 from B to A along X and tau; limb 2 from A to B along y and tau."""
+        a, b = self._radii
+        if i == 2:
+            return b * cos(beta) - a, -b * sin(beta) - rho
+        side = -1.0 if i == 0 else 1.0
+        return side * (a * cos(gamma) - b), rho - side * a * sin(gamma)
+
+    def solved(self, pose: Objects) -> Inverse:
+        """Limb lengths; limb 3 cannot turn the platform over or above the base."""
+        a, b = self._radii
+        z, beta, gamma = pose
+        cosine = cos(beta)
+        low = maximum(absolute(beta) - 0.5 * math.pi, z)
+        rho = z / maximum(cosine, 1e-300)
+        q = []
+        for i in range(3):
+            along, up = self._limb(i, rho, beta, gamma)
+            q.append(sqrt(minimum(along * along + up * up, 1e300)))
+        far = -rho - FAR * (a + b)
+        # At z = 0 the platform is in the base.
+        flat = -1.0 * (1.0 - maximum(minimum(-1e300 * z, 1.0), 0.0))
+        return Inverse(q, [0.0 * z, 0.0 * z, maximum(maximum(low, far), -flat)])
+
+    def _found(self, q: Any) -> tuple[Any, Any, Any]:
+        """rho, beta, gamma of the home branch.
+
+        With c = cos(gamma) = (P + K) / (2 a b), P = rho^2 and 4 a rho sin(gamma) = L1^2 - L2^2 = D,
+        c^2 + s^2 = 1 is the cubic P (P + K)^2 - 4 a^2 b^2 P + b^2 D^2 / 4 = 0 with
+        K = a^2 + b^2 - (L1^2 + L2^2) / 2. Its slope at a root is
+        4 a b (rho^2 cos(gamma) - a b sin^2(gamma)), so the largest root is the home branch until it
+        meets the middle one, which is the singularity. Limb 3:
+        a cos(beta) - rho sin(beta) = h cos(beta - atan2(-rho, a)).
+        """
+        a, b = self._radii
+        l1, l2, l3 = q
+        k = a * a + b * b - 0.5 * (l1 * l1 + l2 * l2)
+        ab = a * a * b * b
+        d = (l1 - l2) * (l1 + l2)
+        r = sqrt(k * k + 12.0 * ab)
+        c = k * (8.0 / 3.0 * ab - 2.0 / 27.0 * k * k) + 0.25 * b * b * d * d
+        g = minimum(1.0, maximum(-1.0, -13.5 * c / (r * r * r)))
+        third = atan2(sqrt((1.0 - g) * (1.0 + g)), g) * (1.0 / 3.0)
+        square = maximum(2.0 / 3.0 * (r * cos(third) - k), 1e-12 * a * b)
+        rho = -sqrt(square)
+        gamma = atan2(d / (4.0 * a * rho), (square + k) / (2.0 * a * b))
+        h = sqrt(a * a + square)
+        g = minimum(1.0, maximum(-1.0, (a * a + b * b + square - l3 * l3) / (2.0 * b * h)))
+        return rho, atan2(-rho, a) - atan2(sqrt((1.0 - g) * (1.0 + g)), g), gamma
+
+    def start(self, q: Objects) -> Mapping[str, Sequence[Any]]:
+        """Turns of the joints beside home."""
+        rho, beta, gamma = self._found(q)
+        home = (self._height, 0.0, 0.0)
+
+        def turned(i: int) -> Any:
+            """Angle of limb i beside home, from tau to X, or from y to tau of limb 3."""
+            x, z = self._limb(i, rho, beta, gamma)
+            x0, z0 = self._limb(i, *home)
+            return atan2(x * z0 - z * x0, x * x0 + z * z0)
+
+        values: dict[str, Sequence[Any]] = {}
+        for i, limb in enumerate("12"):
+            values[f"U joint {limb}"] = [beta, turned(i)]
+            values[f"R joint {limb}"] = [gamma - turned(i)]
+        # Limb 3's plane is told in axes that turn by beta.
+        values["R joint 3"] = [beta - turned(2)]
+        return values
+
+    def unreachable_limb(self, q: Array) -> tuple[int, float] | None:
+        """The limb of the wrong length, and by how much."""
+        a, b = self._radii
+        for i in range(3):
+            if not q[i] > 0.0:
+                return i, float(-q[i])
+            if q[i] > FAR * (a + b):
+                return i, float(q[i]) - FAR * (a + b)
+        if not self._meets(q[0], q[1]):
+            return self._wrong_pair(float(q[0]), float(q[1]))
+        rho, _, _ = (float(v) for v in self._found(q))
+        low, high = abs(math.hypot(a, rho) - b), math.hypot(a, b - rho)
+        if q[2] < low:
+            return 2, low - float(q[2])
+        return (2, float(q[2]) - high) if q[2] >= high else None
+
+    def _meets(self, l1: float, l2: float) -> bool:
+        """Whether limbs 1 and 2 can be assembled."""
+        rho, _, gamma = (float(v) for v in self._found((l1, l2, 1.0)))
+        lengths = [math.hypot(*(float(v) for v in self._limb(i, rho, 0.0, gamma))) for i in (0, 1)]
+        return rho < -1e-5 * math.sqrt(math.prod(self._radii)) and np.allclose(
+            lengths, (l1, l2), rtol=1e-6
+        )
+
+    def _wrong_pair(self, l1: float, l2: float) -> tuple[int, float]:
+        """Which of limbs 1 and 2 is the wrong length beside the other, by the smaller correction.
+
+        Two limbs of one length are a pose with gamma = 0 if they are longer than |b - a|; between
+        that and the given lengths a bisection finds where the assembly begins.
+        """
+        a, b = self._radii
+        best = (0 if l1 < l2 else 1), abs(b - a) - min(l1, l2)
+        least = math.inf
+        for i, (given, other) in enumerate(((l1, l2), (l2, l1))):
+            good, bad = max(other, abs(b - a) * (1.0 + 1e-6)), given
+            if not self._meets(*((good, other) if i == 0 else (other, good))):
+                continue
+            for _ in range(60):
+                middle = 0.5 * (good + bad)
+                if self._meets(*((middle, other) if i == 0 else (other, middle))):
+                    good = middle
+                else:
+                    bad = middle
+            if abs(given - good) < least:
+                least = abs(given - good)
+                best = i, least
+        return best
+
+    def limit_angles(self, pose: ArrayLike) -> Array:
+        """Angle of each limb to the vertical, then to the platform's normal, (..., 6), rad."""
+        z, beta, gamma = np.moveaxis(np.asarray(pose, np.float64), -1, 0)
+        a, b = self._radii
+        zero = np.zeros_like(z)
+        origin = np.stack([zero, -z * np.tan(beta), z], -1)
+        x = np.stack(
+            [np.cos(gamma), np.sin(beta) * np.sin(gamma), -np.cos(beta) * np.sin(gamma)], -1
+        )
+        y = np.stack([zero, np.cos(beta), np.sin(beta)], -1)
+        normal = np.cross(x, y)
+        angles = []
+        for i in range(3):
+            arm = _PATTERN[i, 0] * x + _PATTERN[i, 1] * y
+            up = b * _PATTERN[i] - origin - a * arm
+            up /= np.linalg.norm(up, axis=-1, keepdims=True)
+            angles.append(np.arctan2(np.hypot(up[..., 0], up[..., 1]), up[..., 2]))
+            along = np.clip((up * normal).sum(-1), -1.0, 1.0)
+            angles.append(np.arccos(along))
+        return np.stack(angles, -1)
+
+    def grid(self) -> PoseGrid:
+        """Tilts about the vertical axis, in the plane of beta and gamma."""
+        return PoseGrid("cylinder", self.pose_names, "z", ("beta", "gamma"))
+
+    def search_box(self) -> Array:
+        """Limbs 1 and 2 end above and below o alike, so it is no deeper than they are long.
+
+        :raises ParameterError: limbs without limits grow without end.
+        """
+        lengths = self.limits.limb_length
+        if lengths is None:
+            raise ParameterError(
+                "limits.limb_length", None, "limits of the limbs: without them z has no end"
+            )
+        right = math.pi / 2
+        return np.array([(-float(lengths[:2].max()), 0.0), (-right, right), (-right, right)])
+
+    def make_graph(self) -> Graph:
+        """Telescopic limbs at home, the platform level."""
+        a, b = self._radii
+        origin = array([0.0, 0.0, self._height])
+        bodies: dict[str, Body] = {}
+        joints: dict[str, Joint] = {}
+        inertia = self.inertia
+        for i, limb in enumerate("123"):
+            foot, head = array(b * _PATTERN[i]), array(origin + a * _PATTERN[i])
+            reach = float(np.linalg.norm(head - foot))
+            d = (head - foot) / reach
+            low, high = f"lower tube {limb}", f"upper tube {limb}"
+            for name, at in ((low, foot + 0.25 * reach * d), (high, head - 0.25 * reach * d)):
+                bodies[name] = self._tube(name, i, reach / 2, d, at)
+            u = np.cross(_Y, -d) if i < 2 else _X
+            v = _Y if i < 2 else np.cross(-d, _X)
+            turning = high if i < 2 else low
+            revolute = _named((turning, u), (turning, v), (turning, -d))
+            universal = _named((BASE if i < 2 else high, _X), (low if i < 2 else PLATFORM, _Y))
+            drive = Joint(
+                self.joints[i], "prismatic", low, high, foot, array([d]), actuated=True, home=reach,
+                rotor_inertia=0.0 if inertia is None else inertia.rotor_inertia,
+                label=f"P joint {limb}",
+            )  # fmt: skip
+            if i < 2:
+                chain = [
+                    _joint(f"U joint {limb}", (BASE, low), foot, [_X, _Y], universal, f"{limb}U"),
+                    drive,
+                    _joint(f"R joint {limb}", (high, PLATFORM), head, [_Y], revolute, f"{limb}R"),
+                ]
+            else:
+                chain = [
+                    _joint(f"R joint {limb}", (BASE, low), foot, [_X], revolute, f"{limb}R"),
+                    drive,
+                    _joint(
+                        f"U joint {limb}", (high, PLATFORM), head, [_X, _Y], universal, f"{limb}U"
+                    ),
+                ]
+            joints |= {joint.name: joint for joint in chain}
+        if inertia is None:
+            bodies[PLATFORM] = Body(PLATFORM, 0.0, origin)
+        else:
+            own = inertia.platform_inertia
+            turning_inertia = disc(inertia.platform_mass, a) if own is None else own
+            bodies[PLATFORM] = Body(
+                PLATFORM, inertia.platform_mass, array(origin + inertia.platform_com),
+                array(turning_inertia),
+            )  # fmt: skip
+        return Graph(bodies, joints, {}, PLATFORM, origin)
+
+    def _tube(self, name: str, i: int, reach: float, d: Array, com: Array) -> Body:
+        """A round bar of half the limb."""
+        if self.inertia is None:
+            return Body(name, 0.0, array(com))
+        radius = float(self.members.diameter[i]) / 2
+        weight = self.inertia.density * math.pi * radius**2 * reach
+        across, axial = weight * (reach**2 / 12 + radius**2 / 4), weight * radius**2 / 2
+        inertia = across * np.eye(3) + (axial - across) * np.outer(d, d)
+        return Body(name, weight, array(com), array(inertia))
+
+    @cached_property
+    def beams(self) -> tuple[Beam, ...]:
+        """The bars from B to A."""
+        a, b = self._radii
+        beams = []
+        for i, limb in enumerate("123"):
+            low, high = f"lower tube {limb}", f"upper tube {limb}"
+            ends = (low, b * _PATTERN[i]), (high, self.graph.origin + a * _PATTERN[i])
+            radius = float(self.members.diameter[i]) / 2
+            beams.append(Beam(f"{limb}B", f"{limb}B", i, *ends, (low, high), radius))
+        return tuple(beams)
+
+    def structure(self) -> Structure:
         """Bars between base and platform, joints elastic in their own axes, drives locked.
 
         A bar reaches from B to A, as in the paper, and its mass with it: a telescope's tubes that
         overlap are not told apart.
 
-        :param pose: shape (3,): z (m), beta, gamma (rad).
         :raises ParameterError: the file has no inertia.
         """
-        g, members, joints, inertia = (
-            self.geometry,
-            self.members,
-            self.joints_compliance,
-            self.inertia,
-        )
+        m, j, inertia = self.members, self.joints_compliance, self.inertia
         if inertia is None:
             raise ParameterError(
                 "inertia", None, "a section with density, platform_mass and more, for modes"
             )
-        turn = self.rotation(pose)
-        z, beta = float(pose[0]), float(pose[1])
-        origin = np.array([0.0, -z * math.tan(beta), z])
-        pattern = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-        x, y = np.array([1.0, 0.0, 0.0]), turn[:, 1]
-        universal = np.column_stack((x, y, np.cross(x, y)))
-        bars: list[Member] = []
-        for i, limb in enumerate("123"):
-            d = float(members.diameter[i])
-            section = Section(
-                members.youngs_modulus,
-                members.shear_modulus,
-                d,
-                0.0,
-                inertia.density * math.pi / 4 * d * d,
-                members.shear_factor,
+        sections = {
+            beam.name: Section(
+                m.youngs_modulus, m.shear_modulus, float(d), 0.0,
+                inertia.density * math.pi / 4 * float(d) ** 2, m.shear_factor,
             )
-            lower = g.base_radius * pattern[i]
-            upper = origin + g.platform_radius * turn @ pattern[i]
-            w = (lower - upper) / np.linalg.norm(lower - upper)
-            if i == 2:
-                revolute = np.column_stack((x, np.cross(w, x), w))
-                feet = (f"{limb}R", revolute, joints.rpu_revolute)
-                heads = (f"{limb}U", universal, joints.rpu_universal)
-            else:
-                revolute = np.column_stack((np.cross(y, w), y, w))
-                feet = (f"{limb}U", universal, joints.upr_universal)
-                heads = (f"{limb}R", revolute, joints.upr_revolute)
-            bar = f"{limb}B"
-            inner = Support(feet[0], GROUND, feet[1], tuple(feet[2].tolist()))
-            outer = Support(heads[0], MOVING, heads[1], tuple(heads[2].tolist()))
-            bars.append(Member(bar, bar, section, lower, upper, inner, outer))
-        own = inertia.platform_inertia
-        if own is None:
-            own = disc(inertia.platform_mass, g.platform_radius)
-        platform = RigidBody(
-            MOVING, inertia.platform_mass, turn @ inertia.platform_com, turn @ own @ turn.T
-        )
-        return Frame(origin, tuple(bars), (platform,))
+            for beam, d in zip(self.beams, m.diameter, strict=True)
+        }  # fmt: skip
+        compliances = {"3U": j.rpu_universal.tolist(), "3R": j.rpu_revolute.tolist()}
+        for limb in "12":
+            compliances[f"{limb}U"] = j.upr_universal.tolist()
+            compliances[f"{limb}R"] = j.upr_revolute.tolist()
+        return Structure(self.beams, sections, compliances)
 
-    @property
-    def radii(self) -> tuple[float, ...] | None:
-        """Radii of the three bars, m."""
-        return tuple((self.members.diameter / 2).tolist())
-
-    def _pack(self) -> list[float]:
+    @cached_property
+    def elastic_parameters(self) -> Array:
+        """Run-time inputs of :meth:`limb_elements`."""
         m, j = self.members, self.joints_compliance
-        area = np.pi * m.diameter**2 / 4
-        second = np.pi * m.diameter**4 / 64
+        area, second = np.pi * m.diameter**2 / 4, np.pi * m.diameter**4 / 64
         joints = np.concatenate([j.upr_revolute, j.upr_universal, j.rpu_universal, j.rpu_revolute])
-        return [
-            self.geometry.base_radius,
-            self.geometry.platform_radius,
-            *(1 / (m.youngs_modulus * area)),
-            *(m.shear_factor / (m.shear_modulus * area)),
-            *(1 / (m.youngs_modulus * second)),
-            *(1 / (m.shear_modulus * 2 * second)),
-            # Free axes carry no load; their entries are never read.
-            *np.where(np.isinf(joints), 0.0, joints),
-            *(m.diameter / 2),
-        ]
+        return schema.frozen(
+            np.concatenate(
+                [
+                    1 / (m.youngs_modulus * area),
+                    m.shear_factor / (m.shear_modulus * area),
+                    1 / (m.youngs_modulus * second),
+                    1 / (m.shear_modulus * 2 * second),
+                    # Free axes carry no load; their entries are never read.
+                    np.where(np.isinf(joints), 0.0, joints),
+                ]
+            )
+        )
 
+    def limb_elements(self, pose: Any, p: Any) -> list[LimbElements]:
+        """Unit wrenches of each limb and the compliances of R joint, bar and U joint on them.
 
-@scalar
-def _place(p, pose, fault):  # type: ignore[no-untyped-def]
-    """rho, then cosines and sines of beta and gamma; False where the pose is none."""
-    z = pose[0]
-    beta = pose[1]
-    if not math.isfinite(z + beta + pose[2]):
-        fault[0] = NOT_FINITE
-        return False, 0.0, 0.0, 0.0, 0.0, 0.0
-    # Limb 3 cannot turn the platform over: o is below the base where rho < 0 < cos(beta).
-    if not z < 0.0 or not abs(beta) < 0.5 * math.pi:
-        fault[0] = UNREACHABLE
-        fault[1] = 2
-        fault[2] = abs(z)
-        return False, 0.0, 0.0, 0.0, 0.0, 0.0
-    cb = math.cos(beta)
-    rho = z / cb
-    excess = -rho - FAR * (p[BASE] + p[PLATFORM])
-    if excess > 0.0:
-        fault[0] = UNREACHABLE
-        fault[1] = 2
-        fault[2] = excess
-        return False, 0.0, 0.0, 0.0, 0.0, 0.0
-    return True, rho, cb, math.sin(beta), math.cos(pose[2]), math.sin(pose[2])
+        Wrenches: f1 along the limb, f2 along y through B (UPR) or along X through A (RPU), the
+        couple m about tau (2UPR-RPU paper, equations 1 and 19). Each joint's compliance is that of
+        its own directions, with f1, f2 and m projected to its centre (equations 5 to 14, 21 to 25).
+        """
+        a, b = self._radii
+        z, beta, gamma = pose
+        cb, sb, cg, sg = cos(beta), sin(beta), cos(gamma), sin(gamma)
+        rho = z / cb
+        bars, joints = np.reshape(p[:12], (4, 3)), np.reshape(p[12:36], (4, 6))
+        limbs = []
 
+        def wrench(fx: Any, fy: Any, ft: Any, mx: Any, my: Any, mt: Any) -> list[Any]:
+            """Given along X, y and tau."""
+            return [
+                fx,
+                cb * fy - sb * ft,
+                sb * fy + cb * ft,
+                mx,
+                cb * my - sb * mt,
+                sb * my + cb * mt,
+            ]
 
-@scalar
-def _limb(p, i, rho, cb, sb, cg, sg):  # type: ignore[no-untyped-def]
-    """Limb i = 0 or 1 from B to A along X and tau; limb 2 from A to B along y and tau."""
-    if i == 2:
-        return p[BASE] * cb - p[PLATFORM], -p[BASE] * sb - rho
-    side = -1.0 if i == 0 else 1.0
-    return side * (p[PLATFORM] * cg - p[BASE]), rho - side * p[PLATFORM] * sg
-
-
-def _inverse(p, pose, q, scratch, fault):  # type: ignore[no-untyped-def]
-    """Limb lengths of a pose."""
-    good, rho, cb, sb, cg, sg = _place(p, pose, fault)
-    if not good:
-        return
-    for i in range(3):
-        across, up = _limb(p, i, rho, cb, sb, cg, sg)
-        q[i] = math.sqrt(across * across + up * up)
-
-
-@scalar
-def _distance(a, b, l1, l2):  # type: ignore[no-untyped-def]
-    """P = rho^2 of the home branch from the lengths of limbs 1 and 2; -1 where there is none.
-
-    With c = cos(gamma) = (P + K) / (2 a b) and 4 a rho sin(gamma) = L1^2 - L2^2 = D, c^2 + s^2 = 1
-    is the cubic P (P + K)^2 - 4 a^2 b^2 P + b^2 D^2 / 4 = 0, K = a^2 + b^2 - (L1^2 + L2^2) / 2.
-    Its slope at a root is 4 a b (rho^2 cos(gamma) - a b sin^2(gamma)), so the largest root is
-    the home branch until it meets the middle one, which is the singularity.
-    """
-    k = a * a + b * b - 0.5 * (l1 * l1 + l2 * l2)
-    ab = a * a * b * b
-    d = (l1 - l2) * (l1 + l2)
-    r = math.sqrt(k * k + 12.0 * ab)
-    # Depressed by P = t - 2 k / 3: t^3 - r^2 / 3 t + c = 0.
-    c = k * (8.0 / 3.0 * ab - 2.0 / 27.0 * k * k) + 0.25 * b * b * d * d
-    g = -13.5 * c / (r * r * r)
-    if not abs(g) <= 1.0:
-        if not abs(g) <= 1.0 + 1e-14:
-            return -1.0
-        g = max(-1.0, min(1.0, g))
-    square = 2.0 / 3.0 * (r * math.cos(math.acos(g) / 3.0) - k)
-    # Limbs too short for each other leave the root 0 of limbs of one length, in rounding.
-    return square if square > 1e-12 * a * b else -1.0
-
-
-@scalar
-def _blame(a, b, l1, l2):  # type: ignore[no-untyped-def]
-    """Which of limbs 0 and 1 is the wrong length beside the other, and by how much (m).
-
-    Two limbs of one length are a pose with gamma = 0 if they are longer than |b - a|; between that
-    and the given lengths a bisection finds where the assembly begins. The smaller of the two
-    possible corrections counts.
-    """
-    limb = 0
-    miss = math.inf
-    for i in range(2):
-        given = l1 if i == 0 else l2
-        other = l2 if i == 0 else l1
-        good = max(other, abs(b - a) * (1.0 + 1e-9))
-        if not _distance(a, b, good, other) > 0.0:
-            continue
-        bad = given
-        for _ in range(60):
-            middle = 0.5 * (good + bad)
-            first = middle if i == 0 else other
-            second = other if i == 0 else middle
-            if _distance(a, b, first, second) > 0.0:
-                good = middle
+        for i in range(3):
+            across, up = self._limb(i, rho, beta, gamma)
+            size = sqrt(across * across + up * up)
+            across, up = across / size, up / size
+            axial, shear, bend_rate, twist_rate = (bars[k][i] for k in range(4))
+            if i == 2:
+                # The couple's parts along the limb's bending axis and along the limb itself.
+                bend, turn, revolute, universal = -across, up, joints[3], joints[2]
+                wrenches = [wrench(0, across, up, a * up, 0, 0), wrench(1, 0, 0, 0, 0, -a)]
+                sideways, about = revolute[0], revolute[4]
+                c1, c2 = across * across * universal[1] + up * up * universal[2], universal[0]
             else:
-                bad = middle
-        if abs(given - good) < miss:
-            limb = i
-            miss = abs(given - good)
-    if miss == math.inf:
-        limb = 0 if l1 < l2 else 1
-        miss = abs(b - a) - min(l1, l2)
-    return limb, miss
+                side = -1.0 if i == 0 else 1.0
+                bend, turn, revolute, universal = across, -up, joints[0], joints[1]
+                rx, rt = side * a * cg, -side * a * sg
+                wrenches = [
+                    wrench(across, 0, up, 0, rt * across - rx * up, 0),
+                    wrench(0, 1, 0, rho, 0, side * b),
+                ]
+                sideways, about = revolute[1], revolute[3]
+                c1, c2 = across * across * universal[0] + up * up * universal[2], universal[1]
+            wrenches.append(wrench(0, 0, 0, 0, 0, 1))
+            bending = bend_rate * size
+            # Force f2 acts at one end of the limb, the joint R stands at the other: moment -L f2.
+            elements = [
+                (
+                    revolute[2], sideways + size * size * about, -size * bend * about,
+                    bend * bend * about + turn * turn * revolute[5],
+                ),
+                (
+                    axial * size, shear * size + bending * size * size / 3.0,
+                    -0.5 * bend * bending * size,
+                    bend * bend * bending + turn * turn * twist_rate * size,
+                ),
+                (c1, c2, 0.0, universal[5]),
+            ]  # fmt: skip
+            limbs.append(LimbElements(wrenches, elements))
+        return limbs
 
 
-@scalar
-def _solve(p, q, fault):  # type: ignore[no-untyped-def]
-    """rho, beta, gamma of the limb lengths; False where there is no assembly."""
-    l1 = q[0]
-    l2 = q[1]
-    l3 = q[2]
-    a = p[PLATFORM]
-    b = p[BASE]
-    if not math.isfinite(l1 + l2 + l3):
-        fault[0] = NOT_FINITE
-        return False, 0.0, 0.0, 0.0
-    fault[0] = UNREACHABLE
-    for i in range(3):
-        if not q[i] > 0.0:
-            fault[1] = i
-            fault[2] = -q[i]
-            return False, 0.0, 0.0, 0.0
-    bound = FAR * (a + b)
-    for i in range(3):
-        if q[i] > bound:
-            fault[1] = i
-            fault[2] = q[i] - bound
-            return False, 0.0, 0.0, 0.0
-    square = _distance(a, b, l1, l2)
-    if not square > 0.0:
-        limb, miss = _blame(a, b, l1, l2)
-        fault[1] = limb
-        fault[2] = miss
-        return False, 0.0, 0.0, 0.0
-    rho = -math.sqrt(square)
-    sg = (l1 - l2) * (l1 + l2) / (4.0 * a * rho)
-    cg = (square + a * a + b * b - 0.5 * (l1 * l1 + l2 * l2)) / (2.0 * a * b)
-    gamma = math.atan2(sg, cg)
-    for _ in range(2):
-        cg = math.cos(gamma)
-        sg = math.sin(gamma)
-        # Half the errors of the squared lengths, and their derivatives.
-        x = b - a * cg
-        u = rho + a * sg
-        v = rho - a * sg
-        e1 = 0.5 * (x * x + u * u - l1 * l1)
-        e2 = 0.5 * (x * x + v * v - l2 * l2)
-        g1 = a * (b * sg + rho * cg)
-        g2 = a * (b * sg - rho * cg)
-        det = u * g2 - v * g1
-        # At the singularity the two roots are one; a step would leave it.
-        if abs(det) > 1e-6 * a * square:
-            rho -= (e1 * g2 - e2 * g1) / det
-            gamma -= (u * e2 - v * e1) / det
-    # Limb 3: a cos(beta) - rho sin(beta) = h cos(beta - atan2(-rho, a)).
-    h = math.sqrt(a * a + rho * rho)
-    low = abs(h - b)
-    if l3 < low:
-        fault[1] = 2
-        fault[2] = low - l3
-        return False, 0.0, 0.0, 0.0
-    # At beta = -90 degrees the platform stands upright, at a longer limb it would be above.
-    high = math.sqrt(a * a + (b - rho) * (b - rho))
-    if l3 >= high:
-        fault[1] = 2
-        fault[2] = l3 - high
-        return False, 0.0, 0.0, 0.0
-    g = (a * a + b * b + rho * rho - l3 * l3) / (2.0 * b * h)
-    beta = math.atan2(-rho, a) - math.acos(max(-1.0, min(1.0, g)))
-    cb = math.cos(beta)
-    sb = math.sin(beta)
-    slope = a * sb + rho * cb
-    if abs(slope) > 1e-6 * h:
-        y = b * cb - a
-        w = b * sb + rho
-        beta -= 0.5 * (y * y + w * w - l3 * l3) / (b * slope)
-    fault[0] = 0.0
-    return True, rho, beta, gamma
+def _joint(
+    name: str, pair: tuple[str, str], at: Array, axes: Sequence[Array],
+    directions: tuple[Direction, ...], label: str,
+) -> Joint:  # fmt: skip
+    kind = "universal" if len(axes) == 2 else "revolute"
+    return Joint(name, kind, *pair, at, array(axes), directions=directions, label=label)
 
 
-def _forward(p, q, pose, scratch, fault):  # type: ignore[no-untyped-def]
-    """Pose of limb lengths, on the home branch."""
-    good, rho, beta, gamma = _solve(p, q, fault)
-    if good:
-        pose[0] = rho * math.cos(beta)
-        pose[1] = beta
-        pose[2] = gamma
-
-
-def _jacobian(p, q, rates, twist, scratch, fault):  # type: ignore[no-untyped-def]
-    """Pose rates and platform twist per joint rate, joint by joint.
-
-    The squared lengths above, differentiated: limbs 1 and 2 give rho and gamma, limb 3 beta. The
-    twist is v = d(rho tau), omega = beta' X + gamma' y.
-    """
-    good, rho, beta, gamma = _solve(p, q, fault)
-    if not good:
-        return
-    a = p[PLATFORM]
-    b = p[BASE]
-    cb = math.cos(beta)
-    sb = math.sin(beta)
-    cg = math.cos(gamma)
-    sg = math.sin(gamma)
-    pair = rho * rho * cg - a * b * sg * sg
-    slope = a * sb + rho * cb
-    square = rho * rho
-    measure = min(abs(pair) / (square + a * b), abs(slope) / math.sqrt(square + a * a))
-    # Squared: where two assemblies meet, lengths tell the pose only to the root of their error.
-    measure *= measure
-    if not measure > SINGULARITY_BOUND:
-        fault[0] = SINGULAR
-        fault[2] = measure
-        return
-    for j in range(3):
-        r = 0.0
-        g = 0.0
-        e = 0.0
-        if j == 0:
-            r = q[0] * (rho * cg - b * sg) / (2.0 * pair)
-            g = q[0] * (rho - a * sg) / (2.0 * a * pair)
-        elif j == 1:
-            r = q[1] * (rho * cg + b * sg) / (2.0 * pair)
-            g = -q[1] * (rho + a * sg) / (2.0 * a * pair)
-        else:
-            e = q[2] / (b * slope)
-        e -= (rho + b * sb) * r / (b * slope)
-        rates[3 * j] = cb * r - rho * sb * e
-        rates[3 * j + 1] = e
-        rates[3 * j + 2] = g
-        twist[3 * j] = 0.0
-        twist[3 * j + 1] = -sb * r - rho * cb * e
-        twist[3 * j + 2] = cb * r - rho * sb * e
-        twist[9 + 3 * j] = e
-        twist[9 + 3 * j + 1] = cb * g
-        twist[9 + 3 * j + 2] = sb * g
-
-
-def _angles(p, pose, angles, scratch, fault):  # type: ignore[no-untyped-def]
-    """Angle of each limb to the vertical, then to the platform's normal, limb by limb, rad."""
-    good, rho, cb, sb, cg, sg = _place(p, pose, fault)
-    if not good:
-        return
-    for i in range(3):
-        across, up = _limb(p, i, rho, cb, sb, cg, sg)
-        # Both from the platform up to the base.
-        if i == 2:
-            x = 0.0
-            y = across * cb - up * sb
-            z = across * sb + up * cb
-            along = up * cg
-        else:
-            x = -across
-            y = up * sb
-            z = -up * cb
-            along = -across * sg - up * cg
-        size = math.sqrt(across * across + up * up)
-        angles[2 * i] = math.atan2(math.sqrt(x * x + y * y), z)
-        angles[2 * i + 1] = math.acos(max(-1.0, min(1.0, along / size))) if size > 0.0 else 0.0
-
-
-def _clearance(p, pose, q, clearance, scratch, fault):  # type: ignore[no-untyped-def]
-    """Clearance of the bars from B to A, see clearance.py."""
-    good, rho, cb, sb, cg, sg = _place(p, pose, fault)
-    if not good:
-        return
-    a = p[PLATFORM]
-    b = p[BASE]
-    # o = rho tau, y = (0, cb, sb), tau = (0, -sb, cb).
-    for i in range(2):
-        side = -1.0 if i == 0 else 1.0
-        up = rho - side * a * sg
-        bar(scratch, i, i, p[RADIUS + i], (side * b, 0.0, 0.0), (side * a * cg, -sb * up, cb * up))
-    bar(scratch, 2, 2, p[RADIUS + 2], (0.0, b, 0.0), (0.0, a * cb - rho * sb, a * sb + rho * cb))
-    clearance[0] = least(scratch, 3)
-
-
-@scalar
-def _element(s, o, c11, c22, c23, c33):  # type: ignore[no-untyped-def]
-    """Write one element's compliance on (f1, f2, m)."""
-    for k in range(9):
-        s[o + k] = 0.0
-    s[o] = c11
-    s[o + 4] = c22
-    s[o + 5] = c23
-    s[o + 7] = c23
-    s[o + 8] = c33
-
-
-@scalar
-def _wrench(s, o, cb, sb, fx, fy, ft, mx, my, mt):  # type: ignore[no-untyped-def]
-    """Write one unit wrench, given along X, y, tau, in fixed axes."""
-    s[o] = fx
-    s[o + 1] = cb * fy - sb * ft
-    s[o + 2] = sb * fy + cb * ft
-    s[o + 3] = mx
-    s[o + 4] = cb * my - sb * mt
-    s[o + 5] = sb * my + cb * mt
-
-
-@scalar
-def _elements(p, pose, s, fault):  # type: ignore[no-untyped-def]
-    """Blocks of the three limbs, see elements.py; False where the pose has none.
-
-    Wrenches of each limb: f1 along it, f2 along y through B (UPR) or along X through A (RPU), the
-    couple m about tau (2UPR-RPU paper, equations 1 and 19). Each joint's compliance is that of
-    its own directions, with f1, f2 and m projected to its centre (equations 5 to 14, 21 to 25).
-    """
-    good, rho, cb, sb, cg, sg = _place(p, pose, fault)
-    if not good:
-        return False
-    a = p[PLATFORM]
-    b = p[BASE]
-    for i in range(3):
-        across, up = _limb(p, i, rho, cb, sb, cg, sg)
-        size = math.sqrt(across * across + up * up)
-        if not size > 0.0:
-            fault[0] = SINGULAR
-            fault[1] = i
-            return False
-        across /= size
-        up /= size
-        o = BLOCK * i
-        # The couple's parts along the limb's bending axis and along the limb itself.
-        if i == 2:
-            # In the revolute's axes u = X, v = w x u, w from A to B.
-            bend = -across
-            turn = up
-            _wrench(s, o, cb, sb, 0.0, across, up, a * up, 0.0, 0.0)
-            _wrench(s, o + 6, cb, sb, 1.0, 0.0, 0.0, 0.0, 0.0, -a)
-        else:
-            # In the revolute's axes u = v x w, v = y, w from A to B.
-            bend = across
-            turn = -up
-            side = -1.0 if i == 0 else 1.0
-            rx = side * a * cg
-            rt = -side * a * sg
-            _wrench(s, o, cb, sb, across, 0.0, up, 0.0, rt * across - rx * up, 0.0)
-            _wrench(s, o + 6, cb, sb, 0.0, 1.0, 0.0, rho, 0.0, side * b)
-        _wrench(s, o + 12, cb, sb, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-        bending = p[BENDING + i] * size
-        # Force f2 acts at one end of the limb, the joint R stands at the other: moment -L f2 there.
-        if i == 2:
-            j = RPU_R
-            c2, about = p[j], p[j + 4]
-        else:
-            j = UPR_R
-            c2, about = p[j + 1], p[j + 3]
-        _element(
-            s,
-            o + 18,
-            p[j + 2],
-            c2 + size * size * about,
-            -size * bend * about,
-            bend * bend * about + turn * turn * p[j + 5],
-        )
-        _element(
-            s,
-            o + 27,
-            p[AXIAL + i] * size,
-            p[SHEAR + i] * size + bending * size * size / 3.0,
-            -0.5 * bend * bending * size,
-            bend * bend * bending + turn * turn * p[TORSION + i] * size,
-        )
-        # The universal joint's axes are X, y and tau.
-        if i == 2:
-            j = RPU_U
-            c1 = across * across * p[j + 1] + up * up * p[j + 2]
-            c2 = p[j]
-        else:
-            j = UPR_U
-            c1 = across * across * p[j] + up * up * p[j + 2]
-            c2 = p[j + 1]
-        _element(s, o + 36, c1, c2, 0.0, p[j + 5])
-    return True
-
-
-def _elastic(p, pose, c, scratch, fault):  # type: ignore[no-untyped-def]
-    """Compliance of the platform, row-major."""
-    if _elements(p, pose, scratch, fault) and factorise(scratch, fault):
-        invert(scratch, c)
-
-
-def _energy(p, pose, wrench, deflection, energies, factors, summary, scratch, fault):  # type: ignore[no-untyped-def]
-    """Deflection and strain energies of a wrench, see elements.py."""
-    if _elements(p, pose, scratch, fault) and factorise(scratch, fault):
-        divide(scratch, wrench, deflection, energies, factors, summary, fault)
-
-
-UprRpu.inverse_kernel = Kernel(_inverse, (3,), (3,))
-UprRpu.forward_kernel = Kernel(_forward, (3,), (3,))
-UprRpu.jacobian_kernel = Kernel(_jacobian, (3,), (9, 18))
-UprRpu.angles_kernel = Kernel(_angles, (3,), (6,))
-UprRpu.clearance_kernel = Kernel(_clearance, (3, 3), (1,), 3 * BAR)
-UprRpu.elastic_kernel = Kernel(_elastic, (3,), (36,), SCRATCH)
-UprRpu.energy_kernel = Kernel(_energy, (3, 6), (6, 9, 9, 3), SCRATCH)
+def _named(*given: tuple[str, Array]) -> tuple[Direction, ...]:
+    """Directions u, v and w; without a third one it is normal to both, at home too."""
+    known = list(given)
+    if len(known) == 2:
+        known.append((known[0][0], np.cross(known[0][1], known[1][1])))
+    return tuple(Direction(n, body, array(v)) for n, (body, v) in zip("uvw", known, strict=True))

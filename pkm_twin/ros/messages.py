@@ -12,7 +12,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,17 +157,22 @@ class Trajectory:
 
 @dataclass
 class JointReader:
-    """Reads joint states and trajectories of one robot."""
+    """Reads joint states and trajectories of one robot.
+
+    ``limited``: positions and velocities beyond the robot's limits are refused, else only those
+    beyond all machines.
+    """
 
     robot: Robot
+    limited: bool = True
     _known: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         joints = len(self.robot.joint_names)
-        # Declared by every robot with a section of limits.
-        limits = cast(Any, self.robot).limits
-        position, velocity = limits.position, limits.velocity
-        reach = [100.0 if unit == "m" else 2000.0 * math.pi for unit in joint_units(self.robot)]
+        limits = self.robot.limits
+        position = limits.position if self.limited else None
+        velocity = limits.velocity if self.limited else None
+        reach = [100.0 if unit == "m" else 2000.0 * math.pi for unit in self.robot.joint_units]
         self._limited = {"position": position is not None, "velocity": velocity is not None}
         self._position = (
             [(-r, r) for r in reach] if position is None else list(map(tuple, position.tolist()))
@@ -398,11 +403,6 @@ def read_wrench(
 def shown(name: str) -> str:
     """A foreign name between quotes, cut where it is long."""
     return repr(name if len(name) <= MAX_SHOWN else name[:MAX_SHOWN] + "...")
-
-
-def joint_units(robot: Robot) -> tuple[str, ...]:
-    """Unit of every actuated joint's position, rad or m."""
-    return (robot.joint_unit,) * len(robot.joint_names)
 
 
 def as_message_error(call: Callable[..., Any], *arguments: Any) -> Any:

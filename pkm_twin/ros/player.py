@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pkm_twin.bags.cdr import message_class, message_definition, parse_definition
+from pkm_twin.bags.qos import OfferedQos, parse_qos, require_topic
 from pkm_twin.bags.reader import Bag, TopicInfo, open_bag
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError
 
@@ -33,9 +34,6 @@ _COARSE = 0.002
 _FINE = 0.0001
 # How often a long wait looks for a signal, s.
 _LOOK = 0.02
-
-_RELIABILITIES = {"1": "reliable", "2": "best_effort"}
-_DURABILITIES = {"1": "transient_local", "2": "volatile"}
 
 
 @dataclass
@@ -180,7 +178,10 @@ def _targets(bag: Bag, names: list[str], remap: Mapping[str, str]) -> dict[str, 
             path=bag.report.path,
             reason="no_topic",
         )
-    return {name: remap.get(name, name) for name in names}
+    # Looked at before anything is published.
+    for name in names:
+        parse_qos(name, bag.report.topics[name].offered_qos)
+    return {name: require_topic(remap.get(name, name)) for name in names}
 
 
 @contextmanager
@@ -225,7 +226,7 @@ def _publishers(
             name: node.create_publisher(
                 message_class(bag.report.topics[name].type),
                 target,
-                _qos(bag.report.topics[name].offered_qos),
+                _qos(parse_qos(name, bag.report.topics[name].offered_qos)),
             )
             for name, target in targets.items()
         }
@@ -240,28 +241,17 @@ def _publishers(
         context.try_shutdown()
 
 
-def _qos(text: str) -> Any:
-    """Return the publisher's QoS of a recorded offer; reliable and volatile where there is none.
+def _qos(offer: OfferedQos) -> Any:
+    """Return the publisher's QoS of a recorded offer.
 
-    rosbag2 writes names since Jazzy, numbers before. Deadline, lifespan and liveliness are not
-    taken over: a replay does not keep such promises. Of several publishers the first counts.
+    Deadline, lifespan and liveliness are not taken over: a replay does not keep such promises.
     """
-    import yaml
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-    try:
-        offers = yaml.safe_load(text)
-        offer = offers[0] if isinstance(offers, list) and isinstance(offers[0], dict) else {}
-        depth = int(offer.get("depth", 0))
-    except (yaml.YAMLError, IndexError, ValueError, TypeError):
-        offer, depth = {}, 0
-    reliability = str(offer.get("reliability", "reliable"))
-    durability = str(offer.get("durability", "volatile"))
-    best_effort = _RELIABILITIES.get(reliability, reliability) == "best_effort"
-    latched = _DURABILITIES.get(durability, durability) == "transient_local"
+    latched = offer.transient_local
     return QoSProfile(
-        depth=max(depth, 1 if latched else _MIN_DEPTH),
-        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        depth=max(offer.depth, 1 if latched else _MIN_DEPTH),
+        reliability=ReliabilityPolicy.RELIABLE if offer.reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
 

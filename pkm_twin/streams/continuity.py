@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.tracking import MAX_MOVE
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, joint_units
+from pkm_twin.ros.messages import SECOND
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ JUMP_SLACK: Final = 5e-3
 over the time between their stamps and this slack for stamps that are off, s."""
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class _State:
     """A sample: q (n,), the pose (m,) and its rates per joint rate (m, n), angles at the rim."""
 
@@ -83,8 +83,10 @@ class Continuity:
         self.robot = robot
         self.warn, self.stop = warn, stop
         self._velocity = tuple(velocity)
-        self._scale = _scale(robot)
-        self._largest = MAX_MOVE * _size(robot)
+        self._largest = MAX_MOVE * robot.size
+        self._rows = robot.pose_scales
+        self._matrix = robot.pose_scales[:, None]
+        self._joints = robot.joint_scales
         self._clearance = Clearance()
         self.reset()
 
@@ -104,9 +106,9 @@ class Continuity:
             The next sample is then compared with the one before.
         :raises UnreachableError: the robot has no assembly there.
         """
-        pose = self._scale * self.robot.forward(q)
-        rates = self._scale[:, None] * self.robot.jacobian(q)
-        clearance = self._clearance.at_least(rates, self.warn)
+        pose = self._rows * self.robot.forward(q)
+        rates = self._matrix * self.robot.jacobian(q)
+        clearance = self._clearance.at_least(rates / self._joints, self.warn)
         state = _State(stamp, q, pose, rates, clearance, self._clearance.greatest)
         if self._last is not None:
             self._check_jump(self._last, state)
@@ -134,7 +136,7 @@ class Continuity:
         moves = move.tolist()
         for joint, (moved, velocity) in enumerate(zip(moves, self._velocity, strict=True)):
             if not abs(moved) <= velocity * factor:
-                unit = joint_units(self.robot)[joint]
+                unit = self.robot.joint_units[joint]
                 raise MessageError(
                     "jump",
                     f"{self.robot.joint_names[joint]} moved by {moved:g} {unit} in {period:g} s, "
@@ -144,7 +146,7 @@ class Continuity:
         greatest = max(state.greatest, last.greatest)
         # What is predicted is no longer than the joints' move times the greatest singular value,
         # so most samples need no more than two lengths.
-        if _length(shift) + 0.5 * greatest * _length(move) <= self._largest:
+        if _length(shift) + 0.5 * greatest * _length(move * self._joints) <= self._largest:
             return
         # What the mean of both rates predicts errs by the third power of the move; how much, the
         # change of the rates tells. Half of what is predicted is for where they turn between.
@@ -162,14 +164,3 @@ class Continuity:
 
 def _length(vector: Array) -> float:
     return math.sqrt(float(vector @ vector))
-
-
-def _size(robot: Robot) -> float:
-    """The robot's characteristic length, at which angles count as lengths, m."""
-    return float(getattr(robot, "geometry").platform_radius)  # noqa: B009
-
-
-def _scale(robot: Robot) -> Array:
-    """From pose units to metres at the platform's rim, shape (m,)."""
-    size = _size(robot)
-    return np.array([1.0 if unit == "m" else size for unit in robot.pose_units])

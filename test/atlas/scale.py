@@ -15,15 +15,16 @@ import numba
 import psutil
 
 from pkm_twin import load
-from pkm_twin.atlas.commands import sweep_of
+from pkm_twin.atlas.isotropy import isotropy_sweep
+from pkm_twin.atlas.modes import modes_sweep
+from pkm_twin.atlas.strain_energy import strain_energy_sweep
+from pkm_twin.atlas.workspace import workspace_sweep
 
-OPTIONS = {
-    "points": None,
-    "wrench": "P1",
-    "height": None,
-    "energy": 100.0,
-    "least_singularity": 0.0,
-    "least_clearance": 0.0,
+SWEEPS = {
+    "workspace": workspace_sweep,
+    "strain-energy": strain_energy_sweep,
+    "isotropy": isotropy_sweep,
+    "modes": modes_sweep,
 }
 KINDS = (
     ("strain-energy", "upr_rpu", 10**6, "strain energy (total, nine factors, dominant element)"),
@@ -43,7 +44,7 @@ RUNS = ((10**6, 2), (10**7, 2), (10**6, 1), (10**7, 1))
 
 def rate(kind: str, robot: str, points: int) -> float:
     """Samples a second of processor time, of chunks alone, kernels compiled before."""
-    sweep = sweep_of(load(robot), kind, OPTIONS | {"points": points})
+    sweep = SWEEPS[kind](load(robot), points=points)
     chunks = [chunk for chunk in sweep.chunks() if sweep.count(chunk)]
     sweep.evaluate(chunks[0])
     done, begin = 0, time.process_time()

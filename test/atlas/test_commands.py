@@ -10,13 +10,14 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pkm_twin.atlas.store import open_atlas
 from test.atlas.conftest import same
 
 ROOT = Path(__file__).parents[2]
-COMMAND = [sys.executable, "-m", "pkm_twin.atlas.commands"]
+COMMAND = [sys.executable, "-m", "pkm_twin.apps.cli"]
 SWEEP = ["atlas", "upr_rpu", "strain-energy", "--wrench", "P2", "--points", "20000"]
 
 
@@ -93,6 +94,14 @@ def test_interrupted_and_resumed(tmp_path):
         (["atlas", "delta", "strain-energy"], 1, "elastic"),
         (["atlas", "delta", "weather"], 1, "workspace"),
         (["atlas", "upr_rpu", "strain-energy", "--wrench", "1,2"], 2, "six numbers"),
+        (["atlas", "delta", "modess"], 1, "did you mean 'modes'"),
+        (["atlas", "delt", "modes"], 1, "did you mean"),
+        (["atlas", "delta", "workspace", "--wrench", "P1"], 2, "--wrench"),
+        (["atlas", "prru", "isotropy", "--least-clearance", "0.1"], 2, "--least-clearance"),
+        (["atlas", "upr_rpu", "strain-energy", "--beyond-limits"], 2, "--beyond-limits"),
+        (["atlas", "upr_rpu", "strain-energy", "--wrench", "0,0,0,0,0,0"], 1, "above zero"),
+        (["atlas", "prru", "isotropy", "--height", "nan"], 1, "height"),
+        (["atlas", "delta", "workspace", "--points", "9" * 18], 2, "--points"),
         (["show", "none.nc"], 1, "none.nc"),
     ],
 )
@@ -101,3 +110,62 @@ def test_refusals_are_one_line(words, code, text, tmp_path):
     assert text in result.stderr
     assert "Traceback" not in result.stderr
     assert list(tmp_path.iterdir()) == []
+    if code == 1:
+        assert result.stderr.count("\n") == 1
+
+
+def test_each_kind_says_its_own_options(tmp_path):
+    shared = {"--points", "--out", "--workers", "--scheduler", "--html", "--overwrite"}
+    own = {
+        "workspace": {"--least-singularity", "--least-clearance"},
+        "strain-energy": {"--wrench"},
+        "isotropy": {"--height", "--energy", "--beyond-limits"},
+        "modes": set(),
+    }
+    for kind, options in own.items():
+        text = call("atlas", "delta", kind, "--help", folder=tmp_path).stdout
+        for option in set().union(shared, *own.values()):
+            assert (option in text) == (option in shared | options)
+
+
+def test_damaged_atlases_are_one_line(tmp_path):
+    call(*SWEEP, "--out", "a.nc", "--no-picture", folder=tmp_path)
+    whole = (tmp_path / "a.nc").read_bytes()
+    rng = np.random.default_rng(5)
+    for k in range(6):
+        damaged = bytearray(whole[: len(whole) // 3] if k == 0 else whole)
+        for _ in range(40 * k):
+            # Where the file says what it holds, not in its numbers.
+            damaged[rng.integers(0, 60_000)] ^= 255
+        (tmp_path / "b.nc").write_bytes(damaged)
+        result = subprocess.run(
+            [*COMMAND, "show", "b.nc"],
+            cwd=tmp_path,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert result.returncode == 1, result
+        assert result.stderr.startswith("pkm-twin: b.nc: ")
+        assert result.stderr.count("\n") == 1
+
+
+def test_output_that_cannot_be_written_is_one_line(tmp_path):
+    call(*SWEEP, "--out", "a.nc", "--no-picture", folder=tmp_path)
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(
+            [*COMMAND, "show", "a.nc"],
+            cwd=tmp_path,
+            env=environment(),
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=120,
+        )
+    assert result.returncode == 1
+    assert result.stderr.count("\n") == 1
+    (tmp_path / "a_plane.png").mkdir()
+    result = call("show", "a.nc", folder=tmp_path, code=1)
+    assert "a_plane.png" in result.stderr
+    assert result.stderr.count("\n") == 1

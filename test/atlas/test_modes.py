@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pkm_twin import load
-from pkm_twin.atlas.grids import polar_pose
 from pkm_twin.atlas.modes import frame_edges, modes_sweep
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.errors import ParameterError
@@ -24,7 +23,7 @@ def test_frequencies_are_those_of_the_library(small_atlases):
     robot = load("prru")
     with open_atlas(small_atlases["modes prru"]) as data:
         grid = np.meshgrid(data.z, data.distance, data.azimuth, indexing="ij")
-        poses = polar_pose(robot, *grid)
+        poses = robot.grid().polar_pose(*grid)
         assert reachable(robot, poses).all()
         f = data.frequency.values
         assert (np.diff(f, axis=-1) >= 0).all()
@@ -43,7 +42,7 @@ def test_refusals():
 @ROBOTS
 def test_stored_shapes_are_those_of_the_library_at_the_middle_pose(name, small_atlases):
     with open_atlas(small_atlases[f"modes {name}"]) as data:
-        middle = polar_pose(load(name), data.z.values[data.sizes["z"] // 2], 0.0, 0.0)
+        middle = load(name).grid().polar_pose(data.z.values[data.sizes["z"] // 2], 0.0, 0.0)
         assert data.shape_pose.values.tolist() == middle.tolist()
         found = modes(load(name), middle, 6)
         assert tuple(data.node.values) == found.nodes

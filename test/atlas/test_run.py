@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
+import resource
 import signal
+import subprocess
 import sys
+import time
 
 import pytest
 
@@ -20,6 +24,7 @@ from pkm_twin.atlas.strain_energy import strain_energy_sweep
 from pkm_twin.errors import PkmTwinError
 from test.atlas.conftest import same
 from test.atlas.scale import command
+from test.atlas.test_commands import COMMAND, SWEEP, environment
 
 
 class Stop(Exception):
@@ -189,3 +194,160 @@ def test_memory_is_flat(tmp_path):
     assert seconds < 30.0
     assert large < 1.2 * small
     assert large < 2e9
+
+
+@pytest.fixture
+def held(tmp_path):
+    """A target that a run of this process works on, half done."""
+    sweep, out = strain_energy_sweep(load("upr_rpu"), "P1", 1000), tmp_path / "held.nc"
+    parts = Parts(out, sweep)
+    parts.open()
+    chunk = sweep.chunks()[0]
+    parts.save(0, sweep.evaluate(chunk))
+    yield sweep, out, parts
+    parts.close()
+
+
+def test_one_run_at_a_time_works_on_an_atlas(held):
+    """The second names the first, drops nothing, and goes on when the first is gone."""
+    sweep, out, parts = held
+    for overwrite in (False, True):
+        for other in (sweep, strain_energy_sweep(load("upr_rpu"), "P2", 1000)):
+            with pytest.raises(AtlasError, match=f"process {os.getpid()} on .* works on this"):
+                run(other, out, workers=1, overwrite=overwrite)
+    assert 0 not in parts.pending()
+    parts.close()
+    run(sweep, out, workers=1)
+    assert not parts.folder.exists()
+
+
+def test_the_lock_of_a_killed_process_is_nobodys(tmp_path):
+    program = (
+        "import sys, time; from pathlib import Path; from pkm_twin import load;"
+        "from pkm_twin.atlas.store import Parts;"
+        "from pkm_twin.atlas.strain_energy import strain_energy_sweep;"
+        "Parts(Path(sys.argv[1]), strain_energy_sweep(load('upr_rpu'), 'P1', 1000)).open();"
+        "print('locked', flush=True); time.sleep(600)"
+    )
+    out = tmp_path / "a.nc"
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(out)], stdout=subprocess.PIPE, env=environment()
+    ) as process:
+        assert process.stdout.readline().strip() == b"locked"
+        sweep = strain_energy_sweep(load("upr_rpu"), "P1", 1000)
+        with pytest.raises(AtlasError, match=f"process {process.pid} on"):
+            run(sweep, out, workers=1)
+        process.kill()
+        process.wait()
+        run(sweep, out, workers=1)
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_no_run_wrote_is_never_dropped(overwrite, tmp_path):
+    sweep, out = strain_energy_sweep(load("upr_rpu"), "P1", 1000), tmp_path / "a.nc"
+    folder = tmp_path / "a.nc.parts"
+    folder.mkdir()
+    for name in ("thesis.txt", "00000000.npz"):
+        (folder / name).write_text("years of work")
+    with pytest.raises(AtlasError, match=r"'thesis\.txt', which no atlas wrote"):
+        run(sweep, out, workers=1, overwrite=overwrite)
+    assert sorted(path.name for path in folder.iterdir()) == ["00000000.npz", "thesis.txt"]
+
+
+def test_a_target_that_is_no_file_is_not_replaced(tmp_path):
+    sweep = strain_energy_sweep(load("upr_rpu"), "P1", 1000)
+    (tmp_path / "folder.nc").mkdir()
+    os.mkfifo(tmp_path / "pipe.nc")
+    (tmp_path / "file").write_text("")
+    for name in ("folder.nc", "pipe.nc", "file/a.nc", "x" * 300, "/proc/a.nc"):
+        with pytest.raises(AtlasError) as caught:
+            run(sweep, tmp_path / name, workers=1, overwrite=True)
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 400
+    for name in ("folder.nc", "pipe.nc", "none.nc"):
+        with pytest.raises(AtlasError):
+            open_atlas(tmp_path / name)
+
+
+def limited(path, limit):
+    """Exit code and errors of an atlas in a process whose files end at a number of bytes."""
+    return subprocess.run(
+        [*COMMAND, *SWEEP, "--no-picture", "--workers", "1", "--out", str(path)],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
+
+
+@pytest.mark.parametrize("limit", [20_000, 1_000_000])
+def test_a_full_disk_costs_no_finished_chunk(limit, tmp_path):
+    """While chunks are written, and while HDF5 joins them: one line, and the rest goes on."""
+    out = tmp_path / "a.nc"
+    ended = limited(out, limit)
+    assert ended.returncode == 1, ended.stderr
+    assert ended.stderr.count("\n") == 1
+    assert "File too large" in ended.stderr
+    assert not out.exists()
+    assert not list(tmp_path.rglob("*.tmp"))
+    again = subprocess.run(
+        [*COMMAND, *SWEEP, "--no-picture", "--out", str(out)], env=environment(), timeout=300
+    )
+    assert again.returncode == 0
+    assert not Parts(out, strain_energy_sweep(load("upr_rpu"), "P2", 20_000)).folder.exists()
+
+
+def test_a_killed_scheduler_is_one_error_and_costs_no_finished_chunk(strain, tmp_path):
+    pytest.importorskip("distributed")
+    sweep, path = strain
+    folder = tmp_path / "dask"
+    scheduler = subprocess.Popen(
+        [
+            sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1",
+            "--port", "0", "--no-dashboard", "--scheduler-file", str(folder / "address.json"),
+        ],
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    folder.mkdir(exist_ok=True)
+    worker = None
+    try:
+        worker = subprocess.Popen(
+            [
+                sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file",
+                str(folder / "address.json"), "--nthreads", "1", "--no-dashboard",
+                "--local-directory", str(folder), "--no-nanny",
+            ],
+            stderr=subprocess.DEVNULL,
+            env=environment(),
+        )  # fmt: skip
+        address = address_of(folder / "address.json")
+
+        def progress(done):
+            if done:
+                scheduler.kill()
+
+        with pytest.raises(ClusterError, match="went away") as caught:
+            run(sweep, tmp_path / "a.nc", scheduler=address, progress=progress)
+        assert "\n" not in str(caught.value)
+    finally:
+        for process in filter(None, (scheduler, worker)):
+            process.kill()
+            process.wait()
+    assert len(Parts(tmp_path / "a.nc", sweep).pending()) < len(sweep.chunks())
+    assert same(path, run(sweep, tmp_path / "a.nc", workers=1))
+
+
+def address_of(file):
+    """Address of a scheduler that has a worker, as soon as it has."""
+    import distributed
+
+    end = time.monotonic() + 120
+    while time.monotonic() < end:
+        if file.exists() and file.read_text():
+            found = json.loads(file.read_text())["address"]
+            with distributed.Client(found, timeout="60s", set_as_default=False) as client:
+                client.wait_for_workers(1, timeout=120)
+            return found
+        time.sleep(0.05)
+    raise AssertionError("the scheduler does not begin")

@@ -8,13 +8,12 @@ import pytest
 
 from pkm_twin import load
 from pkm_twin.atlas import workspace
-from pkm_twin.atlas.commands import sweep_of
-from pkm_twin.atlas.grids import circles, largest_cylinder, nice, polar_pose, singularity
+from pkm_twin.atlas.grids import circles, largest_cylinder, nice
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace import workspace_sweep
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.workspace import clearance
+from pkm_twin.kinematics.workspace import clearance, singularity_at
 from stiffness_monitor import reachable, regular_workspace
 from test.conftest import parameters_of
 
@@ -69,7 +68,7 @@ def test_the_cylinder_is_reachable_and_no_wider_one_is(reach_atlas):
     assert len(heights) > 5
 
     def whole(factor):
-        poses = polar_pose(robot, heights[:, None], factor * radius, TURN)
+        poses = robot.grid().polar_pose(heights[:, None], factor * radius, TURN)
         return reachable(robot, poses).all()
 
     assert whole(0.999)
@@ -97,7 +96,7 @@ def test_no_cylinder_where_nothing_is_reachable():
     far = circles(load("delta"), [-5.0, -4.0])
     assert (far.radius == 0.0).all()
     assert largest_cylinder(far).radius == 0.0
-    assert singularity(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
+    assert singularity_at(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
 
 
 def test_a_bound_on_singularity_takes_away(tmp_path, monkeypatch):
@@ -158,24 +157,17 @@ def test_the_box_holds_what_interference_takes_away(variant):
         assert (one == other).all()
 
 
-def test_the_command_line_gives_both_bounds():
-    options = {"points": 4000, "least_singularity": 0.2, "least_clearance": 0.03}
-    sweep = sweep_of(load("delta"), "workspace", options)
-    assert (sweep.least, sweep.least_clearance) == (0.2, 0.03)
-    assert sweep.settings["least_clearance"] == 0.03
-
-
 def test_pictures_show_what_interference_takes_away(tmp_path, monkeypatch):
     """A name for the hatching, in words that say why."""
     from matplotlib import pyplot
 
-    from pkm_twin.atlas import figures
+    from pkm_twin.atlas import kinds
 
     monkeypatch.setattr(workspace, "LAYERS", 15)
     for least, words in ((0.0, "limbs meet nowhere"), (0.03, "limbs are within 30 mm in ")):
         sweep = workspace_sweep(load("delta"), 30000, least_clearance=least)
         with open_atlas(run(sweep, tmp_path / f"{least}.nc", workers=1)) as data:
-            figure = figures.draw(data)["sections"]
+            figure = kinds.draw(data)["sections"]
         assert words in figure.get_suptitle()
         legends = [ax.get_legend() for ax in figure.axes if ax.get_legend()]
         texts = {text.get_text() for legend in legends for text in legend.get_texts()}
@@ -187,7 +179,7 @@ def test_pictures_show_what_interference_takes_away(tmp_path, monkeypatch):
 def test_all_taken_away_is_still_an_atlas(tmp_path, monkeypatch):
     from matplotlib import pyplot
 
-    from pkm_twin.atlas import figures
+    from pkm_twin.atlas import kinds
 
     monkeypatch.setattr(workspace, "LAYERS", 15)
     sweep = workspace_sweep(load("delta"), 4000, least_clearance=0.05)
@@ -195,13 +187,13 @@ def test_all_taken_away_is_still_an_atlas(tmp_path, monkeypatch):
         assert float(data.volume) == 0.0
         assert float(data.interference) == 1.0
         assert float(data.cylinder_radius) == 0.0
-        pyplot.close(figures.draw(data)["sections"])
+        pyplot.close(kinds.draw(data)["sections"])
 
 
 def test_without_members_there_is_no_clearance(tmp_path, monkeypatch):
     from matplotlib import pyplot
 
-    from pkm_twin.atlas import figures
+    from pkm_twin.atlas import kinds
 
     monkeypatch.setattr(workspace, "LAYERS", 15)
     robot = load("delta")
@@ -212,12 +204,11 @@ def test_without_members_there_is_no_clearance(tmp_path, monkeypatch):
         assert set(one.variables) - set(other.variables) == {"clearance", "interference"}
         for variable in other.variables:
             assert one[variable].equals(other[variable])
-        figure = figures.draw(other)["sections"]
+        figure = kinds.draw(other)["sections"]
         assert "limbs" not in figure.get_suptitle()
         pyplot.close(figure)
-    options = {"points": 4000, "least_singularity": 0.0, "least_clearance": 0.01}
     with pytest.raises(ParameterError) as caught:
-        sweep_of(load("delta"), "workspace", options)
+        workspace_sweep(load("delta"), 4000, least_clearance=0.01)
     assert caught.value.field == "least_clearance"
 
 

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from pkm_twin.bags.reader import inspect, read_messages, recover
+from pkm_twin.bags.reader import inspect, read_messages
+from pkm_twin.bags.recover import recover
 from pkm_twin.errors import BagError
 
 Rows = Callable[[Any], list[tuple[Any, ...]]]

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pkm_twin.bags.reader import BagWriter, inspect, read_messages, recover
+from pkm_twin.bags.reader import BagWriter, inspect, read_messages
+from pkm_twin.bags.recover import recover
 from pkm_twin.errors import BagError
 
 TEXT = "std_msgs/msg/String"

@@ -4,6 +4,7 @@
 The replay here is the nodes' own cores fed with the recorded messages, without a middleware.
 """
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
+from bags.recording import residuals
 from bags.recording.capture import machine_parameters, parameters_digest
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward
@@ -192,7 +194,7 @@ class TestPickAndPlace:
         _, held = self.phases(bags, time)
         bare = load("delta_cu")
         loaded = bare.changed(payload={"mass": float(facts_of(bag)["payload_mass_kg"])})
-        still = np.zeros(3)
+        still = np.zeros(len(bare.joint_names))
         q = {stamp_of(m.message.header): m.message.position for m in bag.messages([STATES])}
         at = EPOCH + np.round(time[held] * SECOND).astype(np.int64)
         q = np.array([q[1_000_000 * round(stamp / 1_000_000)] for stamp in at.tolist()])
@@ -269,3 +271,16 @@ def test_readme_names_what_is_there():
         assert f"{size:.2f} MB" in row
         for topic in EXPECTED[name]:
             assert f"`{topic}`" in text.split(f"## {name}")[1].split("\n## ")[0]
+
+
+@pytest.mark.parametrize("name", list(residuals.SECTIONS))
+def test_readme_has_the_figures_that_are_printed(name):
+    """Word for word, and number for number within the last digit."""
+    page = residuals.PAGE.read_text(encoding="utf-8")
+    stands = page.split(f"<!-- printed: {name} -->\n")[1].split("\n<!-- end -->")[0]
+    number = re.compile(r"\d+\.?\d*")
+    printed = residuals.SECTIONS[name]()
+    assert number.sub("#", stands) == number.sub("#", printed)
+    for old, new in zip(number.findall(stands), number.findall(printed), strict=True):
+        digits = len(old.partition(".")[2])
+        assert abs(float(old) - float(new)) < 1.1 * 10**-digits, (name, old, new)

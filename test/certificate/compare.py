@@ -6,11 +6,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from pkm_twin.machine.joints import platform_motion
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.reactions import reactions
 from delta_dynamics.virtual_work import energy
-from pkm_twin.machine.joints import platform_motion
 from test.certificate.lagrange import energies
 from test.certificate.machines import Case, friction, random_case
 from test.certificate.mujoco_models import tree

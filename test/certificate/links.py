@@ -15,6 +15,7 @@ import numpy as np
 from pkm_twin import load
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor import compliance
+from stiffness_monitor.structure import structural_model
 from test.conftest import parameters_of
 from test.validation.calculix import Mesh, solid_compliance
 from test.validation.test_upr_rpu_paper import LOAD, TABLE_1
@@ -104,7 +105,7 @@ def compare_links(name: str) -> Links:
     """All comparisons of one pose by its name."""
     robot = with_rigid_joints()
     pose = np.array(POSES[name])
-    frame = robot.frame(pose)
+    frame = structural_model(robot, pose)
     with tempfile.TemporaryDirectory() as folder:
         coarse, fine = (solid_compliance(frame, Path(folder), mesh) for mesh in (MESH, FINE))
         held = solid_compliance(frame, Path(folder), FINE, rigid_ends=True)

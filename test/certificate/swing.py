@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pkm_twin.machine.joints import platform_motion
 from scipy.integrate import solve_ivp
 
 from bags.recording.pinocchio_models import DeltaEngine, LoopEngine, PrruEngine
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import forward_dynamics
 from pkm_twin import Robot
-from pkm_twin.machine.joints import platform_motion
 from test.certificate.lagrange import energies
 from test.certificate.machines import build
 from test.conftest import parameters_of

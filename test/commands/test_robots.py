@@ -2,12 +2,17 @@
 """robots, info and compliance: what they print for people and for scripts."""
 
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from pkm_twin import load, robot_names
+from pkm_twin.apps.recorded import why_no_torques
 from stiffness_monitor import compliance, strain_energy
+from test.commands.conftest import REPOSITORY
 
 POSE = (-0.6, 0.1, -0.05)
 WRENCH = (30.0, -50.0, -40.0, 10.0, -20.0, 50.0)
@@ -86,16 +91,17 @@ class TestInfo:
             for field in vars(getattr(robot, section)):
                 assert rows[f"{section}: {field}"], field
         assert rows["geometry: base_radius"].endswith(" m")
-        if robot.dynamics_kernel is not None:
+        if not why_no_torques(robot):
             assert rows["inertia: platform_mass"].endswith(" kg")
-            assert rows["limits: effort"].endswith(f" {robot.effort_unit}")
+            if robot.limits.effort is not None:
+                assert rows["limits: effort"].endswith(f" {robot.effort_units[0]}")
             # A fraction of a length, not a length.
             com = rows.get("inertia: arm_com") or rows["inertia: link_com"]
             assert " of the " in com
 
 
 def test_overconstraint_is_named(twin):
-    assert "constraint couples" in twin("info", "upr_rpu").out
+    assert "moment along" in twin("info", "upr_rpu").out
     assert "│ no:" in twin("info", "delta_cu").out
 
 
@@ -140,6 +146,26 @@ class TestCompliance:
             "dominant"
         ] == ("none")
 
+    def test_a_tie_is_told_as_one(self, twin):
+        text = twin("compliance", "upr_rpu", *POSE, "--wrench", "0,0,1,0,0,0")
+        data = parse(twin("compliance", "upr_rpu", *POSE, "--json").out)
+        energy = strain_energy(load("upr_rpu"), POSE, [0, 0, 1, 0, 0, 0])
+        assert energy.tie == bool(data["tie"])
+        assert ("a tie of the dominant elements" in text.out) == energy.tie
+        level = parse(twin("compliance", "upr_rpu", -0.6, 0, 0, "--json").out)
+        assert level["tie"] == ["1U", "2U"]
+        assert "elements 1U, 2U" in twin("compliance", "upr_rpu", -0.6, 0, 0).out
+
+    def test_beyond_limits_is_refused_or_marked(self, twin):
+        close = "compliance", "upr_rpu", -0.25, 0, 0
+        assert "0.3 to 1 m" in twin(*close).one_line_error()
+        result = twin(*close, "--beyond-limits")
+        assert result.code == 0
+        assert result.out.splitlines()[-1].startswith("beyond limits: limb_3.position is 0.2")
+        marked = parse(twin(*close, "--beyond-limits", "--json").out)["beyond_limits"]
+        assert set(marked) == set(load("upr_rpu").joint_names)
+        assert parse(twin("compliance", "upr_rpu", *POSE, "--json").out)["beyond_limits"] == {}
+
     @pytest.mark.parametrize(
         ("arguments", "code", "text"),
         [
@@ -167,3 +193,43 @@ class TestCompliance:
         path.write_text("mechanism: delta\ngeometry: {base_radius: -1}\n")
         assert "geometry" in twin("info", path).one_line_error()
         assert twin("info", tmp_path / "absent.yaml").code == 1
+
+
+class TestEnds:
+    """Where the output goes wrong, and what a command says of itself."""
+
+    @pytest.mark.parametrize("command", ["robots", "info delta_cu", "info prru --json"])
+    def test_a_full_disk_is_one_line(self, command):
+        with open("/dev/full", "w") as full:
+            done = subprocess.run(
+                [sys.executable, "-m", "pkm_twin.apps.cli", *command.split()],
+                stdout=full,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+            )
+        assert done.returncode == 1
+        assert done.stderr == "pkm-twin: cannot write the output: No space left on device\n"
+
+    def test_a_reader_that_leaves_is_no_error(self):
+        command = f"{sys.executable} -m pkm_twin.apps.cli info delta_cu | head -n 1"
+        done = subprocess.run(
+            command,
+            shell=True,
+            capture_output=True,
+            text=True,
+            env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        )
+        assert done.stderr == ""
+
+    @pytest.mark.parametrize("name", ["a" * 5000, "a/" * 3000, "\n\x1b[31m", "x\udcff.yaml"])
+    def test_odd_names_are_one_line(self, twin, name):
+        for command in ("info", "check", "compliance", "torques"):
+            arguments = {"compliance": (0, 0, 0), "torques": ("m.csv",)}.get(command, ())
+            result = twin(command, name, *arguments)
+            assert result.code == 1
+            result.one_line_error()
+
+    def test_version(self, twin):
+        result = twin("--version")
+        assert result.code == 0 and result.out.startswith("pkm-twin")

@@ -3,13 +3,14 @@
 
 import csv
 import importlib.util
+import os
 
 import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, reactions
 from pkm_twin import load
-from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
+from test.commands.conftest import DELTA, MILLING, STIFFNESS, massless, rewrite
 
 TERMS = ("gravity", "inertia", "velocity", "payload", "friction", "external")
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -147,9 +148,9 @@ def spoiled(change):
         (lambda c: c["arm_1.position"].__setitem__(2, float("nan")), "line 4"),
         (lambda c: c["arm_1.position"].__setitem__(2, ""), "line 4"),
         (lambda c: c["arm_1.position"].__setitem__(2, "0,5"), "line 4"),
-        (lambda c: c["arm_1.position"].__setitem__(2, 3.0), "at sample 2 is unreachable"),
-        (lambda c: c["arm_1.velocity"].__setitem__(2, 1e300), "finite"),
-        (lambda c: [values.clear() for values in c.values()], "a head line and rows"),
+        (lambda c: c["arm_1.position"].__setitem__(2, 3.0), "arm_1.position at sample 2: 3.0 is"),
+        (lambda c: c["arm_1.velocity"].__setitem__(2, 1e300), "allowed: -15 to 15 rad/s"),
+        (lambda c: [values.clear() for values in c.values()], "a header row and rows"),
     ],
 )
 def test_bad_csv(twin, tmp_path, change, text):
@@ -164,8 +165,134 @@ def test_an_unreachable_sample_is_counted_from_the_motions_beginning(twin, tmp_p
     columns = motion("delta", 5000)
     columns["arm_1.position"][4321] = 3.0
     source = write(tmp_path / "long.csv", columns)
-    result = twin("torques", "delta", source, "--out", tmp_path / "t.csv")
-    assert "at sample 4321 " in result.one_line_error()
+    result = twin("torques", "delta", source, "--out", tmp_path / "t.csv", "--beyond-limits")
+    assert "at sample 4321 is unreachable" in result.one_line_error()
+
+
+def test_a_result_that_is_not_finite_is_one_line(twin, tmp_path):
+    columns = motion("delta")
+    columns["arm_1.velocity"][2] = 1e300
+    source = write(tmp_path / "fast.csv", columns)
+    result = twin("torques", "delta", source, "--out", tmp_path / "t.csv", "--beyond-limits")
+    assert result.code == 1 and "finite" in result.one_line_error()
+
+
+class TestBeyondLimits:
+    """One rule for nodes and commands: refused, or computed and marked."""
+
+    def test_a_motion_is_refused_or_marked(self, twin, tmp_path):
+        columns = motion("delta")
+        columns["arm_2.position"] = columns["arm_2.position"] + 1.1
+        low, high = load("delta").limits.position[1]
+        outside = (columns["arm_2.position"] > high) | (columns["arm_2.position"] < low)
+        assert 0 < outside.sum() < len(outside)
+        command = (
+            "torques",
+            "delta",
+            write(tmp_path / "m.csv", columns),
+            "--out",
+            tmp_path / "t.csv",
+        )
+        assert f"{low:g} to {high:g} rad" in twin(*command).one_line_error()
+        result = twin(*command, "--beyond-limits")
+        assert (result.code, result.err) == (0, "")
+        assert "beyond limits: arm_2.position is" in result.out
+        assert np.array_equal(columns_of(tmp_path / "t.csv")["beyond_limits"], outside)
+
+    def test_a_motion_within_has_no_column(self, twin, tmp_path):
+        source = write(tmp_path / "m.csv", motion("delta"))
+        out = tmp_path / "t.csv"
+        assert twin("torques", "delta", source, "--out", out, "--beyond-limits").code == 0
+        assert "beyond_limits" not in columns_of(out)
+
+    def test_a_bags_samples_are_not_dropped_in_silence(self, twin, tmp_path):
+        def far(topic, message, time):
+            if topic == "/joint_states" and 0.0995 < time < 0.1005:
+                message.position = [1.31, *message.position[1:]]
+            return message
+
+        bag = rewrite(DELTA, tmp_path / "far.mcap", far, seconds=0.2)
+        command = "torques", "delta_cu", bag, "--out", tmp_path / "t.csv"
+        assert "arm_1.position" in twin(*command).one_line_error()
+        assert twin(*command, "--beyond-limits").code == 0
+        assert columns_of(tmp_path / "t.csv")["beyond_limits"].sum() == 1
+
+
+class TestPayload:
+    def test_it_is_held_when_told(self, twin, tmp_path):
+        source = write(tmp_path / "m.csv", motion("delta"))
+        tables = {}
+        for name, options in {
+            "bare": (),
+            "always": ("--payload", "0.3"),
+            "later": ("--payload", "0.3", "--load-times", "0.5,2"),
+        }.items():
+            out = tmp_path / f"{name}.csv"
+            assert twin("torques", "delta", source, "--out", out, *options).code == 0
+            tables[name] = columns_of(out)
+        bare, always, later = (joined(t, "delta", "effort") for t in tables.values())
+        held = tables["bare"]["time"] >= 0.5
+        assert np.allclose(later[held], always[held]) and np.allclose(later[~held], bare[~held])
+        assert np.abs(always - bare).max() > 0.1
+
+    def test_its_centre_counts(self, twin, tmp_path):
+        source = write(tmp_path / "m.csv", motion("prru"))
+        outs = [tmp_path / "a.csv", tmp_path / "b.csv"]
+        for out, payload in zip(outs, ("3", "3,0.1,0,0"), strict=True):
+            assert twin("torques", "prru", source, "--out", out, "--payload", payload).code == 0
+        one, other = (joined(columns_of(out), "prru", "effort") for out in outs)
+        assert not np.allclose(one, other)
+
+    def test_a_bags_own_is_part_of_the_table(self, twin, tmp_path):
+        bag = rewrite(DELTA, tmp_path / "b.mcap", begin=8.0, seconds=0.6)
+        # In this part the pick, at 8.275 s, is behind.
+        for name, options in (("told", ()), ("none", ("--payload", "0"))):
+            out = tmp_path / f"{name}.csv"
+            times = ("--load-times", "0,1") if options else ()
+            assert twin("torques", "delta_cu", bag, "--out", out, *options, *times).code == 0
+        told, none = (columns_of(tmp_path / f"{name}.csv") for name in ("told", "none"))
+        assert np.allclose(told["arm_1.effort"], none["arm_1.effort"])
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            ("--payload", "x"),
+            ("--payload", "-1"),
+            ("--payload", "nan"),
+            ("--payload", "1,2"),
+            ("--load-times", "1,2"),
+            ("--payload", "1", "--load-times", "2,1"),
+            ("--payload", "1", "--load-times", "1"),
+            ("--topic", "/joint_states"),
+        ],
+    )
+    def test_usage(self, twin, tmp_path, options):
+        source = write(tmp_path / "m.csv", motion("delta"))
+        result = twin("torques", "delta", source, "--out", tmp_path / "t.csv", *options)
+        assert (result.code, result.out) == (2, "")
+
+
+def test_only_regular_files_and_sizes_first(twin, tmp_path):
+    fifo = tmp_path / "m.csv"
+    os.mkfifo(fifo)
+    out = "--out", tmp_path / "t.csv"
+    assert "FIFO" in twin("torques", "delta", fifo, *out).one_line_error()
+    assert "device" in twin("torques", "delta", "/dev/zero", *out).one_line_error()
+    huge = tmp_path / "huge.csv"
+    with huge.open("wb") as file:
+        file.truncate(2 * 1024**3)
+    assert "at most" in twin("torques", "delta", huge, *out).one_line_error()
+    long = tmp_path / "long.csv"
+    long.write_text("time" + "," * 3_000_000)
+    assert "below" in twin("torques", "delta", long, *out).one_line_error()
+
+
+def test_parquet_without_pyarrow_is_refused_before_the_work(twin, tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    source = write(tmp_path / "motion.csv", motion("delta"))
+    target = tmp_path / "p.parquet"
+    text = twin("torques", "delta", source, "--out", target).one_line_error()
+    assert str(target) in text and "pyarrow" in text and ".part" not in text
 
 
 @pytest.mark.parametrize(
@@ -224,7 +351,7 @@ def test_parquet_has_the_same_columns(twin, tmp_path):
         ("delta_cu", "absent.csv", "t.csv", "absent.csv"),
         ("delta_cu", "absent.mcap", "t.csv", "does not exist"),
         ("prru", DELTA, "t.csv", "slider_1"),
-        ("upr_rpu", STIFFNESS, "t.csv", "masses"),
+        ("massless", STIFFNESS, "t.csv", "inertia"),
     ],
 )
 def test_refusals(twin, tmp_path, sample, robot, motion_file, out, text):
@@ -232,6 +359,7 @@ def test_refusals(twin, tmp_path, sample, robot, motion_file, out, text):
         motion_file = sample
     elif motion_file == STIFFNESS:
         motion_file = rewrite(STIFFNESS, tmp_path / "stiff.mcap", seconds=0.1)
+        robot = massless(tmp_path / "light.yaml")
     result = twin("torques", robot, motion_file, "--out", tmp_path / out)
     assert (result.code, result.out) == (1, "")
     assert text in result.one_line_error()

@@ -4,23 +4,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.linalg import eigh, null_space
 from scipy.optimize import brentq
 
-from pkm_twin.machine.members import (
-    GROUND,
-    MOVING,
-    RIGID,
-    Frame,
-    Member,
-    RigidBody,
-    Section,
-    Support,
-    cowper,
-)
+from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.members import Section, cowper
 from stiffness_monitor.beams import (
     assemble,
     body_mass,
@@ -29,6 +21,9 @@ from stiffness_monitor.beams import (
     member_matrices,
     rigid_offset,
 )
+from stiffness_monitor.structure import RIGID, Member, RigidBody, StructuralModel, Support
+
+PLATFORM = "platform"
 
 FREE = math.inf
 LENGTH = 0.8
@@ -214,17 +209,23 @@ def test_frequencies_converge_with_the_elements(section, order):
 # ------------------------------------------------------------------ frames
 
 
+def frame_of(origin, members, bodies):
+    """A model of members alone; bodies of the platform by their place from its origin."""
+    placed = tuple(replace(body, at=origin + body.at) for body in bodies)
+    return StructuralModel(origin, PLATFORM, members, (), placed)
+
+
 def point(mass, inertia=0.0):
-    return RigidBody(MOVING, mass, np.zeros(3), inertia * np.eye(3))
+    return RigidBody(PLATFORM, mass, np.zeros(3), inertia * np.eye(3), PLATFORM)
 
 
 def cantilever(section, along, compliance=RIGID, body=None):
     axes = local_axes(along)
     end = LENGTH * along
-    inner = Support("root", GROUND, axes, compliance)
-    outer = Support("tip", MOVING, axes)
+    inner = Support("root", BASE, axes, compliance)
+    outer = Support("tip", PLATFORM, axes)
     bar = Member("bar", "bar", section, np.zeros(3), end, inner, outer)
-    return Frame(end, (bar,), (body or point(0.0),))
+    return frame_of(end, (bar,), (body or point(0.0),))
 
 
 @pytest.mark.parametrize("ratio", [0.1, 1.0, 25.0])
@@ -281,8 +282,8 @@ def test_a_pinned_strut_has_the_simply_supported_beams_frequencies():
         TUBE,
         np.zeros(3),
         end,
-        Support("foot", GROUND, axes, (0.0,) * 4 + (FREE,) * 2),
-        Support("head", MOVING, axes, (FREE, 0.0, 0.0) + (FREE,) * 3),
+        Support("foot", BASE, axes, (0.0,) * 4 + (FREE,) * 2),
+        Support("head", PLATFORM, axes, (FREE, 0.0, 0.0) + (FREE,) * 3),
     )
     hold = Member(
         "post",
@@ -290,10 +291,10 @@ def test_a_pinned_strut_has_the_simply_supported_beams_frequencies():
         post,
         np.array([LENGTH, 0.0, 0.01]),
         end,
-        Support("a", GROUND, axes),
-        Support("b", MOVING, axes),
+        Support("a", BASE, axes),
+        Support("b", PLATFORM, axes),
     )
-    system = assemble(Frame(end, (rod, hold), (point(1e3, 1e3),)), 16)
+    system = assemble(frame_of(end, (rod, hold), (point(1e3, 1e3),)), 16)
     found = lowest(system, 20)
     for n in (1, 2):
         near = np.sort(np.abs(found / timoshenko_simply_supported(TUBE, n) - 1))[:2]
@@ -313,9 +314,7 @@ def random_frame(rng):
         start, knee, end = rng.normal(size=(3, 3))
         spring = tuple(10.0 ** rng.uniform(-9, -6, 6))
         members += [
-            Member(
-                f"thigh {leg}", "thigh", SOLID, start, knee, Support("hip", GROUND, axes()), None
-            ),
+            Member(f"thigh {leg}", "thigh", SOLID, start, knee, Support("hip", BASE, axes()), None),
             Member(
                 f"shin {leg}",
                 "shin",
@@ -323,21 +322,21 @@ def random_frame(rng):
                 knee + 0.1 * rng.normal(size=3),
                 end,
                 Support("knee", f"thigh {leg}", axes(), (0.0, *spring[1:5], FREE)),
-                Support("foot", MOVING, axes(), (spring[0], 0.0, 0.0, FREE, 0.0, spring[5])),
+                Support("foot", PLATFORM, axes(), (spring[0], 0.0, 0.0, FREE, 0.0, spring[5])),
             ),
         ]
-    body = RigidBody(MOVING, 3.0, rng.normal(size=3) * 0.1, np.diag([0.1, 0.2, 0.25]))
-    return Frame(origin, tuple(members), (body,))
+    body = RigidBody(PLATFORM, 3.0, rng.normal(size=3) * 0.1, np.diag([0.1, 0.2, 0.25]), PLATFORM)
+    return frame_of(origin, tuple(members), (body,))
 
 
 def by_constraints(frame, elements):
     """The same frame with six unknowns at every node, and constraint equations for the joints."""
-    count = 6 + sum(6 * (elements + 1) for _ in frame.members)
+    count = 6 + sum(6 * (elements + 1) for _ in frame.parts)
     stiffness, mass = np.zeros((count, count)), np.zeros((count, count))
     for body in frame.bodies:
-        mass[:6, :6] += body_mass(body)
+        mass[:6, :6] += body_mass(body, frame.origin)
     rows, at, free_ends = [], 6, {}
-    for member in frame.members:
+    for member in frame.parts:
         span = member.end - member.start
         length = np.linalg.norm(span)
         turn = np.kron(np.eye(2 * (elements + 1)), local_axes(span / length))
@@ -356,9 +355,9 @@ def by_constraints(frame, elements):
                 continue
             gap = np.zeros((6, count))
             gap[:, first : first + 6] = np.eye(6)
-            if support.body != GROUND:
+            if support.body != BASE:
                 there, origin = (
-                    (0, frame.origin) if support.body == MOVING else free_ends[support.body]
+                    (0, frame.origin) if support.body == PLATFORM else free_ends[support.body]
                 )
                 gap[:, there : there + 6] -= rigid_offset(place - origin)
             gap = np.kron(np.eye(2), support.axes.T) @ gap
@@ -432,17 +431,22 @@ def test_named_nodes_move_with_what_they_stand_on(rng):
     assert len(system.nodes) == 1 + 4 * 4 == len(system.positions)
 
 
+def loads(frame):
+    """Bodies of a frame by their place from its origin."""
+    return tuple(replace(body, at=body.at - frame.origin) for body in frame.bodies)
+
+
 def test_mass_of_a_frame_is_that_of_its_bodies(rng):
     frame = random_frame(rng)
-    loose = Support("x", GROUND, np.eye(3), (FREE,) * 6)
-    free = [Member(m.name, m.body, m.section, m.start, m.end, loose, None) for m in frame.members]
-    system = assemble(Frame(frame.origin, tuple(free), frame.bodies), 2)
-    bars = sum(m.section.mass_per_length * np.linalg.norm(m.end - m.start) for m in frame.members)
+    loose = Support("x", BASE, np.eye(3), (FREE,) * 6)
+    free = [Member(m.name, m.body, m.section, m.start, m.end, loose, None) for m in frame.parts]
+    system = assemble(frame_of(frame.origin, tuple(free), loads(frame)), 2)
+    bars = sum(m.section.mass_per_length * np.linalg.norm(m.end - m.start) for m in frame.parts)
     for k in range(3):
         push = np.zeros(len(system.mass))
         push[k] = 1.0
         at = 6
-        for member in frame.members:
+        for member in frame.parts:
             axes = local_axes(
                 (member.end - member.start) / np.linalg.norm(member.end - member.start)
             )
@@ -458,4 +462,4 @@ def test_a_member_on_nothing_is_refused():
         "bar", "bar", TUBE, np.zeros(3), np.ones(3), Support("j", "arm", np.eye(3)), None
     )  # fmt: skip
     with pytest.raises(ValueError, match="stands on arm"):
-        assemble(Frame(np.zeros(3), (bar,), ()), 2)
+        assemble(frame_of(np.zeros(3), (bar,), ()), 2)

@@ -56,10 +56,10 @@ def test_assembly_over_random_dimensions(variant, rng, rcu):
             },
         )
         q = rng.uniform(-0.5, 0.9, (50, 3))
-        try:
-            pose = robot.forward(q)
-        except UnreachableError:
-            continue
+        pose, good = robot.try_forward(q)
+        # A machine whose joints reach nothing would hold the law for nothing.
+        assert good.mean() > 0.5
+        q, pose = q[good], pose[good]
         assert np.abs(closure_errors(robot, pose, q)).max() < 1e-12
         np.testing.assert_allclose(robot.forward(robot.inverse(pose)), pose, atol=1e-9)
 
@@ -110,9 +110,8 @@ def test_rcu_forward_finds_assemblies_that_no_rod_reaches(variant, rng):
     rod, _ = variant("delta", geometry={"base_radius": 0.33})
     rcu, _ = variant("delta_cu", geometry={"base_radius": 0.33})
     q = rng.uniform(-1.2, 1.5, (20000, 3))
-    pose, fault = rcu.forward_kernel(rcu.parameters, q)
-    _, rod_fault = rod.forward_kernel(rod.parameters, q)
-    gained = (fault[:, 0] == 0) & (rod_fault[:, 0] != 0)
+    pose, good = rcu.try_forward(q)
+    gained = good & ~rod.try_forward(q)[1]
     assert gained.any()
     assert np.abs(closure_errors(rcu, pose[gained], q[gained])).max() < 1e-12
 

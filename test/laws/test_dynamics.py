@@ -1,59 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws that the dynamics of every robot with masses keeps."""
 
-import os
-import subprocess
-import sys
+import json
 
 import numpy as np
 import pytest
+from support.bodies import bodies
+from support.robots import (
+    FREE,
+    both_ways,
+    loaded,
+    massive,
+    parameters_of,
+    random_joints,
+    random_motion,
+)
 
 from delta_dynamics import energy, forward_dynamics, inverse_dynamics, mass_matrix
-from delta_dynamics.virtual_work import bodies
-from pkm_twin import load, robot_names
+from pkm_twin import load
 from pkm_twin.errors import SingularityError, UnreachableError
-from test.conftest import finite_difference, random_joints
 
-MASSIVE = [name for name in robot_names() if load(name).dynamics_kernel is not None]
-LOADED = {
-    "payload": {"mass": 0.3, "com": [0.01, -0.02, -0.04], "inertia": [4e-4, 5e-4, 3e-4]},
-    "gravity": [0.5, -1.0, -9.7],
-    "friction": {"viscous": [0.1, 0.2, 0.3], "coulomb": [0.05, 0.06, 0.07]},
-}
-FRICTIONLESS = {"viscous": [0.0] * 3, "coulomb": [0.0] * 3}
-
-pytestmark = pytest.mark.parametrize("name", MASSIVE)
+pytestmark = massive
 
 
 def states(robot, rng, count):
-    """Positions, rates and accelerations of a size that suits the joint's unit."""
-    scale = 1.0 if robot.joint_unit == "rad" else 0.2
-    q = random_joints(robot, rng, count)
-    return q, *(scale * rng.normal(0.0, spread, (count, 3)) for spread in (3.0, 30.0))
+    return random_motion(robot, rng, count)[:3]
 
 
 @pytest.fixture
 def robot(name):
-    return load(name).changed(**LOADED)
-
-
-def test_forward_undoes_inverse(name, robot, rng):
-    q = random_joints(robot, rng, 500)
-    pose = robot.forward(q)
-    np.testing.assert_allclose(robot.inverse(pose), q, atol=1e-11)
-    np.testing.assert_allclose(robot.forward(robot.inverse(pose)), pose, atol=1e-11)
-
-
-def test_jacobian_is_the_derivative_of_forward(name, robot, rng):
-    q = random_joints(robot, rng, 50)
-    np.testing.assert_allclose(
-        robot.jacobian(q), finite_difference(robot.forward, q), rtol=1e-6, atol=1e-7
-    )
+    return loaded(name)
 
 
 def test_power_is_the_rate_of_energy(name, robot, rng):
     """tau . qd = dE/dt along random motions q(t), by a five-point stencil in t."""
-    robot = robot.changed(friction=FRICTIONLESS)
+    robot = robot.changed(friction=FREE)
     q, qd, qdd = states(robot, rng, 100)
     jerk = rng.normal(0.0, 10.0, q.shape)
 
@@ -69,19 +50,41 @@ def test_power_is_the_rate_of_energy(name, robot, rng):
 
 
 def test_efforts_are_the_virtual_work_of_all_bodies(name, robot, rng):
-    """The kernel against the sum over the rows that reactions and energies are made of."""
+    """The compiled torques against the sum over bodies, Jacobian by Jacobian, on numbers."""
     q, qd, qdd = states(robot, rng, 100)
     wrench = rng.normal(0.0, 10.0, (100, 6))
-    rows, twist = bodies(robot, q, qd, qdd)
-    force = rows[..., 0:1] * (rows[..., 4:7] - robot.gravity)
-    linear, angular = (rows[..., k : k + 9].reshape(*rows.shape[:-1], 3, 3) for k in (10, 19))
-    expected = np.einsum("nbjk,nbk->nj", linear, force)
-    expected += np.einsum("nbjk,nbk->nj", angular, rows[..., 7:10])
-    expected -= np.einsum("nkj,nk->nj", twist, wrench)
+    all_ = bodies(robot, q, qd, qdd)
+    force = all_.mass[:, None] * (all_.acceleration - robot.gravity)
+    expected = np.einsum("nbij,nbi->nj", all_.linear, force)
+    expected += np.einsum("nbij,nbi->nj", all_.angular, all_.moment)
+    expected -= np.einsum("nkj,nk->nj", robot.platform_jacobian(q), wrench)
     expected += robot.friction.viscous * qd + robot.friction.coulomb * np.sign(qd)
+    expected += rotors(robot) * qdd
+    size = np.maximum(1.0, np.abs(expected).max())
     np.testing.assert_allclose(
-        inverse_dynamics(robot, q, qd, qdd, wrench), expected, rtol=1e-11, atol=1e-11
+        inverse_dynamics(robot, q, qd, qdd, wrench), expected, rtol=1e-11, atol=1e-11 * size
     )
+
+
+def rotors(robot):
+    """Rotor inertias of the actuated joints, shape (n,)."""
+    return np.array([robot.graph.joints[name].rotor_inertia for name in robot.joint_names])
+
+
+def test_energy_and_mass_matrix_are_the_sums_over_all_bodies(name, robot, rng):
+    q, qd, qdd = states(robot, rng, 100)
+    all_ = bodies(robot, q, qd, qdd)
+    matrix = np.einsum("nbij,b,nbik->njk", all_.linear, all_.mass, all_.linear)
+    matrix += np.einsum("nbij,nbil,nblk->njk", all_.angular, all_.inertia, all_.angular)
+    matrix += np.diag(rotors(robot))
+    found = mass_matrix(robot, q)
+    np.testing.assert_allclose(found, matrix, rtol=1e-11, atol=1e-12 * np.abs(matrix).max())
+    both = energy(robot, q, qd)
+    kinetic = np.einsum("ni,nij,nj->n", qd, matrix, qd) / 2
+    np.testing.assert_allclose(both.kinetic, kinetic, rtol=1e-11)
+    potential = -np.einsum("b,nbi,i->n", all_.mass, all_.com, robot.gravity)
+    np.testing.assert_allclose(both.potential, potential, rtol=1e-11, atol=1e-12)
+    np.testing.assert_array_equal(both.total, both.kinetic + both.potential)
 
 
 def test_external_power_reaches_the_actuators(name, robot, rng):
@@ -97,7 +100,7 @@ def test_external_power_reaches_the_actuators(name, robot, rng):
 
 def test_linear_in_acceleration_with_the_mass_matrix(name, robot, rng):
     q, qd, qdd = states(robot, rng, 100)
-    at_rest = inverse_dynamics(robot, q, qd, np.zeros(3))
+    at_rest = inverse_dynamics(robot, q, qd, np.zeros(len(robot.joint_names)))
     inertial = np.einsum("nij,nj->ni", mass_matrix(robot, q), qdd)
     np.testing.assert_allclose(
         inverse_dynamics(robot, q, qd, qdd), at_rest + inertial, rtol=1e-11, atol=1e-11
@@ -105,9 +108,9 @@ def test_linear_in_acceleration_with_the_mass_matrix(name, robot, rng):
 
 
 def test_mass_matrix_is_symmetric_and_positive(name, robot, rng):
-    still = robot.changed(gravity=[0, 0, 0], friction=FRICTIONLESS)
+    still = robot.changed(gravity=[0, 0, 0], friction=FREE)
     q = random_joints(robot, rng, 100)
-    raw = inverse_dynamics(still, q[:, None], np.zeros(3), np.eye(3))
+    raw = inverse_dynamics(still, q[:, None], np.zeros(len(robot.joint_names)), np.eye(q.shape[1]))
     np.testing.assert_allclose(raw, raw.swapaxes(-1, -2), atol=1e-13 * np.abs(raw).max())
     assert (np.linalg.eigvalsh(mass_matrix(robot, q)) > 0).all()
 
@@ -124,7 +127,7 @@ def test_forward_dynamics_undoes_inverse(name, robot, rng):
 def test_friction_is_viscous_and_coulomb(name, robot, rng):
     q, qd, qdd = states(robot, rng, 20)
     qd[0] = 0.0
-    free = robot.changed(friction=FRICTIONLESS)
+    free = robot.changed(friction=FREE)
     change = inverse_dynamics(robot, q, qd, qdd) - inverse_dynamics(free, q, qd, qdd)
     friction = robot.friction
     np.testing.assert_allclose(
@@ -134,9 +137,11 @@ def test_friction_is_viscous_and_coulomb(name, robot, rng):
 
 @pytest.mark.parametrize("batch", [(), (4,), (4, 2), (0,)])
 def test_batches_equal_single_samples(name, robot, rng, batch):
-    q, qd, qdd = (x[: int(np.prod(batch))].reshape(*batch, 3) for x in states(robot, rng, 8))
+    q, qd, qdd = (
+        x[: int(np.prod(batch))].reshape(*batch, x.shape[-1]) for x in states(robot, rng, 8)
+    )
     tau = inverse_dynamics(robot, q, qd, qdd)
-    assert tau.shape == (*batch, 3)
+    assert tau.shape == (*batch, len(robot.joint_names))
     for index in np.ndindex(batch):
         np.testing.assert_array_equal(
             tau[index], inverse_dynamics(robot, q[index], qd[index], qdd[index])
@@ -165,51 +170,74 @@ def test_values_that_are_not_finite_are_refused(name, robot, rng, bad, which):
         inverse_dynamics(robot, *values)
 
 
-def test_unreachable_names_limb_sample_and_miss(name, robot, rng):
-    far = np.tile(robot.forward(random_joints(robot, rng, 1)[0]), (2, 3, 1))
-    far[1, 2, -1 if robot.pose_names[2] == "z" else 0] = -50.0
-    if robot.pose_names[0] == "z":
-        far[1, 2] = [0.0, 1.4, 1.4]
-    with pytest.raises((UnreachableError, SingularityError)) as caught:
-        robot.inverse(far)
-    assert caught.value.index == (1, 2)
-    if isinstance(caught.value, UnreachableError):
-        assert caught.value.limb in robot.limb_names
-        assert caught.value.miss > 0
+def test_refused_poses_name_sample_and_limb_or_measure(name, robot, rng):
+    """Poses far outside: by the machine's size along its lengths, nearly on edge by its angles."""
+    at = robot.forward(random_joints(robot, rng, 1)[0])
+    reach = np.array([5 * robot.engine.tree.size if u == "m" else 1.5 for u in robot.pose_units])
+    refused = 0
+    for far in at + reach * rng.uniform(-1.0, 1.0, (40, len(at))):
+        if robot.try_inverse(far)[1]:
+            continue
+        refused += 1
+        batch = np.tile(at, (2, 3, 1))
+        batch[1, 2] = far
+        with pytest.raises((UnreachableError, SingularityError)) as caught:
+            robot.inverse(batch)
+        error = caught.value
+        assert error.index == (1, 2)
+        if isinstance(error, UnreachableError):
+            assert error.limb in {*robot.limb_names, *robot.graph.joints, *robot.graph.rods}
+            assert error.miss > 0.0
+        else:
+            assert error.measure < error.bound
+    assert refused > 10
 
 
 def test_wrong_last_axis_is_refused(name, robot):
+    n = len(robot.joint_names)
     with pytest.raises(ValueError, match="last axis"):
-        inverse_dynamics(robot, np.zeros(4), np.zeros(3), np.zeros(3))
+        inverse_dynamics(robot, np.zeros(n + 1), np.zeros(n), np.zeros(n))
     with pytest.raises(ValueError, match="last axis"):
-        inverse_dynamics(robot, np.zeros((2, 3)), np.zeros(3), np.zeros(2))
+        inverse_dynamics(robot, np.zeros((2, n)), np.zeros(n), np.zeros(n - 1))
 
 
-def test_without_numba_the_numbers_are_the_same(name, rng):
+def test_without_a_compiler_the_numbers_are_the_same(name, rng):
     """The same formulas as plain Python, in a process of its own."""
     code = f"""
+import json, sys
 import numpy as np
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.codegen import kernels
-assert not kernels.COMPILED
 robot = load({name!r})
-q = np.load("in.npy")
-np.save("out.npy", inverse_dynamics(robot, q, 2 * q, 3 * q, np.ones(6)))
+q = np.array(json.loads(sys.stdin.read()))
+tau = inverse_dynamics(robot, q, 2 * q, 3 * q, np.ones(6))
+one = inverse_dynamics(robot, q[0], 2 * q[0], 3 * q[0], np.ones(6))
+print(json.dumps({{"compiled": kernels.compiled(), "tau": tau.tolist(), "one": one.tolist()}}))
 """
-    import tempfile
+    q = random_joints(load(name), rng, 20)
+    fast, slow = both_ways(code, json.dumps(q.tolist()))
+    scale = np.abs(fast["tau"]).max()
+    for word in fast:
+        np.testing.assert_allclose(slow[word], fast[word], rtol=1e-12, atol=1e-12 * max(1, scale))
 
-    robot = load(name)
-    q = random_joints(robot, rng, 20)
-    with tempfile.TemporaryDirectory() as folder:
-        np.save(f"{folder}/in.npy", q)
-        root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-        environment = {
-            **{k: v for k, v in os.environ.items() if k != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"},
-            "PKM_TWIN_NO_NUMBA": "1",
-            "PYTHONPATH": root,
-        }
-        subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, check=True)
-        plain = np.load(f"{folder}/out.npy")
-    compiled = inverse_dynamics(robot, q, 2 * q, 3 * q, np.ones(6))
-    np.testing.assert_allclose(plain, compiled, rtol=1e-12, atol=1e-12)
+
+@pytest.mark.parametrize("heavier", [0.5, 3.0])
+def test_machines_of_one_geometry_keep_their_own_masses(name, variant, heavier, rng):
+    """Two robots share compiled programs; masses, rotors and friction are each its own."""
+    data = parameters_of(name)["inertia"]
+    masses = {k: heavier * v for k, v in data.items() if k.endswith("mass") or k == "density"}
+    if not masses:
+        pytest.fail(f"{name}: a file with inertia that names no mass")
+    robot, (other, _) = load(name), variant(name, inertia=masses)
+    assert other.engine is robot.engine
+    q, qd, qdd = states(robot, rng, 10)
+    for machine in (robot, other, robot):
+        all_ = bodies(machine, q, qd, qdd)
+        matrix = np.einsum("nbij,b,nbik->njk", all_.linear, all_.mass, all_.linear)
+        matrix += np.einsum("nbij,nbil,nblk->njk", all_.angular, all_.inertia, all_.angular)
+        matrix += np.diag(rotors(machine))
+        found = mass_matrix(machine, q)
+        np.testing.assert_allclose(found, matrix, rtol=1e-11, atol=1e-12 * np.abs(matrix).max())
+    traces = [mass_matrix(machine, q).trace(axis1=1, axis2=2) for machine in (robot, other)]
+    assert (np.abs(traces[1] / traces[0] - 1.0) > 0.05).all()

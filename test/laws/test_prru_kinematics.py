@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.bodies import bodies
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.virtual_work import bodies, energy
+from delta_dynamics.virtual_work import energy
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
@@ -179,11 +180,11 @@ def test_closure(robot: Prru, tilt: float) -> None:
     assert np.linalg.norm(limbs, axis=-1) == pytest.approx(robot.geometry.limb_length, abs=1e-13)
     up = limbs[..., 2] if robot.geometry.branch == "below" else -limbs[..., 2]
     assert (up > 0).all()
-    rows, _ = bodies(robot, q, np.zeros(3), np.zeros(3))
+    found = bodies(robot, q, np.zeros(3), np.zeros(3)).com
     com = centre + rotation @ robot.inertia.platform_com
-    np.testing.assert_allclose(rows[:, 9, 1:4], com, atol=1e-13)
+    np.testing.assert_allclose(found[:, 9], com, atol=1e-13)
     payload = centre + rotation @ robot.payload.com
-    np.testing.assert_allclose(rows[:, 10, 1:4], payload, atol=1e-13)
+    np.testing.assert_allclose(found[:, 10], payload, atol=1e-13)
 
 
 def test_forward_undoes_inverse(robot: Prru) -> None:
@@ -206,8 +207,7 @@ def test_forward_undoes_inverse_for_any_size(branch: str, seed: int) -> None:
     }
     robot = machine("paper", geometry=geometry)
     pose = poses(5000, 85, seed)
-    q, fault = robot.inverse_kernel(robot.parameters, pose)
-    kept = fault[:, 0] == 0.0
+    q, kept = robot.try_inverse(pose)
     assert kept.sum() > 300
     again = robot.forward(q[kept])
     # At the singularity the pose turns without the sliders: the bound is on the sliders.
@@ -225,10 +225,9 @@ def test_forward_undoes_inverse_for_any_size(branch: str, seed: int) -> None:
 def test_forward_follows_the_level_platform(geometry: dict[str, Any]) -> None:
     """Where many assemblies stand side by side, the one that a fine walk from level leads to."""
     robot = machine("paper", geometry=geometry)
-    q, fault = robot.inverse_kernel(robot.parameters, poses(3000, 85))
-    q = q[fault[:, 0] == 0.0]
-    _, fault = robot.forward_kernel(robot.parameters, q)
-    q = q[fault[:, 0] == 0.0][:400]
+    q, good = robot.try_inverse(poses(3000, 85))
+    q = q[good]
+    q = q[robot.try_forward(q)[1]][:400]
     assert len(q) == 400
     way = np.linspace(0.0, 1.0, 2001)[:, None, None]
     level = q.mean(axis=-1, keepdims=True)
@@ -244,8 +243,7 @@ def test_parasitic_motions_at_thirds() -> None:
     gamma = np.arctan2(-np.sin(a) * np.sin(b), np.cos(a) + np.cos(b))
     _, rotation, _ = place(robot, pose)
     np.testing.assert_allclose(rotation, rotations(a, b, gamma), atol=1e-13)
-    rows, _ = bodies(robot, robot.inverse(pose), np.zeros(3), np.zeros(3))
-    x, y, _ = rows[:, 9, 1:4].T
+    x, y, _ = bodies(robot, robot.inverse(pose), np.zeros(3), np.zeros(3)).com[:, 9].T
     r = robot.geometry.platform_radius
     m, n, o = rotation[:, 0, 0], rotation[:, 1, 1], rotation[:, 1, 0]
     np.testing.assert_allclose(x, r * (m - n) / 2, atol=1e-13)
@@ -306,40 +304,40 @@ def inertias(robot: Prru) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_rows_along_a_motion(robot: Prru, seed: int) -> None:
+def test_bodies_along_a_motion(robot: Prru, seed: int) -> None:
     motion = Motion(robot, seed)
     q, qd, qdd = motion(TIMES)
-    rows, _ = bodies(robot, q, qd, qdd)
-    velocity = np.einsum("nbji,nj->nbi", rows[..., 10:19].reshape(-1, 11, 3, 3), qd)
-    spin = np.einsum("nbji,nj->nbi", rows[..., 19:28].reshape(-1, 11, 3, 3), qd)
+    now = bodies(robot, q, qd, qdd)
+    velocity = np.einsum("nbij,nj->nbi", now.linear, qd)
+    spin = np.einsum("nbij,nj->nbi", now.angular, qd)
     near_q, near_qd, near_qdd = motion(around())
-    near, _ = bodies(robot, near_q, near_qd, near_qdd)
-    np.testing.assert_allclose(velocity, in_time(near[..., 1:4]), atol=1e-9)
-    near_velocity = np.einsum("tnbji,tnj->tnbi", near[..., 10:19].reshape(7, -1, 11, 3, 3), near_qd)
-    np.testing.assert_allclose(rows[..., 4:7], in_time(near_velocity), atol=1e-7)
+    near = bodies(robot, near_q, near_qd, near_qdd)
+    np.testing.assert_allclose(velocity, in_time(near.com), atol=1e-9)
+    near_velocity = np.einsum("tnbij,tnj->tnbi", near.linear, near_qd)
+    np.testing.assert_allclose(now.acceleration, in_time(near_velocity), atol=1e-7)
     frames = frames_of_bodies(robot, near_q)
     np.testing.assert_allclose(spin, spins(frames), atol=1e-8)
-    near_spin = np.einsum("tnbji,tnj->tnbi", near[..., 19:28].reshape(7, -1, 11, 3, 3), near_qd)
+    near_spin = np.einsum("tnbij,tnj->tnbi", near.angular, near_qd)
     momentum = np.einsum("tnbij,bjk,tnblk,tnbl->tnbi", frames, inertias(robot), frames, near_spin)
-    np.testing.assert_allclose(rows[..., 7:10], in_time(momentum), atol=1e-7)
-    assert np.abs(rows[:, [2, 5, 8], 7:10]).max() > 1e-2
+    np.testing.assert_allclose(now.moment, in_time(momentum), atol=1e-7)
+    assert np.abs(now.moment[:, [2, 5, 8]]).max() > 1e-2
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_power_balance(robot: Prru, seed: int) -> None:
-    """The actuators' power is the rate of the energy that the rows hold."""
+    """The actuators' power is the rate of the energy that the bodies hold."""
     motion = Motion(robot, seed)
     q, qd, qdd = motion(TIMES)
     power = np.einsum("ni,ni->n", inverse_dynamics(robot, q, qd, qdd), qd)
     near_q, near_qd, near_qdd = motion(around())
-    near, _ = bodies(robot, near_q, near_qd, near_qdd)
-    velocity = np.einsum("tnbji,tnj->tnbi", near[..., 10:19].reshape(7, -1, 11, 3, 3), near_qd)
-    spin = np.einsum("tnbji,tnj->tnbi", near[..., 19:28].reshape(7, -1, 11, 3, 3), near_qd)
+    near = bodies(robot, near_q, near_qd, near_qdd)
+    velocity = np.einsum("tnbij,tnj->tnbi", near.linear, near_qd)
+    spin = np.einsum("tnbij,tnj->tnbi", near.angular, near_qd)
     frames = frames_of_bodies(robot, near_q)
     local = np.einsum("tnbji,tnbj->tnbi", frames, spin)
-    kinetic = 0.5 * np.einsum("tnb,tnbi,tnbi->tn", near[..., 0], velocity, velocity)
+    kinetic = 0.5 * np.einsum("b,tnbi,tnbi->tn", near.mass, velocity, velocity)
     kinetic += 0.5 * np.einsum("tnbi,bij,tnbj->tn", local, inertias(robot), local)
-    potential = -np.einsum("tnb,tnbi,i->tn", near[..., 0], near[..., 1:4], robot.gravity)
+    potential = -np.einsum("b,tnbi,i->tn", near.mass, near.com, robot.gravity)
     np.testing.assert_allclose(power, in_time(kinetic + potential), atol=1e-6, rtol=1e-8)
     twin = energy(robot, near_q, near_qd)
     np.testing.assert_allclose(twin.kinetic, kinetic, rtol=1e-11)

@@ -5,44 +5,36 @@ import dataclasses
 
 import numpy as np
 import pytest
+from support.bodies import bodies
+from support.robots import (
+    FREE,
+    MASSIVE,
+    MASSLESS,
+    loaded,
+    loaded_like,
+    massive,
+    random_motion,
+)
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
-from delta_dynamics.virtual_work import bodies
-from pkm_twin import load, robot_names
+from delta_dynamics.reactions import _joints, _loads
+from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.machine import schema
-from pkm_twin.machine.joints import platform_motion
-from pkm_twin.mechanisms.delta import Delta
-from test.conftest import parameters_of, random_joints
 
-MASSIVE = [name for name in robot_names() if load(name).dynamics_kernel is not None]
-MASSLESS = [name for name in robot_names() if load(name).dynamics_kernel is None]
-LOADED = {
-    "payload": {"mass": 0.3, "com": [0.01, -0.02, -0.04], "inertia": [4e-4, 5e-4, 3e-4]},
-    "gravity": [0.5, -1.0, -9.7],
-    "friction": {"viscous": [0.1, 0.2, 0.3], "coulomb": [0.05, 0.06, 0.07]},
-}
-FREE = {"viscous": [0.0] * 3, "coulomb": [0.0] * 3}
-
-massive = pytest.mark.parametrize("name", MASSIVE)
-
-
-def states(robot, rng, count):
-    scale = 1.0 if robot.joint_unit == "rad" else 0.2
-    q = random_joints(robot, rng, count)
-    qd, qdd = (scale * rng.normal(0.0, size, (count, 3)) for size in (3.0, 30.0))
-    return q, qd, qdd, rng.normal(0.0, 10.0, (count, 6))
+states = random_motion
 
 
 def imbalance(robot, result, q, qd, qdd, wrench):
-    """Greatest force or moment (about the world's origin) that is missing on any body, relative.
+    """Greatest force or moment (about the base's origin) that is missing on any body, relative.
 
     Written without the matrix of the solver: sums wrench by wrench.
     """
-    rows, _ = bodies(robot, q, qd, qdd)
+    all_ = bodies(robot, q, qd, qdd)
+    moving = robot.graph.platform
     worst = 0.0
-    names = [n for n in robot.body_names if n != "payload"]
-    for name in names:
+    for name in robot.body_names:
+        if name == "payload":
+            continue
         force, moment = np.zeros((2, len(q), 3))
         size = np.zeros(len(q))
         for k, (inner, outer) in enumerate(result.bodies):
@@ -53,13 +45,12 @@ def imbalance(robot, result, q, qd, qdd, wrench):
             if sign:
                 size = np.maximum(size, np.abs(f).max(-1))
         for k, body in enumerate(robot.body_names):
-            if body == name or (name == "platform" and body == "payload"):
-                row = rows[:, k]
-                inertial = row[:, :1] * (row[:, 4:7] - robot.gravity)
+            if body == name or (name == moving and body == "payload"):
+                inertial = all_.mass[k] * (all_.acceleration[:, k] - robot.gravity)
                 force -= inertial
-                moment -= row[:, 7:10] + np.cross(row[:, 1:4], inertial)
-        if name == "platform":
-            origin = platform_motion(robot, q).position
+                moment -= all_.moment[:, k] + np.cross(all_.com[:, k], inertial)
+        if name == moving:
+            origin = robot.platform(q)[0]
             force += wrench[:, :3]
             moment += wrench[:, 3:] + np.cross(origin, wrench[:, :3])
         worst = max(
@@ -70,16 +61,16 @@ def imbalance(robot, result, q, qd, qdd, wrench):
 
 @massive
 def test_every_body_is_balanced(name, rng):
-    robot = load(name).changed(**LOADED)
+    robot = loaded(name)
     motion = states(robot, rng, 200)
-    result = reactions(robot, *motion)
+    result = least_norm_reactions(robot, *motion)
     assert imbalance(robot, result, *motion) < 1e-10
     assert result.residual.max() < 1e-10
 
 
 @massive
 def test_the_force_route_gives_the_power_routes_efforts(name, rng):
-    robot = load(name).changed(**LOADED)
+    robot = loaded(name)
     motion = states(robot, rng, 300)
     tau = inverse_dynamics(robot.changed(friction=FREE), *motion)
     efforts = reactions(robot, *motion).efforts
@@ -87,13 +78,18 @@ def test_the_force_route_gives_the_power_routes_efforts(name, rng):
 
 
 @massive
-def test_the_shipped_mechanisms_are_determinate(name, rng):
-    robot = load(name).changed(**LOADED)
+def test_what_is_determinate_is_a_matter_of_counting(name, rng):
+    robot = loaded(name)
     result = reactions(robot, *states(robot, rng, 100))
-    assert result.indeterminate == ()
-    assert result.determinate.all()
-    assert np.isfinite(result.wrenches).all()
-    count = {"delta": 9, "prru": 12}[robot.mechanism]
+    held = [joint for joint in robot.graph.joints.values() if not joint.given]
+    count = len(held) + 2 * len(robot.graph.rods)
+    # Six balances a body; a rod's spin about itself is nobody's. What is more is not determinate.
+    balances = 6 * (len(robot.body_names) - 1) - len(robot.graph.rods)
+    surplus = len(result.components) - balances
+    assert surplus >= 0
+    assert (result.indeterminate == ()) == (surplus == 0)
+    assert result.determinate.all() == (surplus == 0)
+    np.testing.assert_array_equal(np.isfinite(result.wrenches), result.determinate)
     assert len(result.names) == len(set(result.names)) == count
     assert result.wrenches.shape == result.determinate.shape == (100, count, 6)
     assert result.bodies[0][0] == "base"
@@ -103,7 +99,9 @@ def test_the_shipped_mechanisms_are_determinate(name, rng):
 def test_reactions_are_linear_in_the_wrench(name, rng):
     robot = load(name)
     q, qd, qdd, wrench = states(robot, rng, 50)
-    none, one, many = (reactions(robot, q, qd, qdd, k * wrench).wrenches for k in (0, 1, -3))
+    none, one, many = (
+        least_norm_reactions(robot, q, qd, qdd, k * wrench).wrenches for k in (0, 1, -3)
+    )
     expected = none - 3 * (one - none)
     np.testing.assert_allclose(many, expected, atol=1e-10 * np.abs(expected).max())
 
@@ -113,21 +111,16 @@ def test_no_joint_does_work_against_its_freedoms(name, rng):
     """Power of all constraint wrenches on the actual motion is that of the actuators."""
     robot = load(name).changed(friction=FREE)
     q, qd, qdd, wrench = states(robot, rng, 50)
-    result = reactions(robot, q, qd, qdd, wrench)
-    rows, twist = bodies(robot, q, qd, qdd)
-    origin = platform_motion(robot, q).position
+    result = least_norm_reactions(robot, q, qd, qdd, wrench)
+    all_ = bodies(robot, q, qd, qdd)
 
     def motion_of(body):
-        """Velocity of the world's origin as a point of the body, and angular velocity."""
+        """Velocity of the base's origin as a point of the body, and angular velocity."""
         if body == "base":
             return np.zeros((2, 50, 3))
-        if body == "platform":
-            v, w = np.split(np.einsum("nij,nj->ni", twist, qd), 2, -1)
-            return v - np.cross(w, origin), w
-        row = rows[:, robot.body_names.index(body)]
-        v, w = (np.einsum("nji,nj->ni", row[:, s].reshape(-1, 3, 3), qd)
-                for s in (slice(10, 19), slice(19, 28)))  # fmt: skip
-        return v - np.cross(w, row[:, 1:4]), w
+        k = robot.body_names.index(body)
+        v, w = (np.einsum("nij,nj->ni", part[:, k], qd) for part in (all_.linear, all_.angular))
+        return v - np.cross(w, all_.com[:, k]), w
 
     power = np.zeros(50)
     for k, (inner, outer) in enumerate(result.bodies):
@@ -141,16 +134,17 @@ def test_no_joint_does_work_against_its_freedoms(name, rng):
 @massive
 @pytest.mark.parametrize("batch", [(), (3,), (3, 2), (0,)])
 def test_batches_equal_single_samples(name, rng, batch):
-    robot = load(name).changed(**LOADED)
+    robot = loaded(name)
     motion = [v[: int(np.prod(batch))].reshape(*batch, v.shape[-1]) for v in states(robot, rng, 6)]
     result = reactions(robot, *motion)
     assert result.wrenches.shape == (*batch, len(result.names), 6)
     assert result.residual.shape == batch
     for index in np.ndindex(batch):
         single = reactions(robot, *(v[index] for v in motion))
-        size = np.abs(single.wrenches).max()
+        size = np.nanmax(np.abs(single.wrenches))
         np.testing.assert_allclose(result.wrenches[index], single.wrenches, atol=1e-12 * size)
-    wide = reactions(robot, motion[0], np.zeros(3), [0, 0, 0])
+    still = np.zeros(len(robot.joint_names))
+    wide = reactions(robot, motion[0], still, still.tolist())
     assert wide.values.shape == (*batch, len(wide.components))
 
 
@@ -193,7 +187,7 @@ def test_a_moment_on_the_delta_platform_loads_the_parallelograms():
 
 
 def test_the_rcu_limb_transmits_what_its_joints_hold(rng):
-    robot = load("delta_cu").changed(**LOADED)
+    robot = loaded("delta_cu")
     result = reactions(robot, *states(robot, rng, 50))
     azimuth = robot.geometry.azimuths[2]
     t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -206,13 +200,12 @@ def test_the_rcu_limb_transmits_what_its_joints_hold(rng):
 
 
 def test_prru_joints_hold_no_moment_about_their_axes(rng, variant):
-    if "prru" not in MASSIVE:
-        pytest.skip("no 3-PRRU in config")
     # Links with inertia about the limb: thin ones leave the universal joint without a moment.
-    robot = variant("prru", inertia={"upper_link_inertia": [0.1, 0.02]})[0].changed(**LOADED)
+    robot = variant("prru", inertia={"upper_link_inertia": [0.1, 0.02]})[0]
+    robot = loaded_like(robot)
     q, *rest = states(robot, rng, 50)
     result = reactions(robot, q, *rest)
-    platform = platform_motion(robot, q)
+    _, rotation = robot.platform(q)
     size = np.abs(result.wrenches).max()
     for i, limb in enumerate(("I", "II", "III")):
         azimuth = robot.geometry.azimuths[i]
@@ -226,81 +219,84 @@ def test_prru_joints_hold_no_moment_about_their_axes(rng, variant):
             np.abs(np.sum(result.wrench(f"link joint {limb}")[:, 3:] * d, -1)).max() < 1e-13 * size
         )
         last = result.wrench(f"platform joint {limb}")[:, 3:]
-        h = platform.axes @ t
+        h = rotation @ t
         assert np.abs(last).min(-1).max() > 1e-5
         assert np.abs(np.sum(last * h, -1)).max() < 1e-13 * size
         assert np.abs(np.sum(last * np.cross(d, h), -1)).max() < 1e-13 * size
 
 
-class RevoluteParallelograms(Delta):
-    """Parallelograms with four pins: each also holds the couple along t x e, three too many."""
-
-    def body_joints(self, q, platform):
-        joints = super().body_joints(q, platform)
-        result = []
-        for joint in joints:
-            limb = joint.name.split()[-1]
-            if not joint.name.startswith("base"):
-                azimuth = self.geometry.azimuths[("I", "II", "III").index(limb)]
-                t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-                extra = np.zeros((*joint.basis.shape[:-1], 1))
-                extra[..., 3:, 0] = np.cross(t, joint.basis[..., 3:, -1])
-                joint = dataclasses.replace(
-                    joint,
-                    components=(*joint.components, f"limb {limb}: moment along t x e"),
-                    basis=np.concatenate([joint.basis, extra], -1),
-                )
-            result.append(joint)
-        return tuple(result)
+OVERCONSTRAINED = [
+    name for name in MASSIVE if load(name).engine.mobility.redundant and name != "delta_cu"
+]
 
 
-@pytest.fixture
-def overconstrained():
-    robot = schema.build(RevoluteParallelograms, parameters_of("delta"))
-    return robot.changed(**LOADED)
+@pytest.fixture(params=OVERCONSTRAINED)
+def overconstrained(request):
+    return loaded(request.param)
 
 
 def test_an_overconstrained_mechanism_names_what_statics_cannot_tell(overconstrained, rng):
     motion = states(overconstrained, rng, 60)
     result = reactions(overconstrained, *motion)
-    limbs = ("I", "II", "III")
-    assert set(result.indeterminate) == {
-        *(f"limb {limb}: moment along {axis}" for limb in limbs for axis in ("e", "t x e")),
-        *(f"base joint {limb}: moment along {axis}" for limb in limbs for axis in ("r", "z")),
-    }
     np.testing.assert_array_equal(result.determinate, np.isfinite(result.wrenches))
     np.testing.assert_array_equal(result.determinate_components, np.isfinite(result.values))
-    assert result.determinate[..., :3].all()
-    # Arm II turns about the world's x axis, along which no surplus couple acts.
-    along_t = np.array([name.endswith(" II") for name in result.names])
-    expected = along_t[:, None] & np.array([True, False, False])
-    np.testing.assert_array_equal(result.determinate[..., 3:], np.tile(expected, (60, 1, 1)))
+    known = result.determinate_components.all(0)
+    assert {n for n, k in zip(result.components, known, strict=True) if not k} == set(
+        result.indeterminate
+    )
     tau = inverse_dynamics(overconstrained.changed(friction=FREE), *motion)
-    np.testing.assert_allclose(result.efforts, tau, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(result.efforts, tau, rtol=1e-9, atol=1e-10 * np.abs(tau).max())
+
+
+def test_the_2upr_rpu_cannot_tell_how_its_three_limbs_share_a_twist():
+    """Its symmetric plane holds three surplus couples and a force (2UPR-RPU paper, section 2)."""
+    robot = load("upr_rpu")
+    home = robot.graph.home
+    result = reactions(robot, home, 0 * home, 0 * home)
+    assert len(result.components) - 6 * (len(robot.body_names) - 1) == 3
+    # What the limbs push along themselves does the weight's work alone.
+    assert np.isfinite(result.efforts).all()
+    for name in result.indeterminate:
+        assert "force along axis" not in name
+
+
+def balance(robot, motion):
+    """What every component does to every body: shape (n, 6 bodies, components), base's origin."""
+    engine = robot.massive()
+    (_, rods, places, _), status = engine.kernel("loads", _loads)(robot.inertial, *motion[:3])
+    assert status is None
+    joints = _joints(engine.graph, rods, places)
+    names = list(dict.fromkeys(c for joint in joints for c in joint.components))
+    rows = [n for n in robot.body_names if n != "payload"]
+    matrix = np.zeros((len(rods), len(rows), 6, len(names)))
+    for joint in joints:
+        unit = joint.basis.copy()
+        lever = np.cross(joint.point[..., None, :], unit[:, :3].swapaxes(-1, -2))
+        unit[:, 3:] += lever.swapaxes(-1, -2)
+        for k, component in enumerate(joint.components):
+            for body, sign in ((joint.outer, 1.0), (joint.inner, -1.0)):
+                if body in rows:
+                    column = matrix[:, rows.index(body), :, names.index(component)]
+                    column += sign * unit[..., k]
+    return names, joints, matrix.reshape(len(rods), -1, len(names))
 
 
 def test_determinate_components_are_the_same_in_every_solution(overconstrained, rng):
-    """With a self-stress of the surplus couples added, the balance stays and so do these."""
+    """With a self-stress of the surplus components added, the balance stays and so do these."""
     motion = states(overconstrained, rng, 60)
     known = reactions(overconstrained, *motion)
     least = least_norm_reactions(overconstrained, *motion)
     assert imbalance(overconstrained, least, *motion) < 1e-10
+    names, joints, matrix = balance(overconstrained, motion)
+    assert tuple(names) == least.components
+    _, s, vt = np.linalg.svd(matrix)
+    rank = int((s[0] > 1e-9 * s[0, 0]).sum())
+    assert (s[:, rank - 1] > 1e-9 * s[:, 0]).all() and rank < len(names)
+    stress = np.einsum("nsk,ns->nk", vt[:, rank:], rng.normal(0.0, 5.0, (60, len(names) - rank)))
     wrenches = least.wrenches.copy()
-    base = overconstrained.body_joints(motion[0], platform_motion(overconstrained, motion[0]))
-    couples = np.concatenate(
-        [j.basis[..., 3:, -2:] for j in base if j.name.startswith("elbow")], -1
-    )
-    # Six couples on the platform's three rotations: any null vector of theirs is a self-stress.
-    null = np.linalg.svd(couples)[2][:, 3:]
-    stress = np.einsum("nsk,ns->nk", null, rng.normal(0.0, 5.0, (60, 3)))
-    slope = np.zeros(60)
-    for i, limb in enumerate(("I", "II", "III")):
-        along = couples[:, :, 2 * i : 2 * i + 2] @ stress[:, 2 * i : 2 * i + 2, None]
-        # Elbow and platform joint share one unknown, so it counts once.
-        for joint in ("base joint", "elbow"):
-            slope += np.sum(least.wrench(f"{joint} {limb}")[:, 3:] * along[..., 0], -1)
-        for joint in ("base joint", "elbow", "platform joint"):
-            wrenches[:, least.names.index(f"{joint} {limb}"), 3:] += along[..., 0]
+    for k, joint in enumerate(joints):
+        along = np.stack([stress[:, names.index(c)] for c in joint.components], -1)
+        wrenches[:, k] += np.einsum("nij,nj->ni", joint.basis, along)
     other = dataclasses.replace(least, wrenches=wrenches)
     assert imbalance(overconstrained, other, *motion) < 1e-10
     size = np.abs(wrenches).max()
@@ -308,7 +304,11 @@ def test_determinate_components_are_the_same_in_every_solution(overconstrained, 
         difference = np.abs(solution.wrenches - known.wrenches)[known.determinate]
         assert difference.max() < 1e-10 * size
     assert np.abs(wrenches - least.wrenches)[~known.determinate].max() > 0.1
-    # The least of all solutions is normal to every self-stress.
+    # The least of all solutions is normal to every self-stress, moments counted as forces.
+    centred = least.points - least.points.mean(-2, keepdims=True)
+    length = np.sqrt(np.mean(np.sum(centred**2, -1), -1))
+    unit = np.where(["moment" in name for name in names], length[:, None], 1.0)
+    slope = np.sum(least.values / unit * stress / unit, -1)
     assert np.abs(slope).max() < 1e-10 * size**2
 
 
@@ -318,9 +318,19 @@ def test_a_single_faulty_pose_in_a_batch_is_told_apart(rng):
     inside, beyond = np.array([0.98, 1.36, 0.785]), np.array([1.758, -0.796, 1.362])
 
     def couples(way):
+        """Joints, and the parallelograms' couples e = t x w as columns."""
         q = (1 - way) * inside + way * beyond
-        joints = robot.body_joints(q, platform_motion(robot, q))
-        return q, np.stack([j.basis[:, -1][3:] for j in joints if j.name.startswith("elbow")], -1)
+        rotations, origins = robot.placements(q)
+        at, g = robot.engine.tree.at, robot.geometry
+        columns = []
+        for azimuth, rod in zip(g.azimuths, robot.graph.rods.values(), strict=True):
+            a, b = (
+                origins[body] + rotations[body] @ (point - at[body])
+                for body, point in zip((rod.inner, rod.outer), rod.ends, strict=True)
+            )
+            e = np.cross([-np.sin(azimuth), np.cos(azimuth), 0.0], b - a)
+            columns.append(e / np.linalg.norm(e))
+        return q, np.stack(columns, -1)
 
     low, high = 0.0, 1.0
     for _ in range(80):
@@ -356,9 +366,7 @@ VARIANTS = [
 
 @pytest.mark.parametrize(("name", "sections"), VARIANTS)
 def test_other_machines_are_balanced_too(variant, rng, name, sections):
-    if name not in MASSIVE:
-        pytest.skip(f"no {name} in config")
-    robot = variant(name, **sections)[0].changed(**LOADED)
+    robot = loaded_like(variant(name, **sections)[0])
     q, qd, qdd, wrench = states(robot, rng, 100)
     q = q.mean(-1, keepdims=True) + 0.5 * (q - q.mean(-1, keepdims=True))
     result = reactions(robot, q, qd, qdd, wrench)
@@ -369,17 +377,22 @@ def test_other_machines_are_balanced_too(variant, rng, name, sections):
 
 
 class RodByRod:
-    """A Delta with every rod a body of its own; moments about the world's origin."""
+    """A Delta with every rod a body of its own; moments about the base's origin."""
 
-    def __init__(self, robot):
-        self.robot = robot
+    def __init__(self, robot, all_, k):
+        self.robot, self.all, self.k = robot, all_, k
         self.loads, self.columns = [], []
 
-    def body(self, row, share=1.0, shift=0.0):
-        force = share * row[0] * (row[4:7] - self.robot.gravity)
-        moment = share * row[7:10] + np.cross(row[1:4] + shift, force)
-        self.loads.append(np.concatenate([force, moment]))
+    def body(self, name, share=1.0, shift=0.0):
+        self.loads.append(self.needs(name, share, shift))
         return len(self.loads) - 1
+
+    def needs(self, name, share=1.0, shift=0.0):
+        at = self.robot.body_names.index(name)
+        all_, k = self.all, self.k
+        force = share * all_.mass[at] * (all_.acceleration[k, at] - self.robot.gravity)
+        moment = share * all_.moment[k, at] + np.cross(all_.com[k, at] + shift, force)
+        return np.concatenate([force, moment])
 
     def unknown(self, inner, outer, force, moment):
         self.columns.append((inner, outer, np.concatenate([force, moment])))
@@ -403,31 +416,36 @@ class RodByRod:
 @pytest.mark.parametrize("half_width", [0.02, 0.05])
 def test_a_parallelogram_rod_by_rod_gives_the_same(half_width, rng):
     """Six rods with ball ends, each with half a limb's mass, beside one limb body with a couple."""
-    robot = load("delta").changed(**LOADED)
+    robot = loaded("delta")
     motion = states(robot, rng, 20)
     result = reactions(robot, *motion)
-    for rows, points, wrenches, wrench in zip(
-        bodies(robot, *motion[:3])[0], result.points, result.wrenches, motion[3], strict=True
+    all_ = bodies(robot, *motion[:3])
+    origin = robot.platform(motion[0])[0]
+    for n, (points, wrenches, wrench) in enumerate(
+        zip(result.points, result.wrenches, motion[3], strict=True)
     ):
-        model = RodByRod(robot)
-        platform = model.body(rows[6])
-        held = model.loads.pop(model.body(rows[7]))
-        about = np.cross(rows[6, 1:4], wrench[:3])
-        model.loads[platform] += held - wrench - np.concatenate([np.zeros(3), about])
+        model = RodByRod(robot, all_, n)
+        platform = model.body("platform")
+        about = np.cross(origin[n], wrench[:3])
+        model.loads[platform] += (
+            model.needs("payload") - wrench - np.concatenate([np.zeros(3), about])
+        )
         rods = {}
-        for i in range(3):
+        for i, limb in enumerate(("I", "II", "III")):
             azimuth = robot.geometry.azimuths[i]
             t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-            a, b, c = points[3 * i : 3 * i + 3]
-            arm = model.body(rows[2 * i])
+            joints = [result.names.index(f"{joint} {limb}")
+                      for joint in ("base joint", "elbow", "platform joint")]  # fmt: skip
+            a, b, c = points[joints]
+            arm = model.body(f"arm {limb}")
             model.ball(None, arm, a)
             for axis in np.eye(3):
                 model.unknown(None, arm, np.zeros(3), axis)
             for lever in (-half_width * t, half_width * t):
-                rod = model.body(rows[2 * i + 1], 0.5, lever)
+                rod = model.body(f"forearm {limb}", 0.5, lever)
                 at_b, at_c = model.ball(arm, rod, b + lever), model.ball(rod, platform, c + lever)
-                rods.setdefault(3 * i + 1, []).append((lever, at_b))
-                rods.setdefault(3 * i + 2, []).append((lever, at_c))
+                rods.setdefault(joints[1], []).append((lever, at_b))
+                rods.setdefault(joints[2], []).append((lever, at_c))
         solution = model.solve()
         for joint, ends in rods.items():
             force = sum(solution[where] for _, where in ends)
@@ -461,4 +479,4 @@ def test_an_unreachable_state_is_named(variant):
 @pytest.mark.parametrize("name", MASSLESS)
 def test_a_robot_without_masses_is_refused(name):
     with pytest.raises(ParameterError):
-        reactions(load(name), np.ones(3), np.zeros(3), np.zeros(3))
+        reactions(load(name), *np.ones((3, len(load(name).joint_names))))

@@ -5,29 +5,13 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from support.robots import MASSLESS, loaded, massive, random_motion
 
 from delta_dynamics import Terms, dynamics_terms, inverse_dynamics, mass_matrix
-from pkm_twin import load, robot_names
+from pkm_twin import load
 from pkm_twin.errors import ParameterError, UnreachableError
-from test.conftest import random_joints
 
-MASSIVE = [name for name in robot_names() if load(name).dynamics_kernel is not None]
-MASSLESS = [name for name in robot_names() if load(name).dynamics_kernel is None]
-LOADED = {
-    "payload": {"mass": 0.3, "com": [0.01, -0.02, -0.04], "inertia": [4e-4, 5e-4, 3e-4]},
-    "gravity": [0.5, -1.0, -9.7],
-    "friction": {"viscous": [0.1, 0.2, 0.3], "coulomb": [0.05, 0.06, 0.07]},
-}
 NAMES = tuple(field.name for field in fields(Terms))
-
-massive = pytest.mark.parametrize("name", MASSIVE)
-
-
-def states(robot, rng, count):
-    scale = 1.0 if robot.joint_unit == "rad" else 0.2
-    q = random_joints(robot, rng, count)
-    qd, qdd = (scale * rng.normal(0.0, size, (count, 3)) for size in (3.0, 30.0))
-    return q, qd, qdd, rng.normal(0.0, 10.0, (count, 6))
 
 
 def close(a, b, tolerance=1e-12):
@@ -37,8 +21,8 @@ def close(a, b, tolerance=1e-12):
 
 @massive
 def test_the_terms_sum_to_inverse_dynamics(name, rng):
-    robot = load(name).changed(**LOADED)
-    motion = states(robot, rng, 300)
+    robot = loaded(name)
+    motion = random_motion(robot, rng, 300)
     terms = dynamics_terms(robot, *motion)
     tau = inverse_dynamics(robot, *motion)
     largest = np.max([np.abs(getattr(terms, n)) for n in NAMES], (0, -1))
@@ -47,8 +31,8 @@ def test_the_terms_sum_to_inverse_dynamics(name, rng):
 
 @massive
 def test_each_term_has_its_own_cause_and_power(name, rng):
-    robot = load(name).changed(**LOADED)
-    q, qd, qdd, wrench = states(robot, rng, 50)
+    robot = loaded(name)
+    q, qd, qdd, wrench = random_motion(robot, rng, 50)
     one = dynamics_terms(robot, q, qd, qdd, wrench)
     two = dynamics_terms(robot, q, 2 * qd, 3 * qdd, 5 * wrench)
     close(two.gravity, one.gravity)
@@ -61,8 +45,8 @@ def test_each_term_has_its_own_cause_and_power(name, rng):
 
 @massive
 def test_terms_against_what_they_stand_for(name, rng):
-    robot = load(name).changed(**LOADED)
-    q, qd, qdd, wrench = states(robot, rng, 50)
+    robot = loaded(name)
+    q, qd, qdd, wrench = random_motion(robot, rng, 50)
     terms = dynamics_terms(robot, q, qd, qdd, wrench)
     bare = robot.changed(payload={"mass": 0.0, "inertia": [0.0] * 3})
     close(terms.inertia, np.einsum("nij,nj->ni", mass_matrix(bare, q), qdd), 1e-11)
@@ -77,30 +61,30 @@ def test_terms_against_what_they_stand_for(name, rng):
 @massive
 def test_absent_causes_give_exact_zeros(name, rng):
     robot = load(name)
-    q, qd, qdd, _ = states(robot, rng, 20)
+    q, qd, qdd, _ = random_motion(robot, rng, 20)
     terms = dynamics_terms(robot, q, qd, qdd)
     for absent in ("payload", "friction", "external"):
         assert not getattr(terms, absent).any()
-    still = dynamics_terms(robot.changed(gravity=[0, 0, 0]), q, np.zeros(3), np.zeros(3))
+    still = dynamics_terms(robot.changed(gravity=[0, 0, 0]), q, 0 * qd, 0 * qd)
     assert not still.total.any()
 
 
 @massive
 def test_every_term_has_the_common_batch_shape(name, rng):
-    robot = load(name).changed(**LOADED)
-    q, qd, qdd, wrench = (value[0] for value in states(robot, rng, 1))
+    robot = loaded(name)
+    q, qd, qdd, wrench = (value[0] for value in random_motion(robot, rng, 1))
     wide = np.tile(wrench, (4, 2, 1))
     terms = dynamics_terms(robot, q, qd[None], qdd, wide)
     single = dynamics_terms(robot, q.tolist(), qd.tolist(), qdd, wrench)
     for n in NAMES:
-        assert getattr(terms, n).shape == (4, 2, 3)
+        assert getattr(terms, n).shape == (4, 2, len(robot.joint_names))
         np.testing.assert_array_equal(getattr(terms, n)[3, 1], getattr(single, n))
 
 
 @massive
 def test_faults_are_those_of_inverse_dynamics(name, rng):
     robot = load(name)
-    q, qd, qdd, wrench = (value[0] for value in states(robot, rng, 1))
+    q, qd, qdd, wrench = (value[0] for value in random_motion(robot, rng, 1))
     with pytest.raises(ValueError, match="last axis"):
         dynamics_terms(robot, q, qd[:2], qdd)
     with pytest.raises(ValueError, match="last axis"):
@@ -122,4 +106,4 @@ def test_an_unreachable_state_is_named(variant):
 @pytest.mark.parametrize("name", MASSLESS)
 def test_a_robot_without_masses_is_refused(name):
     with pytest.raises(ParameterError, match="masses"):
-        dynamics_terms(load(name), np.ones(3), np.zeros(3), np.zeros(3))
+        dynamics_terms(load(name), *np.ones((3, len(load(name).joint_names))))

@@ -3,13 +3,11 @@
 
 import numpy as np
 import pytest
+from support.robots import every_robot, random_poses
 
-from pkm_twin import load, robot_names
+from pkm_twin import load
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.tracking import boundary_distance, follow, track
-from test.conftest import random_poses
-
-every_robot = pytest.mark.parametrize("name", robot_names())
 
 
 def stream(robot, rng, count):
@@ -62,10 +60,9 @@ def test_boundary_distance_is_kept_inside_and_zero_outside(name, rng):
     poses = random_poses(robot, rng, 5)
     distances = boundary_distance(robot, poses)
     assert (distances > 0).all()
-    radius = robot.geometry.platform_radius
-    scale = np.array([1.0 if unit == "m" else radius for unit in robot.pose_units])
+    scale = robot.pose_scales
     for pose, distance in zip(poses, distances, strict=True):
-        for direction in rng.normal(size=(20, 3)):
+        for direction in rng.normal(size=(20, len(scale))):
             moved = pose + 0.8 * distance * direction / np.linalg.norm(direction) / scale
             q = robot.inverse(moved)
             assert (q >= robot.limits.position[:, 0]).all()

@@ -17,8 +17,10 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import qr
 
-from pkm_twin.machine.members import GROUND, MOVING, Frame, Section
+from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.members import Section
 from stiffness_monitor.beams import local_axes
+from stiffness_monitor.structure import StructuralModel
 
 CCX = shutil.which("ccx")
 ABSENT = "no CalculiX (ccx) on this machine"
@@ -61,7 +63,7 @@ class Deck:
 
     lever = 0.03
 
-    def __init__(self, frame: Frame, divisions: int) -> None:
+    def __init__(self, frame: StructuralModel, divisions: int) -> None:
         self.nodes: list[str] = []
         self.elements: list[str] = []
         self.sections: list[str] = []
@@ -72,9 +74,9 @@ class Deck:
         self.count = 0
         self.tips: dict[str, tuple[int, np.ndarray]] = {}
         # The platform: translations of one node, rotations as the translations of another.
-        self.origin = frame.origin
+        self.origin, self.moving = frame.origin, frame.platform
         self.platform = self.node(frame.origin), self.node(frame.origin)
-        for member in frame.members:
+        for member in frame.parts:
             self.member(member, divisions)
         for body in frame.bodies:
             self.body(frame.origin, body)
@@ -129,7 +131,7 @@ class Deck:
         held = {k for k in range(6) if support.compliance[k] == 0.0}
         assert all(support.compliance[k] == np.inf for k in range(6) if k not in held)
         first, second, third = support.axes.T
-        if support.body == GROUND and len(held) == 6:
+        if support.body == BASE and len(held) == 6:
             self.boundaries.append(f"{node}, 1, 6")
         elif held >= {0, 1, 2} and held <= {0, 1, 2, 3}:
             if 3 in held:
@@ -156,7 +158,7 @@ class Deck:
     def hold(self, axis, node, name, place):
         """axis . (displacement of the node - that of the body's point at place) = 0."""
         terms = [((node, k + 1), axis[k]) for k in range(3)]
-        if name == MOVING:
+        if name == self.moving:
             centre, turn = self.platform
             # axis . (turn x lever) = turn . (lever x axis)
             lever = np.cross(place - self.origin, axis)
@@ -176,7 +178,7 @@ class Deck:
         """A flat symmetric platform as four point masses, which have a disc's inertia."""
         radius = np.sqrt(4 * body.inertia[0, 0] / body.mass) / np.sqrt(2)
         assert np.allclose(body.inertia, body.inertia[0, 0] * np.diag([1, 1, 2]))
-        assert not body.com.any()
+        assert np.allclose(body.at, origin, rtol=0.0, atol=1e-12)
         for k, place in enumerate(
             radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
         ):
@@ -184,7 +186,7 @@ class Deck:
             self.elements.append(f"*ELEMENT, TYPE=MASS, ELSET=P{k}\n{k + 1}, {node}")
             self.sections.append(f"*MASS, ELSET=P{k}\n{body.mass / 4:.12e}")
             for axis in np.eye(3):
-                self.hold(axis, node, MOVING, origin + place)
+                self.hold(axis, node, self.moving, origin + place)
 
     def text(self, count):
         return "\n".join(
@@ -201,7 +203,7 @@ class Deck:
         )
 
 
-def frequencies(frame: Frame, count: int, folder: Path, divisions: int = 8) -> np.ndarray:
+def frequencies(frame: StructuralModel, count: int, folder: Path, divisions: int = 8) -> np.ndarray:
     """Lowest frequencies of a frame's beams by CalculiX, Hz."""
     deck = Deck(frame, divisions)
     output = run(deck.text(count + deck.idle), folder)
@@ -335,19 +337,19 @@ class Solids:
     rigid.
     """
 
-    def __init__(self, frame: Frame, mesh: Mesh, *, rigid_ends: bool = False) -> None:
+    def __init__(self, frame: StructuralModel, mesh: Mesh, *, rigid_ends: bool = False) -> None:
         self.nodes: list[str] = []
         self.elements: list[str] = []
         self.sections: list[str] = []
         self.equations: list[str] = []
         self.rigid_ends = rigid_ends
-        self.origin = frame.origin
+        self.origin, self.moving = frame.origin, frame.platform
         # As above: translations of one node, rotations as the translations of another.
         self.platform = self.node(frame.origin), self.node(frame.origin)
         self.mesh = mesh
         self.disc = disc_mesh(mesh.square, mesh.rings)
         self.bricks = 0
-        for member in frame.members:
+        for member in frame.parts:
             self.member(member)
 
     def node(self, place):
@@ -408,7 +410,7 @@ class Solids:
         else:
             motion = section_motion(self.disc, axes, radius)
         dofs += [(i, k) for i in self.platform for k in (1, 2, 3)]
-        assert support.body in (GROUND, MOVING)
+        assert support.body in (BASE, self.moving)
         for k, compliance in enumerate(support.compliance):
             if compliance == np.inf:
                 continue
@@ -417,7 +419,7 @@ class Solids:
             end, body = axis @ motion[:3], np.r_[axis, np.cross(place - self.origin, axis)]
             if k >= 3:
                 end, body = axis @ motion[3:], np.r_[np.zeros(3), axis]
-            if support.body == GROUND:
+            if support.body == BASE:
                 body = np.zeros(6)
             rows.append(np.r_[end, -body])
         self.equate(np.array(rows), dofs)
@@ -482,7 +484,7 @@ def section_motion(disc: Disc, axes: np.ndarray, radius: float) -> np.ndarray:
 
 
 def solid_compliance(
-    frame: Frame, folder: Path, mesh: Mesh | None = None, *, rigid_ends: bool = False
+    frame: StructuralModel, folder: Path, mesh: Mesh | None = None, *, rigid_ends: bool = False
 ) -> np.ndarray:
     """Compliance of the platform at its origin, its bars as solids, shape (6, 6).
 

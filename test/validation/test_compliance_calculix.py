@@ -18,9 +18,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkm_twin.machine.members import GROUND, MOVING, Frame, Member, Section, Support
+from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.members import Section
 from stiffness_monitor import compliance
 from stiffness_monitor.beams import local_axes
+from stiffness_monitor.structure import Member, StructuralModel, Support, structural_model
 from test.certificate.links import (
     BOUND,
     FINITE_ELEMENTS,
@@ -53,7 +55,7 @@ def solids(tmp_path_factory):
 
     def make(robot, name):
         if name not in known:
-            frame = robot.frame(np.array(POSES[name]))
+            frame = structural_model(robot, np.array(POSES[name]))
             known[name] = solid_compliance(frame, tmp_path_factory.mktemp("solids"), MESH)
         return known[name]
 
@@ -83,7 +85,9 @@ def test_the_rest_is_the_shear_factor(name, rigid, solids):
 @needs_calculix
 def test_rigid_ends_are_on_the_other_side(rigid, tmp_path):
     pose = POSES["configuration 2"]
-    theirs = solid_compliance(rigid.frame(np.array(pose)), tmp_path, MESH, rigid_ends=True)
+    theirs = solid_compliance(
+        structural_model(rigid, np.array(pose)), tmp_path, MESH, rigid_ends=True
+    )
     found = difference(compliance(rigid, pose), theirs)
     # Seen: 1.2 %, of which a mesh of 33 x 16 leaves 1.0 %.
     assert (found.diagonal > 0.0).all()
@@ -107,14 +111,14 @@ def test_the_comparison_tells_other_bars_apart(changes, rigid, solids):
 def test_the_comparison_tells_a_held_joint_apart(end, entry, rigid, tmp_path):
     """Limb 1 may not turn about the platform's y, or about X."""
     pose = POSES["configuration 2"]
-    frame = rigid.frame(np.array(pose))
-    first, *others = frame.members
+    frame = structural_model(rigid, np.array(pose))
+    first, *others = frame.parts
     support = getattr(first, end)
     held = list(support.compliance)
     assert held[entry] == np.inf
     held[entry] = 0.0
     first = replace(first, **{end: replace(support, compliance=tuple(held))})
-    theirs = solid_compliance(replace(frame, members=(first, *others)), tmp_path, Mesh(2, 1, 4))
+    theirs = solid_compliance(replace(frame, parts=(first, *others)), tmp_path, Mesh(2, 1, 4))
     assert difference(compliance(rigid, pose), theirs).worst > 10 * BOUND
 
 
@@ -125,8 +129,10 @@ def test_cantilever_and_a_finer_mesh(rigid, tmp_path):
     axes = local_axes(np.array([0.36, 0.48, -0.8]))
     end = length * axes[:, 0]
     section = Section(modulus, shear, diameter, 0.0, 1.0, round_bar(rigid))
-    clamped, tip = Support("root", GROUND, np.eye(3)), Support("tip", MOVING, axes)
-    frame = Frame(end, (Member("bar", "bar", section, np.zeros(3), end, clamped, tip),), ())
+    clamped, tip = Support("root", BASE, np.eye(3)), Support("tip", "platform", axes)
+    frame = StructuralModel(
+        end, "platform", (Member("bar", "bar", section, np.zeros(3), end, clamped, tip),), (), ()
+    )
     area, second = section.area, section.second_moment
     closed = np.zeros((6, 6))
     closed[0, 0] = length / (modulus * area)

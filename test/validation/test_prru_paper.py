@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.bodies import bodies
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.virtual_work import bodies
 from pkm_twin import load
 from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
@@ -194,10 +194,10 @@ def test_position(branch: str) -> None:
     for pose, _, _ in states(50, 0):
         here = paper(robot, pose)
         np.testing.assert_allclose(robot.inverse(pose), here.q, atol=1e-14)
-        rows, _ = bodies(robot, here.q, np.zeros(3), np.zeros(3))
-        np.testing.assert_allclose(rows[9, 1:4], here.centre, atol=1e-13)
+        com = bodies(robot, here.q, np.zeros(3), np.zeros(3)).com
+        np.testing.assert_allclose(com[9], here.centre, atol=1e-13)
         for i in range(3):
-            lever = rows[3 * i + 1, 1:4] - rows[3 * i, 1:4]
+            lever = com[3 * i + 1] - com[3 * i]
             direction = lever / (0.3 * robot.geometry.limb_length)
             np.testing.assert_allclose(direction, here.links[i][1][:, 2], atol=1e-12)
             assert direction[2] == pytest.approx(math.cos(here.swing[i]), abs=1e-12)
@@ -224,11 +224,10 @@ def test_velocity_maps(branch: str) -> None:
         np.testing.assert_allclose(robot.jacobian(q), back, atol=1e-12)
         twist = np.concatenate([j.centre, j.platform]) @ back
         np.testing.assert_allclose(robot.platform_jacobian(q), twist, atol=1e-11)
-        rows, _ = bodies(robot, q, np.zeros(3), np.zeros(3))
+        angular = bodies(robot, q, np.zeros(3), np.zeros(3)).angular
         for k in range(6):
             body = 3 * (k // 2) + 1 + k % 2
-            spin = rows[body, 19:28].reshape(3, 3).T
-            np.testing.assert_allclose(spin, j.links[k] @ back, atol=1e-11)
+            np.testing.assert_allclose(angular[body], j.links[k] @ back, atol=1e-11)
 
 
 @pytest.mark.parametrize("branch", ["below", "above"])

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot's certificate: its torques and places beside other engines', over random states.
+
+The judges compute from the machine's description alone, see ``pkm_twin.apps.certificate``. One of
+them needs numpy only; Pinocchio and MuJoCo are asked where they are installed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics, mass_matrix
+from pkm_twin.apps.certificate.description import UnfitError
+from pkm_twin.apps.certificate.maximal import Maximal
+from pkm_twin.apps.certificate.states import States, random_states
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.robot_urdf import robot_description
+
+Array = NDArray[np.float64]
+
+ENGINES: Final = {
+    "maximal": ("pkm_twin.apps.certificate.maximal:Maximal", "numpy"),
+    "pinocchio": ("pkm_twin.apps.certificate.pinocchio_tree:PinocchioTree", "pin"),
+    "mujoco": ("pkm_twin.apps.certificate.mujoco_tree:MujocoTree", "mujoco"),
+}
+"""A judge's name to its class and to the distribution that it needs."""
+BOUNDS: Final = {
+    "torques": 1e-9,
+    "platform": 1e-9,
+    "jacobian": 1e-9,
+    "mass_matrix": 1e-9,
+    "round_trip": 1e-9,
+    "batch": 0.0,
+}
+"""Greatest difference that passes; places in m and as entries of a rotation, joints in rad or m,
+all else relative."""
+LOOSE: Final = {"mujoco": 1e3}
+"""Engines whose bounds are this much wider: MuJoCo wants some inertia in every body, which a
+small machine shows."""
+SMALL: Final = 1e-3
+"""A state's efforts are not measured against less than this part of the greatest of all states."""
+
+
+class Judge(Protocol):
+    """What a judge answers, for one state."""
+
+    def inverse_dynamics(self, q: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
+        """Efforts, shape (n,)."""
+
+    def platform(self, q: Array) -> tuple[Array, Array]:
+        """Position, shape (3,), and rotation, shape (3, 3)."""
+
+    def jacobian(self, q: Array) -> Array:
+        """Twist per joint rate, shape (6, n)."""
+
+    def mass_matrix(self, q: Array) -> Array:
+        """Shape (n, n)."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """One comparison: the worst and the median difference over all states, and its bound."""
+
+    engine: str
+    what: str
+    worst: float
+    median: float
+    bound: float
+
+    @property
+    def good(self) -> bool:
+        """Whether the bound is kept."""
+        return self.worst <= self.bound
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What was compared, and what could not be."""
+
+    robot: str
+    seed: int
+    states: int
+    drawn: int
+    mobility: int
+    rank: int
+    rows: int
+    versions: Mapping[str, str]
+    """Engine to its version."""
+    missing: Mapping[str, str]
+    """Engine to why it was not asked."""
+    items: Sequence[Item]
+
+    @property
+    def good(self) -> bool:
+        """Whether every bound is kept."""
+        return all(item.good for item in self.items)
+
+    def as_json(self) -> dict[str, Any]:
+        """Numbers and names only; differences relative, or in m and rad where ``what`` is so."""
+        return {
+            "robot": self.robot,
+            "good": self.good,
+            "seed": self.seed,
+            "states": self.states,
+            "drawn": self.drawn,
+            "mobility": self.mobility,
+            "rank": self.rank,
+            "constraints": self.rows,
+            "versions": dict(self.versions),
+            "missing": dict(self.missing),
+            "items": [
+                {
+                    "engine": item.engine,
+                    "what": item.what,
+                    "worst": item.worst if math.isfinite(item.worst) else None,
+                    "median": item.median if math.isfinite(item.median) else None,
+                    "bound": item.bound,
+                    "good": item.good,
+                }
+                for item in self.items
+            ],
+        }
+
+
+def certify(
+    robot: Any,
+    description: Mapping[str, Any],
+    *,
+    states: int = 20,
+    seed: int = 1,
+    engines: Sequence[str] = tuple(ENGINES),
+    progress: Callable[[int], None] = lambda _: None,
+) -> Certificate:
+    """Compare a robot with engines that know its plain description only.
+
+    :param robot: what is judged.
+    :param description: the same machine as a ``mechanism: machine`` mapping; of a robot that is
+        loaded it is ``robot_description(robot)``.
+    :param states: how many random states inside the limits.
+    :param seed: where the random numbers begin.
+    :param engines: names out of ``ENGINES``; what is not installed is told, not raised.
+    :param progress: is told how many of ``states`` are done.
+    :raises PkmTwinError: a machine that no judge can compute, or no state that all can reach.
+    """
+    try:
+        first = Maximal(description)
+        drawn = random_states(first, np.random.default_rng(seed), states)
+    except UnfitError as error:
+        raise PkmTwinError(f"{robot.name} cannot be judged: {error}") from None
+    judges: dict[str, Judge] = {}
+    missing: dict[str, str] = {}
+    for name in engines:
+        module, kind = ENGINES[name][0].split(":")
+        try:
+            maker: Callable[[Mapping[str, Any]], Judge] = getattr(
+                importlib.import_module(module), kind
+            )
+            judges[name] = maker(description)
+        except ImportError as error:
+            if error.name is None or error.name.startswith("pkm_twin"):
+                raise
+            missing[name] = f"{ENGINES[name][1]} is not installed (pkm_twin[certificate])"
+        except UnfitError as error:
+            missing[name] = str(error)
+    items = [*_own(robot, drawn), *_compared(robot, judges, drawn, progress)]
+    return Certificate(
+        robot.name,
+        seed,
+        states,
+        drawn.drawn,
+        first.home.mobility,
+        first.home.rank,
+        first.home.rows,
+        {name: version(ENGINES[name][1]) for name in judges},
+        missing,
+        items,
+    )
+
+
+def certificate_of(robot: Any, **options: Any) -> Certificate:
+    """As :func:`certify`, with the description that the robot brings."""
+    return certify(robot, robot_description(robot), **options)
+
+
+def _own(robot: Any, states: States) -> list[Item]:
+    """What needs no other engine: the round trip, and one sample against the batch."""
+    back = robot.inverse(robot.forward(states.q))
+    trip = np.abs(back - states.q).max(-1)
+    batch = inverse_dynamics(robot, states.q, states.qd, states.qdd, states.wrench)
+    single = np.array(
+        [
+            inverse_dynamics(robot, *state)
+            for state in zip(states.q, states.qd, states.qdd, states.wrench, strict=True)
+        ]
+    )
+    return [_item("twin", "round_trip", trip), _item("twin", "batch", np.abs(batch - single))]
+
+
+def _compared(
+    robot: Any,
+    judges: Mapping[str, Judge],
+    states: States,
+    progress: Callable[[int], None],
+) -> list[Item]:
+    tau = inverse_dynamics(robot, states.q, states.qd, states.qdd, states.wrench)
+    position, rotation = robot.platform(states.q)
+    twist, inertia = robot.platform_jacobian(states.q), mass_matrix(robot, states.q)
+    efforts: dict[str, list[Array]] = {name: [] for name in judges}
+    found: dict[tuple[str, str], list[float]] = {}
+    for k in range(len(states.q)):
+        q = states.q[k]
+        for name, judge in judges.items():
+            effort = judge.inverse_dynamics(q, states.qd[k], states.qdd[k], states.wrench[k])
+            efforts[name].append(effort)
+            place, turned = judge.platform(q)
+            apart = max(np.abs(position[k] - place).max(), np.abs(rotation[k] - turned).max())
+            found.setdefault((name, "platform"), []).append(float(apart))
+            for what, got, expected in (
+                ("jacobian", twist[k], judge.jacobian(q)),
+                ("mass_matrix", inertia[k], judge.mass_matrix(q)),
+            ):
+                found.setdefault((name, what), []).append(relative(got, expected))
+        progress(k + 1)
+    items = []
+    for name in judges:
+        expected = np.array(efforts[name])
+        items.append(_item(name, "torques", effort_differences(tau, expected)))
+        items += [_item(name, what, found[name, what]) for owner, what in found if owner == name]
+    return items
+
+
+def effort_differences(got: Array, expected: Array) -> Array:
+    """Each state's greatest difference over its greatest effort, shape (states,).
+
+    States in which the efforts nearly vanish are measured against the others' size.
+    """
+    size = np.abs(expected).max(-1)
+    scale = np.maximum(size, SMALL * size.max())
+    apart = np.abs(got - expected).max(-1)
+    result: Array = np.divide(apart, scale, out=np.where(apart > 0, np.inf, 0.0), where=scale > 0)
+    return result
+
+
+def relative(got: Array, expected: Array) -> float:
+    """Greatest difference over the greatest expected amount."""
+    apart, size = float(np.abs(got - expected).max()), float(np.abs(expected).max())
+    return apart / size if size else (math.inf if apart else 0.0)
+
+
+def _item(engine: str, what: str, values: Any) -> Item:
+    amounts = np.asarray(values, dtype=float)
+    # A number that is not finite passes no bound.
+    worst = float(np.where(np.isfinite(amounts), amounts, np.inf).max())
+    return Item(
+        engine, what, worst, float(np.median(amounts)), BOUNDS[what] * LOOSE.get(engine, 1.0)
+    )

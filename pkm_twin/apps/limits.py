@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One rule for joint states outside the limits, as the nodes have it: refused, or marked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+OPTION = "--beyond-limits"
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """A joint's position or velocity outside its range: the farthest of a motion.
+
+    ``index`` is its sample, None of a single joint state.
+    """
+
+    joint: str
+    quantity: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    index: int | None = None
+
+    def __str__(self) -> str:
+        where = "" if self.index is None else f" at sample {self.index}"
+        return (
+            f"{self.joint}.{self.quantity} is {self.value:.6g} {self.unit}{where}, "
+            f"limits {self.low:g} to {self.high:g}"
+        )
+
+
+def ranges(robot: Robot) -> Iterator[tuple[str, Array, Array, list[str]]]:
+    """Quantity, lowest and highest values (n,) and units of what a robot's file bounds."""
+    limits = robot.limits
+    units = list(robot.joint_units)
+    if limits.position is not None:
+        yield "position", limits.position[:, 0], limits.position[:, 1], units
+    if limits.velocity is not None:
+        yield "velocity", -limits.velocity, limits.velocity, [f"{unit}/s" for unit in units]
+
+
+def beyond_limits(
+    robot: Robot, q: ArrayLike, qd: ArrayLike | None = None
+) -> tuple[NDArray[np.bool_], list[Beyond]]:
+    """Which joint states are outside the limits, shape (...), and the farthest of each joint.
+
+    q, qd: shape (..., n), rad or m and per s; at most one leading axis.
+    """
+    values = {"position": np.asarray(q, np.float64)}
+    if qd is not None:
+        values["velocity"] = np.asarray(qd, np.float64)
+    single = values["position"].ndim == 1
+    outside = np.zeros(values["position"].shape[:-1], np.bool_)
+    found = []
+    for quantity, low, high, units in ranges(robot):
+        if quantity not in values:
+            continue
+        # A rounding's breadth is no fault: a pose on the limit itself is within it.
+        slack = 1e-9 * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high)))
+        excess = np.maximum(values[quantity] - high, low - values[quantity]) - slack
+        outside |= (excess > 0).any(-1)
+        rows = excess.reshape(-1, excess.shape[-1])
+        for i, name in enumerate(robot.joint_names):
+            worst = int(rows[:, i].argmax()) if len(rows) else 0
+            if len(rows) and rows[worst, i] > 0:
+                value = float(values[quantity].reshape(rows.shape)[worst, i])
+                at = None if single else worst
+                bounds = float(low[i]), float(high[i])
+                found.append(Beyond(name, quantity, value, *bounds, units[i], at))
+    return outside, found
+
+
+def refuse_beyond(found: list[Beyond]) -> None:
+    """Refuse what :func:`beyond_limits` found, if anything.
+
+    :raises ParameterError: naming the first joint, its value and its range.
+    """
+    if not found:
+        return
+    first = found[0]
+    at = "" if first.index is None else f" at sample {first.index}"
+    others = f" ({len(found) - 1} more)" if len(found) > 1 else ""
+    raise ParameterError(
+        f"{first.joint}.{first.quantity}{at}",
+        round(first.value, 9),
+        f"{first.low:g} to {first.high:g} {first.unit}{others}; {OPTION} computes it all the same",
+    )

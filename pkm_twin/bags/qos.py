@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a bag says of its publishers: QoS and topic names, checked. Imports no ROS."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pkm_twin.bags.plain_yaml import load_plain
+from pkm_twin.errors import BagError
+
+MAX_QOS_CHARACTERS: Final = 100_000
+"""Longest recorded offer that is read; one of a publisher has some 400 characters."""
+MAX_DEPTH: Final = 100_000
+"""Largest queue that a recorded offer may ask for."""
+MAX_TOPIC_CHARACTERS: Final = 247
+"""Longest topic name that ROS takes: 255 of DDS less its own prefix."""
+
+_TOPIC = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)+")
+# rosbag2 writes names since Jazzy, numbers before.
+_RELIABILITIES = {"1": "reliable", "2": "best_effort", "reliable": "reliable"}
+_RELIABILITIES |= {"best_effort": "best_effort"}
+_DURABILITIES = {"1": "transient_local", "2": "volatile", "volatile": "volatile"}
+_DURABILITIES |= {"transient_local": "transient_local"}
+
+
+@dataclass(frozen=True)
+class OfferedQos:
+    """What a recorded publisher offered, as far as a replay keeps it."""
+
+    reliable: bool = True
+    transient_local: bool = False
+    depth: int = 0
+    """Samples kept, 0 where the recording does not say."""
+
+
+def parse_qos(topic: str, text: str) -> OfferedQos:
+    """The recorded offer of a topic; reliable and volatile where there is none.
+
+    Of several publishers the first counts. Policies that are "system default" or unknown are those
+    of the default.
+
+    :raises BagError: it is not the YAML that rosbag2 writes, naming the field.
+    """
+
+    def refuse(field: str, value: object, expected: str) -> BagError:
+        return BagError(
+            f"topic {topic}: offered_qos_profiles: {field} is {value!r}; expected {expected}",
+            reason="qos",
+        )
+
+    if not text.strip():
+        return OfferedQos()
+    if len(text) > MAX_QOS_CHARACTERS:
+        raise refuse("length", len(text), f"at most {MAX_QOS_CHARACTERS} characters")
+    try:
+        offers: Any = load_plain(text)
+    except ValueError as error:
+        raise refuse("the text", text, f"plain YAML ({error})") from None
+    if offers in (None, []):
+        return OfferedQos()
+    if not isinstance(offers, list) or not isinstance(offers[0], dict):
+        raise refuse("the text", text, "a list of mappings")
+    offer = offers[0]
+    depth = offer.get("depth", 0)
+    if isinstance(depth, bool) or not isinstance(depth, int) or not 0 <= depth <= MAX_DEPTH:
+        raise refuse("depth", depth, f"0 to {MAX_DEPTH}")
+    reliability = str(offer.get("reliability", "reliable"))
+    durability = str(offer.get("durability", "volatile"))
+    return OfferedQos(
+        _RELIABILITIES.get(reliability, "reliable") == "reliable",
+        _DURABILITIES.get(durability, "volatile") == "transient_local",
+        depth,
+    )
+
+
+def require_topic(name: str) -> str:
+    """A full topic name that ROS takes.
+
+    :raises BagError: it is another text.
+    """
+    if len(name) > MAX_TOPIC_CHARACTERS or not _TOPIC.fullmatch(name):
+        raise BagError(
+            f"{name!r} is no topic name; expected /names of letters, digits and _, none beginning "
+            f"with a digit, at most {MAX_TOPIC_CHARACTERS} characters",
+            reason="topic",
+        )
+    return name

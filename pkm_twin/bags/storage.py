@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a bag's bytes are: one MCAP file, or a folder that rosbag2 wrote. Imports no ROS.
+
+rosbag2 writes a folder with ``metadata.yaml`` and one or more MCAP files (splits), each of which it
+may have packed with zstd as a whole (``.mcap.zstd``).
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import shlex
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import IO, Any, Final
+
+from pkm_twin.bags.format import ZSTD_MAGIC, Budget, FormatError, RecordReader
+from pkm_twin.bags.plain_yaml import load_plain
+from pkm_twin.errors import BagError
+from pkm_twin.files import open_regular
+
+METADATA_FILE: Final = "metadata.yaml"
+MAX_METADATA_BYTES: Final = 4 * 1024**2
+"""Largest ``metadata.yaml`` that is read; one of a hundred topics has some 60 kB."""
+SQLITE_MAGIC: Final = b"SQLite format 3\x00"
+_BLOCK_BYTES = 1024**2
+
+
+class BagFile:
+    """One MCAP file; where it is packed as a whole, its unpacked bytes in a nameless file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @contextmanager
+    def open(self) -> Iterator[RecordReader]:
+        """Open it for reading; whatever the system refuses becomes a BagError."""
+        try:
+            with open_regular(self.path) as file:
+                size = os.fstat(file.fileno()).st_size
+                head = os.pread(file.fileno(), len(SQLITE_MAGIC), 0)
+                if head == SQLITE_MAGIC:
+                    raise BagError(
+                        f"this is an SQLite bag, not MCAP; {conversion(self.path)} converts it",
+                        path=self.path,
+                        reason="not_mcap",
+                    )
+                if not head.startswith(ZSTD_MAGIC):
+                    yield RecordReader(file, size)
+                    return
+            unpacked = self._unpacked
+            with io.BufferedReader(_Positional(unpacked.fileno())) as content:
+                # The budget is that of the bytes on the disk.
+                budget = Budget(size)
+                yield RecordReader(content, os.fstat(unpacked.fileno()).st_size, budget)
+        except FileNotFoundError as error:
+            raise BagError("does not exist", path=self.path, reason="not_found") from error
+        except OSError as error:
+            raise BagError(
+                f"cannot be read: {error.strerror or error}", path=self.path, reason="io"
+            ) from error
+
+    @cached_property
+    def _unpacked(self) -> IO[bytes]:
+        """The file's content. What does not unpack is missing at the end, and is found missing."""
+        try:
+            import zstandard
+        except ImportError:
+            text = "is packed with zstd; the Python package zstandard is missing"
+            raise BagError(text, path=self.path, reason="compression") from None
+        # Closed, and so gone, with the bag that holds it.
+        target = tempfile.TemporaryFile()  # noqa: SIM115
+        with open_regular(self.path) as file:
+            budget = Budget(os.fstat(file.fileno()).st_size)
+            with zstandard.ZstdDecompressor().stream_reader(
+                file, read_across_frames=True
+            ) as source:
+                try:
+                    while block := source.read(_BLOCK_BYTES):
+                        budget.spend(len(block), None)
+                        target.write(block)
+                except zstandard.ZstdError:
+                    pass
+                except FormatError as error:
+                    raise BagError(error.text, path=self.path, reason=error.reason) from None
+        target.flush()
+        return target
+
+
+class _Positional(io.RawIOBase):
+    """Reads a file that others read too, each from a position of its own."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._position = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        if whence != os.SEEK_SET:
+            raise OSError(errno.EINVAL, "only absolute positions")
+        self._position = offset
+        return offset
+
+    def tell(self) -> int:
+        return self._position
+
+    def readinto(self, buffer: Any) -> int:
+        count = os.preadv(self._descriptor, [buffer], self._position)
+        self._position += count
+        return count
+
+
+@dataclass(frozen=True)
+class Storage:
+    """The files of a bag in order, and the message count that its folder states, if any."""
+
+    files: tuple[BagFile, ...]
+    message_count: int | None = None
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is meant as a bag: a folder, or by its name or first bytes one of its files.
+
+    :raises OSError: the file is there, but cannot be opened or is no regular one.
+    """
+    suffixes = {suffix.lower() for suffix in path.suffixes}
+    if os.path.isdir(path) or suffixes & {".mcap", ".db3"}:
+        return True
+    with open_regular(path) as file:
+        head = file.read(len(SQLITE_MAGIC))
+    return head == SQLITE_MAGIC or head.startswith((b"\x89MCAP", ZSTD_MAGIC))
+
+
+def find_storage(path: Path) -> Storage:
+    """Return the files of a bag: the file itself, or those that a folder's metadata name.
+
+    :raises BagError: a folder without ``metadata.yaml``, or one that is not plain, names files
+        outside the folder, or is of another storage than MCAP.
+    """
+    # Unlike Path.is_dir, these never raise: what the system refuses is told at the opening.
+    if not os.path.isdir(path):
+        return Storage((BagFile(path),))
+    file = path / METADATA_FILE
+    if not os.path.lexists(file):
+        inside = ", ".join(p.name for p in files_by_name(path)) or "no .mcap file"
+        raise BagError(
+            f"is a folder without {METADATA_FILE}: no rosbag2 bag; name a file in it: {inside}",
+            path=path,
+            reason="folder",
+        )
+    return _described(path, _Field(file, "", _load(file)))
+
+
+def files_by_name(folder: Path) -> list[Path]:
+    """The MCAP files of a folder in the order that rosbag2 numbers them in."""
+
+    def order(path: Path) -> tuple[str, int, str]:
+        stem = path.name.split(".")[0]
+        digits = stem[len(stem.rstrip("0123456789")) :]
+        return stem[: len(stem) - len(digits)], int(digits[-18:] or 0), path.name
+
+    return sorted((*folder.glob("*.mcap"), *folder.glob("*.mcap.zstd")), key=order)
+
+
+def conversion(path: Path) -> str:
+    """The command line that makes an MCAP bag of an SQLite one."""
+    target = path.with_name(f"{path.stem}_mcap")
+    options = f"output_bags: [{{uri: {target}, storage_id: mcap, all_topics: true}}]"
+    return (
+        f"`echo {shlex.quote(options)} > convert.yaml && "
+        f"ros2 bag convert -i {shlex.quote(str(path))} sqlite3 -o convert.yaml`"
+    )
+
+
+class _Field:
+    """A value of ``metadata.yaml`` with its name, for the error that refuses it."""
+
+    def __init__(self, path: Path, name: str, value: object) -> None:
+        self._path = path
+        self.name = name
+        self.value = value
+
+    def error(self, expected: str) -> BagError:
+        return BagError(
+            f"{self.name or 'the file'} is {self.value!r}; expected {expected}",
+            path=self._path,
+            reason="metadata",
+        )
+
+    def get(self, key: str) -> _Field:
+        """Return the entry ``key`` of a mapping, None where it is missing."""
+        if not isinstance(self.value, Mapping):
+            raise self.error("a mapping")
+        name = f"{self.name}.{key}" if self.name else key
+        return _Field(self._path, name, self.value.get(key))
+
+    def text(self, default: str = "") -> str:
+        if self.value is not None and not isinstance(self.value, str):
+            raise self.error("a text")
+        return default if self.value is None else self.value
+
+    def items(self) -> list[_Field]:
+        if not isinstance(self.value, list):
+            raise self.error("a list")
+        return [_Field(self._path, f"{self.name}[{i}]", v) for i, v in enumerate(self.value)]
+
+    def count(self) -> int | None:
+        if self.value is None:
+            return None
+        if not isinstance(self.value, int) or isinstance(self.value, bool) or self.value < 0:
+            raise self.error("a count, 0 or more")
+        return self.value
+
+
+def _described(folder: Path, root: _Field) -> Storage:
+    facts = root.get("rosbag2_bagfile_information")
+    storage = facts.get("storage_identifier")
+    if storage.text() == "sqlite3":
+        raise BagError(
+            f"is an SQLite bag, not MCAP; {conversion(folder)} converts it",
+            path=folder,
+            reason="not_mcap",
+        )
+    if storage.text() != "mcap":
+        raise storage.error("'mcap'")
+    packing = facts.get("compression_format")
+    if packing.text().lower() not in ("", "none", "zstd"):
+        raise packing.error("'zstd' or ''")
+    files = []
+    for entry in facts.get("relative_file_paths").items():
+        name = entry.text()
+        # rosbag2 puts its files beside the metadata; anything else could be any file.
+        if not name or name in (".", "..") or "/" in name or "\0" in name:
+            raise entry.error("the name of a file in the folder")
+        files.append(BagFile(folder / name))
+    if not files:
+        raise facts.get("relative_file_paths").error("the names of the bag's files")
+    return Storage(tuple(files), facts.get("message_count").count())
+
+
+def _load(path: Path) -> object:
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > MAX_METADATA_BYTES:
+                text = f"has {size} bytes; at most {MAX_METADATA_BYTES}"
+                raise BagError(text, path=path, reason="metadata")
+            return load_plain(file.read(MAX_METADATA_BYTES).decode())
+    except OSError as error:
+        text = f"cannot be read: {error.strerror or error}"
+        raise BagError(text, path=path, reason="io") from error
+    except ValueError as error:
+        raise BagError(f"is not plain YAML: {error}", path=path, reason="metadata") from None

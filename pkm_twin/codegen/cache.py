@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled programs on disk, named by their content. An optimisation: without it all works.
+
+May import: the standard library.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+VARIABLE: Final = "PKM_TWIN_CACHE"
+"""Names the folder; empty switches the cache off."""
+_MARK: Final = b"pkm_twin compiled program 1\n"
+_LARGEST: Final = 64 * 1024 * 1024
+_LOG: Final = logging.getLogger("pkm_twin")
+
+
+class _Said:
+    once = False
+
+
+def folder() -> Path | None:
+    """The folder of compiled programs, made if it has to be; None where there can be none."""
+    named = os.environ.get(VARIABLE)
+    if named == "":
+        return None
+    try:
+        base = os.environ.get("XDG_CACHE_HOME")
+        place = Path(named or (Path(base) if base else Path.home() / ".cache") / "pkm_twin")
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # Code of another user's choice must not run.
+        if place.stat().st_uid != os.geteuid() or place.stat().st_mode & 0o022:
+            raise PermissionError(f"{place} can be written by others")
+        if not os.access(place, os.W_OK):
+            raise PermissionError(f"{place} is read-only")
+    except (OSError, RuntimeError) as error:
+        say_once(error)
+        return None
+    return place
+
+
+def say_once(error: BaseException) -> None:
+    """One line a process: programs are compiled in memory."""
+    if not _Said.once:
+        _Said.once = True
+        text = str(error) or type(error).__name__
+        _LOG.warning("compiled programs are not kept: %s; set %s to a folder", text, VARIABLE)
+
+
+def digest(*parts: str) -> str:
+    """Name of what hangs on these texts."""
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+
+
+def read(name: str) -> tuple[dict[str, Any], bytes] | None:
+    """Header and code of a stored program; None if there is none, or a damaged one."""
+    place = folder()
+    if place is None:
+        return None
+    try:
+        with (place / name).open("rb") as file:
+            data = file.read(_LARGEST)
+    except OSError:
+        return None
+    seal = len(_MARK) + 32
+    if (
+        not data.startswith(_MARK)
+        or hashlib.sha256(data[seal:]).digest() != data[len(_MARK) : seal]
+    ):
+        return None
+    head, _, code = data[seal:].partition(b"\n")
+    header: dict[str, Any] = json.loads(head)
+    return header, code
+
+
+def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
+    """Store a program whole or not at all."""
+    place = folder()
+    if place is None:
+        return
+    body = json.dumps(header).encode() + b"\n" + code
+    temporary: str | None = None
+    try:
+        handle, temporary = tempfile.mkstemp(dir=place)
+        with os.fdopen(handle, "wb") as file:
+            file.write(_MARK + hashlib.sha256(body).digest() + body)
+        os.replace(temporary, place / name)
+    except OSError as error:
+        say_once(error)
+        if temporary is not None:
+            with suppress(OSError):
+                os.unlink(temporary)

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scalar expressions with sharing: formulas run once on these give a program for any back end.
+
+Formulas are written for numbers and run on expressions too: numpy's object arrays of expressions
+add, multiply and take sines like arrays of floats. Equal expressions of one tape are one object,
+and what is zero, one or constant folds away while it is written.
+
+May import: numpy, the standard library.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Objects = NDArray[Any]
+"""Array of expressions, of floats, or of both."""
+
+Numbers = Sequence[Any] | NDArray[Any]
+"""Some expressions or numbers in a row."""
+
+CONSTANT: Final = 0
+PARAMETER: Final = 1
+SAMPLE: Final = 2
+"""What an expression hangs on: nothing, the parameters alone, or the sample."""
+
+PARAMETERS: Final = "p"
+"""Name of the input that is the same for all samples of a call."""
+
+_COMMUTE: Final = frozenset(("add", "mul", "min", "max"))
+
+
+class Tape:
+    """The expressions of one program."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Any, ...], Expression] = {}
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def constant(self, value: float) -> Expression:
+        """A number."""
+        # The sign of zero counts: it is a different number to atan2.
+        key = ("const", value, math.copysign(1.0, value))
+        return self._known.get(key) or self._new(key, "const", float(value), None, CONSTANT)
+
+    def input(self, name: str, index: int) -> Expression:
+        """Entry ``index`` of the input ``name``."""
+        key = ("in", name, index)
+        level = PARAMETER if name == PARAMETERS else SAMPLE
+        return self._known.get(key) or self._new(key, "in", name, index, level)
+
+    def inputs(self, name: str, size: int) -> Objects:
+        """All entries of an input, shape (size,)."""
+        array = np.empty(size, dtype=object)
+        array[:] = [self.input(name, i) for i in range(size)]
+        return array
+
+    def lift(self, value: Any) -> Expression:
+        """An expression as it is, a number as a constant."""
+        return value if isinstance(value, Expression) else self.constant(float(value))
+
+    def make(self, op: str, a: Expression, b: Expression | None = None) -> Expression:
+        """The operation on one or two expressions, one object for equal ones."""
+        if b is not None and op in _COMMUTE and a.number > b.number:
+            a, b = b, a
+        key = (op, a.number, None if b is None else b.number)
+        known = self._known.get(key)
+        if known is not None:
+            return known
+        return self._new(key, op, a, b, a.level if b is None else max(a.level, b.level))
+
+    def _new(self, key: tuple[Any, ...], op: str, a: Any, b: Any, level: int) -> Expression:
+        result = self._known[key] = Expression(self, op, a, b, len(self._known), level)
+        return result
+
+
+class Expression:
+    """One operation. ``a``, ``b``: its arguments; of a constant its value, of an input its name
+    and index.
+    """
+
+    __slots__ = ("a", "b", "level", "number", "op", "tape")
+
+    def __init__(self, tape: Tape, op: str, a: Any, b: Any, number: int, level: int) -> None:
+        self.tape, self.op, self.a, self.b = tape, op, a, b
+        self.number, self.level = number, level
+
+    def is_constant(self, value: float) -> bool:
+        """Whether it is this number."""
+        return self.op == "const" and self.a == value
+
+    def __add__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else _add(self, other)
+
+    def __radd__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else _add(other, self)
+
+    def __sub__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else _subtract(self, other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else _subtract(other, self)
+
+    def __mul__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else _multiply(self, other)
+
+    def __rmul__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else _multiply(other, self)
+
+    def __truediv__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else _divide(self, other)
+
+    def __rtruediv__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else _divide(other, self)
+
+    def __neg__(self) -> Expression:
+        return _negate(self)
+
+    def sqrt(self) -> Any:
+        """As numpy calls it on arrays of objects."""
+        return sqrt(self)
+
+    def __repr__(self) -> str:
+        return f"<{self.op} {self.number}>"
+
+
+def _pair(a: Any, b: Any) -> tuple[Expression, Expression]:
+    tape = a.tape if isinstance(a, Expression) else b.tape
+    return tape.lift(a), tape.lift(b)
+
+
+def _add(x: Any, y: Any) -> Expression:
+    a, b = _pair(x, y)
+    if a.op == "const" and b.op == "const":
+        return a.tape.constant(a.a + b.a)
+    if a.is_constant(0.0):
+        return b
+    if b.is_constant(0.0):
+        return a
+    if b.op == "neg":
+        return _subtract(a, b.a)
+    if a.op == "neg":
+        return _subtract(b, a.a)
+    return a.tape.make("add", a, b)
+
+
+def _subtract(x: Any, y: Any) -> Expression:
+    a, b = _pair(x, y)
+    if a.op == "const" and b.op == "const":
+        return a.tape.constant(a.a - b.a)
+    if a is b:
+        return a.tape.constant(0.0)
+    if b.is_constant(0.0):
+        return a
+    if a.is_constant(0.0):
+        return _negate(b)
+    if b.op == "neg":
+        return _add(a, b.a)
+    if a.op == "neg":
+        return _negate(_add(a.a, b))
+    return a.tape.make("sub", a, b)
+
+
+def _multiply(x: Any, y: Any) -> Expression:
+    a, b = _pair(x, y)
+    if a.op == "const" and b.op == "const":
+        return a.tape.constant(a.a * b.a)
+    for u, v in ((a, b), (b, a)):
+        if u.is_constant(0.0):
+            return u
+        if u.is_constant(1.0):
+            return v
+        if u.is_constant(-1.0):
+            return _negate(v)
+    if a.op == "neg":
+        return _multiply(a.a, b.a) if b.op == "neg" else _negate(_multiply(a.a, b))
+    if b.op == "neg":
+        return _negate(_multiply(a, b.a))
+    return a.tape.make("mul", a, b)
+
+
+def _divide(x: Any, y: Any) -> Expression:
+    a, b = _pair(x, y)
+    if a.is_constant(0.0):
+        return a
+    if b.op == "const":
+        return _multiply(a, a.tape.constant(1.0 / b.a))
+    if a.op == "neg":
+        return _negate(_divide(a.a, b))
+    if b.op == "neg":
+        return _negate(_divide(a, b.a))
+    # One reciprocal, shared.
+    inverse = a.tape.make("inv", b)
+    return inverse if a.is_constant(1.0) else _multiply(a, inverse)
+
+
+def _negate(e: Expression) -> Expression:
+    if e.op == "const":
+        return e.tape.constant(-e.a)
+    if e.op == "neg":
+        inner: Expression = e.a
+        return inner
+    if e.op == "sub":
+        return e.tape.make("sub", e.b, e.a)
+    return e.tape.make("neg", e)
+
+
+def _unary(op: str, plain: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def apply(x: Any) -> Any:
+        if not isinstance(x, Expression):
+            return plain(x)
+        return x.tape.constant(float(plain(x.a))) if x.op == "const" else x.tape.make(op, x)
+
+    return apply
+
+
+def _binary(op: str, plain: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    def apply(x: Any, y: Any) -> Any:
+        if not (isinstance(x, Expression) or isinstance(y, Expression)):
+            return plain(x, y)
+        a, b = _pair(x, y)
+        if a.op == "const" and b.op == "const":
+            return a.tape.constant(float(plain(a.a, b.a)))
+        return a.tape.make(op, a, b)
+
+    return apply
+
+
+sqrt: Final = _unary("sqrt", np.sqrt)
+sin: Final = _unary("sin", np.sin)
+cos: Final = _unary("cos", np.cos)
+absolute: Final = _unary("abs", np.abs)
+sign: Final = _unary("sign", np.sign)
+"""-1, 0 or 1."""
+atan2: Final = _binary("atan2", np.arctan2)
+minimum: Final = _binary("min", np.minimum)
+maximum: Final = _binary("max", np.maximum)
+
+OPERATIONS: Final[Mapping[str, str]] = {
+    "add": "{a} + {b}",
+    "sub": "{a} - {b}",
+    "mul": "{a} * {b}",
+    "neg": "-{a}",
+    "inv": "1.0 / {a}",
+    "sqrt": "sqrt({a})",
+    "sin": "sin({a})",
+    "cos": "cos({a})",
+    "abs": "fabs({a})",
+    "sign": "sign({a})",
+    "atan2": "atan2({a}, {b})",
+    "min": "fmin({a}, {b})",
+    "max": "fmax({a}, {b})",
+}
+"""Every operation, as the plain back end writes it."""
+
+
+def ordered(results: Iterable[Expression]) -> list[Expression]:
+    """Everything that the results hang on, arguments first."""
+    seen: set[int] = set()
+    order: list[Expression] = []
+    for result in results:
+        stack = [(result, False)]
+        while stack:
+            e, done = stack.pop()
+            if done:
+                order.append(e)
+                continue
+            if e.number in seen:
+                continue
+            seen.add(e.number)
+            stack.append((e, True))
+            if e.op not in ("const", "in"):
+                stack.append((e.a, False))
+                if e.b is not None:
+                    stack.append((e.b, False))
+    return order
+
+
+def uses(results: Sequence[Expression]) -> dict[int, int]:
+    """How often each operation's value is used, by number; a result counts as used often."""
+    counts: dict[int, int] = {}
+    for e in ordered(results):
+        if e.op not in ("const", "in"):
+            for argument in (e.a, e.b):
+                if argument is not None:
+                    counts[argument.number] = counts.get(argument.number, 0) + 1
+    for result in results:
+        counts[result.number] = counts.get(result.number, 0) + 2
+    return counts
+
+
+def count(results: Iterable[Expression]) -> int:
+    """Operations a sample: without inputs, constants and what hangs on parameters alone."""
+    return sum(e.level == SAMPLE and e.op != "in" for e in ordered(results))

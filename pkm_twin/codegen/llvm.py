@@ -1,0 +1,520 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Programs as vector machine code: LANES samples a turn, one sample is a batch of one.
+
+So one sample and a batch have the same bits: every lane computes the same operations, and a lane
+that has converged stands still. Products that are used once are fused with the sum that uses them
+where the processor can (FMA); where it cannot, the same program runs unfused.
+
+May import: llvmlite, numpy, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any, Final
+
+import llvmlite
+import llvmlite.binding as binding
+from llvmlite import ir
+
+from pkm_twin.codegen.expressions import PARAMETER, PARAMETERS, SAMPLE, Expression, ordered, uses
+from pkm_twin.codegen.program import (
+    CHANGE,
+    CLOSED,
+    CONTRACTION,
+    DIRECT,
+    RESIDUAL,
+    STEPPED,
+    TURNS,
+    UNKNOWNS,
+    Program,
+)
+
+LANES: Final = 4
+SYMBOL: Final = "kernel"
+OPTIMISATION: Final = 2
+
+DOUBLE: Final = ir.DoubleType()
+INT64: Final = ir.IntType(64)
+INT32: Final = ir.IntType(32)
+BIT: Final = ir.IntType(1)
+VECTOR: Final = ir.VectorType(DOUBLE, LANES)
+INTEGERS: Final = ir.VectorType(INT64, LANES)
+MASK: Final = ir.VectorType(BIT, LANES)
+
+# Minimax polynomials of sine and cosine up to a quarter turn, and pi / 2 in three parts
+# (Cody and Waite 1980; coefficients as in Cephes, public domain).
+_SINE: Final = (
+    1.58962301576546568060e-10, -2.50507477628578072866e-8, 2.75573136213857245213e-6,
+    -1.98412698295895385996e-4, 8.33333333332211858878e-3, -1.66666666666666307295e-1,
+)  # fmt: skip
+_COSINE: Final = (
+    -1.13585365213876817300e-11, 2.08757008419747316778e-9, -2.75573141792967388112e-7,
+    2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.16666666666665929218e-2,
+)  # fmt: skip
+_QUARTER: Final = (1.5707963267341256e00, 6.0771005065061922e-11, 2.0222662487959506e-21)
+# Arctangent up to 0.66 as x + x z P(z) / Q(z), z = x^2 (Cephes).
+_ATAN_P: Final = (
+    -8.750608600031904122785e-1, -1.615753718733365076637e1, -7.500855792314704667340e1,
+    -1.228866684490136173410e2, -6.485021904942025371773e1,
+)  # fmt: skip
+_ATAN_Q: Final = (
+    1.0, 2.485846490142306297962e1, 1.650270098316988542046e2, 4.328810604912902668951e2,
+    4.853903996359136964868e2, 1.945506571482613964425e2,
+)  # fmt: skip
+_MORE: Final = 6.123233995736765886130e-17
+"""pi / 2 less its nearest double."""
+
+
+def _initialise() -> None:
+    # Older releases of llvmlite need it, newer ones refuse it.
+    with suppress(RuntimeError):
+        binding.initialize()
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+
+
+_initialise()
+
+CPU: Final[str] = binding.get_host_cpu_name()
+
+
+def _features() -> str:
+    try:
+        text: str = binding.get_host_cpu_features().flatten()
+    except RuntimeError:  # not every processor tells
+        return ""
+    return text
+
+
+FEATURES: Final = _features()
+FUSED: Final = "+fma" in FEATURES.split(",") or "aarch64" in binding.get_process_triple()
+IDENTITY: Final = f"{llvmlite.__version__} {CPU} {FEATURES} {LANES} {OPTIMISATION}"
+"""What machine code hangs on beside the program."""
+
+
+class _Emitter:
+    """Values of expressions at one place of the code, scalar or in lanes."""
+
+    def __init__(
+        self, builder: ir.IRBuilder, used: Mapping[int, int], known: Mapping[int, Any], wide: bool
+    ) -> None:
+        self.b, self.used, self.wide = builder, used, wide
+        self.known = dict(known)
+        self.type = VECTOR if wide else DOUBLE
+        self.integer = INTEGERS if wide else INT64
+        self._turned: dict[int, tuple[Any, Any]] = {}
+
+    def number(self, value: float) -> Any:
+        return ir.Constant(self.type, [value] * LANES) if self.wide else ir.Constant(DOUBLE, value)
+
+    def whole(self, value: int) -> Any:
+        return (
+            ir.Constant(self.integer, [value] * LANES) if self.wide else ir.Constant(INT64, value)
+        )
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        full = f"llvm.{name}.{f'v{LANES}f64' if self.wide else 'f64'}"
+        module = self.b.module
+        function = module.globals.get(full)
+        if function is None:
+            kind = ir.FunctionType(self.type, [self.type] * len(arguments))
+            function = ir.Function(module, kind, full)
+        return self.b.call(function, arguments)
+
+    def fused(self, x: Any, y: Any, z: Any) -> Any:
+        """X y + z."""
+        return self.call("fma", x, y, z) if FUSED else self.b.fadd(self.b.fmul(x, y), z)
+
+    def polynomial(self, x: Any, coefficients: Sequence[float]) -> Any:
+        result = self.number(coefficients[0])
+        for c in coefficients[1:]:
+            result = self.fused(result, x, self.number(c))
+        return result
+
+    def sine_cosine(self, number: int, x: Any) -> tuple[Any, Any]:
+        if number in self._turned:
+            return self._turned[number]
+        b, n = self.b, self.number
+        quarters = self.call("rint", b.fmul(x, n(2 / math.pi)))
+        y = x
+        for part in _QUARTER:
+            y = self.fused(quarters, n(-part), y)
+        z = b.fmul(y, y)
+        sine = self.fused(b.fmul(z, y), self.polynomial(z, _SINE), y)
+        cosine = b.fadd(
+            self.fused(z, n(-0.5), n(1.0)), b.fmul(b.fmul(z, z), self.polynomial(z, _COSINE))
+        )
+        k = b.fptosi(quarters, self.integer)
+        odd = b.icmp_signed("!=", b.and_(k, self.whole(1)), self.whole(0))
+
+        def signed(value: Any, turns: Any) -> Any:
+            flip = b.shl(b.and_(turns, self.whole(2)), self.whole(62))
+            return b.bitcast(b.xor(b.bitcast(value, self.integer), flip), self.type)
+
+        pair = (
+            signed(b.select(odd, cosine, sine), k),
+            signed(b.select(odd, sine, cosine), b.add(k, self.whole(1))),
+        )
+        self._turned[number] = pair
+        return pair
+
+    def arctangent(self, y: Any, x: Any) -> Any:
+        b, n = self.b, self.number
+        ay, ax = self.call("fabs", y), self.call("fabs", x)
+        steep = b.fcmp_ordered(">", ay, ax)
+        small, large = b.select(steep, ax, ay), b.select(steep, ay, ax)
+        zero = b.fcmp_ordered("==", large, n(0.0))
+        t = b.fdiv(small, b.select(zero, n(1.0), large))
+        high = b.fcmp_ordered(">", t, n(0.66))
+        u = b.select(high, b.fdiv(b.fsub(t, n(1.0)), b.fadd(t, n(1.0))), t)
+        z = b.fmul(u, u)
+        ratio = b.fdiv(self.polynomial(z, _ATAN_P), self.polynomial(z, _ATAN_Q))
+        angle = self.fused(b.fmul(u, z), ratio, u)
+        angle = b.select(high, b.fadd(b.fadd(angle, n(_MORE / 2)), n(math.pi / 4)), angle)
+        angle = b.select(steep, b.fadd(b.fsub(n(math.pi / 2), angle), n(_MORE)), angle)
+        back = b.icmp_signed("<", b.bitcast(x, self.integer), self.whole(0))
+        angle = b.select(back, b.fadd(b.fsub(n(math.pi), angle), n(2 * _MORE)), angle)
+        sign = b.and_(b.bitcast(y, self.integer), self.whole(-(2**63)))
+        return b.bitcast(b.or_(b.bitcast(angle, self.integer), sign), self.type)
+
+    def value(self, e: Expression, inputs: Mapping[str, Sequence[Any]]) -> Any:
+        b, op = self.b, e.op
+        if op == "const":
+            return self.number(e.a)
+        if op == "in":
+            return inputs[e.a][e.b]
+        if op in ("add", "sub"):
+            for first, product, rest in ((True, e.a, e.b), (False, e.b, e.a)):
+                once = product.op == "mul" and self.used.get(product.number, 2) == 1
+                if not once or (product.level == SAMPLE) != (e.level == SAMPLE):
+                    continue
+                x, y = self.known[product.a.number], self.known[product.b.number]
+                z = self.known[rest.number]
+                if op == "sub":
+                    x, z = (x, b.fneg(z)) if first else (b.fneg(x), z)
+                return self.fused(x, y, z)
+        x = self.known[e.a.number]
+        y = None if e.b is None else self.known[e.b.number]
+        if op == "add":
+            return b.fadd(x, y)
+        if op == "sub":
+            return b.fsub(x, y)
+        if op == "mul":
+            return b.fmul(x, y)
+        if op == "neg":
+            return b.fneg(x)
+        if op == "inv":
+            return b.fdiv(self.number(1.0), x)
+        if op in ("sin", "cos"):
+            return self.sine_cosine(e.a.number, x)[op == "cos"]
+        if op == "sqrt":
+            return self.call("sqrt", x)
+        if op == "abs":
+            return self.call("fabs", x)
+        if op == "sign":
+            zero = self.number(0.0)
+            down = b.select(b.fcmp_ordered("<", x, zero), self.number(-1.0), b.fmul(x, zero))
+            return b.select(b.fcmp_ordered(">", x, zero), self.number(1.0), down)
+        if op == "atan2":
+            return self.arctangent(x, y)
+        less = b.fcmp_ordered("<" if op == "min" else ">", x, y)
+        return b.select(less, x, y)
+
+    def run(self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Any]]) -> list[Any]:
+        """Values of the results; every shared expression once."""
+        for e in ordered(results):
+            if e.number not in self.known:
+                self.known[e.number] = self.value(e, inputs)
+        return [self.known[e.number] for e in results]
+
+
+class _Writer:
+    """The function of one program, see :func:`emit`."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.module = ir.Module(SYMBOL)
+        self.module.triple = binding.get_default_triple()
+        kind = ir.FunctionType(INT64, [INT64.as_pointer()])
+        self.function = ir.Function(self.module, kind, SYMBOL)
+        self.used = uses(program.results)
+        b = self.b = ir.IRBuilder(self.function.append_basic_block("entry"))
+        names = list(program.inputs)
+        self.count, self.steps = self._word(0), self._word(1)
+        parameters = self._pointer(2)
+        self.sources = {
+            name: (self._pointer(3 + 2 * k), self._word(4 + 2 * k)) for k, name in enumerate(names)
+        }
+        at = 3 + 2 * len(names)
+        self.targets = {name: self._pointer(at + k) for k, name in enumerate(program.outputs)}
+        self.status = self._pointer(at + len(program.outputs))
+        self.constants = self._hoist(parameters)
+        self.blocks = {
+            name: self.function.append_basic_block(name) for name in ("head", "load", "tail")
+        }
+        self.index, self.flags = self._slot(INT64), self._slot(INT64)
+        b.store(ir.Constant(INT64, 0), self.index)
+        b.store(ir.Constant(INT64, 0), self.flags)
+
+    def _word(self, k: int) -> Any:
+        return self.b.load(self.b.gep(self.function.args[0], [ir.Constant(INT64, k)]))
+
+    def _pointer(self, k: int) -> Any:
+        return self.b.inttoptr(self._word(k), DOUBLE.as_pointer())
+
+    def _slot(self, kind: Any) -> Any:
+        with self.b.goto_entry_block():
+            return self.b.alloca(kind)
+
+    def _splat(self, value: Any, kind: Any = VECTOR) -> Any:
+        b = self.b
+        empty = ir.Constant(kind, ir.Undefined)
+        first = b.insert_element(empty, value, ir.Constant(INT32, 0))
+        return b.shuffle_vector(first, empty, ir.Constant(ir.VectorType(INT32, LANES), [0] * LANES))
+
+    def _hoist(self, parameters: Any) -> dict[int, Any]:
+        """What hangs on parameters alone, computed once a call."""
+        order = ordered(self.program.results)
+        needed = {e.b for e in order if e.op == "in" and e.a == PARAMETERS}
+        loaded = {k: self.b.load(self.b.gep(parameters, [ir.Constant(INT64, k)])) for k in needed}
+        scalar = _Emitter(self.b, self.used, {}, wide=False)
+        wide = _Emitter(self.b, self.used, {}, wide=True)
+        for e in order:
+            if e.op == "const":
+                scalar.known[e.number], wide.known[e.number] = scalar.number(e.a), wide.number(e.a)
+            elif e.level == PARAMETER:
+                value = scalar.known[e.number] = scalar.value(e, {PARAMETERS: loaded})  # type: ignore[dict-item]
+                wide.known[e.number] = self._splat(value)
+        return wide.known
+
+    def emitter(self) -> _Emitter:
+        return _Emitter(self.b, self.used, self.constants, wide=True)
+
+    def _any(self, mask: Any) -> Any:
+        name = f"llvm.vector.reduce.or.v{LANES}i1"
+        function = self.module.globals.get(name)
+        if function is None:
+            function = ir.Function(self.module, ir.FunctionType(BIT, [MASK]), name)
+        return self.b.call(function, [mask])
+
+    def _load(self, name: str, size: int) -> list[Any]:
+        """An input's entries, a vector each."""
+        base, stride = self.sources[name]
+        b = self.b
+        rows = [b.mul(place, stride) for place in self.places]
+        values = []
+        for j in range(size):
+            vector = ir.Constant(VECTOR, ir.Undefined)
+            for lane, row in enumerate(rows):
+                at = b.gep(base, [b.add(row, ir.Constant(INT64, j))])
+                vector = b.insert_element(vector, b.load(at), ir.Constant(INT32, lane))
+            values.append(vector)
+        return values
+
+    def _save(self, base: Any, values: Sequence[Any]) -> None:
+        b = self.b
+        size = ir.Constant(INT64, len(values))
+        rows = [b.mul(place, size) for place in self.places]
+        for j, vector in enumerate(values):
+            for lane, row in enumerate(rows):
+                at = b.gep(base, [b.add(row, ir.Constant(INT64, j))])
+                b.store(b.extract_element(vector, ir.Constant(INT32, lane)), at)
+
+    def write(self) -> str:
+        b, blocks, program = self.b, self.blocks, self.program
+        b.branch(blocks["head"])
+        b.position_at_end(blocks["head"])
+        i = b.load(self.index)
+        b.cbranch(b.icmp_signed("<", i, self.count), blocks["load"], blocks["tail"])
+        b.position_at_end(blocks["load"])
+        # Lanes beyond the last sample compute it once more, and store the same again.
+        last = b.sub(self.count, ir.Constant(INT64, 1))
+        self.places = []
+        for lane in range(LANES):
+            place = b.add(i, ir.Constant(INT64, lane))
+            self.places.append(b.select(b.icmp_signed("<", place, last), place, last))
+        values = {name: self._load(name, size) for name, size in program.inputs.items()}
+        true = ir.Constant(MASK, [1] * LANES)
+        if program.equations is None:
+            alive, reached = true, self.emitter().number(1.0)
+        else:
+            values[UNKNOWNS], alive, reached = self._solve(values)
+        out = self.emitter()
+        names = list(program.outputs)
+        rows = {name: out.run(list(program.outputs[name]), values) for name in names}
+        good = alive
+        if program.equations is not None:
+            residual = out.run([program.equations.residual], values)[0]
+            good = b.and_(good, b.fcmp_ordered("<=", residual, out.number(RESIDUAL**2)))
+        total = None
+        for row in rows.values():
+            for value in row:
+                size = out.call("fabs", value)
+                total = size if total is None else b.fadd(total, size)
+        finite = b.fcmp_ordered("<", total, out.number(math.inf))
+        code = b.select(good, b.select(finite, out.number(0.0), out.number(2.0)), out.number(1.0))
+        good = b.and_(good, finite)
+        nothing = out.number(math.nan)
+        for name in names:
+            self._save(self.targets[name], [b.select(good, v, nothing) for v in rows[name]])
+        self._save(self.status, [code, reached])
+        bad = b.zext(self._any(b.not_(good)), INT64)
+        b.store(b.or_(b.load(self.flags), bad), self.flags)
+        b.store(b.add(i, ir.Constant(INT64, LANES)), self.index)
+        b.branch(blocks["head"])
+        b.position_at_end(blocks["tail"])
+        b.ret(b.load(self.flags))
+        return str(self.module)
+
+    def _solve(self, values: Mapping[str, list[Any]]) -> tuple[list[Any], Any, Any]:
+        """Newton's method in steps; the unknowns, the lanes that got there, and how far."""
+        q = self.program.equations
+        assert q is not None  # noqa: S101
+        b, slot = self.b, self._slot
+        x = [slot(VECTOR) for _ in q.home]
+        t = [slot(VECTOR) for _ in q.origin]
+        alive, moving = slot(MASK), slot(MASK)
+        size, determinant, reached = slot(VECTOR), slot(VECTOR), slot(VECTOR)
+        step, turn = slot(INT64), slot(INT64)
+        block = {
+            name: self.function.append_basic_block(name)
+            for name in ("direct", "stepped", "step", "newton", "next", "solved")
+        }
+        n = self.emitter().number
+        one = ir.Constant(INT64, 1)
+        true = ir.Constant(MASK, [1] * LANES)
+        b.store(true, alive)
+        b.store(n(0.0), reached)
+        b.store(one, step)
+        once = b.icmp_signed("==", self.steps, one)
+        b.cbranch(once, block["direct"], block["stepped"])
+
+        b.position_at_end(block["direct"])
+        home = [n(float(v)) for v in q.home]
+        start = home if q.start is None else self.emitter().run(list(q.start), values)
+        for place, value in zip(x, start, strict=True):
+            b.store(value, place)
+        b.branch(block["step"])
+
+        b.position_at_end(block["stepped"])
+        for place, value in zip(x, home, strict=True):
+            b.store(value, place)
+        b.branch(block["step"])
+
+        b.position_at_end(block["step"])
+        k = b.load(step)
+        part = b.fdiv(b.sitofp(k, DOUBLE), b.sitofp(self.steps, DOUBLE))
+        final = b.icmp_signed("==", k, self.steps)
+        for place, origin, value in zip(t, q.origin, values[q.target], strict=True):
+            way = b.fmul(self._splat(part), b.fsub(value, n(float(origin))))
+            b.store(b.select(final, value, b.fadd(n(float(origin)), way)), place)
+        b.store(b.load(alive), moving)
+        b.store(n(1e300), size)
+        b.store(n(0.0), determinant)
+        b.store(ir.Constant(INT64, 0), turn)
+        b.branch(block["newton"])
+
+        b.position_at_end(block["newton"])
+        on = b.load(moving)
+        at = [b.load(place) for place in x]
+        out = self.emitter()
+        inputs = {**values, UNKNOWNS: at, q.target: [b.load(place) for place in t]}
+        *new, square, det = out.run(q.results, inputs)
+        for place, old, value in zip(x, at, new, strict=True):
+            b.store(b.select(on, value, old), place)
+        contracts = b.fcmp_ordered("<=", square, b.fmul(b.load(size), n(CONTRACTION**2)))
+        before = b.load(determinant)
+        first = b.fcmp_ordered("==", before, n(0.0))
+        steady = b.and_(
+            b.fcmp_ordered("<=", before, b.fmul(det, n(CHANGE))),
+            b.fcmp_ordered("<=", det, b.fmul(before, n(CHANGE))),
+        )
+        least = self._splat(
+            b.select(once, ir.Constant(DOUBLE, DIRECT), ir.Constant(DOUBLE, STEPPED))
+        )
+        # NaN fails every comparison.
+        sound = b.and_(b.and_(contracts, b.or_(first, steady)), b.fcmp_ordered(">", det, least))
+        live = b.and_(b.load(alive), b.or_(sound, b.not_(on)))
+        b.store(live, alive)
+        b.store(square, size)
+        b.store(det, determinant)
+        on = b.and_(b.and_(on, live), b.fcmp_ordered(">", square, n(CLOSED**2)))
+        b.store(on, moving)
+        done = b.add(b.load(turn), one)
+        b.store(done, turn)
+        again = b.and_(self._any(on), b.icmp_signed("<", done, ir.Constant(INT64, TURNS)))
+        b.cbranch(again, block["newton"], block["next"])
+
+        b.position_at_end(block["next"])
+        live = b.and_(b.load(alive), b.not_(b.load(moving)))
+        b.store(live, alive)
+        b.store(b.select(live, self._splat(part), b.load(reached)), reached)
+        k = b.add(b.load(step), one)
+        b.store(k, step)
+        onward = b.and_(self._any(live), b.icmp_signed("<=", k, self.steps))
+        b.cbranch(onward, block["step"], block["solved"])
+
+        b.position_at_end(block["solved"])
+        return [b.load(place) for place in x], b.load(alive), b.load(reached)
+
+
+def emit(program: Program) -> str:
+    """The program as text of LLVM's intermediate language: one function of one argument.
+
+    The argument points at words: number of samples, steps, pointer to the parameters; of each
+    input pointer and stride (0: one for all, else its size); pointers to the outputs, row after
+    row; pointer to the status, two numbers a sample: 0 good, 1 refused, 2 not finite; and the part
+    of the way that was reached. It returns 0 if all samples are good.
+    """
+    return _Writer(program).write()
+
+
+def compile_object(text: str) -> bytes:
+    """Machine code for this processor."""
+    machine = _machine()
+    module = binding.parse_assembly(text)
+    module.verify()
+    if hasattr(binding, "create_pass_builder"):
+        options = binding.create_pipeline_tuning_options(speed_level=OPTIMISATION)
+        options.slp_vectorization = options.loop_vectorization = False
+        builder = binding.create_pass_builder(machine, options)
+        builder.getModulePassManager().run(module, builder)
+    else:
+        # llvmlite before 0.44.
+        builder = binding.create_pass_manager_builder()
+        builder.opt_level = OPTIMISATION
+        passes = binding.create_module_pass_manager()
+        builder.populate(passes)
+        passes.run(module)
+    code: bytes = machine.emit_object(module)
+    return code
+
+
+_ENGINES: Final[list[Any]] = []
+
+
+def load_object(code: bytes) -> Any:
+    """The compiled function, to be called with the address of its words; it holds the GIL off."""
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
+    engine.add_object_file(binding.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    address = engine.get_function_address(SYMBOL)
+    _ENGINES.append(engine)
+    return address
+
+
+def _machine() -> Any:
+    target = binding.Target.from_default_triple()
+    return target.create_target_machine(
+        cpu=CPU, features=FEATURES, opt=OPTIMISATION, jit=True, reloc="pic"
+    )
+
+
+PROTOTYPE: Final = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
+"""For batches: other threads run meanwhile."""
+LOCKED: Final = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
+"""For one sample: letting the lock go costs more than the sample."""

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Programs as plain Python, for machines without a compiler: floats one by one, arrays in batches.
+
+The same expressions, the same order of tests as the vector code; without fused products, so
+results agree to rounding, not to the bit.
+
+May import: numpy, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.codegen.expressions import OPERATIONS, PARAMETERS, Expression, ordered, uses
+from pkm_twin.codegen.program import (
+    CHANGE,
+    CLOSED,
+    CONTRACTION,
+    DIRECT,
+    RESIDUAL,
+    STEPPED,
+    TURNS,
+    UNKNOWNS,
+    Program,
+)
+
+Array = NDArray[np.float64]
+
+_LONGEST: Final = 200
+"""Characters of an expression that is written into another one."""
+
+
+def _sign(value: float) -> float:
+    return (value > 0.0) - (value < 0.0)
+
+
+_ONE: Final = {
+    "sqrt": math.sqrt, "sin": math.sin, "cos": math.cos, "fabs": abs, "sign": _sign,
+    "atan2": math.atan2, "fmin": min, "fmax": max, "inf": math.inf, "nan": math.nan,
+}  # fmt: skip
+_MANY: Final = {
+    "sqrt": np.sqrt, "sin": np.sin, "cos": np.cos, "fabs": np.abs, "sign": np.sign,
+    "atan2": np.arctan2, "fmin": np.minimum, "fmax": np.maximum, "inf": math.inf, "nan": math.nan,
+}  # fmt: skip
+
+
+def source(results: Sequence[Expression], inputs: Mapping[str, int]) -> str:
+    """A function of the inputs' sequences that returns a tuple of the results."""
+    counts = uses(results)
+    order = ordered(results)
+    text: dict[int, str] = {}
+    lines = [f"def program({', '.join(inputs)}):"]
+    read: dict[str, set[int]] = {}
+    for e in order:
+        if e.op == "in":
+            read.setdefault(e.a, set()).add(e.b)
+    for name, size in inputs.items():
+        if read.get(name):
+            lines.append(f"    {', '.join(f'{name}{k}' for k in range(size))}, = {name}")
+    for e in order:
+        if e.op == "const":
+            text[e.number] = f"({e.a!r})"
+        elif e.op == "in":
+            text[e.number] = f"{e.a}{e.b}"
+        else:
+            a = text[e.a.number]
+            b = "" if e.b is None else text[e.b.number]
+            written = OPERATIONS[e.op].format(a=a, b=b)
+            if counts[e.number] == 1 and len(written) < _LONGEST:
+                text[e.number] = f"({written})"
+            else:
+                text[e.number] = f"v{e.number}"
+                lines.append(f"    v{e.number} = {written}")
+    lines.append(f"    return ({', '.join(text[e.number] for e in results)},)")
+    return "\n".join(lines)
+
+
+class PlainCode:
+    """A program as two functions, one of floats and one of arrays over the samples."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        names = {**program.inputs, PARAMETERS: program.parameters}
+        equations = program.equations
+        if equations is not None:
+            names[UNKNOWNS] = len(equations.home)
+        self._names = list(names)
+        results = [e for row in program.outputs.values() for e in row]
+        if equations is not None:
+            results.append(equations.residual)
+        self._results = self._compiled(results, names)
+        self._correction = self._start = None
+        if equations is not None:
+            self._correction = self._compiled(equations.results, names)
+            if equations.start is not None:
+                self._start = self._compiled(equations.start, names)
+
+    @staticmethod
+    def _compiled(
+        results: Sequence[Expression], inputs: Mapping[str, int]
+    ) -> tuple[Callable[..., tuple[Any, ...]], Callable[..., tuple[Any, ...]]]:
+        code = compile(source(results, inputs), "<program>", "exec")
+        functions = []
+        for library in (_ONE, _MANY):
+            space: dict[str, Any] = dict(library)
+            exec(code, space)  # noqa: S102
+            functions.append(space["program"])
+        return functions[0], functions[1]
+
+    def run(
+        self, p: Array, inputs: Sequence[Array], count: int, steps: int
+    ) -> tuple[list[Array], Array]:
+        """Outputs (count, size) and status (count, 2), as the vector code gives them.
+
+        :param inputs: shape (count, size), or (1, size) for all samples.
+        """
+        if count == 1:
+            outputs, status = self._one(
+                p.tolist(), [value.reshape(-1).tolist() for value in inputs], steps
+            )
+            return [np.array([row]) for row in outputs], np.array([status])
+        with np.errstate(all="ignore"):
+            return self._many(p, inputs, count, steps)
+
+    def _split(self, values: Sequence[Any]) -> list[list[Any]]:
+        rows, at = [], 0
+        for row in self.program.outputs.values():
+            rows.append(list(values[at : at + len(row)]))
+            at += len(row)
+        return rows
+
+    def _one(
+        self, p: list[float], inputs: list[list[float]], steps: int
+    ) -> tuple[list[list[float]], tuple[float, float]]:
+        nothing = [[math.nan] * len(row) for row in self.program.outputs.values()]
+        named: dict[str, Any] = dict(zip(self.program.inputs, inputs, strict=True))
+        named[PARAMETERS] = p
+        reached = 1.0
+        q = self.program.equations
+        try:
+            if q is not None:
+                x, reached = self._solve_one(named, steps)
+                if x is None:
+                    return nothing, (1.0, reached)
+                named[UNKNOWNS] = x
+            values = list(self._results[0](**named))
+        except (ZeroDivisionError, ValueError, OverflowError):
+            return nothing, (2.0 if reached == 1.0 else 1.0, reached)
+        if q is not None:
+            *values, residual = values
+            if not residual <= RESIDUAL**2:
+                return nothing, (1.0, reached)
+        if not all(map(math.isfinite, values)):
+            return nothing, (2.0, reached)
+        return self._split(values), (0.0, reached)
+
+    def _solve_one(self, named: dict[str, Any], steps: int) -> tuple[list[float] | None, float]:
+        q = self.program.equations
+        assert q is not None and self._correction is not None  # noqa: S101
+        correction, goal = self._correction[0], named[q.target]
+        x: list[float] = list(q.home)
+        if steps == 1 and self._start is not None:
+            x = list(self._start[0](**{**named, UNKNOWNS: x}))
+        least = DIRECT if steps == 1 else STEPPED
+        for k in range(1, steps + 1):
+            part = k / steps
+            target = (
+                goal
+                if k == steps
+                else [a + part * (b - a) for a, b in zip(q.origin, goal, strict=True)]
+            )
+            size, before = 1e300, 0.0
+            for _ in range(TURNS):
+                *x, square, det = correction(**{**named, UNKNOWNS: x, q.target: target})
+                steady = before == 0.0 or (before <= CHANGE * det and det <= CHANGE * before)
+                if not (square <= CONTRACTION**2 * size and det > least and steady):
+                    return None, (k - 1) / steps
+                size, before = square, det
+                if square <= CLOSED**2:
+                    break
+            else:
+                return None, (k - 1) / steps
+        return x, 1.0
+
+    def _many(
+        self, p: Array, inputs: Sequence[Array], count: int, steps: int
+    ) -> tuple[list[Array], Array]:
+        named: dict[str, Any] = {
+            name: [np.broadcast_to(column, count) for column in value.T]
+            for name, value in zip(self.program.inputs, inputs, strict=True)
+        }
+        named[PARAMETERS] = p.tolist()
+        good, reached = np.ones(count, bool), np.ones(count)
+        q = self.program.equations
+        if q is not None:
+            x, good, reached = self._solve_many(named, count, steps)
+            named[UNKNOWNS] = list(x)
+        values = [np.broadcast_to(v, count) for v in self._results[1](**named)]
+        if q is not None:
+            good = good & (values.pop() <= RESIDUAL**2)
+        finite = np.ones(count, bool)
+        for value in values:
+            finite &= np.isfinite(value)
+        code = np.where(good, np.where(finite, 0.0, 2.0), 1.0)
+        outputs = [
+            np.where((good & finite)[:, None], np.stack(row, -1), np.nan)
+            for row in self._split(values)
+        ]
+        return outputs, np.stack([code, reached], -1)
+
+    def _solve_many(
+        self, named: dict[str, Any], count: int, steps: int
+    ) -> tuple[Array, NDArray[np.bool_], Array]:
+        q = self.program.equations
+        assert q is not None and self._correction is not None  # noqa: S101
+        correction, goal = self._correction[1], named[q.target]
+        x = np.repeat(np.array(q.home, float)[:, None], count, 1)
+        if steps == 1 and self._start is not None:
+            begun = self._start[1](**{**named, UNKNOWNS: list(x)})
+            x = np.array([np.broadcast_to(v, count) for v in begun], float)
+        least = DIRECT if steps == 1 else STEPPED
+        alive, reached = np.ones(count, bool), np.zeros(count)
+        for k in range(1, steps + 1):
+            part = k / steps
+            target = (
+                goal
+                if k == steps
+                else [a + part * (b - a) for a, b in zip(q.origin, goal, strict=True)]
+            )
+            moving = alive.copy()
+            size, before = np.full(count, 1e300), np.zeros(count)
+            for _ in range(TURNS):
+                *new, square, det = correction(**{**named, UNKNOWNS: list(x), q.target: target})
+                moved = np.array([np.broadcast_to(v, count) for v in new])
+                x = np.where(moving, moved, x)
+                steady = (before <= CHANGE * det) & (det <= CHANGE * before)
+                sound = (
+                    (square <= CONTRACTION**2 * size) & (det > least) & (steady | (before == 0.0))
+                )
+                alive &= sound | ~moving
+                size, before = np.broadcast_to(square, count), np.broadcast_to(det, count)
+                moving &= alive & (size > CLOSED**2)
+                if not moving.any():
+                    break
+            alive &= ~moving
+            reached[alive] = part
+            if not alive.any():
+                break
+        return x, alive, reached

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a back end gets: results as expressions of inputs, and equations to be solved before.
+
+May import: this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from pkm_twin.codegen.expressions import PARAMETERS, SAMPLE, Expression, ordered
+from pkm_twin.errors import PkmTwinError
+
+UNKNOWNS: Final = "x"
+"""Name of the input that Newton's method finds."""
+
+CLOSED: Final = 1e-9
+"""Newton's method ends with a correction below this: it converges quadratically, so what is left
+is below rounding."""
+TURNS: Final = 12
+"""Most corrections a step."""
+CONTRACTION: Final = 0.25
+"""Most that a correction may be of the one before it."""
+CHANGE: Final = 3.0
+"""Most that the determinant may change by, as a factor, in one correction."""
+DIRECT: Final = 1e-3
+"""Least determinant, over the one at home, of a state that is reached in one step."""
+STEPPED: Final = 1e-8
+"""The same with more steps: no correction can step over a singularity then."""
+RESIDUAL: Final = 1e-10
+"""Largest residual of all equations, those that were not solved too, lengths over the size."""
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Unknowns x of the target q, found by Newton's method from a known state.
+
+    One step goes from ``start`` (expressions of q; None: from home) to the target at once. In k
+    steps the target moves from ``origin`` to q in k equal parts, from the unknowns ``home``.
+
+    A sample is refused where a correction does not contract, where the determinant leaves its
+    bounds, or where a residual stays: then it may be another root that was found.
+    """
+
+    target: str
+    home: Sequence[float]
+    origin: Sequence[float]
+    start: Sequence[Expression] | None
+    corrected: Sequence[Expression]
+    """The unknowns after one correction."""
+    size: Expression
+    """Square of the correction, of unit one."""
+    determinant: Expression
+    """Of the equations, over that at home."""
+    residual: Expression
+    """Square of the residual of all equations, of unit one."""
+
+    @property
+    def results(self) -> list[Expression]:
+        """All expressions of one correction."""
+        return [*self.corrected, self.size, self.determinant]
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """Outputs by name as expressions of the inputs, of the parameters and of solved unknowns.
+
+    ``inputs``: sizes by name, in the order of the call, without parameters and unknowns.
+    """
+
+    inputs: Mapping[str, int]
+    parameters: int
+    outputs: Mapping[str, Sequence[Expression]]
+    equations: Equations | None = None
+
+    def __post_init__(self) -> None:
+        known = {**self.inputs, PARAMETERS: self.parameters}
+        if self.equations is not None:
+            known[UNKNOWNS] = len(self.equations.home)
+        for e in ordered(self.results):
+            if e.op == "in" and not e.b < known.get(e.a, 0):
+                raise PkmTwinError(f"the program reads {e.a}[{e.b}], which is no input")
+
+    @property
+    def results(self) -> list[Expression]:
+        """Every expression that is computed."""
+        rows = [e for row in self.outputs.values() for e in row]
+        q = self.equations
+        if q is not None:
+            rows += [*(q.start or ()), *q.results, q.residual]
+        return rows
+
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Operations of one correction, and of the outputs."""
+        newton = [] if self.equations is None else self.equations.results
+        rows = [e for row in self.outputs.values() for e in row]
+        return tuple(  # type: ignore[return-value]
+            sum(e.level == SAMPLE and e.op != "in" for e in ordered(part))
+            for part in (newton, rows)
+        )

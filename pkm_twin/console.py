@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every command says and reads alike: progress, numbers with commas, JSON, ends of output."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from pkm_twin.errors import PkmTwinError
+
+
+@contextmanager
+def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """A progress bar on stderr, where that is a terminal, that a count moves.
+
+    It begins with the first count, so that the time left of work that is gone on with is that of
+    the rest.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as drawing:
+        task: TaskID | None = None
+
+        def update(count: int) -> None:
+            nonlocal task
+            if task is None:
+                task = drawing.add_task(what, total=total, completed=count)
+            drawing.update(task, completed=count)
+
+        yield update
+
+
+def parse_numbers(text: str) -> list[float]:
+    """Finite numbers with commas between; empty where it is anything else."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        return []
+    return numbers if all(map(math.isfinite, numbers)) else []
+
+
+def numbers(text: str, count: int, expected: str = "") -> list[float]:
+    """``count`` finite numbers of a command line, with commas between.
+
+    :param expected: what is right, in words; by default that count of numbers.
+    """
+    values = parse_numbers(text)
+    if len(values) != count:
+        expected = expected or f"{count} numbers with commas between"
+        raise typer.BadParameter(f"{text!r} is not {expected}")
+    return values
+
+
+def table_console() -> Console:
+    """Stdout; where it is no terminal, as wide as a table here needs."""
+    console = Console()
+    return console if console.is_terminal else Console(width=140)
+
+
+def print_json(data: Any) -> None:
+    """JSON proper: a number that is not finite is a mistake here."""
+    typer.echo(json.dumps(data, indent=2, allow_nan=False))
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Refuse a target that is there, a dangling link too, unless it may be replaced."""
+    if os.path.lexists(path) and not overwrite:
+        raise PkmTwinError(f"{path} exists; give --overwrite to replace it")
+
+
+def system_error(error: OSError) -> str:
+    """What the system refused, as a line."""
+    what = error.strerror or str(error)
+    return f"{error.filename}: {what}" if error.filename else what
+
+
+def flush_output() -> OSError | None:
+    """Write out what stdout still holds; what then fails is returned, and can fail no more."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        silence_output()
+        return error
+    return None
+
+
+def silence_output() -> None:
+    """Send what stdout still holds nowhere: the interpreter writes it out once more at its end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)

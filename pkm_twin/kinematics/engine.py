@@ -1,0 +1,590 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One engine for every machine: what its graph gives at home, and the programs made of it.
+
+At home, on numbers: mobility, rank, redundant closures. Away from it, as compiled programs:
+Newton's method on independent closures from a known state, judged by all of them, and behind it
+whatever is asked: pose, Jacobians, torques.
+
+May import: numpy, pkm_twin's machine and codegen, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.codegen.expressions import Expression, Numbers, Objects, Tape
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.lu import SparseLU, independent_rows
+from pkm_twin.codegen.program import UNKNOWNS, Equations, Program
+from pkm_twin.errors import ParameterError, SingularityError
+from pkm_twin.kinematics import pose as poses
+from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
+from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.machine.graph import FREEDOMS, Array, Graph
+from pkm_twin.machine.tree import Tree
+
+RANK: Final = 1e-9
+"""Part of a matrix's largest singular value below which one counts as zero."""
+SAMPLES: Final = 6
+"""States near home, beside it, in which pivots have to be good."""
+
+Start = Callable[[Objects], Mapping[str, Sequence[Any]]]
+"""A mechanism's closed form of passive tree joints by q, from inner to outer body, beside home."""
+
+
+@dataclass(frozen=True)
+class Mobility:
+    """What the graph at home says.
+
+    ``freedoms``: of the whole machine. ``rank``: of all closures. ``redundant``: closures less
+    their rank. ``parts``: the cut joints and rods among which they are. ``unknowns``: of the tree.
+    """
+
+    freedoms: int
+    closures: int
+    rank: int
+    redundant: int
+    parts: tuple[str, ...]
+    unknowns: int
+
+
+class Engine:
+    """Kinematics of a graph, and the compiled programs of it, each made when it is first used."""
+
+    def __init__(
+        self, graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None
+    ) -> None:
+        self.graph, self.coordinates = graph, tuple(coordinates)
+        self.tree = Tree(graph)
+        self._start = start
+        self._kernels: dict[str, Kernel] = {}
+        text = repr((graph.key, self.coordinates, start is not None))
+        self.key = hashlib.sha256(text.encode()).hexdigest()
+
+    # On numbers.
+
+    @property
+    def joints(self) -> int:
+        """Number of actuated joints."""
+        return len(self.graph.actuated)
+
+    def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
+        """Motion and closures in a state, on numbers."""
+        motion = Motion(self.tree, x, q)
+        return motion, motion.closures()
+
+    def _scaled(self, rows: Sequence[Row]) -> tuple[Array, Array]:
+        """Derivatives by u and by qd, every row and column of unit one."""
+        ju, jq = (numbers(m) for m in matrices(self.tree, rows))
+        left = np.array([row.scale for row in rows]).reshape(-1, 1)
+        drives = np.array([self._drive_scale(name) for name in self.graph.actuated])
+        return left * ju / np.array(self.tree.scales), left * jq / drives
+
+    def _drive_scale(self, name: str) -> float:
+        return 1.0 / self.tree.size if FREEDOMS[self.graph.joints[name].kind] == "P" else 1.0
+
+    def close(self, q: Numbers, start: Numbers | None = None) -> Array | None:
+        """Unknowns of a state near a known one, on numbers; None where they are not found."""
+        x = list(self.tree.home) if start is None else list(start)
+        last = np.inf
+        for _ in range(12):
+            _, rows = self.at(x, q)
+            if not rows:
+                return np.array(x, float)
+            ju, _ = self._scaled(rows)
+            value = np.array([row.scale * float(row.value) for row in rows])
+            step, *_ = np.linalg.lstsq(ju, -value, rcond=RANK)
+            size = float(np.abs(step).max(initial=0.0))
+            if not size < 0.5 * last:
+                return None
+            motion = Motion(self.tree, x, q)
+            x = [float(v) for v in motion.retracted(x, step / np.array(self.tree.scales))]
+            if size < 1e-12:
+                return np.array(x, float) if float(np.abs(value).max()) < 1e-9 else None
+            last = max(size, 1e-13)
+        return None
+
+    @cached_property
+    def _samples(self) -> list[tuple[Array, Array]]:
+        """States (x, q) at home and near it, the same in every run."""
+        graph, home = self.graph, self.graph.home
+        states = [(np.array(self.tree.home, float), home)]
+        random = np.random.default_rng(0)
+        reach = np.array(
+            [0.15 * self.tree.size if self._drive_scale(n) != 1.0 else 0.3 for n in graph.actuated]
+        )
+        for _ in range(4 * SAMPLES):
+            if len(states) > SAMPLES:
+                break
+            way = random.uniform(-1.0, 1.0, len(home)) * reach
+            x: Array | None = states[0][0]
+            for part in (0.5, 1.0):
+                x = None if x is None else self.close(home + part * way, x)
+            if x is not None:
+                states.append((x, home + way))
+            else:
+                reach = reach * 0.8
+        return states
+
+    @cached_property
+    def _sampled(self) -> tuple[Array, Array]:
+        """Scaled derivatives by u and qd in the samples, shape (k, rows, ...)."""
+        pairs = [self._scaled(self.at(x, q)[1]) for x, q in self._samples]
+        return np.array([a for a, _ in pairs]), np.array([b for _, b in pairs])
+
+    @cached_property
+    def kept(self) -> list[int]:
+        """Closures that determine the unknowns; the others only judge.
+
+        :raises ParameterError: something can move while the actuated joints are held.
+        """
+        ju, _ = self._sampled
+        rows = independent_rows(ju)
+        if len(rows) < self.tree.unknown_rates:
+            raise ParameterError("joints", self.mobility.freedoms, self._free(ju[0]))
+        return rows
+
+    def _free(self, ju: Array) -> str:
+        """What moves with the actuated joints held, in words."""
+        _, s, vt = np.linalg.svd(ju) if len(ju) else (0, np.zeros(0), np.eye(ju.shape[1]))
+        rank = int((s > RANK * max(1.0, float(s.max(initial=0.0)))).sum())
+        loose = np.abs(vt[rank:]).max(0, initial=0.0) > 1e-6
+        owners = list(
+            dict.fromkeys(o for o, free in zip(self.tree.owners, loose, strict=True) if free)
+        )
+        return (
+            f"a machine whose {self.joints} actuated joints hold everything; mobility is "
+            f"{self.mobility.freedoms}, and free to move with them held: {', '.join(owners)}"
+        )
+
+    @cached_property
+    def mobility(self) -> Mobility:
+        """Freedoms, rank and redundancy at home."""
+        _, rows = self.at(self.tree.home, self.graph.home)
+        ju, jq = self._scaled(rows)
+        both = np.hstack([ju, jq])
+        rank = _rank(both)
+        parts: tuple[str, ...] = ()
+        if rank < len(rows):
+            left = np.linalg.svd(both)[0][:, rank:]
+            used = np.abs(left).max(1) > 1e-6
+            parts = tuple(dict.fromkeys(r.part for r, u in zip(rows, used, strict=True) if u))
+        unknowns = self.tree.unknown_rates
+        return Mobility(
+            unknowns + self.joints - rank, len(rows), rank, len(rows) - rank, parts, unknowns
+        )
+
+    def check(self) -> None:
+        """Refuse a graph that its actuated joints and pose coordinates do not determine.
+
+        :raises ParameterError: by the field.
+        """
+        near = [_rank(np.hstack([a, b])) for a, b in zip(*self._sampled, strict=True)]
+        if len(near) > 1 and near[0] < min(near[1:]):
+            raise ParameterError(
+                "joints", f"rank {near[0]} of the closures at home, {min(near[1:])} beside it",
+                "a home that is no singularity",
+            )  # fmt: skip
+        if self.mobility.freedoms != self.joints:
+            ju = self._sampled[0]
+            raise ParameterError("joints", self.mobility.freedoms, self._free(ju[0]))
+        _ = self.kept
+        if len(self.coordinates) != self.joints:
+            raise ParameterError(
+                "pose",
+                [c.name for c in self.coordinates],
+                f"{self.joints} coordinates, the mobility",
+            )
+        motion, rows = self.at(*self._samples[0])
+        matrix = self._inverse_matrix(motion, rows, self.home_pose.tolist())
+        if _rank(matrix) < len(matrix):
+            raise ParameterError(
+                "pose", [c.name for c in self.coordinates],
+                "coordinates that determine the platform's pose at home",
+            )  # fmt: skip
+
+    @cached_property
+    def home_pose(self) -> Array:
+        """Pose coordinates at home, shape (m,)."""
+        motion, _ = self.at(self.tree.home, self.graph.home)
+        position, rotation = (numbers(part) for part in motion.platform())
+        return np.array([float(v) for v in poses.values(self.coordinates, position, rotation)])
+
+    def _inverse_matrix(self, motion: Motion, rows: Sequence[Row], pose: Numbers) -> Array:
+        """Scaled derivatives of kept closures and pose equations by u and qd."""
+        ju, jq = self._scaled(rows)
+        extra = self._pose_rows(motion, pose)
+        scale = np.array(
+            [1.0 / self.tree.size if c.axis is not None else 1.0 for c in self.coordinates]
+        )
+        table = scale[:, None] * numbers(extra)
+        n = self.tree.unknown_rates
+        drives = np.array([self._drive_scale(name) for name in self.graph.actuated])
+        lower = np.hstack([table[:, :n] / np.array(self.tree.scales), table[:, n:] / drives])
+        return np.vstack([np.hstack([ju, jq])[self.kept], lower])
+
+    @property
+    def _pose_scales(self) -> list[float]:
+        return [1.0 / self.tree.size if c.axis is not None else 1.0 for c in self.coordinates]
+
+    def _pose_rows(self, motion: Motion, pose: Numbers) -> Objects:
+        n = self.tree.unknown_rates
+        table = np.zeros((len(self.coordinates), n + self.joints), dtype=object)
+        for i, (_, columns) in enumerate(poses.rows(self.coordinates, motion, pose)):
+            for (kind, k), value in columns.items():
+                table[i, k if kind == "u" else n + k] = value
+        return table
+
+    def ending(self, q: Array, reached: float) -> tuple[str, float, float | None]:
+        """Why no assembly is found beyond a part of the straight way from home to q.
+
+        :returns: the part that falls short the most, by how much (m), and None; or, where there is
+            an assembly behind a singularity, the closures' least reciprocal condition on the way.
+        """
+        home = self.graph.home
+        x, done = np.array(self.tree.home, float), 0.0
+        side, least = self._regularity(x, home)
+        step = 1 / 8
+        while step > 1e-4 and done < 1.0:
+            way = min(1.0, done + step)
+            there = home + way * (q - home)
+            new = self.close(there, x)
+            # Beyond a singularity is another assembly.
+            sign, measure = (0.0, 0.0) if new is None else self._regularity(new, there)
+            if new is None or sign != side or way > max(reached, 1e-12) + 1 / 8:
+                step /= 8
+                continue
+            x, done, least = new, way, min(least, measure)
+        part, miss = self._shortest(x, q)
+        # Where nothing falls short there is an assembly, but the way does not lead to it.
+        return part, miss, least if miss < 1e-9 * self.tree.size else None
+
+    def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
+        """Sign of the determinant of the kept closures, and their reciprocal condition."""
+        matrix = self._scaled(self.at(x.tolist(), q)[1])[0][self.kept]
+        return float(np.linalg.slogdet(matrix)[0]), _reciprocal(matrix)
+
+    def _shortest(self, x: Array, q: Array) -> tuple[str, float]:
+        """The closure that misses the most where all together miss the least, and by how much."""
+        for _ in range(20):
+            motion, rows = self.at(x.tolist(), q)
+            value = np.array([row.scale * float(row.value) for row in rows])
+            ju, _ = self._scaled(rows)
+            left = np.linalg.lstsq(
+                ju.T @ ju + 1e-6 * np.eye(ju.shape[1]), -ju.T @ value, rcond=None
+            )[0]
+            left *= min(1.0, 0.2 / max(float(np.abs(left).max(initial=0.0)), 1e-300))
+            x = np.array([float(v) for v in motion.retracted(x, left / np.array(self.tree.scales))])
+        _, rows = self.at(x.tolist(), q)
+        value = np.array([row.scale * float(row.value) for row in rows])
+        worst = int(np.abs(value).argmax())
+        return rows[worst].part, float(abs(value[worst])) * self.tree.size
+
+    def shortest_pose(self, pose: Array) -> tuple[str, float]:
+        """The closure that misses the most on the way to a pose, and by how much, m."""
+        del pose
+        return self.graph.actuated[0], 0.0
+
+    # As programs.
+
+    def kernel(self, name: str, write: Callable[[Traced], Program]) -> Kernel:
+        """The compiled program of that name, the same object every time."""
+        known = self._kernels.get(name)
+        if known is None:
+            known = Kernel(lambda: write(Traced(self)), f"{name} {self.key}")
+            self._kernels[name] = known
+        return known
+
+    @property
+    def forward(self) -> Kernel:
+        """Q to pose (m), position (3) and rotation (9) of the platform."""
+        return self.kernel("forward", _forward)
+
+    @property
+    def jacobian(self) -> Kernel:
+        """Q to pose rates per joint rate (m n) and platform twist per joint rate (6 n), by row."""
+        return self.kernel("jacobian", _jacobian)
+
+    @property
+    def inverse(self) -> Kernel:
+        """Pose to q, by Newton's method from home."""
+        return self.kernel("inverse", _inverse)
+
+    @property
+    def placement(self) -> Kernel:
+        """Q to rotation (9) from home and place of the origin (3) of every body, by body."""
+        return self.kernel("placement", _placement)
+
+    @property
+    def acceleration(self) -> Kernel:
+        """q, qd, qdd to the second derivative of the pose (m)."""
+        return self.kernel("acceleration", _acceleration)
+
+
+def choose_coordinates(graph: Graph) -> tuple[str, ...]:
+    """Pose coordinates that determine the platform at home, the first ones that do.
+
+    :raises ParameterError: something is free to move while the actuated joints are held.
+    """
+    engine = Engine(graph, ())
+    motion, closed = engine.at(engine.tree.home, graph.home)
+    ju, jq = (numbers(m) for m in matrices(engine.tree, closed))
+    kept = engine.kept
+    rates = np.vstack([-np.linalg.solve(ju[kept], jq[kept]), np.eye(engine.joints)])
+    chosen: list[str] = []
+    table = np.zeros((0, engine.joints))
+    for name, coordinate in poses.COORDINATES.items():
+        row = np.zeros(engine.tree.unknown_rates + engine.joints)
+        ((_, columns),) = poses.rows((coordinate,), motion, [0.0])
+        for (kind, k), value in columns.items():
+            row[k if kind == "u" else engine.tree.unknown_rates + k] = float(value)
+        scale = 1.0 / engine.tree.size if coordinate.axis is not None else 1.0
+        extended = np.vstack([table, scale * row @ rates])
+        if np.linalg.matrix_rank(extended, 1e-6) == len(extended):
+            chosen.append(name)
+            table = extended
+    return tuple(chosen)
+
+
+def _rank(matrix: Array) -> int:
+    if not matrix.size:
+        return 0
+    s = np.linalg.svd(matrix, compute_uv=False)
+    return int((s > RANK * max(1.0, float(s[0]))).sum())
+
+
+def _reciprocal(matrix: Array) -> float:
+    """Reciprocal condition number."""
+    s = np.linalg.svd(matrix, compute_uv=False)
+    return float(s[-1] / s[0]) if s.size and s[0] > 0.0 else 0.0
+
+
+class Traced:
+    """A machine's motion on expressions: what programs are written with."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine, self.tape = engine, Tape()
+        self.tree, self.joints = engine.tree, engine.joints
+        self.x = self.tape.inputs(UNKNOWNS, len(self.tree.home))
+        self.q = self.tape.inputs("q", self.joints)
+
+    def solve(self, target: str = "q") -> None:
+        """Take unknowns and closures of ``target``."""
+        engine = self.engine
+        self.motion = Motion(self.tree, self.x, self.q)
+        self.rows = self.motion.closures()
+        self.ju, self.jq = matrices(self.tree, self.rows)
+        kept = engine.kept
+        samples = engine._sampled[0][:, kept]
+        try:
+            self.lu = SparseLU(self.ju[kept], samples)
+        except SingularityError:
+            # No pivots hold in all states: those of home.
+            self.lu = SparseLU(self.ju[kept], samples[:1])
+
+    def equations(self) -> Equations:
+        """Newton's method for the unknowns at q, from home or the mechanism's closed form."""
+        engine, tree = self.engine, self.tree
+        kept = engine.kept
+        step = -self.lu.solve([self.rows[k].value for k in kept])
+        start = None
+        if engine._start is not None:
+            start = self.lift(self._ordered(engine._start(self.q)))
+        return Equations(
+            "q", tree.home, engine.graph.home.tolist(), start,
+            self.lift(self.motion.retracted(self.x, step)),
+            self._square(step, tree.scales), self._determinant(self.lu),
+            self._square([r.value for r in self.rows], [r.scale for r in self.rows]),
+        )  # fmt: skip
+
+    def _ordered(self, values: Mapping[str, Sequence[Any]]) -> list[Any]:
+        """Unknowns of joints' values."""
+        result: list[Any] = list(self.tree.home)
+        for link in self.tree.links.values():
+            steps = link.steps
+            if steps and not steps[0].actuated:
+                given = list(values[str(link.joint)])
+                given = given if steps[0].sign > 0.0 else given[::-1]
+                for step, value in zip(steps, given, strict=True):
+                    result[step.position] = value
+        return result
+
+    def lift(self, values: Numbers) -> list[Expression]:
+        """Results as expressions."""
+        return [self.tape.lift(value) for value in values]
+
+    def _square(self, values: Numbers, scales: Numbers) -> Expression:
+        total: Any = 0.0
+        for value, scale in zip(values, scales, strict=True):
+            part = value * scale
+            total = total + part * part
+        return self.tape.lift(total)
+
+    def _determinant(self, lu: SparseLU) -> Expression:
+        """Of the matrix, over that at home."""
+        engine = self.engine
+        ju = numbers(matrices(self.tree, engine.at(self.tree.home, engine.graph.home)[1])[0])
+        sign, log = np.linalg.slogdet(ju[engine.kept]) if engine.kept else (1.0, 0.0)
+        inverse: Any = lu.inverse_determinant
+        return self.tape.lift(float(np.exp(-log) * sign) / inverse)
+
+    def set_rates(self, qd: Numbers) -> Objects:
+        """Rates of everything by qd; returns those of the unknowns."""
+        kept = self.engine.kept
+        u = self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object)))
+        self.motion.set_rates(u, qd)
+        return u
+
+    def set_accelerations(self, qdd: Numbers, gravity: Any | None = None) -> None:
+        """Accelerations of everything by qdd, after the rates."""
+        kept = self.engine.kept
+        self.motion.set_accelerations(np.zeros(self.tree.unknown_rates), qdd)
+        bias = [self.rows[k].bias() for k in kept]
+        self.motion.set_accelerations(-self.lu.solve(bias), qdd, gravity)
+
+    def rate_columns(self) -> list[Objects]:
+        """Rates of the unknowns per joint rate."""
+        kept = self.engine.kept
+        return [self.lu.solve(-self.jq[kept][:, j]) for j in range(self.joints)]
+
+    def twists(self) -> list[tuple[Any, Any]]:
+        """Velocity of the reference point and angular velocity of the platform per joint rate."""
+        motion, body = self.motion, self.engine.graph.platform
+        position, _ = motion.platform()
+        linear, angular = motion.point_columns(body, position), motion.turn_columns(body)
+        result = []
+        for j, u in enumerate(self.rate_columns()):
+            pair = []
+            for columns in (linear, angular):
+                total: Any = np.zeros(3, dtype=object)
+                for (kind, k), column in columns.items():
+                    if kind == "u":
+                        total = total + np.asarray(column, dtype=object) * u[k]
+                    elif k == j:
+                        total = total + column
+                pair.append(total)
+            result.append((pair[0], pair[1]))
+        return result
+
+
+def _forward(t: Traced) -> Program:
+    t.solve()
+    position, rotation = t.motion.platform()
+    values = poses.values(t.engine.coordinates, position, rotation)
+    outputs = {
+        "pose": t.lift(values),
+        "position": t.lift(position),
+        "rotation": t.lift(np.ravel(rotation)),
+    }
+    return Program({"q": t.joints}, 0, outputs, t.equations())
+
+
+def _jacobian(t: Traced) -> Program:
+    t.solve()
+    _, rotation = t.motion.platform()
+    twists = t.twists()
+    rates = [poses.rates(t.engine.coordinates, rotation, v, w) for v, w in twists]
+    outputs = {
+        "rates": t.lift([row[i] for i in range(len(t.engine.coordinates)) for row in rates]),
+        "twist": t.lift([pair[part][i] for part in (0, 1) for i in range(3) for pair in twists]),
+    }
+    return Program({"q": t.joints}, 0, outputs, t.equations())
+
+
+def _placement(t: Traced) -> Program:
+    t.solve()
+    rows: list[Any] = []
+    for body in t.engine.graph.bodies:
+        rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
+    return Program({"q": t.joints}, 0, {"bodies": t.lift(rows)}, t.equations())
+
+
+def _acceleration(t: Traced) -> Program:
+    t.solve()
+    qd, qdd = t.tape.inputs("qd", t.joints), t.tape.inputs("qdd", t.joints)
+    t.set_rates(qd)
+    t.set_accelerations(qdd)
+    motion, graph = t.motion, t.engine.graph
+    body = graph.platform
+    second = poses.accelerations(
+        t.engine.coordinates, motion.turned(body), motion.omega[body],
+        motion.acceleration(body, graph.origin), motion.alpha[body],
+    )  # fmt: skip
+    sizes = {"q": t.joints, "qd": t.joints, "qdd": t.joints}
+    return Program(sizes, 0, {"acceleration": t.lift(second)}, t.equations())
+
+
+def _inverse(t: Traced) -> Program:
+    engine, tree, tape = t.engine, t.tree, t.tape
+    n, size = engine.joints, len(tree.home)
+    everything = tape.inputs(UNKNOWNS, size + n)
+    t.x, t.q = everything[:size], everything[size:]
+    goal = tape.inputs("pose", len(engine.coordinates))
+    motion = Motion(tree, t.x, t.q)
+    rows = motion.closures()
+    ju, jq = matrices(tree, rows)
+    kept = engine.kept
+    equations = poses.rows(engine.coordinates, motion, goal)
+    matrix = np.vstack([np.hstack([ju, jq])[kept], engine._pose_rows(motion, goal)])
+    samples = []
+    for x, q in engine._samples:
+        there, closed = engine.at(x, q)
+        position, rotation = (numbers(part) for part in there.platform())
+        here = [float(v) for v in poses.values(engine.coordinates, position, rotation)]
+        samples.append(engine._inverse_matrix(there, closed, here))
+    try:
+        lu = SparseLU(matrix, np.array(samples))
+    except SingularityError:
+        lu = SparseLU(matrix, np.array(samples[:1]))
+    values = [rows[k].value for k in kept] + [value for value, _ in equations]
+    step = -lu.solve(values)
+    split = tree.unknown_rates
+    corrected = [*motion.retracted(t.x, step[:split]), *(t.q + step[split:])]
+    drives = [engine._drive_scale(name) for name in engine.graph.actuated]
+    there, closed = engine.at(tree.home, engine.graph.home)
+    home = np.vstack(
+        [
+            np.hstack([numbers(m) for m in matrices(tree, closed)])[kept],
+            numbers(engine._pose_rows(there, engine.home_pose.tolist())),
+        ]
+    )
+    sign, log = np.linalg.slogdet(home)
+    inverse: Any = lu.inverse_determinant
+    solved = Equations(
+        "pose", [*tree.home, *engine.graph.home.tolist()], engine.home_pose.tolist(), None,
+        t.lift(corrected), t._square(step, [*tree.scales, *drives]),
+        tape.lift(float(np.exp(-log) * sign) / inverse),
+        t._square(
+            [r.value for r in rows] + [v for v, _ in equations],
+            [r.scale for r in rows] + engine._pose_scales,
+        ),
+    )  # fmt: skip
+    return Program({"pose": len(goal)}, 0, {"q": t.lift(t.q)}, solved)
+
+
+@lru_cache(maxsize=64)
+def _shared(key: str) -> dict[str, Engine]:
+    return {}
+
+
+def engine_of(
+    graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None, mark: str = ""
+) -> Engine:
+    """The engine of a geometry: machines that differ in inertia or limits alone share it.
+
+    :param mark: text that tells a closed form from others.
+    """
+    store = _shared(f"{graph.key} {coordinates!r} {mark}")
+    if "engine" not in store:
+        store["engine"] = Engine(graph, coordinates, start)
+    return store["engine"]
+
+
+__all__ = ["Engine", "Mobility", "NDArray", "Start", "Traced", "engine_of"]

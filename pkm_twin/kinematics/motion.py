@@ -1,0 +1,437 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Placement, closures, velocities and accelerations of a tree, on numbers and expressions alike.
+
+Nothing is differentiated: columns of Jacobians are axes and levers, accelerations are the
+recursion of rigid bodies in base axes (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter
+2). Rates u belong to the unknowns, qd to the actuated joints.
+
+May import: numpy, pkm_twin's machine and codegen, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.codegen.expressions import Numbers, Objects, cos, sin, sqrt
+from pkm_twin.machine.graph import BASE, Array, Direction, Joint, Rod, across, unit
+from pkm_twin.machine.tree import Link, Step, Tree, snapped
+
+UNITS: Final = np.eye(3)
+Columns = dict[tuple[str, int], Any]
+"""By rate ("u" or "q", index): a vector, or a number."""
+
+
+def cross(a: Any, b: Any) -> Objects:
+    """Vector product of three numbers each."""
+    result = np.empty(3, dtype=object)
+    result[0] = a[1] * b[2] - a[2] * b[1]
+    result[1] = a[2] * b[0] - a[0] * b[2]
+    result[2] = a[0] * b[1] - a[1] * b[0]
+    return result
+
+
+def numbers(values: Any) -> Array:
+    """An array of objects that are floats, as floats."""
+    return np.asarray(np.array(values, dtype=float), np.float64)
+
+
+def _difference(b: Columns, a: Columns) -> Columns:
+    keys = dict.fromkeys([*b, *a])
+    return {k: (b[k] - a[k] if k in a else b[k]) if k in b else -a[k] for k in keys}
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One scalar equation of a closure: ``value`` is zero, ``columns`` its derivatives by rates.
+
+    ``bias``: its second derivative in time at zero accelerations of the unknowns. ``scale`` makes
+    it of unit one. ``part``: the joint or rod. A unit of its multiplier is a force ``force`` and a
+    moment ``moment`` on ``outer`` at ``point``, and the opposite on ``inner``.
+    """
+
+    part: str
+    value: Any
+    columns: Columns
+    bias: Callable[[], Any]
+    scale: float
+    inner: str
+    outer: str
+    point: Any
+    force: Any
+    moment: Any
+
+
+class Motion:
+    """A tree in one state; rates and accelerations are taken after, in this order.
+
+    :param x: unknowns, as ``tree.home``.
+    :param q: positions of the actuated joints, shape (n,).
+    """
+
+    def __init__(self, tree: Tree, x: Numbers, q: Numbers) -> None:
+        self.tree, self.graph = tree, tree.graph
+        origin = tree.graph.home
+        self.rotation: dict[str, Any] = {BASE: UNITS}
+        self.origin: dict[str, Any] = {BASE: np.zeros(3)}
+        self.lever: dict[str, Any] = {}
+        self.axis: dict[int, Any] = {}
+        for link in tree.links.values():
+            turned = self.rotation[link.parent]
+            lever = turned @ link.arm
+            for step in link.steps:
+                if step.kind == "P":
+                    axis = self.axis[id(step)] = turned @ step.local
+                    lever = lever + axis * self._value(step, x, q, origin)
+                elif step.kind == "R":
+                    own = turned if (step.before == UNITS).all() else turned @ step.before
+                    angle = self._value(step, x, q, origin)
+                    s, c = sin(angle), cos(angle)
+                    self.axis[id(step)] = own[:, 2]
+                    turned = np.array(
+                        [own[:, 0] * c + own[:, 1] * s, own[:, 1] * c - own[:, 0] * s, own[:, 2]],
+                        dtype=object,
+                    ).T
+                else:
+                    k = step.position
+                    turned = _quaternion_matrix(x[k : k + 4])
+                    if step.kind == "F":
+                        lever = link.at + np.array(x[k + 4 : k + 7], dtype=object)
+            self.rotation[link.body] = turned
+            self.lever[link.body] = lever
+            self.origin[link.body] = self.origin[link.parent] + lever
+
+    @staticmethod
+    def _value(step: Step, x: Numbers, q: Numbers, origin: Array) -> Any:
+        k = step.position
+        value = q[k] - float(origin[k]) if step.actuated else x[k]
+        return -value if step.sign < 0.0 else value
+
+    # Points and directions that are fixed in a body, given at home.
+
+    def arm(self, body: str, point: Array) -> Any:
+        """From the body's origin to a point of it."""
+        tree = self.tree
+        return self.rotation[body] @ snapped(tree.axes[body].T @ (point - tree.at[body]))
+
+    def point(self, body: str, point: Array) -> Any:
+        """Where a point of a body is."""
+        return self.origin[body] + self.arm(body, point)
+
+    def direction(self, body: str, vector: Array) -> Any:
+        """Where a vector of a body points."""
+        return self.rotation[body] @ snapped(self.tree.axes[body].T @ vector)
+
+    def turned(self, body: str) -> Any:
+        """Rotation of a body relative to home, shape (3, 3)."""
+        return self.rotation[body] @ self.tree.axes[body].T
+
+    def platform(self) -> tuple[Any, Any]:
+        """Position of the reference point, and the platform's rotation relative to home."""
+        graph = self.graph
+        return self.point(graph.platform, graph.origin), self.turned(graph.platform)
+
+    # Columns: velocity of a point of a body, and angular velocity, by rates.
+
+    def point_columns(self, body: str, at: Any) -> Columns:
+        """Velocity per rate of the point of a body that is at a place."""
+        out: Columns = {}
+        while body != BASE:
+            link, absolute = self.tree.links[body], False
+            for step in reversed(link.steps):
+                key = ("q" if step.actuated else "u", step.rate)
+                if step.kind == "R":
+                    out[key] = step.sign * cross(self.axis[id(step)], at - self.origin[body])
+                elif step.kind == "P":
+                    out[key] = step.sign * self.axis[id(step)]
+                else:
+                    absolute = True
+                    for i in range(3):
+                        out["u", step.rate + i] = cross(UNITS[i], at - self.origin[body])
+                        if step.kind == "F":
+                            out["u", step.rate + 3 + i] = UNITS[i]
+            if absolute:
+                # Nothing of the parents' turning is inherited, only their translation.
+                at = self.origin[body]
+            body = link.parent
+        return out
+
+    def turn_columns(self, body: str) -> Columns:
+        """Angular velocity of a body per rate."""
+        out: Columns = {}
+        while body != BASE:
+            link = self.tree.links[body]
+            for step in reversed(link.steps):
+                if step.kind == "R":
+                    key = ("q" if step.actuated else "u", step.rate)
+                    out[key] = step.sign * self.axis[id(step)]
+                elif step.kind in "SF":
+                    for i in range(3):
+                        out["u", step.rate + i] = UNITS[i]
+                    return out
+            body = link.parent
+        return out
+
+    # Closures.
+
+    def closures(self) -> list[Row]:
+        """The equations of all cut joints and rods."""
+        rows: list[Row] = []
+        for name in self.tree.cut:
+            rows += self._cut(self.graph.joints[name])
+        rows += [self._rod(rod) for rod in self.graph.rods.values()]
+        return rows
+
+    def _cut(self, joint: Joint) -> list[Row]:
+        rows: list[Row] = []
+        kind = joint.kind
+        if kind in ("revolute", "universal", "spherical", "fixed"):
+            rows += self._meeting(joint)
+        pair = across(joint.axes[0]) if len(joint.axes) == 1 else ()
+        if kind in ("prismatic", "cylindrical"):
+            rows += [self._offset(joint, e) for e in pair]
+        if kind in ("revolute", "cylindrical"):
+            rows += [self._angle(joint, e, joint.axes[0]) for e in pair]
+        if kind in ("prismatic", "fixed", "translation"):
+            rows += [self._angle(joint, UNITS[i], UNITS[(i + 1) % 3]) for i in range(3)]
+        if kind == "universal":
+            rows.append(self._angle(joint, joint.axes[0], joint.axes[1]))
+        return rows
+
+    def _meeting(self, joint: Joint) -> list[Row]:
+        """Both bodies' points are at one place."""
+        a, b, at = joint.inner, joint.outer, joint.at
+        xa, xb = self.point(a, at), self.point(b, at)
+        columns = _difference(self.point_columns(b, xb), self.point_columns(a, xa))
+
+        def bias(i: int) -> Callable[[], Any]:
+            return lambda: self.acceleration(b, at)[i] - self.acceleration(a, at)[i]
+
+        return [
+            Row(
+                joint.name, xb[i] - xa[i], {k: c[i] for k, c in columns.items()}, bias(i),
+                1.0 / self.tree.size, a, b, xb, UNITS[i], np.zeros(3),
+            )
+            for i in range(3)
+        ]  # fmt: skip
+
+    def _angle(self, joint: Joint, e: Array, u: Array) -> Row:
+        """e, fixed in the inner body, and u, in the outer one, keep their angle."""
+        a, b = joint.inner, joint.outer
+        ea, ub = self.direction(a, e), self.direction(b, u)
+        normal = cross(ub, ea)
+        columns = _difference(self.turn_columns(b), self.turn_columns(a))
+
+        def bias() -> Any:
+            wa, wb = self.omega[a], self.omega[b]
+            va, vb = cross(wa, ea), cross(wb, ub)
+            turning = (self.alpha[b] - self.alpha[a]) @ normal
+            return turning + cross(wa, va) @ ub + cross(wb, vb) @ ea + 2.0 * (va @ vb)
+
+        return Row(
+            joint.name, ea @ ub - float(e @ u), {k: c @ normal for k, c in columns.items()}, bias,
+            1.0, a, b, self.point(b, joint.at), np.zeros(3), normal,
+        )  # fmt: skip
+
+    def _offset(self, joint: Joint, e: Array) -> Row:
+        """The outer body's point stays in the plane across e of the inner body."""
+        a, b, at = joint.inner, joint.outer, joint.at
+        ea, xa, xb = self.direction(a, e), self.point(a, at), self.point(b, at)
+        apart = xb - xa
+        normal = cross(ea, apart)
+        linear = _difference(self.point_columns(b, xb), self.point_columns(a, xa))
+        columns = {k: c @ ea for k, c in linear.items()}
+        for k, c in self.turn_columns(a).items():
+            columns[k] = columns[k] + c @ normal if k in columns else c @ normal
+
+        def bias() -> Any:
+            wa = self.omega[a]
+            turned = cross(wa, ea)
+            return (
+                ea @ (self.acceleration(b, at) - self.acceleration(a, at))
+                + 2.0 * (turned @ (self.velocity(b, at) - self.velocity(a, at)))
+                + (cross(self.alpha[a], ea) + cross(wa, turned)) @ apart
+            )
+
+        # The force acts on both bodies at the outer point, so no moment is left.
+        return Row(
+            joint.name, ea @ apart, columns, bias, 1.0 / self.tree.size, a, b, xb, ea, np.zeros(3)
+        )
+
+    def _rod(self, rod: Rod) -> Row:
+        """The ends keep their distance."""
+        a, b, (start, end) = rod.inner, rod.outer, rod.ends
+        xa, xb = self.point(a, start), self.point(b, end)
+        apart = xb - xa
+        columns = _difference(self.point_columns(b, xb), self.point_columns(a, xa))
+        square = float((end - start) @ (end - start))
+
+        def bias() -> Any:
+            speed = self.velocity(b, end) - self.velocity(a, start)
+            change = self.acceleration(b, end) - self.acceleration(a, start)
+            return apart @ change + speed @ speed
+
+        return Row(
+            rod.name, 0.5 * (apart @ apart - square), {k: c @ apart for k, c in columns.items()},
+            bias, 1.0 / (self.tree.size * square**0.5), a, b, xb, apart, np.zeros(3),
+        )  # fmt: skip
+
+    # Velocities and accelerations.
+
+    def set_rates(self, u: Numbers, qd: Numbers) -> None:
+        """Angular velocity, and velocity of the origin, of every body."""
+        zero = np.zeros(3)
+        self.omega: dict[str, Any] = {BASE: zero}
+        self.speed: dict[str, Any] = {BASE: zero}
+        self._before: dict[int, Any] = {}
+        self._rate: dict[int, Any] = {}
+        for link in self.tree.links.values():
+            w = self.omega[link.parent]
+            v = self.speed[link.parent] + cross(w, self.lever[link.body])
+            for step in link.steps:
+                k = step.rate
+                if step.kind in "RP":
+                    rate = self._rate[id(step)] = step.sign * (qd[k] if step.actuated else u[k])
+                    axis = self.axis[id(step)]
+                    if step.kind == "P":
+                        v = v + axis * rate
+                    else:
+                        self._before[id(step)] = w
+                        w = w + axis * rate
+                else:
+                    w = np.array(u[k : k + 3], dtype=object)
+                    if step.kind == "F":
+                        v = np.array(u[k + 3 : k + 6], dtype=object)
+            self.omega[link.body], self.speed[link.body] = w, v
+
+    def set_accelerations(self, du: Numbers, qdd: Numbers, gravity: Any | None = None) -> None:
+        """Angular acceleration, and acceleration of the origin less gravity, of every body."""
+        zero = np.zeros(3)
+        pull = zero if gravity is None else gravity
+        self.alpha: dict[str, Any] = {BASE: zero}
+        self.change: dict[str, Any] = {BASE: -pull if gravity is not None else zero}
+        self._spin: dict[str, Any] = {BASE: np.zeros((3, 3))}
+        for link in self.tree.links.values():
+            parent = link.parent
+            w = self.omega[parent]
+            al = self.alpha[parent]
+            acc = self.change[parent] + self._spin[parent] @ self.lever[link.body]
+            for step in link.steps:
+                k = step.rate
+                if step.kind in "RP":
+                    second = step.sign * (qdd[k] if step.actuated else du[k])
+                    axis, rate = self.axis[id(step)], self._rate[id(step)]
+                    if step.kind == "P":
+                        acc = acc + axis * second + 2.0 * rate * cross(w, axis)
+                    else:
+                        al = al + axis * second + cross(self._before[id(step)], axis) * rate
+                else:
+                    al = np.array(du[k : k + 3], dtype=object)
+                    if step.kind == "F":
+                        acc = np.array(du[k + 3 : k + 6], dtype=object) - pull
+            self.alpha[link.body], self.change[link.body] = al, acc
+            self._spin[link.body] = _spin(self.omega[link.body], al)
+
+    def velocity(self, body: str, point: Array) -> Any:
+        """Velocity of a point of a body, given at home."""
+        return self.speed[body] + cross(self.omega[body], self.arm(body, point))
+
+    def acceleration(self, body: str, point: Array) -> Any:
+        """Its acceleration, less gravity where that was given."""
+        return self.change[body] + self._spin[body] @ self.arm(body, point)
+
+    def spin(self, body: str) -> Any:
+        """The matrix that takes a lever to the acceleration across it, shape (3, 3)."""
+        return self._spin[body]
+
+    def retracted(self, x: Numbers, du: Numbers) -> list[Any]:
+        """Unknowns, moved by small rates."""
+        new = list(x)
+        for link in self.tree.links.values():
+            for step in link.steps:
+                k, r = step.position, step.rate
+                if step.actuated:
+                    continue
+                if step.kind in "RP":
+                    new[k] = x[k] + du[r]
+                    continue
+                w, v = x[k], np.array(x[k + 1 : k + 4], dtype=object)
+                d = np.array(du[r : r + 3], dtype=object) * 0.5
+                w, v = w - d @ v, v + d * w + cross(d, v)
+                length = 1.0 / sqrt(w * w + v @ v)
+                new[k] = w * length
+                new[k + 1 : k + 4] = list(v * length)
+                if step.kind == "F":
+                    for i in range(3):
+                        new[k + 4 + i] = x[k + 4 + i] + du[r + 3 + i]
+        return new
+
+    def reaction_axes(self, joint: Joint) -> list[tuple[str, Any]]:
+        """Directions of a joint's reactions, by name: given ones, or along and across its axis."""
+        return [(d.name, self.direction(d.body, d.vector)) for d in reaction_directions(joint)]
+
+
+def reaction_directions(joint: Joint) -> tuple[Direction, ...]:
+    """Three directions in which a joint's reactions are told, fixed in bodies."""
+    if joint.directions:
+        return joint.directions
+    if not len(joint.axes):
+        return tuple(Direction(n, joint.inner, UNITS[i]) for i, n in enumerate("xyz"))
+    axis = joint.axes[0]
+    if joint.kind == "universal":
+        first = unit(joint.axes[1] - (joint.axes[1] @ axis) * axis)
+        pair = first, np.cross(axis, first)
+    else:
+        pair = across(axis)
+    return (
+        Direction("axis", joint.inner, axis),
+        Direction("across 1", joint.inner, pair[0]),
+        Direction("across 2", joint.inner, pair[1]),
+    )
+
+
+def matrices(tree: Tree, rows: Sequence[Row]) -> tuple[Objects, Objects]:
+    """Derivatives of the closures by u, shape (rows, unknown rates), and by qd, (rows, n)."""
+    n = len(tree.graph.actuated)
+
+    def block(letter: str, size: int) -> NDArray[Any]:
+        table = np.zeros((len(rows), size), dtype=object)
+        for i, row in enumerate(rows):
+            for (kind, k), value in row.columns.items():
+                if kind == letter:
+                    table[i, k] = value
+        return table
+
+    return block("u", tree.unknown_rates), block("q", n)
+
+
+def _quaternion_matrix(parts: Numbers) -> Objects:
+    w, i, j, k = parts
+    return np.array(
+        [
+            [1.0 - 2.0 * (j * j + k * k), 2.0 * (i * j - k * w), 2.0 * (i * k + j * w)],
+            [2.0 * (i * j + k * w), 1.0 - 2.0 * (i * i + k * k), 2.0 * (j * k - i * w)],
+            [2.0 * (i * k - j * w), 2.0 * (j * k + i * w), 1.0 - 2.0 * (i * i + j * j)],
+        ],
+        dtype=object,
+    )
+
+
+def _spin(w: Any, al: Any) -> Objects:
+    x, y, z = w
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    return np.array(
+        [
+            [-(yy + zz), xy - al[2], xz + al[1]],
+            [xy + al[2], -(xx + zz), yz - al[0]],
+            [xz - al[1], yz + al[0], -(xx + yy)],
+        ],
+        dtype=object,
+    )
+
+
+__all__ = ["Columns", "Link", "Mapping", "Motion", "Row", "cross", "matrices", "numbers"]

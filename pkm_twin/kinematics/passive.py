@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values of the passive joints in a URDF's convention: one number a revolute or prismatic axis.
+
+A spherical joint and a free body's ball are three revolutes in a row (x, y and z at home), a
+universal joint is two, a cylindrical one a slide and a turn, a translation three slides. Rods are
+links on two revolutes, that turn them from their direction at home.
+
+May import: numpy, pkm_twin's codegen, machine and this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pkm_twin.codegen.expressions import Numbers, Objects, atan2, sqrt
+from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics.engine import Engine, Traced
+from pkm_twin.machine.graph import Array, Rod, across, unit
+
+_LETTERS = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """One passive number: its name, its kind (R or P), its axis and a point of it at home.
+
+    ``inner``, ``outer``: bodies; of several axes in a row those between are named for them.
+    """
+
+    name: str
+    kind: str
+    axis: Array
+    point: Array
+    inner: str
+    outer: str
+    joint: str
+
+
+def passive_axes(engine: Engine) -> list[Axis]:
+    """All passive axes of the tree, in order, then those of the rods."""
+    graph, tree = engine.graph, engine.tree
+    result: list[Axis] = []
+
+    def chain(
+        joint: str, kinds: str, axes: Numbers, point: Array, inner: str, outer: str,
+        names: Sequence[str],
+    ) -> None:  # fmt: skip
+        before = inner
+        for k, (kind, axis) in enumerate(zip(kinds, axes, strict=True)):
+            after = outer if k == len(kinds) - 1 else f"{names[k]}_link"
+            result.append(
+                Axis(names[k], kind, np.asarray(axis, float), point, before, after, joint)
+            )
+            before = after
+
+    for link in tree.links.values():
+        steps = link.steps
+        if not steps or steps[0].actuated:
+            continue
+        name = link.joint or f"{link.body}_free"
+        point = link.at
+        if steps[0].kind == "S":
+            names = [f"{name}_{c}" for c in _LETTERS]
+            chain(name, "RRR", np.eye(3), point, link.parent, link.body, names)
+        elif steps[0].kind == "F":
+            names = [f"{name}_p{c}" for c in _LETTERS] + [f"{name}_{c}" for c in _LETTERS]
+            chain(name, "PPPRRR", [*np.eye(3), *np.eye(3)], point, link.parent, link.body, names)
+        else:
+            kinds = "".join(step.kind for step in steps)
+            labels = {1: [name], 2: [f"{name}_1", f"{name}_2"]}.get(
+                len(steps), [f"{name}_{c}" for c in _LETTERS]
+            )
+            chain(
+                name, kinds, [step.sign * step.axis for step in steps], point, link.parent,
+                link.body, labels,
+            )  # fmt: skip
+    for rod in graph.rods.values():
+        first, second = rod_axes(rod)
+        names = [f"{rod.name}_1", f"{rod.name}_2"]
+        chain(rod.name, "RR", [first, second], rod.ends[0], rod.inner, rod.name, names)
+    return result
+
+
+def rod_axes(rod: Rod) -> tuple[Array, Array]:
+    """The two axes that a rod turns about at its inner end, at home."""
+    return across(unit(rod.ends[1] - rod.ends[0]))
+
+
+def passive_names(engine: Engine) -> tuple[str, ...]:
+    """Names of all passive numbers."""
+    return tuple(axis.name for axis in passive_axes(engine))
+
+
+def passive_program(t: Traced) -> Program:
+    """Q to all passive numbers."""
+    t.solve()
+    motion, tree = t.motion, t.tree
+    values: list[Any] = []
+    for link in tree.links.values():
+        steps = link.steps
+        if not steps or steps[0].actuated:
+            continue
+        if steps[0].kind in "SF":
+            parent = motion.turned(link.parent)
+            if steps[0].kind == "F":
+                k = steps[0].position
+                values += list(t.x[k + 4 : k + 7])
+            values += _three_angles(parent.T @ motion.turned(link.body))
+            continue
+        # A joint of one freedom has its own value at home.
+        single = link.joint is not None and len(steps) == 1
+        home = tree.graph.joints[str(link.joint)].home if single else 0.0
+        values += [t.x[step.position] + home for step in steps]
+    for rod in t.engine.graph.rods.values():
+        start, end = motion.point(rod.inner, rod.ends[0]), motion.point(rod.outer, rod.ends[1])
+        along = unit(rod.ends[1] - rod.ends[0])
+        first, second = rod_axes(rod)
+        span = motion.turned(rod.inner).T @ (end - start)
+        x = span @ along
+        # Turned by b about the second axis, then by a about the first: along becomes
+        # (cos b) (cos a along + sin a (first x along)) + sin b (second x along).
+        side, up = np.cross(second, along), np.cross(first, along)
+        b = span @ side
+        a = span @ up
+        values += [atan2(a, x), atan2(b, sqrt(x * x + a * a))]
+    return Program({"q": t.joints}, 0, {"passive": t.lift(values)}, t.equations())
+
+
+def _three_angles(matrix: Objects) -> list[Any]:
+    """a, b, c of Rx(a) Ry(b) Rz(c)."""
+    root = sqrt(matrix[0][0] * matrix[0][0] + matrix[0][1] * matrix[0][1])
+    return [
+        atan2(-matrix[1][2], matrix[2][2]),
+        atan2(matrix[0][2], root),
+        atan2(-matrix[0][1], matrix[0][0]),
+    ]

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pose coordinates of a platform, of its position and rotation, and their rates.
+
+A coordinate is a coordinate of the position, a turn atan2(a, b) or an elevation asin(s) of signed
+entries of the rotation matrix. Written on numbers and expressions alike.
+
+May import: pkm_twin's codegen and machine, numpy, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pkm_twin.codegen.expressions import Numbers, atan2, cos, sin, sqrt
+from pkm_twin.kinematics.motion import Columns, Motion, cross
+
+Entry = tuple[int, int, float]
+"""Row, column and sign of an entry of the rotation matrix."""
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One pose coordinate: ``axis`` of the position, or entries of the rotation.
+
+    One entry is the sine of an elevation, two are those of a turn, atan2(first, second).
+    """
+
+    name: str
+    axis: int | None = None
+    entries: tuple[Entry, ...] = ()
+
+    @property
+    def unit(self) -> str:
+        """``m`` or ``rad``."""
+        return "rad" if self.entries else "m"
+
+
+COORDINATES: Final = {
+    "x": Coordinate("x", 0),
+    "y": Coordinate("y", 1),
+    "z": Coordinate("z", 2),
+    # R = Rz(yaw) Ry(pitch) Rx(roll)
+    "roll": Coordinate("roll", entries=((2, 1, 1.0), (2, 2, 1.0))),
+    "pitch": Coordinate("pitch", entries=((2, 0, -1.0),)),
+    "yaw": Coordinate("yaw", entries=((1, 0, 1.0), (0, 0, 1.0))),
+}
+"""The pose coordinates that every machine may have."""
+
+
+def about_x(name: str) -> Coordinate:
+    """The first angle of R = Rx Ry Rz."""
+    return Coordinate(name, entries=((1, 2, -1.0), (2, 2, 1.0)))
+
+
+def about_y(name: str) -> Coordinate:
+    """The second angle of R = Rx Ry Rz."""
+    return Coordinate(name, entries=((0, 2, 1.0),))
+
+
+def _entry(matrix: Any, entry: Entry) -> Any:
+    row, column, sign = entry
+    return matrix[row][column] if sign > 0.0 else -matrix[row][column]
+
+
+def _root(matrix: Any, entry: Entry) -> Any:
+    """Cosine of an elevation, from the other entries of its column: no square is subtracted."""
+    row, column, _ = entry
+    a, b = (matrix[i][column] for i in range(3) if i != row)
+    return sqrt(a * a + b * b)
+
+
+def values(coordinates: Sequence[Coordinate], position: Any, rotation: Any) -> list[Any]:
+    """The pose of a platform."""
+    result = []
+    for c in coordinates:
+        if c.axis is not None:
+            result.append(position[c.axis])
+        elif len(c.entries) == 2:
+            result.append(atan2(_entry(rotation, c.entries[0]), _entry(rotation, c.entries[1])))
+        else:
+            result.append(atan2(_entry(rotation, c.entries[0]), _root(rotation, c.entries[0])))
+    return result
+
+
+def _columns_turned(rotation: Any, by: Any) -> list[list[Any]]:
+    """``by`` x each column of a matrix."""
+    turned = [cross(by, [rotation[i][k] for i in range(3)]) for k in range(3)]
+    return [[turned[k][i] for k in range(3)] for i in range(3)]
+
+
+def rates(coordinates: Sequence[Coordinate], rotation: Any, velocity: Any, omega: Any) -> list[Any]:
+    """First derivatives of the pose in time, of the platform's velocity and angular velocity."""
+    turned = _columns_turned(rotation, omega)
+    result = []
+    for c in coordinates:
+        if c.axis is not None:
+            result.append(velocity[c.axis])
+        elif len(c.entries) == 2:
+            a, b = (_entry(rotation, e) for e in c.entries)
+            ad, bd = (_entry(turned, e) for e in c.entries)
+            result.append((b * ad - a * bd) / (a * a + b * b))
+        else:
+            result.append(_entry(turned, c.entries[0]) / _root(rotation, c.entries[0]))
+    return result
+
+
+def accelerations(
+    coordinates: Sequence[Coordinate],
+    rotation: Any,
+    omega: Any,
+    acceleration: Any,
+    alpha: Any,
+) -> list[Any]:
+    """Second derivatives of the pose in time."""
+    once = _columns_turned(rotation, omega)
+    again = _columns_turned(once, omega)
+    bent = _columns_turned(rotation, alpha)
+    twice = [[again[i][k] + bent[i][k] for k in range(3)] for i in range(3)]
+    result = []
+    for c in coordinates:
+        if c.axis is not None:
+            result.append(acceleration[c.axis])
+        elif len(c.entries) == 2:
+            a, b = (_entry(rotation, e) for e in c.entries)
+            ad, bd = (_entry(once, e) for e in c.entries)
+            add, bdd = (_entry(twice, e) for e in c.entries)
+            square = a * a + b * b
+            rate = (b * ad - a * bd) / square
+            swell = 2.0 * (a * ad + b * bd)
+            result.append((b * add - a * bdd - rate * swell) / square)
+        else:
+            entry = c.entries[0]
+            root = _root(rotation, entry)
+            rate = _entry(once, entry) / root
+            result.append((_entry(twice, entry) + _entry(rotation, entry) * rate * rate) / root)
+    return result
+
+
+def rows(
+    coordinates: Sequence[Coordinate], motion: Motion, pose: Numbers
+) -> list[tuple[Any, Columns]]:
+    """Equations of a pose, zero where the platform is there, and their derivatives by rates."""
+    body = motion.graph.platform
+    position, rotation = motion.platform()
+    linear = motion.point_columns(body, position)
+    angular = motion.turn_columns(body)
+    result: list[tuple[Any, Columns]] = []
+    for c, goal in zip(coordinates, pose, strict=True):
+        if c.axis is not None:
+            axis = c.axis
+            result.append((position[axis] - goal, {k: v[axis] for k, v in linear.items()}))
+            continue
+        factors = (cos(goal), -sin(goal)) if len(c.entries) == 2 else (1.0,)
+        value: Any = 0.0 if len(c.entries) == 2 else -sin(goal)
+        columns: Columns = dict.fromkeys(angular, 0.0)
+        for entry, factor in zip(c.entries, factors, strict=True):
+            row, column, _ = entry
+            value = value + _entry(rotation, entry) * factor
+            vector = [rotation[i][column] for i in range(3)]
+            for k, w in angular.items():
+                change = cross(w, vector)[row]
+                columns[k] = columns[k] + (change if entry[2] > 0.0 else -change) * factor
+        result.append((value, columns))
+    return result

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run-time inputs of the dynamics: ten numbers a body, rods, gravity, friction, rotors.
+
+Efforts are linear in every one of them, so a payload or a mass changes no program.
+
+May import: numpy, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.machine.graph import Array, Graph, Joint
+from pkm_twin.machine.tree import Tree
+
+Objects = NDArray[Any]
+
+BODIES: Final = 0
+RODS: Final = 1
+GRAVITY: Final = 2
+ROTORS: Final = 5
+FRICTION: Final = (3, 4, 6)
+"""Parts of the inputs; friction is viscous, Coulomb, and of passive joints with their rotors."""
+
+
+def ten_numbers(mass: float, com: Array, inertia: Array) -> Array:
+    """Mass, first moments and inertia (xx yy zz xy xz yz) about the point that com starts at.
+
+    :param com: centre of mass, shape (3,), m; ``inertia`` about it, shape (3, 3), kg m2.
+    """
+    about = inertia + mass * (com @ com * np.eye(3) - np.outer(com, com))
+    return np.array(
+        [
+            mass, *(mass * com), about[0, 0], about[1, 1], about[2, 2], about[0, 1], about[0, 2],
+            about[1, 2],
+        ]
+    )  # fmt: skip
+
+
+def loaded_joints(graph: Graph) -> tuple[Joint, ...]:
+    """Passive joints with friction or a rotor."""
+    return tuple(joint for joint in graph.joints.values() if joint.loaded)
+
+
+class Coefficients(Protocol):
+    """Friction of the actuated joints, shape (n,) each."""
+
+    @property
+    def viscous(self) -> Array:
+        """Per rate, N m s/rad or N s/m."""
+
+    @property
+    def coulomb(self) -> Array:
+        """By the rate's sign, N m or N."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each run-time input stands; the sizes of its parts."""
+
+    tree: Tree
+
+    @property
+    def starts(self) -> Array:
+        """Starts of the parts that :meth:`part` names, and the end."""
+        graph = self.tree.graph
+        n = len(graph.actuated)
+        sizes = [
+            10 * len(self.tree.links),
+            len(graph.rods),
+            3,
+            n,
+            n,
+            n,
+            3 * len(loaded_joints(graph)),
+        ]
+        return np.cumsum([0, *sizes])
+
+    @property
+    def size(self) -> int:
+        """Number of inputs."""
+        return int(self.starts[-1])
+
+    def part(self, k: int) -> slice:
+        """Part k: 0 bodies, 1 rods, 2 gravity, 3 viscous, 4 Coulomb, 5 rotors, 6 passive."""
+        a, b = self.starts[k : k + 2]
+        return slice(int(a), int(b))
+
+    def body(self, name: str) -> slice:
+        """The ten numbers of a body."""
+        k = 10 * list(self.tree.links).index(name)
+        return slice(k, k + 10)
+
+    def split(self, p: Objects) -> list[Objects]:
+        """The parts of an input vector; bodies with shape (bodies, 10)."""
+        parts = [p[self.part(k)] for k in range(7)]
+        parts[0] = parts[0].reshape(-1, 10)
+        return parts
+
+    def pack(self, graph: Graph, gravity: Array, friction: Coefficients) -> Array:
+        """Inputs of a graph's own masses, without a payload.
+
+        :param graph: of this tree's geometry; the tree's own may be of a machine with other masses.
+        :param friction: of the actuated joints; that of passive ones stands in the graph.
+        """
+        tree = self.tree
+        bodies = []
+        for link in tree.links.values():
+            body = graph.bodies[link.body]
+            axes = link.axes
+            bodies.append(
+                ten_numbers(body.mass, axes.T @ (body.com - link.at), axes.T @ body.inertia @ axes)
+            )
+        drives = [graph.joints[name] for name in graph.actuated]
+        return np.concatenate(
+            [
+                *bodies,
+                [rod.mass for rod in graph.rods.values()],
+                gravity,
+                friction.viscous,
+                friction.coulomb,
+                [j.rotor_inertia for j in drives],
+                [
+                    value
+                    for j in loaded_joints(graph)
+                    for value in (j.viscous, j.coulomb, j.rotor_inertia)
+                ],
+            ]
+        )
+
+    def payload(self, mass: float, com: Array, inertia: Array) -> Array:
+        """What a body fixed to the platform adds; com from its reference point, home axes."""
+        graph = self.tree.graph
+        link = self.tree.links[graph.platform]
+        result = np.zeros(self.size)
+        lever = link.axes.T @ (graph.origin + com - link.at)
+        result[self.body(graph.platform)] = ten_numbers(
+            mass, lever, link.axes.T @ inertia @ link.axes
+        )
+        return result

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An MJCF file as links, joints and loop closures, as MuJoCo compiles it.
+
+``connect`` and ``weld`` constraints close loops, a ``joint`` constraint on one joint alone locks
+it; a body on a free joint is held by closures only. Sites are links without mass. Actuated are the
+joints that actuators drive.
+
+May import: mujoco, numpy, the URDF file's parts.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.rotations import about
+from pkm_twin.machine.urdf_file import Joint, Link, Urdf
+from pkm_twin.machine.urdf_loops import Closure
+from pkm_twin.machine.urdf_xml import Pose
+
+Array = NDArray[np.float64]
+
+WORLD: Final = "world"
+"""The root's name."""
+
+
+def read(path: Path) -> Urdf:
+    """Read an MJCF file with its closures.
+
+    :raises ParameterError: no mujoco package, a model that it does not compile, or a part of it
+        that is refused, by name.
+    """
+    try:
+        import mujoco
+    except ImportError:
+        raise ParameterError(
+            str(path), "an MJCF file without the mujoco package", "pip install 'pkm_twin[mjcf]'"
+        ) from None
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        text = " ".join(str(error).split())
+        raise ParameterError(str(path), text, "a model that MuJoCo compiles") from None
+    return _Reader(mujoco, model, path).urdf()
+
+
+class _Reader:
+    def __init__(self, mujoco: Any, model: Any, path: Path) -> None:
+        self.mj, self.model, self.path = mujoco, model, path
+        self.links = {WORLD: Link(WORLD, 0.0, np.zeros(3), np.zeros((3, 3)))}
+        self.joints: dict[str, Joint] = {}
+        kinds = mujoco.mjtJoint
+        self.types = {
+            int(kinds.mjJNT_FREE): "free",
+            int(kinds.mjJNT_BALL): "spherical",
+            int(kinds.mjJNT_SLIDE): "prismatic",
+            int(kinds.mjJNT_HINGE): "revolute",
+        }
+
+    def urdf(self) -> Urdf:
+        locks = self._locks()
+        for body in range(1, self.model.nbody):
+            self._body(body, locks)
+        for site in range(self.model.nsite):
+            name = self._name("SITE", site)
+            if name in self.links:
+                continue
+            self._link(name)
+            place = Pose(_rotation(self.model.site_quat[site]), self.model.site_pos[site])
+            owner = self._body_name(self.model.site_bodyid[site])
+            self._joint(f"{name}_frame", "fixed", owner, name, place)
+        return Urdf(
+            self.path.stem,
+            WORLD,
+            self.links,
+            self.joints,
+            tuple(self._closures()),
+            self._actuated(locks),
+            self.model.opt.gravity.tolist(),
+        )
+
+    def _name(self, kind: str, index: int) -> str:
+        name = self.mj.mj_id2name(self.model, getattr(self.mj.mjtObj, f"mjOBJ_{kind}"), index)
+        return str(name) if name else f"{kind.lower()}_{index}"
+
+    def _body_name(self, body: int) -> str:
+        return self._name("BODY", body) if body else WORLD
+
+    def _link(self, name: str) -> None:
+        self.links[name] = Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
+
+    def _joint(
+        self, name: str, kind: str, parent: str, child: str, origin: Pose, **more: Any
+    ) -> None:
+        values: dict[str, Any] = {"axes": np.zeros((0, 3)), "limits": {}, **more}
+        values = {"viscous": 0.0, "coulomb": 0.0, **values}
+        self.joints[name] = Joint(name, kind, parent, child, origin, **values)
+
+    def _body(self, body: int, locks: dict[int, float]) -> None:
+        """A body on its joints, one after another, each in the body's frame."""
+        m, name = self.model, self._body_name(body)
+        turn = _rotation(m.body_iquat[body])
+        inertia = turn @ np.diag(m.body_inertia[body]) @ turn.T
+        parent = self._body_name(m.body_parentid[body])
+        place = Pose(_rotation(m.body_quat[body]), m.body_pos[body].copy())
+        back = np.zeros(3)
+        first = m.body_jntadr[body]
+        for k in range(m.body_jntnum[body]):
+            joint = first + k
+            own = self._name("JOINT", joint)
+            kind, axis = self.types[int(m.jnt_type[joint])], m.jnt_axis[joint].copy()
+            at = np.zeros(3) if kind == "free" else m.jnt_pos[joint].copy()
+            origin, link = place @ Pose(position=at - back), f"{own}_link"
+            place, back = Pose(), at
+            if kind in ("revolute", "prismatic") and abs(m.qpos0[m.jnt_qposadr[joint]]) > 0.0:
+                raise ParameterError(
+                    f"joint.{own}.ref", m.qpos0[m.jnt_qposadr[joint]], "zero, as in a URDF"
+                )
+            self._link(link)
+            if joint in locks:
+                held = Pose(about(axis, locks[joint]))
+                if kind == "prismatic":
+                    held = Pose(position=axis * locks[joint])
+                self._joint(own, "fixed", parent, link, origin @ held)
+            elif kind in ("free", "spherical"):
+                self._joint(own, kind, parent, link, origin)
+            else:
+                self._joint(own, kind, parent, link, origin, **self._single(joint, own, axis))
+            parent = link
+        self.links[name] = Link(name, float(m.body_mass[body]), m.body_ipos[body].copy(), inertia)
+        self._joint(f"{name}_body", "fixed", parent, name, place @ Pose(position=-back))
+
+    def _single(self, joint: int, name: str, axis: Array) -> dict[str, Any]:
+        """Axis, limits, friction and drive of a hinge or a slide."""
+        m = self.model
+        limits: dict[str, Any] = {}
+        if m.jnt_limited[joint]:
+            limits["position"] = m.jnt_range[joint].tolist()
+        if m.jnt_actfrclimited[joint]:
+            limits["effort"] = float(np.abs(m.jnt_actfrcrange[joint]).max())
+        if m.jnt_stiffness[joint]:
+            warnings.warn(f"{self.path}: the spring of joint {name} is left out", stacklevel=6)
+        dof = m.jnt_dofadr[joint]
+        return {
+            "axes": axis[None],
+            "limits": limits,
+            "viscous": float(m.dof_damping[dof]),
+            "coulomb": float(m.dof_frictionloss[dof]),
+            "rotor_inertia": float(m.dof_armature[dof]),
+        }
+
+    def _equalities(self) -> list[tuple[str, int, Array, tuple[int, int], bool]]:
+        m = self.model
+        sites = int(self.mj.mjtObj.mjOBJ_SITE)
+        return [
+            (
+                self._name("EQUALITY", i),
+                int(m.eq_type[i]),
+                m.eq_data[i],
+                (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])),
+                int(m.eq_objtype[i]) == sites,
+            )
+            for i in range(m.neq)
+            if m.eq_active0[i]
+        ]
+
+    def _locks(self) -> dict[int, float]:
+        """Joints that a constraint holds at a value."""
+        locks = {}
+        for name, kind, data, (joint, other), _ in self._equalities():
+            if kind != int(self.mj.mjtEq.mjEQ_JOINT):
+                continue
+            if other >= 0 or self.types[int(self.model.jnt_type[joint])] in ("free", "spherical"):
+                raise ParameterError(
+                    f"equality.{name}", self._name("JOINT", joint), "joints that move by themselves"
+                )
+            locks[joint] = float(data[0])
+        return locks
+
+    def _closures(self) -> list[Closure]:
+        kinds = self.mj.mjtEq
+        closures = []
+        for name, kind, data, ids, sites in self._equalities():
+            if kind == int(kinds.mjEQ_JOINT):
+                continue
+            if kind == int(kinds.mjEQ_CONNECT):
+                frames = Pose(position=data[:3].copy()), Pose(position=data[3:6].copy())
+                closure = "spherical"
+            elif kind == int(kinds.mjEQ_WELD):
+                # The weld's point and orientation in the first body, the point in the second.
+                frames = (
+                    Pose(_rotation(data[6:10]), data[3:6].copy()),
+                    Pose(position=data[:3].copy()),
+                )
+                closure = "fixed"
+            else:
+                raise ParameterError(f"equality.{name}", kind, "connect, weld or joint")
+            if sites:
+                frames = Pose(), Pose()
+            ends = [self._name("SITE", i) if sites else self._body_name(i) for i in ids]
+            closures.append(Closure(name, closure, (ends[0], ends[1]), frames, None))
+        return closures
+
+    def _actuated(self, locks: dict[int, float]) -> tuple[str, ...]:
+        names: list[str] = []
+        for i in range(self.model.nu):
+            name = self._name("ACTUATOR", i)
+            if int(self.model.actuator_trntype[i]) != int(self.mj.mjtTrn.mjTRN_JOINT):
+                raise ParameterError(f"actuator.{name}", name, "an actuator of a joint")
+            joint = int(self.model.actuator_trnid[i][0])
+            own = self._name("JOINT", joint)
+            if joint in locks or self.joints[own].type not in ("revolute", "prismatic"):
+                raise ParameterError(
+                    f"actuator.{name}", own, "an actuator of a hinge or slide that can move"
+                )
+            if own not in names:
+                names.append(own)
+        if not names:
+            raise ParameterError(
+                str(self.path), "no actuator", "an <actuator> of each driven joint"
+            )
+        return tuple(names)
+
+
+def _rotation(quaternion: Array) -> Array:
+    """The rotation of a unit quaternion w, x, y, z."""
+    w, vector = quaternion[0], quaternion[1:]
+    size = float(np.linalg.norm(vector))
+    if size < 1e-15:
+        return np.eye(3)
+    return about(vector / size, 2.0 * np.arctan2(size, w))

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the poses of a machine are laid out: about an axis, or along its pose coordinates.
+
+May import: numpy, the standard library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PoseGrid:
+    """A layout of poses.
+
+    ``kind`` "cylinder": height along an axis, distance from it and azimuth about it. Distance is
+    one of places (m) or of tilts (rad). "box": the pose coordinates themselves, of any number.
+
+    ``names``: the pose coordinates. Of a cylinder: ``height``, the coordinate along the axis, and
+    ``lateral``, the two across it. ``zero_torsion``: the lateral coordinates are angles of
+    Rx Ry, and distance and azimuth are tilt-and-torsion angles without torsion; else they are
+    distance times cosine and sine of the azimuth.
+    """
+
+    kind: Literal["cylinder", "box"]
+    names: tuple[str, ...]
+    height: str = ""
+    lateral: tuple[str, ...] = ()
+    zero_torsion: bool = False
+
+    def polar_pose(self, height: ArrayLike, distance: ArrayLike, azimuth: ArrayLike) -> Array:
+        """Poses of cylinder coordinates, shape (..., m).
+
+        :param height: m, shape (...).
+        :param distance: from the axis, m or rad.
+        :param azimuth: rad.
+        :raises ValueError: a box has no axis.
+        """
+        if self.kind != "cylinder":
+            raise ValueError("a box of poses has no height, distance and azimuth")
+        z, r, a = np.broadcast_arrays(
+            *(np.asarray(v, np.float64) for v in (height, distance, azimuth))
+        )
+        across = zero_torsion(r, a) if self.zero_torsion else (r * np.cos(a), r * np.sin(a))
+        parts = dict(zip(self.lateral, across, strict=True)) | {self.height: z}
+        return np.stack([parts[name] for name in self.names], -1)
+
+
+def zero_torsion(tilt: ArrayLike, azimuth: ArrayLike) -> tuple[Array, Array]:
+    """Angles (alpha, beta), rad, of Rx(alpha) Ry(beta) Rz(.) whose z axis leans by a tilt.
+
+    The axis leans towards the azimuth: (sin t cos a, sin t sin a, cos t).
+    """
+    t, a = np.asarray(tilt, np.float64), np.asarray(azimuth, np.float64)
+    x, y = np.sin(t) * np.cos(a), np.sin(t) * np.sin(a)
+    return np.arctan2(-y, np.cos(t)), np.arcsin(x)

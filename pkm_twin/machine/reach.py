@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bounds of a graph's workspace from the lengths of its bodies and the limits of its slides.
+
+May import: numpy, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+
+import numpy as np
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.graph import BASE, FREEDOMS, Array, Graph
+
+
+def position_box(graph: Graph, limits: Array | None) -> Array:
+    """Bounds that the platform's reference point cannot leave, shape (3, 2), m.
+
+    Every joint on the base is the centre of a ball: its radius is the length of the shortest chain
+    of bodies from there to the reference point, slides at their limits. The box is where all
+    the balls' boxes meet.
+
+    :param limits: of the actuated joints, shape (n, 2), or None.
+    :raises ParameterError: a slide without limits in every chain.
+    """
+    travel: dict[str, float] = {}
+    for k, name in enumerate(graph.actuated):
+        joint = graph.joints[name]
+        if FREEDOMS[joint.kind] == "P":
+            ends = None if limits is None else np.abs(limits[k] - joint.home)
+            travel[name] = math.inf if ends is None else float(ends.max())
+    # Points of bodies: where joints and rods' ends are, and the reference point.
+    hops: list[tuple[tuple[str, Array], tuple[str, Array], float]] = []
+    for joint in graph.joints.values():
+        slack = travel.get(joint.name, 0.0)
+        if not joint.actuated and "P" in FREEDOMS[joint.kind]:
+            slack = math.inf
+        hops.append(((joint.inner, joint.at), (joint.outer, joint.at), slack))
+    for rod in graph.rods.values():
+        length = float(np.linalg.norm(rod.ends[1] - rod.ends[0]))
+        hops.append(((rod.inner, rod.ends[0]), (rod.outer, rod.ends[1]), length))
+    box = np.array([[-math.inf, math.inf]] * 3)
+    for inner, outer, slack in hops:
+        for start, after in ((inner, outer), (outer, inner)):
+            if start[0] == BASE:
+                radius = _shortest(graph, hops, after, slack)
+                box[:, 0] = np.maximum(box[:, 0], start[1] - radius)
+                box[:, 1] = np.minimum(box[:, 1], start[1] + radius)
+    if not np.isfinite(box).all():
+        free = [name for name, way in travel.items() if math.isinf(way)]
+        named = f"joints.{free[0]}.limits.position" if free else "joints"
+        raise ParameterError(named, None, "limits of the slides: without them poses have no end")
+    return box
+
+
+def _shortest(
+    graph: Graph,
+    hops: list[tuple[tuple[str, Array], tuple[str, Array], float]],
+    start: tuple[str, Array],
+    begun: float,
+) -> float:
+    """Length of the shortest chain from a point of a body to the reference point."""
+    order = itertools.count()
+    queue = [(begun, next(order), start)]
+    done: set[tuple[str, tuple[float, ...]]] = set()
+    while queue:
+        length, _, (body, point) = heapq.heappop(queue)
+        key = body, tuple(point.tolist())
+        if key in done or math.isinf(length):
+            continue
+        done.add(key)
+        if body == graph.platform and np.array_equal(point, graph.origin):
+            return length
+        if body == graph.platform:
+            far = length + float(np.linalg.norm(point - graph.origin))
+            heapq.heappush(queue, (far, next(order), (body, graph.origin)))
+        for inner, outer, slack in hops:
+            for here, there in ((inner, outer), (outer, inner)):
+                if here[0] == body and body != BASE:
+                    far = length + float(np.linalg.norm(here[1] - point)) + slack
+                    heapq.heappush(queue, (far, next(order), there))
+    return math.inf

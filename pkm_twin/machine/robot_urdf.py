@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot as a URDF, and as a ``mechanism: machine`` description.
+
+May import: numpy, this package, the names of passive joints.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.kinematics.engine import Engine
+from pkm_twin.kinematics.passive import Axis, passive_axes
+from pkm_twin.machine.graph import POSE
+from pkm_twin.machine.graph_description import graph_description
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.urdf_tree import urdf_tree
+from pkm_twin.machine.urdf_write import UrdfBody, UrdfDrive, write_urdf
+
+Array = NDArray[np.float64]
+
+
+def robot_urdf(robot: Robot) -> str:
+    """The robot as a URDF that parsers of trees read, see docs/urdf.md.
+
+    Its joints are ``robot.joint_names`` and ``robot.passive_joints``; with their values the link
+    ``platform`` stands where ``robot.platform`` says, and the masses sum to the robot's.
+    """
+    engine, load = robot.engine, robot.payload
+    tree = urdf_tree(
+        robot.graph,
+        single_joints(engine),
+        engine.tree.cut,
+        robot.name or robot.mechanism,
+        drives=_drives(robot),
+        payload=UrdfBody("payload", load.mass, load.com, load.inertia),
+    )
+    return write_urdf(tree)
+
+
+def robot_description(robot: Robot) -> dict[str, Any]:
+    """The robot as a description of ``mechanism: machine``, limits and payload included."""
+    data = graph_description(robot.graph)
+    data["gravity"] = robot.gravity.tolist()
+    pose = [coordinate.name for coordinate in robot.coordinates]
+    # A mechanism may have coordinates of its own.
+    if all(name in POSE for name in pose):
+        data["pose"] = pose
+    load = robot.payload
+    if load.mass > 0.0:
+        data["payload"] = {
+            "mass": load.mass, "com": load.com.tolist(), "inertia": load.inertia.tolist()
+        }  # fmt: skip
+    for name, drive in _drives(robot).items():
+        joint = data["joints"][name]
+        limits: dict[str, Any] = {}
+        if drive.position is not None:
+            limits["position"] = list(drive.position)
+        for key, value in (("velocity", drive.velocity), ("effort", drive.effort)):
+            if value is not None:
+                limits[key] = value
+        if limits:
+            joint["limits"] = limits
+        if drive.damping or drive.friction:
+            joint["friction"] = {"viscous": drive.damping, "coulomb": drive.friction}
+    return data
+
+
+def single_joints(engine: Engine) -> list[Axis]:
+    """All single joints from the ground outwards, rods last; fixed ones are of the kind ""."""
+    passive: dict[str, list[Axis]] = {}
+    for axis in passive_axes(engine):
+        passive.setdefault(axis.joint, []).append(axis)
+    joints: list[Axis] = []
+    for link in engine.tree.links.values():
+        name = link.joint or f"{link.body}_free"
+        if name in passive:
+            joints += passive.pop(name)
+            continue
+        kind, axis_at_home = "", np.zeros(3)
+        if link.steps:
+            (step,) = link.steps
+            kind, axis_at_home = step.kind, step.sign * step.axis
+        joints.append(Axis(name, kind, axis_at_home, link.at, link.parent, link.body, name))
+    for rest in passive.values():
+        joints += rest
+    return joints
+
+
+def _drives(robot: Robot) -> dict[str, UrdfDrive]:
+    """Limits and friction of the actuated joints, by the graph's names."""
+    limits, friction = robot.limits, robot.friction
+
+    def one(values: Array | None, k: int) -> float | None:
+        return None if values is None or not np.isfinite(values[k]) else float(values[k])
+
+    drives = {}
+    for k, name in enumerate(robot.graph.actuated):
+        position = None
+        if limits.position is not None:
+            position = float(limits.position[k][0]), float(limits.position[k][1])
+        drives[name] = UrdfDrive(
+            position,
+            one(limits.velocity, k),
+            one(limits.effort, k),
+            float(friction.viscous[k]),
+            float(friction.coulomb[k]),
+        )
+    return drives

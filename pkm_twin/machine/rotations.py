@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rotation matrices: about an axis, and roll, pitch and yaw of REP 103, Rz(yaw) Ry(pitch) Rx(roll).
+
+May import: numpy, the standard library.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def about(axis: Array, angle: ArrayLike) -> Array:
+    """Rotations by angles (...,), rad, about a unit vector (3,), shape (..., 3, 3)."""
+    x, y, z = axis
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sine, rest = np.sin(angle)[..., None, None], 1.0 - np.cos(angle)[..., None, None]
+    rotation: Array = np.eye(3) + sine * skew + rest * (skew @ skew)
+    return rotation
+
+
+def from_rpy(angles: Array) -> Array:
+    """The rotation of roll, pitch and yaw (3,), rad."""
+    roll, pitch, yaw = angles
+    x, y, z = np.eye(3)
+    rotation: Array = about(z, yaw) @ about(y, pitch) @ about(x, roll)
+    return rotation
+
+
+def to_rpy(rotation: Array) -> Array:
+    """Roll, pitch and yaw (3,), rad; yaw is zero where the x axis stands upright."""
+    level = math.hypot(rotation[0, 0], rotation[1, 0])
+    pitch = math.atan2(-rotation[2, 0], level)
+    if level < 1e-9:
+        return np.array([math.atan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])
+    roll = math.atan2(rotation[2, 1], rotation[2, 2])
+    return np.array([roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0])])
+
+
+def across(axis: Array) -> Array:
+    """A unit vector across another one, shape (3,)."""
+    # Rounded, so that of two equal components the last bit does not choose.
+    least = int(np.argmin(np.round(np.abs(axis), 9)))
+    side = np.cross(axis, np.eye(3)[least])
+    vector: Array = side / np.linalg.norm(side)
+    return vector

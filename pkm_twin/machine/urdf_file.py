@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A URDF file as it stands: links, joints and loop closures, each in its own frames.
+
+May import: numpy, the standard library, the parameter files' reader.
+"""
+
+from __future__ import annotations
+
+import warnings
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine import schema, urdf_loops, urdf_xml
+from pkm_twin.machine.urdf_loops import Closure
+from pkm_twin.machine.urdf_xml import UNLIMITED, Pose
+
+Array = NDArray[np.float64]
+
+LARGE: Final = 10.0
+"""Offsets beyond this, m, look like millimetres."""
+
+JOINTS: Final = ("revolute", "continuous", "prismatic", "fixed", "spherical")
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A link: ``mass`` (kg), ``com`` (3,) m and ``inertia`` (3, 3) about it, link axes."""
+
+    name: str
+    mass: float
+    com: Array
+    inertia: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint of the tree; ``axes``: unit vectors, shape (count, 3), joint frame.
+
+    ``type``: also ``free``, of a body that closures alone hold. ``limits``: those of position,
+    velocity and effort that the file states. ``rotor_inertia``: kg m2 or kg.
+    """
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    origin: Pose
+    axes: Array
+    limits: dict[str, Any]
+    viscous: float
+    coulomb: float
+    rotor_inertia: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Urdf:
+    """A file's content; ``root``: the link that has no parent; ``gravity``: m/s2, if it tells."""
+
+    name: str
+    root: str
+    links: dict[str, Link]
+    joints: dict[str, Joint]
+    closures: tuple[Closure, ...]
+    actuated: tuple[str, ...]
+    gravity: list[float] | None = None
+
+
+def read(path: Path, robot: ET.Element) -> Urdf:
+    """The links, joints and closures of a URDF file.
+
+    :param robot: the file's top element; the path is for what stands beside the file.
+    :raises ParameterError: not readable, not a URDF, or an element that is refused, by name.
+    """
+    if robot.tag != "robot":
+        raise ParameterError(str(path), f"<{robot.tag}>", "a <robot> element at the top")
+    if any(str(child.tag).startswith("xacro:") for child in robot):
+        raise ParameterError(str(path), "xacro elements", "a URDF: run xacro on this file first")
+    links: dict[str, Link] = {}
+    for element in robot.findall("link"):
+        name = urdf_xml.name(element, links)
+        links[name] = _link(element, name)
+    if not links:
+        raise ParameterError(str(path), "no <link>", "a robot with links")
+    joints: dict[str, Joint] = {}
+    for element in robot.findall("joint"):
+        name = urdf_xml.name(element, joints)
+        joints[name] = _joint(element, name, links)
+    root = _root(links, joints)
+    for element in robot.findall("coupling"):
+        raise ParameterError(
+            f"coupling.{element.get('name')}", "a gear", "a machine without coupled joints"
+        )
+    beside = _beside(path)
+    joints = _retyped(joints, beside)
+    closures = urdf_loops.closures(
+        robot, beside, links, {name: joint.child for name, joint in joints.items()}
+    )
+    _warn_of_units(joints, closures)
+    actuated = _actuated(path, robot, beside, joints)
+    idle = [j.name for j in joints.values() if j.type != "fixed" and j.name not in actuated]
+    if not closures and idle:
+        raise ParameterError(
+            str(path),
+            f"no loop closure, and passive joints: {', '.join(idle)}",
+            "<constraint> or <loop> elements, or closed_loop in a YAML file beside it",
+        )
+    name = robot.get("name") or path.stem
+    return Urdf(name, root, links, joints, tuple(closures.values()), actuated)
+
+
+def _link(element: ET.Element, name: str) -> Link:
+    inertial = element.find("inertial")
+    if inertial is None:
+        return Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
+    where = f"link.{name}.inertial"
+    mass = inertial.find("mass")
+    value = urdf_xml.number(None if mass is None else mass.get("value"), f"{where}.mass")
+    if value < 0.0:
+        raise ParameterError(f"{where}.mass", value, "zero or more, kg")
+    inertia = inertial.find("inertia")
+    if inertia is None:
+        raise ParameterError(f"{where}.inertia", None, "an <inertia> beside the mass, kg m2")
+    xx, xy, xz, yy, yz, zz = (
+        urdf_xml.number(
+            inertia.get(key, "0" if key[1] != key[2] else None), f"{where}.inertia.{key}"
+        )
+        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    )
+    pose = urdf_xml.origin(inertial.find("origin"), where)
+    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return Link(name, value, pose.position, pose.rotation @ matrix @ pose.rotation.T)
+
+
+def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
+    where = f"joint.{name}"
+    kind = element.get("type")
+    if kind in ("floating", "planar"):
+        raise ParameterError(f"{where}.type", kind, "revolute and prismatic joints in its place")
+    if kind not in JOINTS:
+        raise UnknownNameError(f"{where}.type", kind, JOINTS)
+    if element.find("mimic") is not None:
+        raise ParameterError(f"{where}.mimic", "<mimic>", "joints that move by themselves")
+    parent, child = (
+        urdf_xml.reference(element.find(end), f"{where}.{end}", links)
+        for end in ("parent", "child")
+    )
+    origin = urdf_xml.origin(element.find("origin"), where)
+    bare = kind in ("fixed", "spherical")
+    axes = [] if bare else [urdf_xml.axis(element, "axis", where)]
+    limits: dict[str, Any] = {}
+    limit = element.find("limit")
+    if limit is not None and kind in ("revolute", "continuous", "prismatic"):
+        limits = _limits(limit, where, kind)
+    viscous = coulomb = 0.0
+    for tag in ("dynamics", "joint_properties"):
+        dynamics = element.find(tag)
+        if dynamics is not None:
+            viscous = urdf_xml.positive(dynamics.get("damping", "0"), f"{where}.{tag}.damping")
+            coulomb = urdf_xml.positive(dynamics.get("friction", "0"), f"{where}.{tag}.friction")
+            break
+    kind = "revolute" if kind == "continuous" else kind
+    return Joint(
+        name, kind, parent, child, origin, np.reshape(axes, (-1, 3)), limits, viscous, coulomb
+    )
+
+
+def _limits(limit: ET.Element, where: str, kind: str) -> dict[str, Any]:
+    """What is stated; no width and zero are empty entries, what is far off is no limit either."""
+    limits: dict[str, Any] = {}
+    if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
+        low, high = (
+            _bound(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper")
+        )
+        if low > high:
+            raise ParameterError(f"{where}.limit", [low, high], "lower below upper")
+        far = UNLIMITED[kind]
+        if low < high and (low > -far or high < far):
+            limits["position"] = [max(low, -far), min(high, far)]
+    for key in ("velocity", "effort"):
+        value = _bound(limit.get(key, "0"), f"{where}.limit.{key}")
+        if value < 0.0:
+            raise ParameterError(f"{where}.limit.{key}", value, "zero or more")
+        if 0.0 < value < UNLIMITED[key]:
+            limits[key] = value
+    return limits
+
+
+def _bound(text: str, where: str) -> float:
+    """A limit, which alone of all numbers may be infinite."""
+    endless = text.strip().lower().lstrip("+-") in ("inf", "infinity")
+    return float(text) if endless else urdf_xml.number(text, where)
+
+
+def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
+    parents: dict[str, Joint] = {}
+    for joint in joints.values():
+        if joint.child in parents:
+            raise ParameterError(
+                f"joint.{joint.name}.child",
+                joint.child,
+                f"a tree of links: {joint.child!r} hangs on {parents[joint.child].name!r} already; "
+                "a loop is closed by a <constraint> element",
+            )
+        parents[joint.child] = joint
+    roots = [name for name in links if name not in parents]
+    if len(roots) != 1:
+        raise ParameterError("robot", roots, "one root link: exactly one that is no child")
+    for name in links:
+        seen: set[str] = set()
+        while name in parents:
+            if name in seen:
+                raise ParameterError(
+                    f"joint.{parents[name].name}", sorted(seen), "a tree: these go in a circle"
+                )
+            seen.add(name)
+            name = parents[name].parent
+    return roots[0]
+
+
+def _beside(path: Path) -> dict[str, Any]:
+    """The YAML file of the same name, if it speaks of closures or motors, else nothing."""
+    for suffix in (".yaml", ".yml"):
+        other = path.with_suffix(suffix)
+        # An empty one is the target of a conversion that reads this very URDF.
+        if not other.is_file() or other.stat().st_size == 0:
+            continue
+        data = schema.read_yaml(other)
+        if not any(key in data for key in urdf_loops.BESIDE):
+            continue
+        for key in urdf_loops.BESIDE:
+            if not isinstance(data.get(key, []), list):
+                raise ParameterError(f"{other}: {key}", data[key], "a list")
+        return {key: data[key] for key in urdf_loops.BESIDE if data.get(key)}
+    return {}
+
+
+def _retyped(joints: dict[str, Joint], beside: dict[str, Any]) -> dict[str, Joint]:
+    """Joints that the YAML file calls spherical, universal or fixed."""
+    names, kinds = beside.get("joint_name", []), beside.get("joint_type", [])
+    if len(names) != len(kinds):
+        raise ParameterError("joint_type", kinds, f"one a name of joint_name: {len(names)}")
+    unit = dict(zip("XYZ", np.eye(3), strict=True))
+    universal = {f"UJOINT_{a}{b}": (a, b) for a in "XYZ" for b in "XYZ" if a != b}
+    joints = dict(joints)
+    for name, kind in zip(names, kinds, strict=True):
+        if name not in joints:
+            raise UnknownNameError("joint_name", name, joints)
+        if kind in universal:
+            changed, axes = "universal", [unit[key] for key in universal[kind]]
+        elif kind in ("SPHERICAL", "FIXED"):
+            changed, axes = str(kind).lower(), []
+        else:
+            raise UnknownNameError("joint_type", kind, ["SPHERICAL", "FIXED", *universal])
+        old = joints[name]
+        joints[name] = Joint(
+            name,
+            changed,
+            old.parent,
+            old.child,
+            old.origin,
+            np.reshape(axes, (-1, 3)),
+            {},
+            old.viscous,
+            old.coulomb,
+        )
+    return joints
+
+
+def _actuated(
+    path: Path, robot: ET.Element, beside: dict[str, Any], joints: dict[str, Joint]
+) -> tuple[str, ...]:
+    """name_mot of the YAML file, else joints with command interfaces, else independent ones."""
+    names, source = [str(name) for name in beside.get("name_mot", [])], "name_mot"
+    if not names:
+        source = "ros2_control"
+        names = [
+            str(joint.get("name"))
+            for system in robot.findall("ros2_control")
+            for joint in system.findall("joint")
+            if joint.find("command_interface") is not None
+        ]
+    if not names:
+        source = "independent"
+        names = [
+            str(joint.get("name"))
+            for joint in robot.findall("joint")
+            if joint.get("independent") == "true"
+        ]
+    if not names:
+        raise ParameterError(
+            str(path),
+            "no actuated joint",
+            "command interfaces in a <ros2_control> element, or name_mot in a YAML file beside it",
+        )
+    for name in names:
+        if name not in joints:
+            raise UnknownNameError(source, name, joints)
+        if joints[name].type not in ("revolute", "prismatic"):
+            raise ParameterError(
+                f"{source}.{name}", joints[name].type, "a revolute or prismatic joint"
+            )
+        if names.count(name) > 1:
+            raise ParameterError(source, name, "each joint once")
+    return tuple(names)
+
+
+def _warn_of_units(joints: dict[str, Joint], closures: dict[str, Closure]) -> None:
+    offsets = {f"joint.{n}.origin": j.origin for n, j in joints.items()}
+    offsets |= {f"{n}.{i}": f for n, c in closures.items() for i, f in enumerate(c.frames)}
+    where, pose = max(
+        offsets.items(),
+        key=lambda item: float(np.abs(item[1].position).max()),
+        default=("", Pose()),
+    )
+    size = float(np.abs(pose.position).max())
+    if size > LARGE:
+        warnings.warn(
+            f"{where}: an offset of {size:g} m; a URDF is in metres, does it say millimetres?",
+            stacklevel=4,
+        )

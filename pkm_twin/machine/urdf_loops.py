@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What closes a URDF's loops, in the three ways that people write it.
+
+``<constraint>`` elements (urdfdom pull request 264), ``<loop>`` elements (Chignoli, Slotine,
+Wensing, Kim 2024, URDF+, arXiv:2411.19753), pairs of frames in a YAML file (Batto, De Matteis,
+Mansard 2025, Extended URDF, arXiv:2504.04767).
+
+May import: numpy, the standard library, the XML's parts.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine import urdf_xml
+from pkm_twin.machine.urdf_xml import Pose
+
+Array = NDArray[np.float64]
+
+CONSTRAINTS: Final = {
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
+    "cylindrical": "cylindrical",
+    "universal": "universal",
+    "spherical": "spherical",
+    "translation": "translation",
+    "fixed": "fixed",
+    "link": "fixed",  # a link that was cut in two
+}
+PARTS: Final = (
+    "parent",
+    "parent_origin",
+    "parent_axis",
+    "child",
+    "child_origin",
+    "child_axis",
+)
+LOOPS: Final = {
+    name: CONSTRAINTS[name]
+    for name in ("revolute", "continuous", "prismatic", "fixed", "spherical")
+}
+BESIDE: Final = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
+"""What a YAML file beside a URDF can say."""
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """A joint that closes a loop: a frame on either link, an axis in either frame (or none)."""
+
+    name: str
+    type: str
+    links: tuple[str, str]
+    frames: tuple[Pose, Pose]
+    axes: tuple[Array, Array] | None
+
+
+def closures(
+    robot: ET.Element, beside: Mapping[str, Any], links: Iterable[str], joints: Mapping[str, str]
+) -> dict[str, Closure]:
+    """All closures of a robot by name.
+
+    :param beside: the YAML file's entries.
+    :param joints: the joints' names, each with its child link.
+    :raises ParameterError: an element that is refused, by name.
+    """
+    known = list(links)
+    found: dict[str, Closure] = {}
+    for element in robot.findall("constraint"):
+        name = urdf_xml.name(element, {**joints, **found})
+        found[name] = _constraint(element, name, known)
+    for element in robot.findall("loop"):
+        name = urdf_xml.name(element, {**joints, **found})
+        found[name] = _loop(element, name, known)
+    for closure in _pairs(beside, known, joints):
+        if closure.name in joints or closure.name in found:
+            raise ParameterError("closed_loop", closure.name, "each pair once")
+        found[closure.name] = closure
+    return found
+
+
+def _constraint(element: ET.Element, name: str, links: Sequence[str]) -> Closure:
+    where = f"constraint.{name}"
+    kind = (element.get("type") or "").removesuffix("_joint")
+    if kind not in CONSTRAINTS:
+        raise UnknownNameError(f"{where}.type", element.get("type"), CONSTRAINTS)
+    urdf_xml.only(element, where, PARTS)
+    for end in ("parent", "child"):
+        urdf_xml.only(element.find(end), f"{where}.{end}", ())
+    ends = tuple(
+        urdf_xml.reference(element.find(e), f"{where}.{e}", links) for e in ("parent", "child")
+    )
+    frames = tuple(
+        urdf_xml.origin(element.find(f"{e}_origin"), f"{where}.{e}_origin")
+        for e in ("parent", "child")
+    )
+    parent = urdf_xml.axis(element, "parent_axis", where)
+    # The child's axis is the parent's where the two frames meet, unless it is given.
+    alone = kind != "universal" and element.find("child_axis") is None
+    child = parent if alone else urdf_xml.axis(element, "child_axis", where)
+    return _closure(name, CONSTRAINTS[kind], ends, frames, (parent, child))
+
+
+def _loop(element: ET.Element, name: str, links: Sequence[str]) -> Closure:
+    where = f"loop.{name}"
+    kind = element.get("type")
+    if kind not in LOOPS:
+        raise UnknownNameError(f"{where}.type", kind, LOOPS)
+    urdf_xml.only(element, where, ("predecessor", "successor", "sucessor", "axis"))
+    ends, frames = [], []
+    for tags in (("predecessor",), ("successor", "sucessor")):
+        end = next((e for tag in tags if (e := element.find(tag)) is not None), None)
+        urdf_xml.only(end, f"{where}.{tags[0]}", ("origin",))
+        ends.append(urdf_xml.reference(end, f"{where}.{tags[0]}", links))
+        origin = None if end is None else end.find("origin")
+        frames.append(urdf_xml.origin(origin, f"{where}.{tags[0]}"))
+    axis = urdf_xml.axis(element, "axis", where)
+    return _closure(name, LOOPS[kind], ends, frames, (axis, axis))
+
+
+def _pairs(
+    beside: Mapping[str, Any], links: Sequence[str], joints: Mapping[str, str]
+) -> list[Closure]:
+    """The closures of the YAML file: two frames that meet whole (6d) or in their origins (3d)."""
+    pairs = beside.get("closed_loop", [])
+    kinds = beside.get("type", ["6d"] * len(pairs))
+    if len(kinds) != len(pairs):
+        raise ParameterError("type", kinds, f"one a pair of closed_loop: {len(pairs)}")
+    closures = []
+    for i, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise ParameterError(f"closed_loop[{i}]", pair, "a pair of frame names")
+        types = {"6d": "fixed", "3d": "spherical"}
+        if str(kind).lower() not in types:
+            raise UnknownNameError(f"type[{i}]", kind, types)
+        # A joint's frame moves with its child, so that the child link's frame is the same.
+        for name in pair:
+            if name not in joints and name not in links:
+                raise UnknownNameError(f"closed_loop[{i}]", name, [*links, *joints])
+        ends = [joints.get(name, name) for name in pair]
+        closures.append(
+            _closure("_".join(pair), types[str(kind).lower()], ends, (Pose(), Pose()), None)
+        )
+    return closures
+
+
+def _closure(
+    name: str,
+    kind: str,
+    links: Sequence[str],
+    frames: Sequence[Pose],
+    axes: tuple[Array, Array] | None,
+) -> Closure:
+    if links[0] == links[1]:
+        raise ParameterError(name, links[0], "a closure between two links")
+    bare = kind in ("spherical", "fixed", "translation")
+    return Closure(name, kind, (links[0], links[1]), (frames[0], frames[1]), None if bare else axes)

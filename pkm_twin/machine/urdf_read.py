@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A URDF or MJCF with its loop closures as plain data of a ``mechanism: machine`` description.
+
+May import: numpy, the files' parts, the assembly.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
+from pkm_twin.machine.assembly import EXACT, Assembly
+from pkm_twin.machine.urdf_file import Joint, Urdf
+from pkm_twin.machine.urdf_loops import Closure
+from pkm_twin.machine.urdf_xml import Pose
+
+Array = NDArray[np.float64]
+
+PLATFORMS: Final = (
+    "platform",
+    "moving_platform",
+    "end_effector",
+    "effector",
+    "end_effector_link",
+    "ee_link",
+    "ee",
+    "eff",
+    "tool0",
+    "tool",
+    "tool_link",
+    "tcp",
+)
+"""Names of links that are taken for the platform, the first that is there."""
+GROUND: Final = "base"
+"""The ground's name in a description."""
+
+
+def read_urdf(
+    path: str | Path, *, platform: str | None = None, base: str | None = None
+) -> dict[str, Any]:
+    """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
+
+    A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package.
+
+    Links that fixed joints hold together are one body. Home is the assembly nearest to the zeros
+    of the joints; ``home`` of a joint is its value there, so that joint values are the URDF's.
+
+    :param platform: the link that carries the tool; default the first of ``PLATFORMS``.
+    :param base: the link that is the ground and gives the base axes; default the root.
+    :raises ParameterError: a file, element or name that is refused, by its name.
+    """
+    path = Path(path)
+    top = urdf_xml.elements(path)
+    urdf = mjcf_file.read(path) if top.tag == "mujoco" else urdf_file.read(path, top)
+    tool = _platform(urdf, platform)
+    ground = urdf.root if base is None else base
+    if ground not in urdf.links:
+        raise UnknownNameError("base", ground, urdf.links)
+    assembly = Assembly(urdf)
+    bodies = _bodies(urdf, assembly.order, tool, ground)
+    values, miss = assembly.nearest()
+    if miss > EXACT:
+        warnings.warn(f"{path}: the loops close within {miss:.1g} only (m or rad)", stacklevel=2)
+    spins = assembly.spins(values, set(urdf.actuated), tool)
+    if spins:
+        warnings.warn(
+            f"{path}: held, as they only let a part spin about itself: {', '.join(spins)}",
+            stacklevel=2,
+        )
+    view = assembly.links[ground].inverse()
+    home = dict(zip(assembly.steps, values.tolist(), strict=True))
+    axes: dict[str, list[Array]] = {}
+    for name, axis in zip(assembly.steps, assembly.axes, strict=True):
+        axes.setdefault(name, []).append(view.rotation @ axis)
+    places = {name: view @ pose for name, pose in assembly.links.items()}
+    joints: dict[str, Any] = {}
+    passive = [n for n, j in urdf.joints.items() if j.type != "fixed" and n not in urdf.actuated]
+    for name in (*urdf.actuated, *passive):
+        joint = urdf.joints[name]
+        if joint.type == "free":
+            continue
+        joints[name] = _joint(joint, bodies, places, axes[name], home[name], name in urdf.actuated)
+        if name in spins:
+            joints[name] = {k: joints[name][k] for k in ("between", "at")} | {"type": "fixed"}
+    for closure in urdf.closures:
+        if bodies[closure.links[0]] != bodies[closure.links[1]]:
+            joints[closure.name] = _closure(
+                closure, bodies, view @ assembly.frame(closure, 0), view
+            )
+            if closure.axes is not None and closure.type == "universal":
+                second = view @ assembly.frame(closure, 1)
+                joints[closure.name]["axes"][1] = _snapped(second.rotation @ closure.axes[1])
+    gravity = {} if urdf.gravity is None else {"gravity": urdf.gravity}
+    return {
+        "mechanism": "machine",
+        **gravity,
+        "platform": bodies[tool],
+        "origin": _snapped(places[tool].position),
+        "bodies": _masses(urdf, bodies, places),
+        "joints": joints,
+    }
+
+
+def _platform(urdf: Urdf, asked: str | None) -> str:
+    if asked is not None:
+        if asked not in urdf.links:
+            raise UnknownNameError("platform", asked, urdf.links)
+        return asked
+    lower = {name.lower(): name for name in urdf.links}
+    for name in PLATFORMS:
+        if name in lower:
+            return lower[name]
+    raise ParameterError(
+        "platform", None, f"the link that carries the tool, one of {', '.join(sorted(urdf.links))}"
+    )
+
+
+def _bodies(urdf: Urdf, order: list[Joint], tool: str, ground: str) -> dict[str, str]:
+    """Each link's body, named by its link nearest to the root; the tool's is named by the tool.
+
+    :raises ParameterError: the tool is fixed to the ground.
+    """
+    group = {name: name for name in urdf.links}
+    for joint in order:
+        if joint.type == "fixed":
+            group[joint.child] = group[joint.parent]
+    if group[tool] == group[ground]:
+        raise ParameterError("platform", tool, "a link that can move")
+    names = {group[ground]: GROUND}
+    for first, wanted in ((group[tool], tool), *((first, first) for first in group.values())):
+        name = wanted
+        while first not in names and name in names.values():
+            name += "_"
+        names.setdefault(first, name)
+    return {link: names[first] for link, first in group.items()}
+
+
+def _joint(
+    joint: Joint,
+    bodies: dict[str, str],
+    places: dict[str, Pose],
+    axes: list[Array],
+    home: float,
+    actuated: bool,
+) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "type": joint.type,
+        "between": [bodies[joint.parent], bodies[joint.child]],
+        "at": _snapped((places[joint.parent] @ joint.origin).position),
+    }
+    if joint.type == "universal":
+        data["axes"] = [_snapped(axis) for axis in axes]
+    elif joint.type != "spherical":
+        data["axis"] = _snapped(axes[0])
+        if actuated:
+            data["actuated"] = True
+        value = round(home, 14)
+        if value != 0.0:
+            data["home"] = value
+    if actuated and joint.limits:
+        data["limits"] = joint.limits
+    if "axis" in data and (joint.viscous > 0.0 or joint.coulomb > 0.0):
+        data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
+    if actuated and joint.rotor_inertia > 0.0:
+        data["rotor_inertia"] = joint.rotor_inertia
+    return data
+
+
+def _closure(closure: Closure, bodies: dict[str, str], place: Pose, view: Pose) -> dict[str, Any]:
+    data: dict[str, Any] = {
+        "type": closure.type,
+        "between": [bodies[link] for link in closure.links],
+        "at": _snapped(place.position),
+    }
+    if closure.axes is not None:
+        first = _snapped(place.rotation @ closure.axes[0])
+        if closure.type == "universal":
+            data["axes"] = [first, first]
+        else:
+            data["axis"] = first
+    return data
+
+
+def _masses(
+    urdf: Urdf, bodies: dict[str, str], places: dict[str, Pose]
+) -> dict[str, dict[str, Any]]:
+    """Masses, centres (m) and inertias about them of all bodies but the ground, base axes."""
+    result: dict[str, dict[str, Any]] = {}
+    for body in dict.fromkeys(bodies.values()):
+        if body == GROUND:
+            continue
+        links = [link for name, link in urdf.links.items() if bodies[name] == body]
+        centres = [
+            places[link.name].rotation @ link.com + places[link.name].position for link in links
+        ]
+        mass = sum(link.mass for link in links)
+        com = centres[0]
+        if mass > 0.0:
+            com = sum(
+                (link.mass / mass * c for link, c in zip(links, centres, strict=True)), np.zeros(3)
+            )
+        inertia = np.zeros((3, 3))
+        for link, centre in zip(links, centres, strict=True):
+            rotation, arm = places[link.name].rotation, centre - com
+            inertia += rotation @ link.inertia @ rotation.T
+            inertia += link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        result[body] = {"mass": mass, "com": _snapped(com), "inertia": _moments(inertia)}
+    return result
+
+
+def _moments(inertia: Array) -> list[Any]:
+    """A diagonal as three numbers, else the matrix; rounding left over by rotations is dropped."""
+    inertia = (inertia + inertia.T) / 2
+    scale = float(np.abs(inertia).max())
+    clean = np.where(np.abs(inertia) > 1e-14 * scale, inertia, 0.0)
+    short = [[float(f"{x:.15g}") for x in row] for row in clean.tolist()]
+    if np.count_nonzero(clean - np.diag(np.diag(clean))) == 0:
+        return [short[i][i] for i in range(3)]
+    return short
+
+
+def _snapped(vector: Array) -> list[float]:
+    """A vector as a list without what rotations leave in the sixteenth digit."""
+    return [round(float(x), 14) + 0.0 for x in vector]

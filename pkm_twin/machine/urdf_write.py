@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A tree of bodies and single joints as a URDF that every parser reads, byte for byte the same.
+
+All is given at home, in base axes: every link's frame stands on its joint, parallel to the base
+at home, and a joint at home has the value ``home``. Loops that the tree cuts are ``<constraint>``
+elements (urdfdom pull request 264), which parsers of trees pass over; ``cylindrical_joint`` and
+``translation_joint`` are additions to that proposal.
+
+May import: numpy, the standard library, the rotations, the bounds of what is read.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.machine import rotations
+from pkm_twin.machine.urdf_xml import UNLIMITED
+
+Array = NDArray[np.float64]
+
+GROUND: Final = "base_link"
+"""The root link's name."""
+PLATFORM: Final = "platform"
+"""The link that stands on the platform's reference point."""
+CLOSURES: Final = {
+    "revolute": "revolute_joint",
+    "prismatic": "prismatic_joint",
+    "cylindrical": "cylindrical_joint",
+    "universal": "universal_joint",
+    "spherical": "spherical_joint",
+    "translation": "translation_joint",
+    "fixed": "link",
+}
+"""Types of closures, as a description has them and as ``<constraint>`` has them."""
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfBody:
+    """A link: ``mass`` (kg), ``com`` (3,) m, ``inertia`` (3, 3) about it, base axes at home."""
+
+    name: str
+    mass: float
+    com: Array
+    inertia: Array
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfDrive:
+    """Limits of a joint, None where there is none, and its friction per rate and dry."""
+
+    position: tuple[float, float] | None = None
+    velocity: float | None = None
+    effort: float | None = None
+    damping: float = 0.0
+    friction: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfJoint:
+    """A joint of the tree, one axis or none: ``point`` (3,) m and ``axis`` (3,), base axes at home.
+
+    ``type``: revolute, prismatic or fixed. ``home``: its value at home.
+    """
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    point: Array
+    axis: Array
+    home: float = 0.0
+    drive: UrdfDrive = field(default_factory=UrdfDrive)
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfClosure:
+    """A joint between two links that the tree leaves out; ``axes``: (count, 3), base axes."""
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    point: Array
+    axes: Array
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfCapsule:
+    """A bar to look at, from ``start`` to ``end``, (3,) m, base axes at home."""
+
+    body: str
+    start: Array
+    end: Array
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfTree:
+    """A machine as a tree of links; joints from the ground outwards, each child once.
+
+    ``actuated``: joints, in the robot's order. ``platform``: the body that carries the tool;
+    ``origin``: its reference point at home, (3,).
+    """
+
+    name: str
+    bodies: tuple[UrdfBody, ...]
+    joints: tuple[UrdfJoint, ...]
+    closures: tuple[UrdfClosure, ...]
+    capsules: tuple[UrdfCapsule, ...]
+    actuated: tuple[str, ...]
+    platform: str
+    origin: Array
+
+
+def write_urdf(tree: UrdfTree) -> str:
+    """The URDF of a tree.
+
+    The root is ``base_link``; ``platform`` is a link without mass on the reference point, fixed
+    to the platform's body.
+    """
+    robot = ET.Element("robot", name=tree.name)
+    places = {GROUND: np.zeros(3)} | {joint.child: joint.point for joint in tree.joints}
+    ground = ET.SubElement(robot, "link", name=GROUND)
+    _visuals(ground, places[GROUND], (c for c in tree.capsules if c.body == GROUND))
+    for body in tree.bodies:
+        link = ET.SubElement(robot, "link", name=body.name)
+        _inertial(link, body, places[body.name])
+        _visuals(link, places[body.name], (c for c in tree.capsules if c.body == body.name))
+    ET.SubElement(robot, "link", name=PLATFORM)
+    for joint in tree.joints:
+        _joint(robot, joint, places)
+    tool = UrdfJoint(
+        f"{PLATFORM}_frame", "fixed", tree.platform, PLATFORM, tree.origin, np.zeros(3)
+    )
+    _joint(robot, tool, places)
+    for closure in tree.closures:
+        _closure(robot, closure, places)
+    _control(robot, tree)
+    ET.indent(robot)
+    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def _inertial(link: ET.Element, body: UrdfBody, place: Array) -> None:
+    # Also where there is no mass: some simulators take a kilogram for what is not said.
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=_text(body.com - place), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=f"{body.mass:.15g}")
+    keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    upper = body.inertia[np.triu_indices(3)]
+    # Rounding that turned axes leave behind says nothing.
+    upper = np.where(np.abs(upper) > 1e-14 * float(np.abs(upper).max()), upper, 0.0)
+    values = {key: _text([value], 0.0) for key, value in zip(keys, upper, strict=True)}
+    ET.SubElement(inertial, "inertia", values)
+
+
+def _visuals(link: ET.Element, place: Array, capsules: Iterable[UrdfCapsule]) -> None:
+    round_ends: list[Array] = []
+    for capsule in capsules:
+        along = capsule.end - capsule.start
+        length = float(np.linalg.norm(along))
+        radius = _text([capsule.radius])
+        shapes = [("sphere", capsule.start, "0 0 0"), ("sphere", capsule.end, "0 0 0")]
+        if length > 0.0:
+            # Snapped, so that an angle does not hang on the sign of what is nearly zero.
+            x, y, z = np.round(along / length, 12) + 0.0
+            turned = _text([0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)])
+            shapes.insert(0, ("cylinder", (capsule.start + capsule.end) / 2, turned))
+        for shape, centre, rpy in shapes:
+            if shape == "sphere" and any(np.array_equal(centre, other) for other in round_ends):
+                continue
+            if shape == "sphere":
+                round_ends.append(centre)
+            visual = ET.SubElement(link, "visual")
+            ET.SubElement(visual, "origin", xyz=_text(centre - place), rpy=rpy)
+            geometry = ET.SubElement(visual, "geometry")
+            size = {"radius": radius}
+            if shape == "cylinder":
+                size["length"] = _text([length])
+            ET.SubElement(geometry, shape, size)
+
+
+def _joint(robot: ET.Element, joint: UrdfJoint, places: dict[str, Array]) -> None:
+    element = ET.SubElement(robot, "joint", name=joint.name, type=joint.type)
+    xyz, rpy = joint.point - places[joint.parent], np.zeros(3)
+    # The joint's frame is where the child stands at the value zero.
+    if joint.type == "prismatic":
+        xyz = xyz - joint.axis * joint.home
+    elif joint.type == "revolute":
+        rpy = rotations.to_rpy(rotations.about(joint.axis, -joint.home))
+    ET.SubElement(element, "origin", xyz=_text(xyz), rpy=_text(rpy))
+    ET.SubElement(element, "parent", link=joint.parent)
+    ET.SubElement(element, "child", link=joint.child)
+    if joint.type == "fixed":
+        return
+    ET.SubElement(element, "axis", xyz=_text(joint.axis))
+    free, drive = UNLIMITED[joint.type], joint.drive
+    low, high = drive.position or (-free, free)
+    ET.SubElement(
+        element,
+        "limit",
+        lower=_text([low]),
+        upper=_text([high]),
+        velocity=_text([UNLIMITED["velocity"] if drive.velocity is None else drive.velocity]),
+        effort=_text([UNLIMITED["effort"] if drive.effort is None else drive.effort]),
+    )
+    if drive.damping or drive.friction:
+        ET.SubElement(
+            element, "dynamics", damping=_text([drive.damping]), friction=_text([drive.friction])
+        )
+
+
+def _closure(robot: ET.Element, closure: UrdfClosure, places: dict[str, Array]) -> None:
+    element = ET.SubElement(robot, "constraint", name=closure.name, type=CLOSURES[closure.type])
+    for i, (end, link) in enumerate((("parent", closure.parent), ("child", closure.child))):
+        ET.SubElement(element, end, link=link)
+        at = _text(closure.point - places[link])
+        ET.SubElement(element, f"{end}_origin", xyz=at, rpy="0 0 0")
+        if len(closure.axes):
+            axis = closure.axes[min(i, len(closure.axes) - 1)]
+            ET.SubElement(element, f"{end}_axis", xyz=_text(axis))
+
+
+def _control(robot: ET.Element, tree: UrdfTree) -> None:
+    control = ET.SubElement(robot, "ros2_control", name=tree.name, type="system")
+    hardware = ET.SubElement(control, "hardware")
+    ET.SubElement(hardware, "plugin").text = "mock_components/GenericSystem"
+    home = {joint.name: joint.home for joint in tree.joints}
+    for name in tree.actuated:
+        element = ET.SubElement(control, "joint", name=name)
+        for interface in ("position", "effort"):
+            ET.SubElement(element, "command_interface", name=interface)
+        position = ET.SubElement(element, "state_interface", name="position")
+        ET.SubElement(position, "param", name="initial_value").text = _text([home[name]])
+        for interface in ("velocity", "effort"):
+            ET.SubElement(element, "state_interface", name=interface)
+
+
+def _text(values: Iterable[float], least: float = 1e-12) -> str:
+    """Numbers to 12 digits, so that the last bits of another machine's arithmetic do not show."""
+    return " ".join(f"{value:.12g}" if abs(value) > least else "0" for value in values)

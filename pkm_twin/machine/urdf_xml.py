@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""XML from strangers: elements, numbers and frames of a URDF, every refusal by the field's name.
+
+May import: numpy, the standard library, the parameter files' bounds.
+"""
+
+from __future__ import annotations
+
+import math
+import stat
+import warnings
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Container, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine import schema
+from pkm_twin.machine.rotations import from_rpy
+
+Array = NDArray[np.float64]
+
+MAX_FILE_SIZE: Final = 4 * 1024 * 1024
+"""Largest URDF that is read, bytes."""
+MAX_DEPTH: Final = 64
+"""Deepest nesting of elements that is read."""
+UNLIMITED: Final = {
+    "revolute": 2.0 * math.pi - 1e-6,
+    "prismatic": 10.0,
+    "velocity": 1e6,
+    "effort": 1e6,
+}
+"""From here on a limit is none, as a URDF needs numbers: rad, m, per second, N m or N."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A frame in another: ``rotation`` (3, 3), ``position`` (3,), m."""
+
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    position: Array = field(default_factory=lambda: np.zeros(3))
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.rotation @ other.rotation, self.rotation @ other.position + self.position)
+
+    def inverse(self) -> Pose:
+        """The other frame in this one."""
+        return Pose(self.rotation.T, -self.rotation.T @ self.position)
+
+
+def elements(path: Path) -> ET.Element:
+    """The file's top element; no document types and thus no entities, no namespaces needed.
+
+    :raises ParameterError: not readable, too large, too deep, or not well-formed.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise OSError("not a file")
+        with path.open("rb") as file:
+            content = file.read(MAX_FILE_SIZE + 1)
+    except OSError as error:
+        raise ParameterError(str(path), str(error), "a readable URDF file") from None
+    if len(content) > MAX_FILE_SIZE:
+        raise ParameterError(
+            str(path), f"{path.stat().st_size} bytes", f"at most {MAX_FILE_SIZE} bytes"
+        )
+    builder = ET.TreeBuilder()
+    depth = 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > MAX_DEPTH:
+            raise ParameterError(
+                str(path), "deeply nested elements", f"a nesting of at most {MAX_DEPTH}"
+            )
+        builder.start(tag, attributes)
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag)
+
+    def doctype(*_: object) -> None:
+        raise ParameterError(str(path), "<!DOCTYPE", "XML without a document type")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(content, True)
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        if isinstance(error, ParameterError):
+            raise
+        raise ParameterError(str(path), str(error), "well-formed XML") from None
+    return builder.close()
+
+
+def name(element: ET.Element, taken: Container[str]) -> str:
+    """An element's name, one of its own."""
+    own = element.get("name")
+    kind = element.tag
+    if not own:
+        raise ParameterError(kind, own, f"every <{kind}> with a name")
+    if own in taken:
+        raise ParameterError(f"{kind}.{own}", own, "a name that stands once")
+    return own
+
+
+def only(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
+    """No child element but these; a misspelt one would be taken for a missing one.
+
+    :raises UnknownNameError: another child, with the closest of these.
+    """
+    for child in element if element is not None else ():
+        if child.tag not in tags and ":" not in child.tag:
+            raise UnknownNameError(where, child.tag, tags)
+
+
+def reference(element: ET.Element | None, where: str, links: Iterable[str]) -> str:
+    """The link that an element names."""
+    link = None if element is None else element.get("link", element.get("name"))
+    if link is None:
+        raise ParameterError(where, None, "the name of a link")
+    if link not in links:
+        raise UnknownNameError(where, link, links)
+    return link
+
+
+def axis(element: ET.Element, tag: str, where: str) -> Array:
+    """A unit vector; a missing one is x, as in every URDF."""
+    stated = element.find(tag)
+    value = vector("1 0 0" if stated is None else stated.get("xyz"), f"{where}.{tag}", 3)
+    size = float(np.linalg.norm(value))
+    if not size > 1e-9:
+        raise ParameterError(f"{where}.{tag}", value.tolist(), "a vector that is not zero")
+    return value / size
+
+
+def origin(element: ET.Element | None, where: str) -> Pose:
+    """The frame of an ``<origin>`` or its like; without one the identity."""
+    if element is None:
+        return Pose()
+    position = vector(element.get("xyz", "0 0 0"), f"{where}.xyz", 3)
+    quaternion = element.get("quat_xyzw")
+    if quaternion is not None:
+        x, y, z, w = vector(quaternion, f"{where}.quat_xyzw", 4)
+        size = math.sqrt(x * x + y * y + z * z + w * w)
+        if not size > 1e-9:
+            raise ParameterError(f"{where}.quat_xyzw", quaternion, "a quaternion that is not zero")
+        x, y, z, w = x / size, y / size, z / size, w / size
+        skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        return Pose(np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew, position)
+    angles = vector(element.get("rpy", "0 0 0"), f"{where}.rpy", 3)
+    if float(np.abs(angles).max()) > 2.0 * math.pi + 1e-6:
+        warnings.warn(
+            f"{where}.rpy: {angles.tolist()}; a URDF is in radians, does it say degrees?",
+            stacklevel=5,
+        )
+    return Pose(from_rpy(angles), position)
+
+
+def vector(text: str | None, where: str, size: int) -> Array:
+    """``size`` finite numbers, shape (size,)."""
+    items = (text or "").split()
+    if len(items) != size:
+        raise ParameterError(where, text, f"{size} numbers")
+    return np.array([number(item, where) for item in items])
+
+
+def positive(text: str | None, where: str) -> float:
+    """A finite number that is not negative."""
+    value = number(text, where)
+    if value < 0.0:
+        raise ParameterError(where, value, "zero or more")
+    return value
+
+
+def number(text: str | None, where: str) -> float:
+    """A finite number."""
+    try:
+        value = float(text)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ParameterError(where, text, "a number") from None
+    if not math.isfinite(value) or abs(value) > schema.MAX_SIZE:
+        raise ParameterError(where, text, "a finite number")
+    return value

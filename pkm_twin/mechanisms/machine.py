@@ -1,0 +1,547 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Any parallel machine: its parameter file is the graph of bodies, joints and rods at home.
+
+Every vector stands in base axes at the home pose. ``forward`` gives the assembly that is connected
+to home along the straight line in joint space; a singularity on the way is an error that says
+where. ``inverse`` goes the straight way in the pose coordinates.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.kinematics.engine import choose_coordinates
+from pkm_twin.kinematics.motion import matrices, numbers
+from pkm_twin.kinematics.pose import COORDINATES, Coordinate
+from pkm_twin.machine import schema
+from pkm_twin.machine.graph import (
+    AXES,
+    BASE,
+    FREEDOMS,
+    Body,
+    Graph,
+    Joint,
+    Rod,
+    array,
+    rotation_about_z,
+    unit,
+)
+from pkm_twin.machine.members import Beam, Structure, Tube
+from pkm_twin.machine.robot import (
+    Payload,
+    Robot,
+    check_angles,
+    friction_of,
+    length,
+    limits_of,
+    mass,
+)
+from pkm_twin.machine.robot_urdf import robot_description
+
+Array = NDArray[np.float64]
+
+MOST_JOINTS: Final = 6
+"""Most actuated joints."""
+
+
+@dataclass(frozen=True, eq=False)
+class MemberSpec:
+    """A body as an elastic bar between two of its points, m; or as a capsule of a radius, m.
+
+    ``section``: with the body's mass along the bar; without one the body is rigid.
+    """
+
+    start: Array = schema.vector(3, key="from")
+    end: Array = schema.vector(3, key="to")
+    section: Tube | None = schema.section(Tube, default=None)
+    radius: float | None = length(default=None)
+
+    def verify(self, path: str) -> None:
+        """A length, and a radius from somewhere."""
+        if not float(np.linalg.norm(self.end - self.start)) > 1e-9:
+            raise ParameterError(f"{path}.to", self.end.tolist(), "a point apart from `from`")
+        if self.section is None and self.radius is None:
+            raise ParameterError(path, None, "a section, or a radius")
+
+    @property
+    def outer(self) -> float:
+        """Outer radius, m."""
+        return (
+            self.section.outer_diameter / 2 if self.section is not None else float(self.radius or 0)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BodySpec:
+    """Mass (kg), centre of mass (m) and inertia about it (kg m2), base axes at home."""
+
+    mass: float = mass(default=0.0)
+    com: Array | None = schema.vector(3, default=None)
+    inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
+    member: MemberSpec | None = schema.section(MemberSpec, default=None)
+
+    def verify(self, path: str) -> None:
+        """A mass needs a place."""
+        if self.com is None and (self.mass > 0.0 or self.inertia.any()):
+            raise ParameterError(f"{path}.com", None, "the centre of mass of a body with mass, m")
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionSpec:
+    """Friction of one joint: N m s/rad or N s/m, and N m or N."""
+
+    viscous: float = schema.number(at_least=0.0, default=0.0)
+    coulomb: float = schema.number(at_least=0.0, default=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class LimitSpec:
+    """Limits of one actuated joint: position [min, max], rate, effort."""
+
+    position: Array | None = schema.interval(default=None)
+    velocity: float | None = schema.number(above=0.0, default=None)
+    effort: float | None = schema.number(above=0.0, default=None)
+
+
+@dataclass(frozen=True, eq=False)
+class DriveSpec:
+    """A drive: inertia of the rotor (kg m2) behind a gear of ``ratio`` turns a turn, or of a screw
+    or belt of ``lead`` metres a turn; reflected to the joint it is ``rotor_inertia``.
+    """
+
+    inertia: float = schema.number(at_least=0.0)
+    ratio: float | None = schema.number(above=0.0, default=None)
+    lead: float | None = schema.number(above=0.0, default=None)
+
+    def verify(self, path: str) -> None:
+        """One of the two."""
+        if (self.ratio is None) == (self.lead is None):
+            raise ParameterError(path, None, "one of ratio (turns a turn) and lead (m a turn)")
+
+    def reflected(self, slides: bool, path: str) -> float:
+        """Kg m2 of a joint that turns, kg of one that slides."""
+        if slides != (self.lead is not None):
+            what = "lead, m a turn" if slides else "ratio, turns a turn"
+            raise ParameterError(path, None, f"{what}, for this type of joint")
+        factor = 2 * math.pi / self.lead if self.lead is not None else float(self.ratio or 0.0)
+        return self.inertia * factor**2
+
+
+@dataclass(frozen=True, eq=False)
+class JointSpec:
+    """A joint between an inner and an outer body, see the module's and the graph's words."""
+
+    type: str = schema.choice(*FREEDOMS)
+    between: tuple[str, ...] = schema.names(2)
+    at: Array | None = schema.vector(3, default=None)
+    axis: Array | None = schema.vector(3, default=None)
+    axes: Array | None = schema.matrix(2, 3, default=None)
+    actuated: bool = schema.flag(default=False)
+    home: float = schema.number(default=0.0)
+    limits: LimitSpec | None = schema.section(LimitSpec, default=None)
+    friction: FrictionSpec | None = schema.section(FrictionSpec, default=None)
+    rotor_inertia: float = schema.number(at_least=0.0, default=0.0)
+    drive: DriveSpec | None = schema.section(DriveSpec, default=None)
+    compliance: Array | None = schema.vector(6, at_least=0.0, infinite=True, default=None)
+
+    def verify(self, path: str) -> None:
+        """The axes that its type has, and a point where there has to be one."""
+        count = AXES.get(self.type, 0)
+        for key, wanted in (("axis", count == 1), ("axes", count == 2)):
+            value = getattr(self, key)
+            if wanted and value is None:
+                raise ParameterError(f"{path}.{key}", None, f"required for a {self.type} joint")
+            if value is not None and not wanted:
+                raise ParameterError(
+                    f"{path}.{key}", value.tolist(), f"none for a {self.type} joint"
+                )
+            for row in [] if value is None else np.atleast_2d(value):
+                if not float(np.linalg.norm(row)) > 1e-9:
+                    raise ParameterError(f"{path}.{key}", row.tolist(), "a vector with a length")
+        if self.at is None and self.type not in ("translation", "prismatic", "fixed"):
+            raise ParameterError(f"{path}.at", None, f"the point of a {self.type} joint, m")
+        steps = FREEDOMS[self.type]
+        if self.actuated and steps not in ("R", "P"):
+            raise ParameterError(f"{path}.actuated", self.type, "a revolute or prismatic joint")
+        if self.rotor_inertia and self.drive is not None:
+            raise ParameterError(f"{path}.drive", "given", "either drive or rotor_inertia")
+        for key in ("limits", "friction", "rotor_inertia", "drive", "home"):
+            if getattr(self, key) and steps not in ("R", "P"):
+                raise ParameterError(
+                    f"{path}.{key}", self.type, "a revolute or prismatic joint, of one freedom"
+                )
+        if steps == "R":
+            check_angles(self.home, f"{path}.home")
+
+    def joint(self, name: str, path: str) -> Joint:
+        """As a joint of the graph."""
+        rub = self.friction or FrictionSpec()
+        rotor = self.rotor_inertia
+        if self.drive is not None:
+            rotor = self.drive.reflected(FREEDOMS[self.type] == "P", f"{path}.drive")
+        rows = self.axes if self.axes is not None else self.axis
+        axes = (
+            np.zeros((0, 3)) if rows is None else np.array([unit(r) for r in np.atleast_2d(rows)])
+        )
+        inner, outer = self.between
+        at = np.zeros(3) if self.at is None else self.at
+        return Joint(
+            name, self.type, inner, outer, array(at), array(axes), self.actuated, self.home,
+            rub.viscous, rub.coulomb, rotor,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class RodSpec:
+    """A thin even straight bar with a ball joint at each end: points (m), mass (kg)."""
+
+    between: tuple[str, ...] = schema.names(2)
+    ends: Array = schema.matrix(2, 3)
+    mass: float = mass(default=0.0)
+    section: Tube | None = schema.section(Tube, default=None)
+    radius: float | None = length(default=None)
+
+
+KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
+"""The three mappings of a graph, and the schema of their entries."""
+_KEYS: Final = (
+    "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs",
+)  # fmt: skip
+_TURNED: Final = ("com", "at", "axis", "axes", "ends")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Machine(Robot):
+    """A machine that its parameter file describes as a graph."""
+
+    described: Graph
+    specs: Mapping[str, Mapping[str, Any]]
+    pose: tuple[str, ...]
+
+    changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
+
+    @classmethod
+    def from_data(cls, data: Mapping[str, Any], name: str) -> Machine:
+        """Checked as a file is, then as a machine.
+
+        :raises ParameterError: by the field.
+        """
+        for key in data:
+            if key not in _KEYS:
+                raise UnknownNameError(str(key), key, _KEYS)
+        specs = _written_out(data)
+        graph = _graph(data, specs)
+        graph.check()
+        drives = graph.actuated
+        if len(drives) > MOST_JOINTS:
+            raise ParameterError("joints", len(drives), f"at most {MOST_JOINTS} actuated joints")
+        names = data.get("pose")
+        if names is None:
+            names = choose_coordinates(graph)
+        coordinates = schema.checked(schema.words(*COORDINATES), "pose", names)
+        limits = [specs["joints"][j].limits or LimitSpec() for j in drives]
+        n = len(drives)
+        sections = {
+            "friction": friction_of(n)(
+                viscous=array([graph.joints[j].viscous for j in drives]),
+                coulomb=array([graph.joints[j].coulomb for j in drives]),
+            ),
+            "limits": limits_of(n)(
+                position=_together([v.position for v in limits], [-math.inf, math.inf]),
+                velocity=_together([v.velocity for v in limits], math.inf),
+                effort=_together([v.effort for v in limits], math.inf),
+            ),
+            "payload": schema.build(Payload, data.get("payload") or {}, "payload"),
+            "gravity": schema.checked(
+                schema.vector(3), "gravity", data.get("gravity", [0, 0, -9.81])
+            ),
+        }
+        robot = cls(
+            mechanism="machine",
+            name=name,
+            described=graph,
+            specs=specs,
+            pose=coordinates,
+            **sections,
+        )
+        robot.engine.check()
+        robot.check_masses()
+        return robot
+
+    @property
+    def coordinates(self) -> tuple[Coordinate, ...]:  # type: ignore[override]
+        """The pose coordinates of the file."""
+        return tuple(COORDINATES[name] for name in self.pose)
+
+    @property
+    def description(self) -> str:
+        """How many of what."""
+        g = self.graph
+        return (
+            f"machine of {len(g.bodies)} bodies, {len(g.joints)} joints and {len(g.rods)} rods, "
+            f"{len(g.actuated)} joints actuated"
+        )
+
+    @property
+    def mobility(self) -> str:
+        """Number and the pose coordinates."""
+        return f"{self.engine.mobility.freedoms}: {', '.join(self.pose)}"
+
+    @property
+    def limb_names(self) -> tuple[str, ...]:
+        """Names of the actuated joints: each drives a limb."""
+        return self.graph.actuated
+
+    @property
+    def size(self) -> float:
+        """Greatest distance of a joint on the platform from its reference point, m."""
+        g = self.graph
+        points = [j.at for j in g.joints.values() if g.platform in (j.inner, j.outer)]
+        for rod in g.rods.values():
+            points += [
+                e for e, b in zip(rod.ends, (rod.inner, rod.outer), strict=True) if b == g.platform
+            ]
+        far = max((float(np.linalg.norm(p - g.origin)) for p in points), default=0.0)
+        return far if far > 1e-6 * g.size else 0.1 * g.size
+
+    def make_graph(self) -> Graph:
+        """The graph of the file."""
+        return self.described
+
+    def parameter_sections(self) -> dict[str, Any]:
+        """The machine written out, limbs turned."""
+        return robot_description(self)
+
+    def home(self) -> Array:
+        """The pose at home, shape (m,)."""
+        return self.engine.home_pose.copy()
+
+    def check_masses(self) -> None:
+        """Refuse actuated joints that move no mass at all.
+
+        :raises ParameterError: by a massless body that must move alone.
+        """
+        engine, graph = self.engine, self.graph
+        motion, rows = engine.at(engine.tree.home, graph.home)
+        ju, jq = (numbers(m) for m in matrices(engine.tree, rows))
+        moved = -np.linalg.solve(ju[engine.kept], jq[engine.kept])
+        n = len(graph.actuated)
+        table = []
+        for j in range(n):
+            motion.set_rates(moved[:, j], np.eye(n)[j])
+            column = [
+                np.sqrt(graph.joints[name].rotor_inertia) * np.eye(n)[j][k]
+                for k, name in enumerate(graph.actuated)
+            ]
+            for body in graph.bodies.values():
+                root = _root(body.inertia)
+                column += [*(math.sqrt(body.mass) * numbers(motion.velocity(body.name, body.com)))]
+                column += [*(root @ numbers(motion.omega[body.name]))]
+            for rod in graph.rods.values():
+                ends = zip((rod.inner, rod.outer), rod.ends, strict=True)
+                for body_name, end in ends:
+                    column += [*(math.sqrt(rod.mass) * numbers(motion.velocity(body_name, end)))]
+            table.append(column)
+        values = np.array(table, float)
+        size = np.linalg.norm(values, axis=1, keepdims=True)
+        if (size > 0.0).all() and np.linalg.matrix_rank(values / size, 1e-6) == n:
+            return
+        joint = graph.joints[graph.actuated[int(np.argmin(size))]]
+        idle = next((b for b in (joint.outer, joint.inner) if b != BASE), graph.platform)
+        raise ParameterError(
+            f"bodies.{idle}.mass", graph.bodies[idle].mass,
+            f"mass or rotor_inertia that resists {joint.name}: no massless body can move alone",
+        )  # fmt: skip
+
+    @cached_property
+    def beams(self) -> tuple[Beam, ...]:
+        """Bodies with a member, and rods with a section or radius, limb by limb."""
+        limb = _limbs(self.graph)
+        beams = []
+        for name, body in self.specs["bodies"].items():
+            m = body.member
+            if m is not None:
+                beams.append(
+                    Beam(name, name, limb[name], (name, m.start), (name, m.end), (name,), m.outer)
+                )
+        for name, rod in self.specs["rods"].items():
+            radius = rod.section.outer_diameter / 2 if rod.section is not None else rod.radius
+            if radius is not None:
+                inner, outer = rod.between
+                ends = (inner, rod.ends[0]), (outer, rod.ends[1])
+                beams.append(Beam(name, name, limb[name], *ends, (name,), radius))
+        return tuple(beams)
+
+    def structure(self) -> Structure:
+        """Bars with sections, and the compliance of joints.
+
+        :raises ParameterError: no body and no joint is elastic.
+        """
+        sections = {}
+        for name, body in self.specs["bodies"].items():
+            m = body.member
+            if m is not None and m.section is not None:
+                span = float(np.linalg.norm(m.end - m.start))
+                sections[name] = m.section.section(
+                    body.mass / span, f"bodies.{name}.member.section"
+                )
+        for name, rod in self.specs["rods"].items():
+            if rod.section is not None:
+                span = float(np.linalg.norm(rod.ends[1] - rod.ends[0]))
+                sections[name] = rod.section.section(rod.mass / span, f"rods.{name}.section")
+        compliances = {
+            name: joint.compliance.tolist()
+            for name, joint in self.specs["joints"].items()
+            if joint.compliance is not None
+        }
+        if not sections and not compliances:
+            raise ParameterError(
+                "bodies", None, "a member with a section in a body, a section in a rod, or the "
+                "compliance of a joint: nothing is elastic"
+            )  # fmt: skip
+        missing = [name for name in self.specs["rods"] if name not in sections]
+        if missing:
+            raise ParameterError(
+                f"rods.{missing[0]}.section", None, "a section, as rods carry load"
+            )
+        beams = tuple(beam for beam in self.beams if beam.name in sections)
+        return Structure(beams, sections, compliances)
+
+
+def _root(inertia: Array) -> Array:
+    """A matrix whose square is a symmetric one."""
+    values, vectors = np.linalg.eigh(inertia)
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, np.float64)
+
+
+def _together(values: list[Any], absent: Any) -> Array | None:
+    """One array of what joints have; None where none has it."""
+    if all(value is None for value in values):
+        return None
+    return array([absent if value is None else value for value in values])
+
+
+def _section(data: Mapping[str, Any], key: str, path: str) -> Mapping[str, Any]:
+    value = data.get(key) or {}
+    if not isinstance(value, Mapping):
+        raise ParameterError(f"{path}{key}", value, "a mapping of names to entries")
+    for name in value:
+        if not isinstance(name, str) or not name:
+            raise ParameterError(f"{path}{key}", name, "names as text")
+    return value
+
+
+def _written_out(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """All entries by name, checked, the limbs' copies turned about base z."""
+    result: dict[str, dict[str, Any]] = {
+        kind: {
+            name: schema.build(spec, entry, f"{kind}.{name}")
+            for name, entry in _section(data, kind, "").items()
+        }
+        for kind, spec in KINDS.items()
+    }
+    limbs = data.get("limbs") or []
+    sections = limbs if isinstance(limbs, list) else [limbs]
+    for k, section in enumerate(sections):
+        path = f"limbs[{k}]." if isinstance(limbs, list) else "limbs."
+        if not isinstance(section, Mapping):
+            raise ParameterError(path[:-1], section, "azimuths, bodies, joints and rods")
+        for key in section:
+            if key not in ("azimuths", *KINDS):
+                raise UnknownNameError(f"{path}{key}", key, ("azimuths", *KINDS))
+        azimuths = schema.checked(schema.many(), f"{path}azimuths", section.get("azimuths"))
+        for i, azimuth in enumerate(azimuths):
+            check_angles(azimuth, f"{path}azimuths[{i}]")
+        own = set(_section(section, "bodies", path))
+        checked: dict[str, dict[str, Any]] = {
+            kind: {
+                name: schema.build(spec, entry, f"{path}{kind}.{name}")
+                for name, entry in _section(section, kind, path).items()
+            }
+            for kind, spec in KINDS.items()
+        }
+        for number, azimuth in enumerate(azimuths, 1):
+            for kind, entries in checked.items():
+                for name, entry in entries.items():
+                    full = f"{name}_{number}"
+                    if full in result[kind]:
+                        raise ParameterError(
+                            f"{path}{kind}.{name}", full, "a name that is not taken"
+                        )
+                    result[kind][full] = _turned(entry, float(azimuth), own, number)
+    return result
+
+
+def _turned(entry: Any, azimuth: float, own: set[str], number: int) -> Any:
+    """A copy of a limb's entry, turned about base z, its own bodies' names with their number."""
+    rotation = rotation_about_z(azimuth)
+    new: dict[str, Any] = {}
+    for key in _TURNED:
+        value = getattr(entry, key, None)
+        if value is not None:
+            new[key] = array(value @ rotation.T)
+    if isinstance(entry, BodySpec):
+        new["inertia"] = array(rotation @ entry.inertia @ rotation.T)
+        m = entry.member
+        if m is not None:
+            new["member"] = dataclasses.replace(
+                m, start=array(rotation @ m.start), end=array(rotation @ m.end)
+            )
+    else:
+        new["between"] = tuple(f"{b}_{number}" if b in own else b for b in entry.between)
+    return dataclasses.replace(entry, **new)
+
+
+def _graph(data: Mapping[str, Any], specs: Mapping[str, Mapping[str, Any]]) -> Graph:
+    bodies = {
+        name: Body(name, b.mass, array(np.zeros(3) if b.com is None else b.com), b.inertia)
+        for name, b in specs["bodies"].items()
+    }
+    platform = data.get("platform", "platform")
+    if not bodies:
+        raise ParameterError("bodies", None, "the machine's bodies, by name")
+    if platform not in bodies:
+        raise UnknownNameError("platform", platform, bodies)
+    origin = data.get("origin")
+    place = (
+        bodies[platform].com
+        if origin is None
+        else schema.checked(schema.vector(3), "origin", origin)
+    )
+    joints = {n: j.joint(n, f"joints.{n}") for n, j in specs["joints"].items()}
+    rods = {n: Rod(n, r.between[0], r.between[1], r.ends, r.mass) for n, r in specs["rods"].items()}
+    return Graph(bodies, joints, rods, platform, array(place))
+
+
+def _limbs(graph: Graph) -> dict[str, int]:
+    """By body and rod the number of its limb: what hangs together without base and platform."""
+    outside = {BASE, graph.platform}
+    links = [(j.inner, j.outer) for j in graph.joints.values()]
+    links += [(r.inner, r.name) for r in graph.rods.values()]
+    links += [(r.name, r.outer) for r in graph.rods.values()]
+    number: dict[str, int] = {}
+    for name in [*graph.bodies, *graph.rods]:
+        if name in number or name in outside:
+            continue
+        found, todo = {name}, [name]
+        while todo:
+            here = todo.pop()
+            for a, b in links:
+                for x, y in ((a, b), (b, a)):
+                    if x == here and y not in found and y not in outside:
+                        found.add(y)
+                        todo.append(y)
+        number |= dict.fromkeys(found, max(number.values(), default=-1) + 1)
+    return number | {graph.platform: -1}
+
+
+__all__ = ["BodySpec", "JointSpec", "Machine", "RodSpec"]

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A real browser without a window, driven over its DevTools protocol: pages, mouse, scripts."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--no-first-run",
+    "--disable-dev-shm-usage",
+    "--disable-background-networking",
+    # WebGL without a graphics card.
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--window-size=600,520",
+    "--remote-debugging-port=0",
+)
+PATIENCE = 120.0
+"""Seconds that a page may take, on a machine that does other things as well."""
+
+
+def find_browser() -> str | None:
+    """Path of a browser of this machine; PKM_TWIN_BROWSER goes first."""
+    given = os.environ.get("PKM_TWIN_BROWSER")
+    return given or next(filter(None, map(shutil.which, NAMES)), None)
+
+
+class Browser:
+    """One browser with one page; a context manager that leaves nothing behind."""
+
+    def __init__(self, program: str) -> None:
+        self._program = program
+        self._count = 0
+
+    def __enter__(self) -> Browser:
+        self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        self._loop = asyncio.new_event_loop()
+        self._process = subprocess.Popen(
+            [self._program, *FLAGS, f"--user-data-dir={self._folder.name}", "about:blank"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            self._socket = self._loop.run_until_complete(self._connect())
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.terminate()
+        try:
+            self._process.wait(20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._loop.close()
+        self._folder.cleanup()
+
+    async def _connect(self) -> Any:
+        from tornado.httpclient import AsyncHTTPClient
+        from tornado.websocket import websocket_connect
+
+        port = Path(self._folder.name) / "DevToolsActivePort"
+        end = time.monotonic() + PATIENCE
+        while not port.exists() or not port.read_text().strip():
+            assert self._process.poll() is None, "the browser ended"
+            assert time.monotonic() < end, "the browser does not open its port"
+            await asyncio.sleep(0.05)
+        address = f"127.0.0.1:{port.read_text().split()[0]}"
+        answer = await AsyncHTTPClient().fetch(f"http://{address}/json/list")
+        page = next(p for p in json.loads(answer.body) if p["type"] == "page")
+        return await websocket_connect(page["webSocketDebuggerUrl"], max_message_size=2**28)
+
+    def call(self, method: str, **parameters: Any) -> Any:
+        """One command of the protocol, and its result."""
+        self._count += 1
+        number = self._count
+
+        async def exchange() -> Any:
+            await self._socket.write_message(
+                json.dumps({"id": number, "method": method, "params": parameters})
+            )
+            while True:
+                text = await asyncio.wait_for(self._socket.read_message(), PATIENCE)
+                assert text is not None, "the browser closed the connection"
+                answer = json.loads(text)
+                if answer.get("id") == number:
+                    assert "error" not in answer, answer
+                    return answer["result"]
+
+        return self._loop.run_until_complete(exchange())
+
+    def run(self, script: str) -> Any:
+        """Value of a script in the page; a promise is waited for."""
+        answer = self.call(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def until(self, script: str) -> Any:
+        """Value of a script, as soon as it is true."""
+        end = time.monotonic() + PATIENCE
+        while True:
+            value = self.run(script)
+            if value:
+                return value
+            assert time.monotonic() < end, f"never true: {script}"
+            time.sleep(0.05)
+
+    def open(self, path: Path) -> None:
+        """Go to a file of this machine."""
+        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.until("document.readyState === 'complete'")
+
+    def move(self, x: float, y: float) -> None:
+        """Put the mouse to a place, in pixels of the window."""
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)

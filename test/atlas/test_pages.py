@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages in a real browser: the numbers under the cursor are the file's at the place they say."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+
+import numpy as np
+import pytest
+
+from pkm_twin.atlas.kinds import write_page
+from pkm_twin.atlas.store import open_atlas
+from test.atlas.browser import Browser, find_browser
+
+pytest.importorskip("plotly")
+pytest.importorskip("tornado")
+
+POINTS = 8
+"""Places that the mouse is put to for each entry of a page's menu."""
+LONG = functools.partial(pytest.param, marks=pytest.mark.long)
+"""Robots whose pages are of the same kind as those of the default run."""
+LISTEN = """
+window.gd = document.querySelector('.js-plotly-plot');
+window.under = null;
+gd.on('plotly_hover', event => { window.under = event.points[0]; });
+gd.on('plotly_unhover', () => { window.under = null; });
+// Where a point of a trace stands on the screen.
+window.place = (trace, at) => {
+  const scene = gd._fullLayout[trace.scene]._scene, camera = scene.glplot.cameraParams;
+  const times = (m, v) => [0, 1, 2, 3].map(
+    i => m[i] * v[0] + m[4 + i] * v[1] + m[8 + i] * v[2] + m[12 + i] * v[3]);
+  const v = at.map((value, k) => value * scene.dataScale[k]).concat(1);
+  const p = times(camera.projection, times(camera.view, times(camera.model, v)));
+  const box = scene.glplot.canvas.getBoundingClientRect();
+  return [box.left + (0.5 + 0.5 * p[0] / p[3]) * box.width,
+          box.top + (0.5 - 0.5 * p[1] / p[3]) * box.height];
+};
+// What is under the mouse is looked up, and its label drawn, within some pictures.
+window.soon = read => new Promise(found => {
+  let left = 5;
+  const look = () => {
+    const label = read();
+    if (label || --left === 0) found(label); else requestAnimationFrame(look);
+  };
+  requestAnimationFrame(look);
+});
+// Points of the traces that have labels, spread over all of them.
+window.known = count => {
+  const traces = gd._fullData.filter(trace => trace.hoverinfo !== 'skip' && trace.x.length);
+  return [...Array(count).keys()].map(k => {
+    const trace = traces[Math.floor(k * traces.length / count)];
+    const n = Math.floor(trace.x.length * ((k * 0.381966 + 0.2) % 1));
+    return window.place(trace, [trace.x[n], trace.y[n], trace.z[n]]);
+  });
+};
+"""
+READ = """(() => {
+  const label = document.querySelector('.hovertext');
+  if (!window.under || !label) return null;
+  const spans = [...label.querySelectorAll('tspan')].map(span => span.textContent);
+  const point = window.under;
+  const [x, y] = window.place(point.fullData, [point.x, point.y, point.z]);
+  return {lines: spans.length ? spans : [label.textContent],
+          off: Math.hypot(x - window.mouse[0], y - window.mouse[1])};
+})()"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    program = find_browser()
+    if program is None:
+        pytest.skip("no chromium or chrome on this machine; apt-get install chromium brings one")
+    with Browser(program) as made:
+        yield made
+
+
+def show(browser, atlas, folder):
+    browser.open(write_page(atlas, folder / "page.html"))
+    browser.until("!!(document.querySelector('.js-plotly-plot') || {})._fullLayout")
+    browser.run(LISTEN)
+
+
+def choose(browser, number):
+    """Do what an entry of the page's menu does."""
+    browser.run(
+        "(() => { const [data, layout, traces] = "
+        f"gd.layout.updatemenus[0].buttons[{number}].args; "
+        "return Plotly.update(gd, data, layout, traces).then(() => null); })()"
+    )
+
+
+def labels(browser):
+    """Lines of the labels at known points, or at what stands before them.
+
+    The points that labels tell of are under the mouse, but for some pixels between points.
+    """
+    found = []
+    for x, y in browser.run(f"window.known({POINTS})"):
+        browser.run(f"window.under = null; window.mouse = [{x}, {y}]")
+        # From beside it: a place that the mouse is at already tells nothing new.
+        browser.move(x - 3, y)
+        browser.move(x, y)
+        label = browser.run(f"window.soon(() => {READ})")
+        if label:
+            found.append(label)
+    assert len(found) >= POINTS // 2, found
+    assert np.median([label["off"] for label in found]) < 20, found
+    return [label["lines"] for label in found]
+
+
+def number(line):
+    """Name, number and unit of a line like "gamma -4.5 deg"."""
+    match = re.fullmatch(r"(.*) ([-−]?[\d.]+(?:e[-+−]?\d+)?(?:[kmµnp]?)) ?(.*)", line.strip())
+    assert match, line
+    name, text, unit = match.groups()
+    return name, float(text.replace("−", "-")), unit
+
+
+def test_strain_energy(browser, small_atlases, tmp_path):
+    with open_atlas(small_atlases["strain-energy upr_rpu"]) as data:
+        show(browser, data, tmp_path)
+        for entry in (0, 2):
+            choose(browser, entry)
+            for gamma, beta, z, value in labels(browser):
+                (a, g, _), (b, t, _), (_, h, _) = map(number, (gamma, beta, z))
+                assert (a, b) == ("gamma", "beta")
+                lean, turn = math.hypot(g, t), math.atan2(g, t) % (2 * math.pi)
+                point = data.sel(z=h, tilt=math.radians(lean), azimuth=turn, method="nearest")
+                if turn > 2 * math.pi - 0.04:
+                    point = data.sel(z=h, tilt=math.radians(lean), method="nearest").isel(azimuth=0)
+                assert float(point.tilt) == pytest.approx(math.radians(lean), abs=1e-5)
+                name, shown, unit = number(value)
+                if entry == 0:
+                    assert (name, unit) == ("energy", "nJ")
+                    assert shown == pytest.approx(1e9 * float(point.energy), rel=1e-3)
+                else:
+                    assert name == f"factor of {data.element.values[entry - 1]}"
+                    stored = float(point.factor[entry - 1])
+                    assert shown == pytest.approx(stored, rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("robot", ["prru", LONG("delta_cu")])
+def test_isotropy(browser, robot, small_atlases, tmp_path):
+    """A label names the sphere; which of its points it tells of, its number does."""
+    with open_atlas(small_atlases[f"isotropy {robot}"]) as data:
+        show(browser, data, tmp_path)
+        for entry, (field, said) in enumerate((("eta", "eta_KE"), ("force", "F_max"))):
+            choose(browser, entry)
+            for lines in labels(browser):
+                (a, first, unit), (b, second, _) = map(number, lines[0].split(", "))
+                scale = math.pi / 180 if unit == "deg" else 1.0
+                point = data.sel({a: scale * first, b: scale * second}, method="nearest")
+                name, shown, _ = number(lines[-1])
+                assert name == said
+                values = point[field].values
+                assert np.abs(values / shown - 1).min() < 1e-3
+                assert ("beyond the machine's limits" in lines) == (int(point.within_limits) == 0)
+
+
+@pytest.mark.parametrize("robot", ["delta_cu", LONG("prru"), LONG("upr_rpu")])
+def test_workspace(browser, robot, small_atlases, tmp_path):
+    with open_atlas(small_atlases[f"workspace {robot}"]) as data:
+        show(browser, data, tmp_path)
+        fields = [f for f in ("singularity", "clearance", "joint_angle") if f in data]
+        for entry, field in enumerate(fields):
+            choose(browser, entry)
+            for *place, value in labels(browser):
+                where = {}
+                for name, shown, unit in map(number, place):
+                    where[name] = math.radians(shown) if unit == "deg" else shown
+                point = data.sel(where, method="nearest")
+                assert int(point.reachable) == 1
+                for name, shown in where.items():
+                    assert float(point[name]) == pytest.approx(shown, abs=1e-4)
+                scale = {"mm": 1e3, "deg": 180 / math.pi}.get(number(value)[2], 1.0)
+                stored = scale * float(point[field])
+                assert number(value)[1] == pytest.approx(stored, rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("robot", ["prru", LONG("delta_cu"), LONG("upr_rpu")])
+def test_modes(browser, robot, small_atlases, tmp_path):
+    with open_atlas(small_atlases[f"modes {robot}"]) as data:
+        show(browser, data, tmp_path)
+        swap = robot == "upr_rpu"
+        for mode in (1, 4):
+            choose(browser, mode - 1)
+            for lines in labels(browser):
+                if len(lines) == 1:
+                    # Of the frame: the name of a node.
+                    assert lines[0] in set(data.node.values)
+                    continue
+                x, y, z = (float(line.split()[-1 - line.endswith(" m")].replace("−", "-"))
+                           for line in lines[:3])  # fmt: skip
+                if swap:
+                    x, y = y, x
+                far = math.hypot(x, y)
+                if data.distance.attrs["units"] == "rad":
+                    far = math.radians(far)
+                layer = data.sel(z=z, distance=far, method="nearest").sel(mode=mode)
+                turn = math.atan2(y, x) % (2 * math.pi)
+                frequency = np.append(layer.frequency.values, layer.frequency.values[0])
+                ticks = np.append(data.azimuth.values, 2 * math.pi)
+                # Between the file's azimuths the page is on straight lines.
+                stored = np.interp(turn, ticks, frequency)
+                assert number(lines[3])[1] == pytest.approx(stored, rel=2e-3)

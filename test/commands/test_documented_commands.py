@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every `pkm-twin` line of every page: it parses as it stands, and it runs as it stands."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from functools import cache
+
+import pytest
+from typer.main import get_command
+
+from pkm_twin.apps.cli import app
+from test.commands.conftest import DELTA, REPOSITORY, rewrite
+
+NOT_RUN = {
+    r"pkm-twin play .*": "needs ROS: test_player runs it over the real middleware",
+    r"pkm-twin atlas .* --scheduler .*": "needs a Dask cluster: test/atlas/test_run.py has one",
+    r"pkm-twin atlas \w+ [\w-]+( --wrench \w+)?( --html)?( --out \S+)?( --html)?": "minutes: the "
+    "whole grid of its kind; test/atlas/test_commands.py runs each on few points",
+    r"pkm-twin atlas .* --points \d{5,}.*": "minutes: as many points as the picture has",
+}
+"""Lines that are parsed but not run, and why."""
+ENDS = {"pkm-twin recover damaged.mcap saved.mcap": 3}
+"""Exit codes other than 0, as the page says."""
+INLINE_NAMES = r"ROBOT|FILE|BAG|COMMAND|KIND|HOST| N\b"
+"""Words that stand for something in running text; a line to type has none."""
+
+
+def pages():
+    """Markdown files that a clone has and that people read as they are."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "*.md"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        check=False,
+        text=True,
+    ).stdout.split("\0")
+    found = sorted(name for name in listed if name and not name.startswith("test/"))
+    return found or ["README.md"]
+
+
+def typed(text):
+    """Lines of a page's code blocks, indented or fenced, that are commands of ours."""
+    fenced = re.findall(r"^```.*?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    outside = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    blocks = "\n".join([*fenced, *re.findall(r"^ {4}.*$", outside, re.MULTILINE)])
+    # A line may be continued on the next.
+    for line in re.sub(r"\\\n\s*", " ", blocks).splitlines():
+        words = line.strip().removeprefix("$ ")
+        if words.startswith("pkm-twin "):
+            yield words.split("  #")[0].split(" # ")[0].strip()
+
+
+def quoted(text):
+    """Commands between backquotes in running text and tables, those without placeholders."""
+    for words in re.findall(r"`(pkm-twin [^`\n]+)`", text):
+        if not re.search(INLINE_NAMES, words):
+            yield words
+
+
+@cache
+def commands():
+    found = {}
+    for page in pages():
+        text = (REPOSITORY / page).read_text(encoding="utf-8")
+        for line in typed(text):
+            found.setdefault((page, line), True)
+        for line in quoted(text):
+            found.setdefault((page, line), False)
+    return found
+
+
+def reason(line):
+    return next((why for like, why in NOT_RUN.items() if re.fullmatch(like, line)), None)
+
+
+@pytest.mark.parametrize(("page", "line"), list(commands()))
+def test_it_parses_as_it_stands(page, line):
+    """Every word is an argument or option of the command, with a value of its type."""
+    words = shlex.split(line)[1:]
+    command = get_command(app)
+    if words[0].startswith("-"):
+        assert words[0] in {name for option in command.params for name in option.opts}
+        return
+    assert words[0] in command.commands
+    # A command's name alone, in running text, is only named.
+    if "--help" not in words and (commands()[page, line] or len(words) > 1):
+        command.commands[words[0]].make_context(words[0], words[1:])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """What the lines name: the repository's bags, and a damaged one."""
+    path = tmp_path_factory.mktemp("typed")
+    for name in ("bags", "config"):
+        (path / name).symlink_to(REPOSITORY / name)
+    whole = rewrite(DELTA, path / "whole.mcap", seconds=0.5).read_bytes()
+    (path / "damaged.mcap").write_bytes(whole[: len(whole) * 3 // 4])
+    return path
+
+
+@pytest.mark.timeout(900)
+def test_it_runs_as_it_stands(folder):
+    """In the order of the page, in one folder: a later line may use what an earlier one wrote."""
+    program = f"{shlex.quote(sys.executable)} -m pkm_twin.apps.cli"
+    done = set()
+    for (page, line), block in commands().items():
+        if not block or line in done or reason(line):
+            continue
+        done.add(line)
+        shell = f'pkm-twin() {{ {program} "$@"; }}\n{line}'
+        result = subprocess.run(
+            ["bash", "-c", shell],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+            check=False,
+        )
+        assert result.returncode == ENDS.get(line, 0), f"{page}: {line}\n{result.stderr}"
+        assert "Traceback" not in result.stderr
+    assert len(done) >= 8
+
+
+def test_the_list_of_what_is_not_run_is_of_use():
+    lines = [line for _, line in commands()]
+    for like in NOT_RUN:
+        assert any(re.fullmatch(like, line) for line in lines), like
+    for line in ENDS:
+        assert line in lines

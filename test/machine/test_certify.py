@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is judged by other engines, and that they stay other engines."""
+
+import ast
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import pkm_twin.apps.certificate as judges
+from pkm_twin.apps import certify as certification
+from pkm_twin.apps.certify import ENGINES, Certificate, certify
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.catalogue import CATALOGUE
+from test.machine.random_machines import FILES, plain
+
+needs_machines = pytest.mark.skipif(
+    "machine" not in CATALOGUE, reason="load knows no mechanism machine"
+)
+
+
+def test_judges_import_nothing_of_the_twin():
+    allowed = {"numpy", "pinocchio", "mujoco", *sys.stdlib_module_names}
+    for path in Path(judges.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module]
+            for name in names:
+                own = name.startswith("pkm_twin.apps.certificate.")
+                assert own or name.split(".")[0] in allowed, f"{path.name} imports {name}"
+
+
+class Echo:
+    """A twin that answers what a judge does, with an error of its own if it is told one."""
+
+    name = "echo"
+
+    def __init__(self, description, **errors):
+        from pkm_twin.apps.certificate.maximal import Maximal
+
+        self.judge, self.errors = Maximal(description), errors
+        self.description_data = description
+
+    def each(self, what, *batches):
+        answers = [getattr(self.judge, what)(*sample) for sample in zip(*batches, strict=True)]
+        return np.array(answers) * (1.0 + self.errors.get(what, 0.0))
+
+    def forward(self, q):
+        return q
+
+    def inverse(self, pose):
+        return pose + self.errors.get("inverse", 0.0)
+
+    def platform(self, q):
+        places = [self.judge.platform(one) for one in q]
+        position = np.array([place for place, _ in places]) + self.errors.get("platform", 0.0)
+        return position, np.array([rotation for _, rotation in places])
+
+    def platform_jacobian(self, q):
+        return self.each("jacobian", q)
+
+
+@pytest.fixture
+def echoes(monkeypatch):
+    """The twin's dynamics, answered by an Echo."""
+
+    def torques(robot, *state):
+        if np.ndim(state[0]) == 1:
+            return torques(robot, *(x[None] for x in state))[0]
+        return robot.each("inverse_dynamics", *state)
+
+    monkeypatch.setattr(certification, "inverse_dynamics", torques)
+    monkeypatch.setattr(certification, "mass_matrix", lambda robot, q: robot.each("mass_matrix", q))
+    return lambda **errors: Echo(plain("rps3"), **errors)
+
+
+def judged(twin) -> Certificate:
+    return certify(twin, twin.description_data, states=2, engines=["maximal"])
+
+
+def test_what_is_right_is_certified(echoes):
+    result = judged(echoes())
+    assert result.good
+    assert (result.mobility, result.rows - result.rank) == (3, 0)
+    assert {item.what for item in result.items} == set(certification.BOUNDS)
+    assert json.loads(json.dumps(result.as_json()))["good"] is True
+
+
+@pytest.mark.parametrize(
+    ("error", "what"),
+    [
+        ({"inverse_dynamics": 1e-8}, "torques"),
+        ({"platform": 1e-8}, "platform"),
+        ({"jacobian": 1e-8}, "jacobian"),
+        ({"mass_matrix": 1e-8}, "mass_matrix"),
+        ({"inverse": 1e-8}, "round_trip"),
+        ({"inverse_dynamics": np.nan}, "torques"),
+    ],
+)
+def test_what_is_wrong_is_named(echoes, error, what):
+    result = judged(echoes(**error))
+    assert not result.good
+    assert what in {item.what for item in result.items if not item.good}
+    json.dumps(result.as_json(), allow_nan=False)
+
+
+def test_progress_counts_states(echoes):
+    seen, twin = [], echoes()
+    certify(twin, twin.description_data, states=3, engines=["maximal"], progress=seen.append)
+    assert seen == [1, 2, 3]
+
+
+def test_an_engine_that_is_not_installed_is_told(echoes, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.delitem(sys.modules, ENGINES["mujoco"][0].split(":")[0], raising=False)
+    twin = echoes()
+    result = certify(twin, twin.description_data, states=1, engines=["maximal", "mujoco"])
+    assert result.missing == {"mujoco": "mujoco is not installed (pkm_twin[certificate])"}
+    assert result.good
+
+
+def test_a_machine_that_no_judge_can_take(echoes):
+    twin = echoes()
+    twin.description_data["joints"] = {"odd": {"type": "screw", "between": ["base", "platform"]}}
+    with pytest.raises(PkmTwinError, match="screw"):
+        judged(twin)
+
+
+@needs_machines
+@pytest.mark.parametrize("name", ["five_bar", "linear_delta", "rps3", "slider_crank"])
+def test_the_command_certifies_a_file(name):
+    from pkm_twin import load
+    from pkm_twin.apps.certify import certificate_of
+
+    result = certificate_of(load(FILES[name]), states=3)
+    assert result.good, [item for item in result.items if not item.good]
+    assert result.robot == name
+
+
+@needs_machines
+def test_a_file_that_is_not_the_machine_fails(tmp_path):
+    from pkm_twin import load
+
+    data = plain("five_bar")
+    data["bodies"]["arm_left"]["mass"] *= 1.0 + 1e-6
+    path = tmp_path / "heavier.yaml"
+    path.write_text(yaml.safe_dump(data))
+    result = certify(load(path), plain("five_bar"), states=3, engines=["maximal"])
+    assert "torques" in {item.what for item in result.items if not item.good}

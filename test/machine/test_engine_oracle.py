@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The engine beside a judge in maximal coordinates, over machines of every kind of joint."""
+
+import copy
+import os
+
+import numpy as np
+import pytest
+import yaml
+
+from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
+from pkm_twin import load
+from pkm_twin.apps.certificate.maximal import Maximal
+from pkm_twin.apps.certificate.states import random_states
+from pkm_twin.apps.certify import effort_differences, relative
+from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.machine.catalogue import CATALOGUE
+from test.machine.random_machines import NAMES, plain, variant
+
+if "machine" not in CATALOGUE:
+    pytest.skip("load knows no mechanism machine", allow_module_level=True)
+
+VARIANTS = int(os.environ.get("PKM_TWIN_VARIANTS", "1"))
+"""Machines of other dimensions for each of the folder; hundreds for a long run."""
+STATES = 2
+BOUND = 1e-9
+
+
+def loaded(description, folder):
+    path = folder / "machine.yaml"
+    path.write_text(yaml.safe_dump(description, sort_keys=False))
+    return load(path)
+
+
+class Case:
+    """A machine, what judges it, and states of it."""
+
+    def __init__(self, name, number, folder):
+        rng = np.random.default_rng([20261121, NAMES.index(name), number])
+        self.description = variant(name, rng) if number else plain(name)
+        self.robot = loaded(self.description, folder)
+        self.judge = Maximal(self.description)
+        self.states = random_states(self.judge, rng, STATES)
+
+
+@pytest.fixture(
+    scope="module", params=[(n, k) for n in NAMES for k in range(VARIANTS + 1)], ids=str
+)
+def case(request, tmp_path_factory):
+    return Case(*request.param, tmp_path_factory.mktemp("machine"))
+
+
+def samples(states):
+    return zip(states.q, states.qd, states.qdd, states.wrench, strict=True)
+
+
+def test_names(case):
+    assert tuple(case.robot.joint_names) == tuple(j.name for j in case.judge.machine.actuated)
+    assert tuple(case.robot.pose_names) == case.judge.machine.pose
+
+
+def test_torques(case):
+    s = case.states
+    got = inverse_dynamics(case.robot, s.q, s.qd, s.qdd, s.wrench)
+    expected = np.array([case.judge.inverse_dynamics(*sample) for sample in samples(s)])
+    assert got.shape == s.q.shape
+    assert effort_differences(got, expected).max() < BOUND
+
+
+def test_platform_and_pose(case):
+    position, rotation = case.robot.platform(case.states.q)
+    poses = case.robot.forward(case.states.q)
+    for k, q in enumerate(case.states.q):
+        place, turned = case.judge.platform(q)
+        assert np.abs(position[k] - place).max() < BOUND
+        assert np.abs(rotation[k] - turned).max() < BOUND
+        assert np.abs(poses[k] - case.judge.pose(q)).max() < BOUND
+
+
+def test_home(case):
+    home = case.judge.machine.home
+    position, rotation = case.robot.platform(home)
+    assert np.abs(position - case.judge.machine.origin).max() < BOUND
+    assert np.abs(rotation - np.eye(3)).max() < BOUND
+
+
+def test_round_trip(case):
+    q = case.states.q
+    assert np.abs(case.robot.inverse(case.robot.forward(q)) - q).max() < BOUND
+
+
+def test_mass_matrix_and_jacobian(case):
+    inertia = mass_matrix(case.robot, case.states.q)
+    twist = case.robot.platform_jacobian(case.states.q)
+    for k, q in enumerate(case.states.q):
+        assert relative(inertia[k], case.judge.mass_matrix(q)) < BOUND
+        assert relative(twist[k], case.judge.jacobian(q)) < BOUND
+
+
+def test_forward_dynamics_inverts(case):
+    s = case.states
+    tau = inverse_dynamics(case.robot, s.q, s.qd, s.qdd, s.wrench)
+    back = forward_dynamics(case.robot, s.q, s.qd, tau, s.wrench)
+    condition = np.linalg.cond(mass_matrix(case.robot, s.q)).max()
+    assert np.abs(back - s.qdd).max() < 1e-12 * condition * max(1.0, np.abs(tau).max())
+
+
+def test_batch_axes_and_bits(case):
+    s, n = case.states, len(case.robot.joint_names)
+    m = len(case.robot.pose_names)
+    batch = inverse_dynamics(case.robot, s.q, s.qd, s.qdd, s.wrench)
+    single = [inverse_dynamics(case.robot, *sample) for sample in samples(s)]
+    assert np.array_equal(batch, single)
+    assert np.array_equal(case.robot.forward(s.q), [case.robot.forward(q) for q in s.q])
+    grid = [x.reshape(2, STATES // 2, -1) for x in (s.q, s.qd, s.qdd, s.wrench)]
+    assert np.array_equal(inverse_dynamics(case.robot, *grid), batch.reshape(2, -1, n))
+    assert case.robot.forward(grid[0]).shape == (2, STATES // 2, m)
+    position, rotation = case.robot.platform(grid[0])
+    assert position.shape == (2, STATES // 2, 3)
+    assert rotation.shape == (2, STATES // 2, 3, 3)
+    assert mass_matrix(case.robot, grid[0]).shape == (2, STATES // 2, n, n)
+
+
+def test_no_wrench_is_none(case):
+    s = case.states
+    none = inverse_dynamics(case.robot, s.q, s.qd, s.qdd)
+    assert np.array_equal(none, inverse_dynamics(case.robot, s.q, s.qd, s.qdd, np.zeros(6)))
+
+
+def test_out_of_reach_is_told(tmp_path):
+    robot = loaded(plain("rps3"), tmp_path)
+    with pytest.raises(PkmTwinError):
+        robot.forward([0.3, 1.3, 0.3])
+
+
+def test_a_singularity_on_the_way_is_told(tmp_path):
+    """The five-bar's elbows meet on the way: behind it all loops close, in no assembly of ours."""
+    robot = loaded(plain("five_bar"), tmp_path)
+    with pytest.raises(PkmTwinError):
+        robot.forward([0.9, -0.9])
+
+
+# What a file is refused for, and by which field
+
+
+def broken_connection(data):
+    data["bodies"]["island"] = {"mass": 1.0, "com": [1, 0, 0], "inertia": [1e-3, 1e-3, 1e-3]}
+
+
+def missing_motor(data):
+    data["joints"]["right"].pop("actuated")
+
+
+def pendulum(data):
+    """A body that swings as it likes."""
+    data["bodies"]["bob"] = {"mass": 0.1, "com": [-0.1, 0, 0], "inertia": [1e-4, 1e-4, 1e-4]}
+    data["joints"]["pivot"] = {
+        "type": "revolute",
+        "between": ["arm_left", "bob"],
+        "at": [-0.1, 0, 0.1],
+        "axis": [0, 1, 0],
+    }
+
+
+def motor_too_many(data):
+    data["joints"]["tip"]["actuated"] = True
+
+
+def idle_motor(data):
+    """Three motors for three freedoms, but two of them hold the third and the head is free."""
+    data["joints"]["elbow_left"]["actuated"] = True
+    data["bodies"]["head"] = {"mass": 0.2, "com": [0, 0, 0.4], "inertia": [1e-4, 1e-4, 1e-4]}
+    data["joints"]["neck"] = {
+        "type": "revolute",
+        "between": ["forearm_right", "head"],
+        "at": [0, 0, 0.36],
+        "axis": [0, 1, 0],
+    }
+    data["platform"], data["pose"] = "head", ["x", "z", "pitch"]
+
+
+def pose_out_of_plane(data):
+    data["pose"] = ["x", "y"]
+
+
+def pose_too_short(data):
+    data["pose"] = ["x"]
+
+
+def feather(data):
+    """The second motor of a serial arm moves nothing that has mass."""
+    data["bodies"]["link_2"] = {}
+    data["origin"] = [0.5, 0, 0.1]
+
+
+def unknown_body(data):
+    data["joints"]["tip"]["between"] = ["forearm_lef", "forearm_right"]
+
+
+def unknown_type(data):
+    data["joints"]["tip"]["type"] = "revolut"
+
+
+def two_axes(data):
+    data["joints"]["tip"].update(type="universal")
+
+
+def zero_axis(data):
+    data["joints"]["tip"]["axis"] = [0, 0, 0]
+
+
+def actuated_ball(data):
+    data["joints"]["tip"].update(type="spherical", actuated=True)
+
+
+def parallel_axes(data):
+    data["joints"]["tip"].pop("axis")
+    data["joints"]["tip"].pop("friction")
+    data["joints"]["tip"].update(type="universal", axes=[[0, 1, 0], [0, 2, 0]])
+
+
+def negative_mass(data):
+    data["bodies"]["arm_left"]["mass"] = -0.1
+
+
+def broken_triangle(data):
+    data["bodies"]["arm_left"]["inertia"] = [1e-3, 1e-3, 9e-3]
+
+
+def no_platform(data):
+    data["platform"] = "forearm_rigth"
+
+
+def unknown_pose(data):
+    data["pose"] = ["x", "zz"]
+
+
+REFUSALS = [
+    ("five_bar", broken_connection, ("bodies.island", "bodies"), "island"),
+    ("five_bar", missing_motor, ("joints",), ""),
+    ("five_bar", pendulum, ("joints", "joints.pivot"), "pivot"),
+    ("five_bar", motor_too_many, ("joints", "joints.tip"), ""),
+    ("five_bar", idle_motor, ("joints", "joints.neck", "platform"), "neck"),
+    ("five_bar", pose_out_of_plane, ("pose",), "y"),
+    ("five_bar", pose_too_short, ("pose",), ""),
+    ("arm_2r", feather, ("bodies.link_2", "bodies.link_2.mass"), "link_2"),
+    ("five_bar", unknown_body, ("joints.tip.between",), "forearm_left"),
+    ("five_bar", unknown_type, ("joints.tip.type",), "revolute"),
+    ("five_bar", two_axes, ("joints.tip.axes", "joints.tip.axis"), ""),
+    ("five_bar", zero_axis, ("joints.tip.axis",), ""),
+    ("five_bar", actuated_ball, ("joints.tip.actuated", "joints.tip.type", "joints.tip.axis"), ""),
+    ("five_bar", parallel_axes, ("joints.tip.axes",), ""),
+    ("five_bar", negative_mass, ("bodies.arm_left.mass",), ""),
+    ("five_bar", broken_triangle, ("bodies.arm_left.inertia",), ""),
+    ("five_bar", no_platform, ("platform",), "forearm_right"),
+    ("five_bar", unknown_pose, ("pose", "pose[1]", "pose.1"), ""),
+]
+
+
+@pytest.mark.parametrize(("name", "breaks", "fields", "text"), REFUSALS)
+def test_refusals_name_the_field(name, breaks, fields, text, tmp_path):
+    data = copy.deepcopy(plain(name))
+    breaks(data)
+    with pytest.raises(ParameterError) as refused:
+        loaded(data, tmp_path)
+    assert refused.value.field in fields
+    assert text in str(refused.value)
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The YAML of a description: the same numbers again, plain YAML, few long lines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from pkm_twin.machine import schema
+from pkm_twin.machine.machine_yaml import describe_machine_yaml
+from pkm_twin.machine.urdf_read import read_urdf
+
+from .descriptions import DESCRIPTIONS
+from .sketches import SKETCHES
+
+
+def read_back(data, tmp_path):
+    path = tmp_path / "machine.yaml"
+    path.write_text(describe_machine_yaml(data))
+    return schema.read_yaml(path)
+
+
+@pytest.mark.parametrize("name", sorted(DESCRIPTIONS))
+def test_the_same_description_comes_back(name, tmp_path):
+    data = DESCRIPTIONS[name]()
+    assert read_back(data, tmp_path) == data
+    assert yaml.safe_load(describe_machine_yaml(data)) == data
+
+
+@pytest.mark.parametrize("name", sorted(SKETCHES))
+def test_a_urdf_s_description_comes_back(name, tmp_path):
+    data = read_urdf(SKETCHES[name]().save(tmp_path))
+    assert read_back(data, tmp_path) == data
+
+
+def test_hard_names_and_numbers(tmp_path):
+    values = [1e-5, -0.0, 3.0, 1e300, float("inf"), 0.1 + 0.2, 5e-324, -1e-17]
+    data = {
+        "mechanism": "machine",
+        "platform": "yes",
+        "bodies": {"toe_b_1/2": {"mass": 1e-9, "com": values}, "3": {}, "a, b": {"mass": np.pi}},
+        "joints": {"on": {"between": ["a, b", "no"], "actuated": True}},
+        "rods": {},
+        "limbs": [{"azimuths": [0.0, 1.5], "bodies": {"x": {"mass": 1.0}}}],
+    }
+    assert read_back(data, tmp_path) == data
+    assert "-0" not in describe_machine_yaml({"origin": [-0.0]})
+
+
+def test_one_list_in_two_places_is_written_twice(tmp_path):
+    point = [0.1, 0.2, 0.3]
+    data = {"mechanism": "machine", "origin": point, "bodies": {"a": {"com": point}}}
+    assert read_back(data, tmp_path) == data
+
+
+def test_units_and_meanings_are_told():
+    content = describe_machine_yaml(DESCRIPTIONS["six_rods"]())
+    for words in ("kg m2", "rad", "the body that carries the tool", "# pose:", "a ball joint"):
+        assert words in content
+    assert max(map(len, content.splitlines())) <= 120

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shipped robots as URDFs: Pinocchio puts platform and loops where the robot says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import load, robot_names
+from pkm_twin.machine import urdf_file, urdf_xml
+from pkm_twin.machine.robot_urdf import robot_description, robot_urdf
+from pkm_twin.machine.urdf_read import read_urdf
+from pkm_twin.mechanisms.machine import Machine
+
+from .sketches import closure_rows
+
+STATES = 50
+
+
+@pytest.fixture(params=robot_names(), scope="module")
+def robot(request):
+    return load(request.param).changed(payload={"mass": 0.3, "com": [0.01, 0.02, -0.05]})
+
+
+@pytest.fixture(scope="module")
+def states(robot):
+    """Joint positions about home, shape (STATES, n)."""
+    home = robot.inverse(robot.home())
+    rng = np.random.default_rng(4)
+    return home + rng.uniform(-0.05, 0.05, (STATES, len(home))) * robot.graph.size
+
+
+def configuration(model, robot, q, passive):
+    found = np.zeros(model.nq)
+    names = (*robot.joint_names, *robot.passive_joints)
+    for name, value in zip(names, (*q, *passive), strict=True):
+        found[model.joints[model.getJointId(name)].idx_q] = value
+    return found
+
+
+def test_the_platform_stands_where_the_robot_says_and_all_loops_are_closed(robot, states, tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot_urdf(robot))
+    model = pin.buildModelFromUrdf(str(path))
+    assert model.nq == model.nv == len(robot.joint_names) + len(robot.passive_joints)
+    ends = []
+    for closure in urdf_file.read(path, urdf_xml.elements(path)).closures:
+        pair = []
+        for link, at in zip(closure.links, closure.frames, strict=True):
+            body = model.frames[model.getFrameId(link, pin.BODY)]
+            place = body.placement * pin.SE3(at.rotation, at.position)
+            frame = pin.Frame(f"{closure.name}_{link}", body.parentJoint, place, pin.OP_FRAME)
+            pair.append(model.addFrame(frame))
+        axis = None if closure.axes is None else closure.axes[0]
+        ends.append((closure.type, *pair, axis))
+    assert ends
+    data = model.createData()
+    position, rotation = robot.platform(states)
+    for q, passive, at, turned in zip(
+        states, robot.passive(states), position, rotation, strict=True
+    ):
+        residual, _ = closure_rows(model, data, ends, configuration(model, robot, q, passive))
+        assert np.abs(residual).max() < 1e-9
+        platform = data.oMf[model.getFrameId("platform", pin.BODY)]
+        np.testing.assert_allclose(platform.translation, at, atol=1e-9)
+        np.testing.assert_allclose(platform.rotation, turned, atol=1e-9)
+
+
+def test_masses_sum_to_the_robot_s(robot):
+    model = pin.buildModelFromXML(robot_urdf(robot))
+    graph = robot.graph
+    parts = [*graph.bodies.values(), *graph.rods.values()]
+    expected = sum(part.mass for part in parts) + 0.3
+    assert sum(i.mass for i in model.inertias) == pytest.approx(expected, rel=1e-13)
+
+
+def test_the_text_is_the_same_each_time(robot):
+    assert robot_urdf(robot) == robot_urdf(load(robot.name).changed(
+        payload={"mass": 0.3, "com": [0.01, 0.02, -0.05]}
+    ))  # fmt: skip
+
+
+def test_the_description_has_all_that_the_graph_has(robot):
+    data, graph = robot_description(robot), robot.graph
+    assert list(data["bodies"]) == list(graph.bodies)
+    assert list(data["joints"]) == list(graph.joints)
+    assert list(data.get("rods", {})) == list(graph.rods)
+    assert [n for n, j in data["joints"].items() if j.get("actuated")] == list(robot.joint_names)
+    assert data["payload"]["mass"] == 0.3
+    for name, body in graph.bodies.items():
+        assert data["bodies"][name]["mass"] == body.mass
+        np.testing.assert_allclose(data["bodies"][name]["com"], body.com, atol=1e-14)
+    limits = robot.limits.position
+    if limits is not None:
+        first = data["joints"][robot.joint_names[0]]
+        assert first["limits"]["position"] == limits[0].tolist()
+
+
+def test_read_back_it_needs_the_same_efforts(robot, states, tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot_urdf(robot))
+    again = Machine.from_data(read_urdf(path), "again")
+    assert again.joint_names == robot.joint_names
+    rng = np.random.default_rng(6)
+    qd, qdd = rng.normal(size=(2, *states.shape))
+    wrench = rng.normal(size=(len(states), 6))
+    expected = inverse_dynamics(robot, states, qd, qdd, wrench)
+    found = inverse_dynamics(again, states, qd, qdd, wrench)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(again.platform(states)[0], robot.platform(states)[0], atol=1e-9)
+
+
+def test_described_it_needs_the_same_efforts(robot, states):
+    again = Machine.from_data(robot_description(robot), "again")
+    rng = np.random.default_rng(7)
+    qd, qdd = rng.normal(size=(2, *states.shape))
+    expected = inverse_dynamics(robot, states, qd, qdd)
+    np.testing.assert_allclose(
+        inverse_dynamics(again, states, qd, qdd), expected, rtol=1e-9, atol=1e-9
+    )

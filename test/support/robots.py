@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robots that laws are held over, and random states of them.
+
+A law asks the robot what it is, so that a file added to ``config/`` joins all laws by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+
+from pkm_twin import Robot, load, robot_names
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.catalogue import config_folder
+
+Array = NDArray[np.float64]
+
+LIMITED = 0.7
+"""Part of the joint range that random states are drawn from."""
+CLEAR = 0.2
+"""Least singularity measure of random states: nearer to one, no tolerance is the law's own."""
+FREE = {"viscous": 0.0, "coulomb": 0.0}
+"""Friction section without friction."""
+
+
+def has(robot: Robot, ask: str) -> bool:
+    """Whether a robot's file gives what a method needs: ``massive`` or ``structure``."""
+    try:
+        getattr(robot, ask)()
+    except ParameterError:
+        return False
+    return True
+
+
+MASSIVE = [name for name in robot_names() if has(load(name), "massive")]
+MASSLESS = [name for name in robot_names() if name not in MASSIVE]
+ELASTIC = [name for name in robot_names() if has(load(name), "structure")]
+
+every_robot = pytest.mark.parametrize("name", robot_names())
+massive = pytest.mark.parametrize("name", MASSIVE)
+elastic = pytest.mark.parametrize("name", ELASTIC)
+
+
+def parameters_of(name: str) -> dict[str, Any]:
+    """The plain parameter mapping of a shipped robot."""
+    data: dict[str, Any] = yaml.safe_load((config_folder() / f"{name}.yaml").read_text())
+    return data
+
+
+def loaded(name: str) -> Robot:
+    """A shipped robot with a payload, gravity in no special direction, and friction."""
+    return loaded_like(load(name))
+
+
+def loaded_like(robot: Robot) -> Robot:
+    """The same of any robot."""
+    count = np.arange(1, len(robot.joint_names) + 1)
+    return robot.changed(
+        payload={"mass": 0.3, "com": [0.01, -0.02, -0.04], "inertia": [4e-4, 5e-4, 3e-4]},
+        gravity=[0.5, -1.0, -9.7],
+        friction={"viscous": (0.1 * count).tolist(), "coulomb": (0.04 + 0.01 * count).tolist()},
+    )
+
+
+def joint_range(robot: Robot) -> tuple[Array, Array]:
+    """Middle and half width of what random joints are drawn from, shape (n,) each."""
+    if robot.limits.position is not None:
+        low, high = robot.limits.position.T
+        return (low + high) / 2, LIMITED * (high - low) / 2
+    size = robot.engine.tree.size
+    half = [0.15 * size if unit == "m" else 0.3 for unit in robot.joint_units]
+    return robot.graph.home, np.array(half)
+
+
+def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
+    """Joint positions inside the middle of the limits that can be assembled, shape (count, n).
+
+    Clear of singularities by CLEAR.
+    """
+    middle, half = joint_range(robot)
+    kept = np.empty((0, len(middle)))
+    for _ in range(100):
+        drawn = rng.uniform(middle - half, middle + half, (max(count, 1), len(middle)))
+        rates, good = robot.try_jacobian(drawn)
+        good[good] = robot.singularity_of(rates[good]) > CLEAR
+        kept = np.concatenate([kept, drawn[good]])
+        if len(kept) >= count:
+            return kept[:count]
+    raise AssertionError(f"{robot.name}: of 100 draws {len(kept)} joint states can be assembled")
+
+
+def random_poses(robot: Robot, rng: np.random.Generator, count: int) -> Array:
+    """Poses of such joint states, shape (count, m)."""
+    return robot.forward(random_joints(robot, rng, count))
+
+
+def joint_units_of_size(robot: Robot) -> Array:
+    """What makes rates of a size that suits the joints' units, shape (n,)."""
+    return np.array([0.2 if unit == "m" else 1.0 for unit in robot.joint_units])
+
+
+def random_motion(robot: Robot, rng: np.random.Generator, count: int) -> tuple[Array, ...]:
+    """Positions, rates and accelerations, shape (count, n) each, and wrenches, (count, 6)."""
+    q = random_joints(robot, rng, count)
+    scale = joint_units_of_size(robot)
+    qd, qdd = (scale * rng.normal(0.0, size, q.shape) for size in (3.0, 30.0))
+    return q, qd, qdd, rng.normal(0.0, 10.0, (count, 6))
+
+
+def finite_difference(function: Any, x: Array, step: float = 1e-6) -> Array:
+    """Central differences of function by the last axis of x: shape (..., outputs, inputs)."""
+    columns = []
+    for j in range(x.shape[-1]):
+        shift = step * np.eye(x.shape[-1])[j]
+        columns.append((function(x + shift) - function(x - shift)) / (2 * step))
+    return np.stack(columns, -1)
+
+
+def both_ways(program: str, given: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a program prints as JSON, compiled and as plain Python, fed the text on its input."""
+    results = []
+    for plain in ("0", "1"):
+        environment = {k: v for k, v in os.environ.items() if k != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
+        environment |= {"PKM_TWIN_PLAIN": plain, "PYTHONPATH": os.pathsep.join(sys.path)}
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            input=given,
+            capture_output=True,
+            text=True,
+            check=True,
+            env=environment,
+        )
+        results.append(json.loads(done.stdout))
+    fast, slow = results
+    assert (fast.pop("compiled"), slow.pop("compiled")) == (True, False)
+    return fast, slow
