@@ -243,6 +243,7 @@ class DeltaDynamics(health.TwinNode):
         }
 
     def _declare_changes(self, robot: Robot) -> dict[str, Any]:
+        """What is given beside the robot's file."""
         changes = {}
         for name, (section, key) in CHANGES.items():
             value = getattr(robot, section)
@@ -253,13 +254,15 @@ class DeltaDynamics(health.TwinNode):
             bounds: dict[str, Any] = {}
             if name == "payload.mass":
                 bounds = {"low": 0.0, "high": MAX_MASS}
-            changes[name] = self.declare(
+            given = self.declare(
                 name,
                 default,
                 f"the robot's {name}, by default its file's",
                 unit=UNITS[name],
                 **bounds,
             )
+            if name in self._parameter_overrides:
+                changes[name] = given
         return changes
 
     def _declare_settings(self) -> Settings:
