@@ -93,7 +93,7 @@ class DeltaDynamics(health.TwinNode):
             else None
         )
         self._reactions = self._create_reaction_publishers(robot)
-        names = list(robot.joint_names)
+        names = list(robot.controller.names)
         numbers = [0.0] * len(names)
         definition = message_definition(JOINT_STATE)
         self._decode = JointStateDecoder(definition)
@@ -306,6 +306,10 @@ class DeltaDynamics(health.TwinNode):
             recovery_count=self.declare(
                 "recovery_count", d.recovery_count, "good samples that start it again", **counts
             ),
+            extra_joints=self.declare(
+                "extra_joints", d.extra_joints, "a trajectory's joints that the model lacks",
+                choices=("refuse", "zero"),
+            ),
             on_stop=self.declare(
                 "on_stop", d.on_stop, "sent once on a stop",
                 choices=("nothing", "zeros", "gravity"),
@@ -373,11 +377,11 @@ class DeltaDynamics(health.TwinNode):
         stamp = header.sec, header.nanosec
         if core.settings.accept_zero_stamp:
             stamp = divmod(torques.stamp, SECOND)
-        self._torques.publish(self._effort_message.fill(torques.effort, stamp))
+        self._torques.publish(self._effort_message.fill(core.sent(torques.effort), stamp))
         if torques.residual is not None:
-            self._residual.publish(self._effort_message.fill(torques.residual, stamp))
+            self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))
         if self._commands is not None:
-            self._commands.publish(self._numbers_message.fill(torques.effort))
+            self._commands.publish(self._numbers_message.fill(core.sent(torques.effort)))
         # A dense solve a sample is too much for the stream's own rate.
         if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
             self._reactions_due = torques.stamp
@@ -419,6 +423,7 @@ class DeltaDynamics(health.TwinNode):
         effort = core.stop_effort()
         if effort is None:
             return
+        effort = core.sent(effort)
         self._torques.publish(self._effort_message.fill(effort, divmod(self.now(), SECOND)))
         if self._commands is not None:
             self._commands.publish(self._numbers_message.fill(effort))

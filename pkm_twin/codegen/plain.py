@@ -21,12 +21,12 @@ from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
     CONTRACTION,
-    DIRECT,
     RESIDUAL,
     STEPPED,
     TURNS,
     UNKNOWNS,
     Program,
+    progress,
 )
 
 Array = NDArray[np.float64]
@@ -166,9 +166,9 @@ class PlainCode:
         x: list[float] = list(q.home)
         if steps == 1 and self._start is not None:
             x = list(self._start[0](**{**named, UNKNOWNS: x}))
-        least = DIRECT if steps == 1 else STEPPED
+        least = q.least if steps == 1 else STEPPED
         for k in range(1, steps + 1):
-            part = k / steps
+            part = progress(k / steps)
             target = (
                 goal
                 if k == steps
@@ -179,12 +179,12 @@ class PlainCode:
                 *x, square, det = correction(**{**named, UNKNOWNS: x, q.target: target})
                 steady = before == 0.0 or (before <= CHANGE * det and det <= CHANGE * before)
                 if not (square <= CONTRACTION**2 * size and det > least and steady):
-                    return None, (k - 1) / steps
+                    return None, progress((k - 1) / steps)
                 size, before = square, det
                 if square <= CLOSED**2:
                     break
             else:
-                return None, (k - 1) / steps
+                return None, progress((k - 1) / steps)
         return x, 1.0
 
     def _many(
@@ -223,10 +223,10 @@ class PlainCode:
         if steps == 1 and self._start is not None:
             begun = self._start[1](**{**named, UNKNOWNS: list(x)})
             x = np.array([np.broadcast_to(v, count) for v in begun], float)
-        least = DIRECT if steps == 1 else STEPPED
+        least = q.least if steps == 1 else STEPPED
         alive, reached = np.ones(count, bool), np.zeros(count)
         for k in range(1, steps + 1):
-            part = k / steps
+            part = progress(k / steps)
             target = (
                 goal
                 if k == steps

@@ -30,6 +30,7 @@ from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import FREEDOMS, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
+from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import position_box
@@ -159,6 +160,7 @@ class Robot:
     friction: Coefficients = schema.section(friction_of(3), default={})
     gravity: Array = schema.vector(3, default=[0, 0, -9.81])
     limits: JointLimits = schema.section(limits_of(3), default={})
+    joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
     changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
@@ -171,7 +173,9 @@ class Robot:
 
         :raises ParameterError: by the field.
         """
-        return dataclasses.replace(schema.build(cls, data), name=name)
+        robot = dataclasses.replace(schema.build(cls, data), name=name)
+        _ = robot.controller
+        return robot
 
     # What a mechanism gives.
 
@@ -341,6 +345,14 @@ class Robot:
         """The parameters by section, as plain data."""
         fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
         return {name: schema.plain(getattr(self, name)) for name in fields}
+
+    @cached_property
+    def controller(self) -> JointMap:
+        """Between the controller's joints and the model's.
+
+        :raises ParameterError: a map of joints that there are not.
+        """
+        return JointMap.of(self.joint_names, self.joint_map)
 
     @cached_property
     def joints_count(self) -> int:

@@ -35,6 +35,7 @@ from pkm_twin.machine.graph import (
     rotation_about_z,
     unit,
 )
+from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.members import Beam, Structure, Tube
 from pkm_twin.machine.robot import (
     Payload,
@@ -214,7 +215,7 @@ class RodSpec:
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
 """The three mappings of a graph, and the schema of their entries."""
 _KEYS: Final = (
-    "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs",
+    "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs", "joint_map",
 )  # fmt: skip
 _TURNED: Final = ("com", "at", "axis", "axes", "ends")
 
@@ -261,6 +262,9 @@ class Machine(Robot):
                 effort=_together([v.effort for v in limits], math.inf),
             ),
             "payload": schema.build(Payload, data.get("payload") or {}, "payload"),
+            "joint_map": schema.checked(
+                schema.mapping(JointMapEntry), "joint_map", data.get("joint_map") or {}
+            ),
             "gravity": schema.checked(
                 schema.vector(3), "gravity", data.get("gravity", [0, 0, -9.81])
             ),
@@ -273,6 +277,7 @@ class Machine(Robot):
             pose=coordinates,
             **sections,
         )
+        _ = robot.controller
         robot.engine.check()
         robot.check_masses()
         return robot
