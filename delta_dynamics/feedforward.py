@@ -7,7 +7,7 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, cast
 
@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, JointReader, StampRules, Trajectory, as_message_error
+from pkm_twin.ros.messages import (
+    SECOND,
+    ExtraJoints,
+    JointReader,
+    StampRules,
+    Trajectory,
+    as_message_error,
+)
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.monitor import StreamMonitor
@@ -45,6 +52,7 @@ class Settings:
     accept_zero_stamp: bool = False
     trip_count: int = 5
     recovery_count: int = 5
+    extra_joints: ExtraJoints = "refuse"
     on_stop: OnStop = "nothing"
     singularity_warn: float = 0.05
     singularity_stop: float = 0.01
@@ -105,7 +113,7 @@ class Feedforward:
         self._last_good: Array | None = None
         self._differentiator = Differentiator(s.order, s.window)
         self._rules = s.stamp_rules
-        self._reader = JointReader(self.robot)
+        self._reader = JointReader(self.robot, extra_joints=s.extra_joints)
         self._continuity = Continuity(
             self.robot, s.singularity_warn, s.singularity_stop, self._reader.highest_velocity
         )
@@ -118,7 +126,7 @@ class Feedforward:
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity, friction or limits, between two samples."""
         self.robot = robot
-        self._reader = JointReader(robot)
+        self._reader = JointReader(robot, extra_joints=self.settings.extra_joints)
         self._continuity.robot = robot
 
     def change_settings(self, settings: Settings) -> None:
@@ -245,7 +253,16 @@ class Feedforward:
             efforts[part], beyond = _gate(robot, settings.limit_policy, solved)
             saturated |= beyond
         self.saturations += saturated
-        return efforts[:, t.columns]
+        return self._for_joints(efforts, t.columns)
+
+    def sent(self, effort: Array) -> Array:
+        """Efforts of the model, shape (..., n), in the controller's numbers."""
+        return self.robot.controller.controller_efforts(effort)
+
+    def _for_joints(self, efforts: Array, columns: Sequence[int]) -> Array:
+        """Efforts (p, n) in a message's order, zero for joints that the model lacks."""
+        padded = np.hstack([self.sent(efforts), np.zeros((len(efforts), 1))])
+        return np.ascontiguousarray(padded[:, columns])
 
     def _check_singularity(self, measures: Array, first: int) -> None:
         """Points of a trajectory from ``first`` on, shape (points,)."""

@@ -93,7 +93,7 @@ class DeltaDynamics(health.TwinNode):
             else None
         )
         self._reactions = self._create_reaction_publishers(robot)
-        names = list(robot.joint_names)
+        names = list(robot.controller.names)
         numbers = [0.0] * len(names)
         definition = message_definition(JOINT_STATE)
         self._decode = JointStateDecoder(definition)
@@ -152,7 +152,9 @@ class DeltaDynamics(health.TwinNode):
         self._last_heard = 0
 
     def deactivated(self) -> None:
-        """A stream that ran is stopped."""
+        """A stream that ran is stopped; goals that wait are ended."""
+        if self._action is not None:
+            self._action.deactivated()
         if self._last_heard:
             self._stop("inactive", "the node was deactivated")
 
@@ -241,6 +243,7 @@ class DeltaDynamics(health.TwinNode):
         }
 
     def _declare_changes(self, robot: Robot) -> dict[str, Any]:
+        """What is given beside the robot's file."""
         changes = {}
         for name, (section, key) in CHANGES.items():
             value = getattr(robot, section)
@@ -251,13 +254,15 @@ class DeltaDynamics(health.TwinNode):
             bounds: dict[str, Any] = {}
             if name == "payload.mass":
                 bounds = {"low": 0.0, "high": MAX_MASS}
-            changes[name] = self.declare(
+            given = self.declare(
                 name,
                 default,
                 f"the robot's {name}, by default its file's",
                 unit=UNITS[name],
                 **bounds,
             )
+            if name in self._parameter_overrides:
+                changes[name] = given
         return changes
 
     def _declare_settings(self) -> Settings:
@@ -300,6 +305,10 @@ class DeltaDynamics(health.TwinNode):
             ),
             recovery_count=self.declare(
                 "recovery_count", d.recovery_count, "good samples that start it again", **counts
+            ),
+            extra_joints=self.declare(
+                "extra_joints", d.extra_joints, "a trajectory's joints that the model lacks",
+                choices=("refuse", "zero"),
             ),
             on_stop=self.declare(
                 "on_stop", d.on_stop, "sent once on a stop",
@@ -368,11 +377,11 @@ class DeltaDynamics(health.TwinNode):
         stamp = header.sec, header.nanosec
         if core.settings.accept_zero_stamp:
             stamp = divmod(torques.stamp, SECOND)
-        self._torques.publish(self._effort_message.fill(torques.effort, stamp))
+        self._torques.publish(self._effort_message.fill(core.sent(torques.effort), stamp))
         if torques.residual is not None:
-            self._residual.publish(self._effort_message.fill(torques.residual, stamp))
+            self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))
         if self._commands is not None:
-            self._commands.publish(self._numbers_message.fill(torques.effort))
+            self._commands.publish(self._numbers_message.fill(core.sent(torques.effort)))
         # A dense solve a sample is too much for the stream's own rate.
         if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
             self._reactions_due = torques.stamp
@@ -414,6 +423,7 @@ class DeltaDynamics(health.TwinNode):
         effort = core.stop_effort()
         if effort is None:
             return
+        effort = core.sent(effort)
         self._torques.publish(self._effort_message.fill(effort, divmod(self.now(), SECOND)))
         if self._commands is not None:
             self._commands.publish(self._numbers_message.fill(effort))

@@ -75,7 +75,10 @@ class Reactions:
 
     @property
     def efforts(self) -> Array:
-        """Actuator efforts less friction, shape (..., n), N m or N, positive as in q."""
+        """What reaches the bodies of the actuators' efforts, shape (..., n), positive as in q.
+
+        N m or N; the efforts less friction and what the rotors need.
+        """
         return self.values[..., [self.components.index(name) for name in self.actuated]]
 
     def wrench(self, name: str) -> Array:
@@ -90,7 +93,7 @@ def reactions(
 
     Force and moment balance of each body (Delta-CU paper, d'Alembert's principle, section 3: at
     A, B and C of each limb), the payload fixed to the platform. The actuated components are
-    what reaches the bodies: motor effort less the joint's friction.
+    what reaches the bodies: motor effort less the joint's friction and its rotor's inertia.
 
     Which components the mechanism's statics determines is decided by the rank of the balance;
     the others are NaN, see ``Reactions.determinate`` and ``Reactions.indeterminate``.

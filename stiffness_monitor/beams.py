@@ -25,7 +25,16 @@ from numpy.typing import NDArray
 
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.members import Section
-from stiffness_monitor.structure import Carried, RigidBody, StructuralModel, Support
+from stiffness_monitor.structure import (
+    Carried,
+    RigidBody,
+    StructuralModel,
+    Support,
+    cross,
+)
+from stiffness_monitor.structure import (
+    size as length_of,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -139,9 +148,9 @@ def local_axes(along: Array) -> Array:
     """Right-handed axes whose first is the unit vector ``along``; columns, shape (3, 3)."""
     side = np.zeros(3)
     side[int(np.argmin(np.abs(along)))] = 1.0
-    y = _cross(side, along)
+    y = cross(side, along)
     y /= math.sqrt(float(y @ y))
-    return np.column_stack((along, y, _cross(along, y)))
+    return np.column_stack((along, y, cross(along, y)))
 
 
 def rigid_offset(arm: Array) -> Array:
@@ -377,7 +386,9 @@ def _nearest(nodes: _Nodes, body: str, point: Array) -> _Node:
     """The node of a body that is nearest to a point."""
     if body not in nodes:
         raise ValueError(f"{body} hangs nowhere")
-    return min(nodes[body], key=lambda node: float(np.linalg.norm(node.at - point)))
+    if len(nodes[body]) == 1:
+        return nodes[body][0]
+    return min(nodes[body], key=lambda node: length_of(node.at - point))
 
 
 def _end(
@@ -406,9 +417,3 @@ def _end(
         point,
     )
     return node, spring, size + len(loose)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    ax, ay, az = a.tolist()
-    bx, by, bz = b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

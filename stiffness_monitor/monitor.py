@@ -151,7 +151,7 @@ class Monitor:
 
     def _answer(self, sample: WrenchSample, q: Array) -> Answer:
         pose = self.robot.forward(q)
-        rotation = self.robot.rotation(pose)
+        _, rotation = self.robot.platform(q)
         turn = np.eye(3) if sample.frame == self.settings.base_frame else rotation
         fixed = np.concatenate((turn @ sample.wrench[:3], turn @ sample.wrench[3:]))
         energy = strain_energy(self.robot, pose, fixed)

@@ -83,7 +83,7 @@ def frame_energies(
 
 def checked_poses(robot: Robot, pose: ArrayLike) -> Array:
     """Poses of a robot with elastic members, refused by sample where they are none."""
-    robot.structure()
+    _ = robot.elastic
     poses = np.asarray(pose, np.float64)
     count = len(robot.pose_names)
     if poses.ndim == 0 or poses.shape[-1] != count:

@@ -25,6 +25,19 @@ from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector product of two vectors, shape (3,): numpy's costs ten times as much."""
+    ax, ay, az = a.tolist()
+    bx, by, bz = b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def size(vector: Array) -> float:
+    """Length of a vector, shape (3,)."""
+    return math.sqrt(float(vector @ vector))
+
+
 RIGID: Final = (0.0,) * 6
 """Compliance of a joint that holds all six directions."""
 FREE: Final = math.inf
@@ -113,7 +126,7 @@ def structural_model(robot: Robot, pose: Array) -> StructuralModel:
     :raises ParameterError: the robot's file lacks a section that elasticity needs.
     :raises UnreachableError: no pose of the robot.
     """
-    return _Builder(robot, robot.structure(), robot.inverse(pose)).build()
+    return _Builder(robot, robot.elastic, robot.inverse(pose)).build()
 
 
 class _Builder:
@@ -192,10 +205,10 @@ class _Builder:
         if joint.kind == "universal":
             first = self.rotations[joint.inner] @ joint.axes[0]
             second = self.rotations[joint.outer] @ joint.axes[1]
-            normal = np.cross(first, second)
-            normal /= np.linalg.norm(normal)
+            normal = cross(first, second)
+            normal /= size(normal)
             # The freedoms span the plane of both axes, right-angled or not.
-            turned = np.column_stack([first, np.cross(normal, first), normal])
+            turned = np.column_stack([first, cross(normal, first), normal])
             order = _matching(axes, turned)
             axes = turned
             values = [values[k] for k in order] + [values[3 + k] for k in order]
@@ -220,7 +233,7 @@ class _Builder:
             self.parts.append(Carried(new, at, support))
             return
         ends = [self.place(*beam.inner), self.place(*beam.outer)]
-        if np.linalg.norm(ends[1] - at) < np.linalg.norm(ends[0] - at):
+        if size(ends[1] - at) < size(ends[0] - at):
             ends.reverse()
         self.hanging.update(beam.parts)
         for part in [j for j in left if self._inside(j)]:
@@ -231,7 +244,7 @@ class _Builder:
             for body, there in ((other.inner, other.outer), (other.outer, other.inner)):
                 if body in beam.parts and self._hangs(there) and there not in beam.parts:
                     place = self.place(body, other.at)
-                    near = np.linalg.norm(place - ends[1]) < np.linalg.norm(place - ends[0])
+                    near = size(place - ends[1]) < size(place - ends[0])
                     if outer is None and near:
                         outer = Support(self._name(other), self._part(there), *self._frame(other))
                         closing = other
@@ -244,13 +257,13 @@ class _Builder:
     def _rod(self, beam: Beam, rod: Rod) -> None:
         """On a ball joint at each end; it would spin idly, so the inner one holds that spin."""
         start, end = self.place(*beam.inner), self.place(*beam.outer)
-        w = (end - start) / np.linalg.norm(end - start)
+        w = (end - start) / size(end - start)
         t = np.eye(3)[int(np.argmin(np.abs(w)))]
         if rod.pair is not None:
             t = self.rotations[rod.outer] @ rod.pair
-        e = np.cross(t, w)
-        e /= np.linalg.norm(e)
-        axes = np.column_stack([w, e, np.cross(w, e)])
+        e = cross(t, w)
+        e /= size(e)
+        axes = np.column_stack([w, e, cross(w, e)])
         supports = []
         for name, body, spin in zip(
             rod.joint_names, (rod.inner, rod.outer), (0.0, FREE), strict=True

@@ -25,7 +25,6 @@ from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
     CONTRACTION,
-    DIRECT,
     RESIDUAL,
     STEPPED,
     TURNS,
@@ -350,6 +349,8 @@ class _Writer:
         if program.equations is not None:
             residual = out.run([program.equations.residual], values)[0]
             good = b.and_(good, b.fcmp_ordered("<=", residual, out.number(RESIDUAL**2)))
+            for value in out.run(list(program.equations.branch), values):
+                good = b.and_(good, b.fcmp_ordered(">", value, out.number(0.0)))
         total = None
         for row in rows.values():
             for value in row:
@@ -407,7 +408,10 @@ class _Writer:
 
         b.position_at_end(block["step"])
         k = b.load(step)
-        part = b.fdiv(b.sitofp(k, DOUBLE), b.sitofp(self.steps, DOUBLE))
+        unity = ir.Constant(DOUBLE, 1.0)
+        left = b.fsub(unity, b.fdiv(b.sitofp(k, DOUBLE), b.sitofp(self.steps, DOUBLE)))
+        # As `progress` has it.
+        part = b.fsub(unity, b.fmul(b.fmul(left, left), left))
         final = b.icmp_signed("==", k, self.steps)
         for place, origin, value in zip(t, q.origin, values[q.target], strict=True):
             way = b.fmul(self._splat(part), b.fsub(value, n(float(origin))))
@@ -434,7 +438,7 @@ class _Writer:
             b.fcmp_ordered("<=", det, b.fmul(before, n(CHANGE))),
         )
         least = self._splat(
-            b.select(once, ir.Constant(DOUBLE, DIRECT), ir.Constant(DOUBLE, STEPPED))
+            b.select(once, ir.Constant(DOUBLE, q.least), ir.Constant(DOUBLE, STEPPED))
         )
         # NaN fails every comparison.
         sound = b.and_(b.and_(contracts, b.or_(first, steady)), b.fcmp_ordered(">", det, least))

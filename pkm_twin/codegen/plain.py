@@ -21,12 +21,12 @@ from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
     CONTRACTION,
-    DIRECT,
     RESIDUAL,
     STEPPED,
     TURNS,
     UNKNOWNS,
     Program,
+    progress,
 )
 
 Array = NDArray[np.float64]
@@ -91,8 +91,10 @@ class PlainCode:
             names[UNKNOWNS] = len(equations.home)
         self._names = list(names)
         results = [e for row in program.outputs.values() for e in row]
+        self._judged = 0
         if equations is not None:
-            results.append(equations.residual)
+            results += [equations.residual, *equations.branch]
+            self._judged = 1 + len(equations.branch)
         self._results = self._compiled(results, names)
         self._correction = self._start = None
         if equations is not None:
@@ -152,8 +154,9 @@ class PlainCode:
         except (ZeroDivisionError, ValueError, OverflowError):
             return nothing, (2.0 if reached == 1.0 else 1.0, reached)
         if q is not None:
-            *values, residual = values
-            if not residual <= RESIDUAL**2:
+            at = len(values) - self._judged
+            values, (residual, *branch) = values[:at], values[at:]
+            if not (residual <= RESIDUAL**2 and all(value > 0.0 for value in branch)):
                 return nothing, (1.0, reached)
         if not all(map(math.isfinite, values)):
             return nothing, (2.0, reached)
@@ -166,9 +169,9 @@ class PlainCode:
         x: list[float] = list(q.home)
         if steps == 1 and self._start is not None:
             x = list(self._start[0](**{**named, UNKNOWNS: x}))
-        least = DIRECT if steps == 1 else STEPPED
+        least = q.least if steps == 1 else STEPPED
         for k in range(1, steps + 1):
-            part = k / steps
+            part = progress(k / steps)
             target = (
                 goal
                 if k == steps
@@ -179,12 +182,12 @@ class PlainCode:
                 *x, square, det = correction(**{**named, UNKNOWNS: x, q.target: target})
                 steady = before == 0.0 or (before <= CHANGE * det and det <= CHANGE * before)
                 if not (square <= CONTRACTION**2 * size and det > least and steady):
-                    return None, (k - 1) / steps
+                    return None, progress((k - 1) / steps)
                 size, before = square, det
                 if square <= CLOSED**2:
                     break
             else:
-                return None, (k - 1) / steps
+                return None, progress((k - 1) / steps)
         return x, 1.0
 
     def _many(
@@ -202,7 +205,11 @@ class PlainCode:
             named[UNKNOWNS] = list(x)
         values = [np.broadcast_to(v, count) for v in self._results[1](**named)]
         if q is not None:
-            good = good & (values.pop() <= RESIDUAL**2)
+            at = len(values) - self._judged
+            values, (residual, *branch) = values[:at], values[at:]
+            good = good & (residual <= RESIDUAL**2)
+            for value in branch:
+                good = good & (value > 0.0)
         finite = np.ones(count, bool)
         for value in values:
             finite &= np.isfinite(value)
@@ -223,10 +230,10 @@ class PlainCode:
         if steps == 1 and self._start is not None:
             begun = self._start[1](**{**named, UNKNOWNS: list(x)})
             x = np.array([np.broadcast_to(v, count) for v in begun], float)
-        least = DIRECT if steps == 1 else STEPPED
+        least = q.least if steps == 1 else STEPPED
         alive, reached = np.ones(count, bool), np.zeros(count)
         for k in range(1, steps + 1):
-            part = k / steps
+            part = progress(k / steps)
             target = (
                 goal
                 if k == steps

@@ -26,19 +26,28 @@ CONTRACTION: Final = 0.25
 CHANGE: Final = 3.0
 """Most that the determinant may change by, as a factor, in one correction."""
 DIRECT: Final = 1e-3
-"""Least determinant, over the one at home, of a state that is reached in one step."""
+"""Least determinant, over the one at home, of a state that is reached in one step from home."""
 STEPPED: Final = 1e-8
 """The same with more steps: no correction can step over a singularity then."""
 RESIDUAL: Final = 1e-10
 """Largest residual of all equations, those that were not solved too, lengths over the size."""
 
 
+def progress(share: float) -> float:
+    """Part of the way after a share of the steps, 0 to 1.
+
+    The steps become short towards the end: next to a singularity only short ones contract.
+    """
+    left = 1.0 - share
+    return 1.0 - left * left * left
+
+
 @dataclass(frozen=True, eq=False)
 class Equations:
     """Unknowns x of the target q, found by Newton's method from a known state.
 
-    One step goes from ``start`` (expressions of q; None: from home) to the target at once. In k
-    steps the target moves from ``origin`` to q in k equal parts, from the unknowns ``home``.
+    One step goes from ``start`` (expressions of q; None: from home) to the target at once. In more
+    steps the target moves from ``origin`` to q, from the unknowns ``home``, by :func:`progress`.
 
     A sample is refused where a correction does not contract, where the determinant leaves its
     bounds, or where a residual stays: then it may be another root that was found.
@@ -56,6 +65,16 @@ class Equations:
     """Of the equations, over that at home."""
     residual: Expression
     """Square of the residual of all equations, of unit one."""
+    branch: Sequence[Expression] = ()
+    """Above zero in the mechanism's own branch, at the target."""
+
+    @property
+    def least(self) -> float:
+        """Least determinant of a state that is reached at once.
+
+        A closed form of the start is in the right assembly; from home a step may lead to another.
+        """
+        return DIRECT if self.start is None else STEPPED
 
     @property
     def results(self) -> list[Expression]:
@@ -89,7 +108,7 @@ class Program:
         rows = [e for row in self.outputs.values() for e in row]
         q = self.equations
         if q is not None:
-            rows += [*(q.start or ()), *q.results, q.residual]
+            rows += [*(q.start or ()), *q.results, q.residual, *q.branch]
         return rows
 
     @property

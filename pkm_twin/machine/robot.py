@@ -25,11 +25,13 @@ from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.kinematics.engine import Engine, Traced, engine_of
+from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.passive import passive_names, passive_program
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import FREEDOMS, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
+from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import position_box
@@ -88,9 +90,14 @@ def check_angles(angle: float, path: str) -> None:
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
     field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
+<<<<<<< HEAD
     units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
     entries = [(n, Array, schema.vector(joints, unit=u, **field)) for n, u in units.items()]
     return dataclasses.make_dataclass("Friction", entries, frozen=True, eq=False)
+=======
+    entries = [(n, Array, schema.vector(joints, **field)) for n in ("viscous", "coulomb")]
+    return _section("Friction", entries, joints)
+>>>>>>> main
 
 
 @remembered
@@ -102,7 +109,23 @@ def limits_of(joints: int) -> Any:
         ("velocity", Any, schema.vector(joints, unit="{joint}/s", **above)),
         ("effort", Any, schema.vector(joints, unit="{effort}", **above)),
     ]
-    return dataclasses.make_dataclass("Limits", entries, frozen=True, eq=False)
+    return _section("Limits", entries, joints)
+
+
+def _section(name: str, entries: list[tuple[str, Any, Any]], joints: int) -> Any:
+    """A section's class for so many joints; what it makes passes between processes."""
+
+    def reduce(self: Any) -> tuple[Any, ...]:
+        return _rebuilt, (name, joints, [getattr(self, entry[0]) for entry in entries])
+
+    return dataclasses.make_dataclass(
+        name, entries, frozen=True, eq=False, namespace={"__reduce__": reduce}
+    )
+
+
+def _rebuilt(name: str, joints: int, values: list[Any]) -> Any:
+    schema_of = friction_of if name == "Friction" else limits_of
+    return schema_of(joints)(*values)
 
 
 class JointLimits(Protocol):
@@ -160,11 +183,13 @@ class Robot:
     friction: Coefficients = schema.section(friction_of(3), default={})
     gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])
     limits: JointLimits = schema.section(limits_of(3), default={})
+    joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
     changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
     has_start: ClassVar[bool] = False
     has_inverse: ClassVar[bool] = False
+    has_branch: ClassVar[bool] = False
 
     @classmethod
     def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
@@ -172,7 +197,9 @@ class Robot:
 
         :raises ParameterError: by the field.
         """
-        return dataclasses.replace(schema.build(cls, data), name=name)
+        robot = dataclasses.replace(schema.build(cls, data), name=name)
+        _ = robot.controller
+        return robot
 
     # What a mechanism gives.
 
@@ -211,9 +238,16 @@ class Robot:
         """Closed form of the inverse, where ``has_inverse``."""
         raise NotImplementedError
 
-    def unreachable_limb(self, q: Array) -> tuple[int, float] | None:
-        """Limb and miss (m) of joint positions without an assembly, shape (n,); None: unknown."""
-        del q
+    def branch(self, motion: Motion) -> Sequence[Any]:
+        """Numbers that are above zero in the branch of ``forward``, where ``has_branch``."""
+        raise NotImplementedError
+
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
+        """Limb and miss (m) of joint positions without an assembly, shape (n,); None: unknown.
+
+        :param reached: part of the straight way from home up to which there is one.
+        """
+        del q, reached
         return None
 
     @cached_property
@@ -256,7 +290,9 @@ class Robot:
     def engine(self) -> Engine:
         """The engine of the robot's geometry, shared by all robots that have the same."""
         start = self.start if self.has_start else None
-        return engine_of(self.graph, self.coordinates, start, self.mechanism)
+        branch = self.branch if self.has_branch else None
+        mark = f"{self.mechanism} {self.closed_key}"
+        return engine_of(self.graph, self.coordinates, start, branch, mark)
 
     @cached_property
     def calls(self) -> dict[str, Any]:
@@ -300,6 +336,16 @@ class Robot:
         :raises ParameterError: the robot's file gives none.
         """
         return self.engine
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy in another process is made from: all but what is derived and kept."""
+        derived = {
+            name
+            for part in type(self).__mro__
+            for name, value in vars(part).items()
+            if isinstance(value, cached_property)
+        }
+        return {name: value for name, value in vars(self).items() if name not in derived}
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -347,6 +393,19 @@ class Robot:
         """Units of the same, by section; empty where a parameter has none."""
         words = {"joint": self.joint_unit, "effort": self.effort_unit}
         return schema.units(type(self), self.parameter_sections(), words)
+
+    @cached_property
+    def controller(self) -> JointMap:
+        """Between the controller's joints and the model's.
+
+        :raises ParameterError: a map of joints that there are not.
+        """
+        return JointMap.of(self.joint_names, self.joint_map)
+
+    @cached_property
+    def elastic(self) -> Structure:
+        """Elastic beams and joints; errors as :meth:`structure`."""
+        return self.structure()
 
     @cached_property
     def joints_count(self) -> int:
@@ -514,13 +573,14 @@ class Robot:
         if status is not None:
             self.refuse_joints(status, q)
         n = self.joints_count
-        return [m.reshape(*m.shape[:-1], -1, n) for m in (rates, twist)]
+        return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in (rates, twist)]
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Pose rates per joint rate (..., m, n), NaN where there is no assembly; which are good."""
         (rates, _), status = self.engine.jacobian(_NONE, q)
         good = np.ones(rates.shape[:-1], bool) if status is None else status[..., 0] == 0.0
-        return rates.reshape(*rates.shape[:-1], -1, self.joints_count), np.asarray(good)
+        n = self.joints_count
+        return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), np.asarray(good)
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Second derivative of the pose in time, shape (..., m)."""
@@ -623,7 +683,7 @@ class Robot:
             raise _not_finite("joint state", index)
         place = np.asarray(q, float)
         sample = np.broadcast_to(place, (*batch, place.shape[-1]))[index]
-        limb = self.unreachable_limb(sample)
+        limb = self.unreachable_limb(sample, reached)
         if limb is not None:
             raise UnreachableError("joint state", self.limb_names[limb[0]], index, limb[1])
         part, miss, measure = self.engine.ending(sample, reached)

@@ -175,6 +175,28 @@ def matrix(rows: int, columns: int, *, unit: str = "", default: Any = dataclasse
     return _field(check, default, f"{rows} lists of {columns} numbers", unit)
 
 
+def text(*, default: Any = dataclasses.MISSING) -> Any:
+    """Field: a non-empty text."""
+
+    def check(field: str, value: Any) -> str:
+        if not isinstance(value, str) or not value:
+            raise ParameterError(field, value, "a non-empty text")
+        return value
+
+    return _field(check, default)
+
+
+def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
+    """Field: names to sections with the schema of the dataclass ``kind``."""
+
+    def check(field: str, value: Any) -> dict[str, Any]:
+        if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
+            raise ParameterError(field, value, "a mapping of names to entries")
+        return {name: build(kind, entry, _join(field, name)) for name, entry in value.items()}
+
+    return _field(check, default)
+
+
 def flag(*, default: Any = dataclasses.MISSING) -> Any:
     """Field: true or false."""
 

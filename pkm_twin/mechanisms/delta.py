@@ -253,7 +253,7 @@ class Delta(Robot):
             misses.append(maximum(short, far))
         return Inverse(q, misses)
 
-    def unreachable_limb(self, q: Array) -> tuple[int, float] | None:
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
         """The limb that stands apart from the two closest elbows, of rods that do not meet."""
         g = self.geometry
         if "rcu" in g.closures:

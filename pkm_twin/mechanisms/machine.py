@@ -35,7 +35,12 @@ from pkm_twin.machine.graph import (
     rotation_about_z,
     unit,
 )
+<<<<<<< HEAD
 from pkm_twin.machine.members import Beam, Structure, Tube, compliances
+=======
+from pkm_twin.machine.joint_map import JointMapEntry
+from pkm_twin.machine.members import Beam, Structure, Tube
+>>>>>>> main
 from pkm_twin.machine.robot import (
     Payload,
     Robot,
@@ -222,7 +227,7 @@ class RodSpec:
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
 """The three mappings of a graph, and the schema of their entries."""
 _KEYS: Final = (
-    "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs",
+    "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs", "joint_map",
 )  # fmt: skip
 _TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
 _SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
@@ -271,6 +276,9 @@ class Machine(Robot):
                 effort=_together([v.effort for v in limits], math.inf),
             ),
             "payload": schema.build(Payload, data.get("payload") or {}, "payload"),
+            "joint_map": schema.checked(
+                schema.mapping(JointMapEntry), "joint_map", data.get("joint_map") or {}
+            ),
             "gravity": schema.checked(
                 schema.vector(3), "gravity", data.get("gravity", [0, 0, -9.81])
             ),
@@ -283,6 +291,7 @@ class Machine(Robot):
             pose=coordinates,
             **sections,
         )
+        _ = robot.controller
         robot.engine.check()
         robot.check_masses()
         return robot

@@ -29,6 +29,7 @@ paper has each link's mass at its slider joint, which ``link_com: 0`` gives.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Final
@@ -38,6 +39,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.expressions import Objects, absolute, cos, maximum, sin, sqrt
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
@@ -132,6 +134,7 @@ class Prru(Robot):
     )  # fmt: skip
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"limb {limb}" for limb in LIMBS)
     has_inverse: ClassVar[bool] = True
+    has_branch: ClassVar[bool] = True
 
     @property
     def size(self) -> float:
@@ -189,6 +192,28 @@ class Prru(Robot):
         off = [-(self._directions(i)[1] @ arms[i]) for i in range(3)]
         centre = [planes[k] @ np.array(off, dtype=object) for k in range(2)]
         return [np.array([*centre, pose[0]], dtype=object) + arm for arm in arms], norm
+
+    def branch(self, motion: Motion) -> Sequence[Any]:
+        """Height of every platform joint over its slider, on the branch's side."""
+        rises = []
+        for limb in LIMBS:
+            foot, head = (self.graph.joints[f"{w} joint {limb}"].at for w in ("slider", "platform"))
+            upper = f"upper link {limb}"
+            rises.append((motion.point(upper, head) - motion.point(upper, foot))[2] * self._sign)
+        return rises
+
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
+        """The slider farthest from the mean height: it has to come back the most."""
+        if reached < 1.0:
+            back = (1.0 - reached) * np.abs(q - q.mean())
+            return int(back.argmax()), float(back.max())
+        x = self.engine.assembled(q)
+        if x is None:
+            return None
+        rises = np.array([float(v) for v in self.branch(self.engine.at(x.tolist(), q)[0])])
+        # The first slider that has passed its platform joint, where inverse has another branch.
+        limb = int((rises <= 0.0).argmax())
+        return limb, float(-rises[limb])
 
     def solved(self, pose: Objects) -> Inverse:
         """Slider heights (equation 9), and the closure's determinant by the swings, 1 at level."""

@@ -281,7 +281,7 @@ class UprRpu(Robot):
         values["R joint 3"] = [beta - turned(2)]
         return values
 
-    def unreachable_limb(self, q: Array) -> tuple[int, float] | None:
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
         """The limb of the wrong length, and by how much."""
         a, b = self._radii
         for i in range(3):

@@ -29,6 +29,10 @@ STAMP: Final = slice(4, 12)
 """Where the stamp of a message stands that begins with a header."""
 LITTLE: Final = b"\x00\x01"
 ENDIANNESS: Final = {b"\x00\x00": ">", LITTLE: "<"}
+MAX_JOINT_STATE: Final = 2**18
+"""Bytes of a joint state, and of a trajectory at most so many names: far beyond all robots, and
+little enough that a stranger's message takes no time of the stream."""
+MAX_NAMES: Final = 1000
 POINT_ARRAYS: Final = ("positions", "velocities", "accelerations", "effort")
 TIME: Final = len(POINT_ARRAYS)
 """Place of a point's time behind its arrays."""
@@ -105,6 +109,8 @@ class JointStateDecoder:
         return self._decode(data)
 
     def _decode(self, data: bytes) -> JointStateView:
+        if len(data) > MAX_JOINT_STATE:
+            raise MessageError("bounds", f"{len(data)} bytes, at most {MAX_JOINT_STATE}")
         try:
             message = self._codec.decode(data)
         except BagError as error:
@@ -191,6 +197,8 @@ class RawTrajectory:
         sec, nanosec = struct.unpack_from(f"{order}iI", data, HEAD)
         frame, at = _text(data, STAMP.stop, order)
         count, at = _number(data, at, order)
+        if count > MAX_NAMES:
+            raise MessageError("bounds", f"{count} joint names, at most {MAX_NAMES}")
         names = []
         for _ in range(count):
             name, at = _text(data, at, order)

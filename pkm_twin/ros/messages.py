@@ -12,12 +12,13 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
+from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -42,6 +43,9 @@ COLUMNS: Final = {
     "accelerations": "acceleration",
 }
 """What a trajectory's point may carry that is read here, and the name of one such value."""
+
+
+ExtraJoints = Literal["refuse", "zero"]
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,15 @@ class StampRules:
                 f"{self.max_age / SECOND:g} s; a replayed bag needs use_sim_time and a /clock",
             )
         return stamp
+
+
+_MODEL: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
+    "position": JointMap.positions,
+    "velocity": JointMap.rates,
+    "acceleration": JointMap.rates,
+    "effort": JointMap.efforts,
+}
+"""What makes the model's numbers of a controller's."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +157,8 @@ class Trajectory:
     """A joint trajectory in the robot's joint order.
 
     ``stamp`` is zero where it starts on receipt. times (p,), s; q, qd, qdd (p, n); None where
-    absent. ``columns``: for every joint of the message, its place in the robot's order.
+    absent. ``columns``: for every joint of the message, its place in the robot's order, -1 for one
+    that the model lacks.
     """
 
     stamp: int
@@ -160,11 +174,13 @@ class JointReader:
     """Reads joint states and trajectories of one robot.
 
     ``limited``: positions and velocities beyond the robot's limits are refused, else only those
-    beyond all machines.
+    beyond all machines. ``extra_joints``: a trajectory's joints that the model lacks, such as a
+    Delta's telescopic fourth axis: ``refuse`` the trajectory, or answer them with effort ``zero``.
     """
 
     robot: Robot
     limited: bool = True
+    extra_joints: ExtraJoints = "refuse"
     _known: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -173,6 +189,8 @@ class JointReader:
         position = limits.position if self.limited else None
         velocity = limits.velocity if self.limited else None
         reach = [100.0 if unit == "m" else 2000.0 * math.pi for unit in self.robot.joint_units]
+        self._map = None if self.robot.controller.plain else self.robot.controller
+        self._names = self.robot.controller.names
         self._limited = {"position": position is not None, "velocity": velocity is not None}
         self._position = (
             [(-r, r) for r in reach] if position is None else list(map(tuple, position.tolist()))
@@ -237,11 +255,12 @@ class JointReader:
             raise MessageError("empty", f"{len(names)} joint names and {points} points")
         if points > MAX_POINTS:
             raise MessageError("bounds", f"{points} points, at most {MAX_POINTS}")
-        unknown = [name for name in names if name not in self.robot.joint_names]
-        if unknown:
+        unknown = [name for name in names if name not in self._names]
+        if unknown and self.extra_joints == "refuse":
             raise MessageError(
                 "unknown joint",
-                f"joint {shown(unknown[0])} is not one of {', '.join(self.robot.joint_names)}",
+                f"joint {shown(unknown[0])} is not one of {', '.join(self._names)}; "
+                "set extra_joints to zero for joints that the model lacks",
             )
         index = self._match(names)
         fields = given or TrajectoryFields.of(message)
@@ -263,7 +282,7 @@ class JointReader:
             q,
             self._columns("velocities", fields, index, self._velocity),
             self._columns("accelerations", fields, index, self._acceleration),
-            tuple(self.robot.joint_names.index(name) for name in names),
+            tuple(self._names.index(n) if n in self._names else -1 for n in names),
         )
 
     def check_derived(self, qd: Array, qdd: Array) -> None:
@@ -296,14 +315,14 @@ class JointReader:
             return known
         if not key:
             raise MessageError("empty", "no joint names")
-        for joint in self.robot.joint_names:
+        for joint in self._names:
             count = key.count(joint)
             if count == 0:
                 given = ", ".join(map(shown, key[:8])) + (", ..." if len(key) > 8 else "")
                 raise MessageError("missing joint", f"joint {joint!r} is missing; given: {given}")
             if count > 1:
                 raise MessageError("duplicated joint", f"joint {joint!r} stands {count} times")
-        index = [key.index(joint) for joint in self.robot.joint_names]
+        index = [key.index(joint) for joint in self._names]
         # Few and short: what strangers send is not kept.
         if len(self._known) < 16 and sum(map(len, key)) < 4096:
             self._known[key] = index
@@ -322,6 +341,8 @@ class JointReader:
         if len(values) != count:
             raise MessageError("length", f"{what}: {len(values)} values for {count} names")
         picked = [float(values[i]) for i in index]
+        if self._map is not None:
+            picked = _MODEL[what](self._map, np.array(picked)).tolist()
         for i, (value, (low, high)) in enumerate(zip(picked, bounds, strict=True)):
             if not low <= value <= high or (-TINY < value < TINY and value != 0.0):
                 if all(map(math.isnan, picked)):
@@ -339,14 +360,16 @@ class JointReader:
         given = fields.columns[what]
         if given is None:
             return None
-        if isinstance(given, Ragged) or given.shape[1] != len(index):
+        if isinstance(given, Ragged) or given.shape[1] != len(fields.names):
             point, length = (
                 (given.point, given.length) if isinstance(given, Ragged) else (0, given.shape[1])
             )
             raise MessageError(
-                "length", f"point {point}: {length} {what} for {len(index)} joint names"
+                "length", f"point {point}: {length} {what} for {len(fields.names)} joint names"
             )
         values = given[:, index]
+        if self._map is not None:
+            values = _MODEL[COLUMNS[what]](self._map, values)
         box = np.array(bounds)
         size = np.abs(values)
         good = (values >= box[:, 0]) & (values <= box[:, 1]) & ((size >= TINY) | (size == 0.0))

@@ -104,6 +104,7 @@ class TestInfo:
         assert rows["gravity"].endswith(" m/s2")
         if robot.limits.effort is not None and "limits" in units:
             assert units["limits"]["effort"] == robot.effort_units[0]
+        assert rows["pose"] and rows["actuated joints"].count("(") == len(robot.joint_names)
 
 
 def test_overconstraint_is_named(twin):

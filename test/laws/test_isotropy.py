@@ -3,7 +3,8 @@
 
 import numpy as np
 import pytest
-from pkm_twin.machine.joints import platform_motion
+from support import robots
+from support.robots import loaded, loaded_like, random_joints
 
 from delta_dynamics import (
     energy,
@@ -20,16 +21,11 @@ from delta_dynamics import (
     tilted_pose,
 )
 from delta_dynamics.isotropy import _descended, _largest, least_direction
-from pkm_twin import load, robot_names
+from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError
-from test.conftest import random_joints
 
-MASSIVE = [name for name in robot_names() if load(name).dynamics_kernel is not None]
-LOADED = {
-    "payload": {"mass": 0.3, "com": [0.01, -0.02, -0.04], "inertia": [4e-4, 5e-4, 3e-4]},
-    "gravity": [0.5, -1.0, -9.7],
-    "friction": {"viscous": [0.1, 0.2, 0.3], "coulomb": [0.05, 0.06, 0.07]},
-}
+MASSIVE = [name for name in robots.MASSIVE if len(load(name).joint_names) == 3]
+"""Directions are on a sphere: machines of three freedoms."""
 THIRD = 2 * np.pi / 3
 TURN = np.array([[np.cos(THIRD), -np.sin(THIRD), 0], [np.sin(THIRD), np.cos(THIRD), 0], [0, 0, 1]])
 
@@ -38,34 +34,17 @@ massive = pytest.mark.parametrize("name", MASSIVE)
 
 @pytest.fixture
 def robot(name):
-    return load(name).changed(**LOADED)
+    return loaded(name)
 
 
 @pytest.fixture
 def head():
-    if "prru" not in MASSIVE:
-        pytest.skip("no 3-PRRU in config")
     return load("prru")
 
 
 def energy_of(robot):
     """A platform energy at which both gravity and velocity count, J."""
-    return 100.0 if robot.joint_unit == "m" else 1.0
-
-
-@massive
-def test_the_platform_frame_is_that_of_the_kinematics(name, robot, rng):
-    q = random_joints(robot, rng, 100)
-    qd = rng.normal(size=q.shape)
-    platform = platform_motion(robot, q, qd)
-    pose = robot.forward(q)
-    np.testing.assert_allclose(platform.axes, robot.rotation(pose), atol=1e-13)
-    twist = np.einsum("nij,nj->ni", robot.platform_jacobian(q), qd)
-    np.testing.assert_allclose(platform.velocity, twist[:, :3], atol=1e-12)
-    turned = np.cross(twist[:, None, 3:], platform.axes.swapaxes(-1, -2)).swapaxes(-1, -2)
-    np.testing.assert_allclose(platform.axes_rate, turned, atol=1e-12)
-    rates, _ = robot.pose_rates(platform)
-    np.testing.assert_allclose(rates, np.einsum("nij,nj->ni", robot.jacobian(q), qd), atol=1e-12)
+    return 100.0 if robot.joint_units[0] == "m" else 1.0
 
 
 @massive
@@ -115,7 +94,7 @@ def test_a_payload_moves_with_the_platform(name, rng):
     """It adds the same energy to the platform as to the whole machine."""
     robot = load(name)
     pose = robot.forward(random_joints(robot, rng, 20))
-    empty, loaded = energy_matrices(robot, pose), energy_matrices(robot.changed(**LOADED), pose)
+    empty, loaded = energy_matrices(robot, pose), energy_matrices(loaded_like(robot), pose)
     added = loaded[0] - empty[0]
     np.testing.assert_allclose(added, loaded[1] - empty[1], atol=1e-12 * np.abs(empty[1]).max())
     assert (np.linalg.eigvalsh(added) > 0).all()

@@ -16,6 +16,7 @@ from stiffness_monitor import compliance
 from stiffness_monitor.beams import assemble
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
 from stiffness_monitor.statics import frame_compliance
+from stiffness_monitor.structure import structural_model
 from test.conftest import parameters_of, random_joints
 
 ROBOTS = ("delta", "delta_cu", "prru", "upr_rpu")
@@ -112,7 +113,7 @@ def test_locked_drives_carry_what_virtual_work_says(name, rng):
     robot = load(name)
     for pose in random_poses(robot, rng, 4):
         wrench = rng.normal(size=6)
-        frame = robot.frame(pose)
+        frame = structural_model(robot, pose)
         system = assemble(frame, 2)
         load_vector = np.zeros(len(system.mass))
         load_vector[:6] = wrench
@@ -120,7 +121,7 @@ def test_locked_drives_carry_what_virtual_work_says(name, rng):
         q = robot.inverse(pose)
         expected = -robot.platform_jacobian(q).T @ wrench
         driven = [
-            k for k, member in enumerate(frame.members)
+            k for k, member in enumerate(frame.parts)
             if name == "upr_rpu" or member.inner.body == "base"
         ]  # fmt: skip
         for i, k in enumerate(driven):
@@ -301,10 +302,10 @@ def test_shares_sum_to_one_and_the_platforms_is_that_of_its_shape(name, rng):
     index = shares.elements.index("platform")
     assert np.abs(shares.strain[..., index]).max() == 0.0
     for k, pose in enumerate(poses):
-        body = robot.frame(pose).bodies[0]
+        body = structural_model(robot, pose).bodies[0]
         moved = found.shapes[k, :, found.nodes.index("platform")]
         spin = moved[:, 3:]
-        velocity = moved[:, :3] + np.cross(spin, body.com)
+        velocity = moved[:, :3] + np.cross(spin, body.at - robot.platform(robot.inverse(pose))[0])
         energy = body.mass * (velocity**2).sum(-1) + np.einsum(
             "ki,ij,kj->k", spin, body.inertia, spin
         )
@@ -433,7 +434,7 @@ def test_bad_arguments_are_refused():
 
 
 def test_the_wall_of_a_tube_follows_from_its_mass():
-    members = load("delta_cu").frame(load("delta_cu").home()).members
+    members = structural_model(load("delta_cu"), load("delta_cu").home()).parts
     inner = {m.name: m.section.inner_diameter for m in members}
     assert inner["arm I"] == pytest.approx(0.03110, abs=1e-5)
     assert inner["forearm I a"] == pytest.approx(0.01389, abs=1e-5)
@@ -464,7 +465,9 @@ def test_an_inner_diameter_can_stand_for_the_density(with_members):
     robot = load("delta")
     members = parameters_of("delta")["members"]
     del members["arm"]["density"]
-    members["arm"]["inner_diameter"] = robot.frame(robot.home()).members[0].section.inner_diameter
+    members["arm"]["inner_diameter"] = (
+        structural_model(robot, robot.home()).parts[0].section.inner_diameter
+    )
     other = with_members("delta", members)
     assert natural_frequencies(other, robot.home()) == pytest.approx(
         natural_frequencies(robot, robot.home())

@@ -209,10 +209,13 @@ def test_forward_undoes_inverse_for_any_size(branch: str, seed: int) -> None:
     pose = poses(5000, 85, seed)
     q, kept = robot.try_inverse(pose)
     assert kept.sum() > 300
-    again = robot.forward(q[kept])
+    again, found = robot.try_forward(q[kept])
+    # Within a hair of the singularity there is nothing that can be told from its far side.
+    assert (~found).sum() <= 2
+    again, pose, q = again[found], pose[kept][found], q[kept][found]
     # At the singularity the pose turns without the sliders: the bound is on the sliders.
-    np.testing.assert_allclose(robot.inverse(again), q[kept], atol=1e-13)
-    np.testing.assert_allclose(again, pose[kept], atol=1e-7)
+    np.testing.assert_allclose(robot.inverse(again), q, atol=1e-13)
+    np.testing.assert_allclose(again, pose, atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -142,8 +142,13 @@ class TestEveryRobot:
             compliance(robot, [50.0, 50.0, 50.0] if name != "prru" else [0.0, 3.0, 0.0])
 
     def test_kernels_are_there_to_warm_up(self, name):
-        for kernel in kernels(load(name)):
+        made = kernels(load(name))
+        assert made
+        for kernel in made:
             kernel.warm_up()
+            parameters, sizes = np.zeros(kernel.program.parameters), kernel.sizes[0]
+            outputs, _ = kernel(parameters, *(np.zeros(size) for size in sizes))
+            assert [len(row) for row in outputs] == list(kernel.sizes[1])
 
 
 @NAMES

@@ -61,7 +61,7 @@ def test_inverse_is_the_distance_of_the_ends():
         _, rotation, upper, lower = points(ROBOT, pose)
         lengths = np.linalg.norm(upper - lower, axis=1)
         assert ROBOT.inverse(pose) == pytest.approx(lengths, rel=1e-13)
-        assert ROBOT.rotation(pose) == pytest.approx(rotation, abs=1e-15)
+        assert ROBOT.rotation(pose) == pytest.approx(rotation, abs=1e-14)
 
 
 def test_constraints_of_the_limbs_hold():

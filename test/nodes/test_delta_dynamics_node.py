@@ -361,7 +361,6 @@ class TestParameters:
         [
             (["payload.masss:=0.1"], "did you mean 'payload.mass'"),
             (["mechanism:=delta_uc"], "did you mean 'delta_cu'"),
-            (["mechanism:=upr_rpu"], "mechanism: 'upr_rpu'"),
             (["mechanism:=/nonexistent/robot.yaml"], "/nonexistent/robot.yaml"),
             (["payload.mass:=.nan"], "payload.mass: nan"),
             (["payload.mass:=heavy"], "payload.mass: 'heavy'"),

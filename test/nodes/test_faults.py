@@ -244,9 +244,10 @@ class TestLoad:
         twin.peer.until(lambda: node.count_subscribers("/late/joint_torques") > heard, 60.0)
         listener.process.send_signal(signal.SIGSTOP)
         try:
-            # Ten times as many as the queue of the one that stands still: each is answered.
-            for _ in range(100):
-                twin.since([at_pace(twin, 1)[0]])
+            # Ten times as many as the queue of the one that stands still holds.
+            torques = twin.received("joint_torques")
+            torques.clear()
+            twin.peer.until(lambda: len(torques) > 100, repeat=lambda: at_pace(twin, 5))
         finally:
             listener.process.send_signal(signal.SIGCONT)
 

@@ -256,15 +256,15 @@ def write(folder, summary, watched, ages):
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "soak.json").write_text(json.dumps(summary, indent=2) + "\n")
     figure, axes = pyplot.subplots(2, 2, figsize=(10, 6), layout="constrained")
-    for name, w in watched.items():
+    for (name, w), style in zip(watched.items(), ("-", "--", ":"), strict=True):
         minutes = np.array(w.time) / 60
-        axes[0, 0].plot(minutes, np.array(w.memory) / 2**20, label=name)
-        axes[0, 1].plot(minutes, w.descriptors, label=name)
-        axes[1, 0].plot(minutes, w.threads, label=name)
+        axes[0, 0].plot(minutes, np.array(w.memory) / 2**20, style, label=name)
+        axes[0, 1].plot(minutes, w.descriptors, style, label=name)
+        axes[1, 0].plot(minutes, w.threads, style, label=name)
     for ax, what in zip(axes.flat, ("memory (MiB)", "descriptors", "threads"), strict=False):
         ax.set_xlabel("time (min)")
         ax.set_ylabel(what)
-        ax.set_ylim(bottom=0)
+        ax.set_ylim(0, 1.2 * ax.get_ylim()[1])
         ax.legend()
     axes[1, 1].hist(np.array(ages) * 1e3, bins=np.geomspace(0.05, 1e3, 80))
     axes[1, 1].set(

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Programs: expressions, both back ends, the sparse factors, and the cache of compiled code."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from support.robots import every_robot, random_joints
+
+from pkm_twin import load
+from pkm_twin.codegen import expressions as ex
+from pkm_twin.codegen import kernels
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.lu import SparseLU, independent_rows
+from pkm_twin.codegen.plain import PlainCode
+from pkm_twin.codegen.program import Program
+
+NONE = np.zeros(0)
+compiled = pytest.mark.skipif(not kernels.compiled(), reason="no compiler here")
+
+
+def program(write, size):
+    """A program of one input x of that size."""
+    tape = ex.Tape()
+    results = write(tape.inputs("x", size))
+    return Program({"x": size}, 0, {"y": [tape.lift(r) for r in results]})
+
+
+def both(write, x, key):
+    """What compiled and plain code give for samples x, shape (count, size)."""
+    made = program(write, x.shape[1])
+    (fast,), status = Kernel(lambda: made, key)(NONE, x)
+    assert status is None
+    (slow,), codes = PlainCode(made).run(NONE, [x], len(x), 1)
+    assert not codes[:, 0].any()
+    return fast, slow
+
+
+def formula(x):
+    a, b, c, d = x
+    s = ex.sqrt(a * a + b * b + 1.0)
+    return [
+        a + b, a - b, a * b, -a, a / s, s, ex.sin(a), ex.cos(b), ex.absolute(c), ex.sign(d),
+        ex.atan2(a, b), ex.minimum(a, c), ex.maximum(b, d), (a + b) * (a - b) - c / s + 3.0 * d,
+        ex.sin(a) * ex.cos(a) - (-b) * (-c), 2.0 - (3.0 - a), (a - b) - (b - a), 0.0 * a + 1.0 * b,
+    ]  # fmt: skip
+
+
+def test_expressions_are_numpys_numbers(rng):
+    """The same formula on expressions, compiled and plain, and on arrays of floats."""
+    x = rng.normal(size=(501, 4))
+    x[0] = 0.0
+    expected = np.stack(np.broadcast_arrays(*formula(x.T)), -1)
+    fast, slow = both(formula, x, "test formula")
+    np.testing.assert_allclose(fast, expected, rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(slow, expected, rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(fast, slow, rtol=1e-13, atol=1e-13)
+
+
+def test_equal_expressions_are_one_and_constants_fold():
+    tape = ex.Tape()
+    a, b = tape.inputs("x", 2)
+    assert a + b is b + a
+    assert ex.sin(a) is ex.sin(a)
+    assert (a * 0.0).is_constant(0.0)
+    assert a * 1.0 is a
+    assert a - a is tape.constant(0.0)
+    assert 0.0 - (-a) is a
+    assert ex.sqrt(tape.constant(4.0)).is_constant(2.0)
+    # The sign of zero is another number to atan2.
+    assert tape.constant(0.0) is not tape.constant(-0.0)
+
+
+@compiled
+def test_sine_cosine_and_arctangent_over_large_ranges(rng):
+    """Within an ulp or two of numpy's, from tiny to a million turns, and in every quadrant."""
+    size = np.concatenate([10.0 ** rng.uniform(-300, -3, 500), 10.0 ** rng.uniform(-3, 6, 4000)])
+    a = size * rng.choice([-1.0, 1.0], len(size))
+    near = np.pi / 2 * rng.integers(-1000, 1000, 1000) + rng.normal(0.0, 1e-9, 1000)
+    a = np.concatenate([a, near, [0.0]])[:, None]
+    fast, _ = both(lambda x: [ex.sin(x[0]), ex.cos(x[0])], a, "test sincos")
+    # The reduction has three parts of pi / 2: what they miss grows with the turns.
+    bound = 4e-16 + 5e-21 * np.abs(a[:, 0])
+    assert (np.abs(fast[:, 0] - np.sin(a[:, 0])) <= bound).all()
+    assert (np.abs(fast[:, 1] - np.cos(a[:, 0])) <= bound).all()
+    small = np.abs(a[:, 0]) < 1e-3
+    np.testing.assert_allclose(fast[small, 0], np.sin(a[small, 0]), rtol=4e-16)
+    pairs = 10.0 ** rng.uniform(-100, 100, (4000, 2)) * rng.choice([-1.0, 1.0], (4000, 2))
+    pairs[:2000] = rng.normal(size=(2000, 2))
+    special = [[0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 0.0], [1.0, 1.0]]
+    pairs = np.concatenate([pairs, special])
+    fast, _ = both(lambda x: [ex.atan2(x[0], x[1])], pairs, "test atan2")
+    np.testing.assert_allclose(fast[:, 0], np.arctan2(*pairs.T), rtol=5e-16, atol=1e-300)
+
+
+@every_robot
+def test_both_back_ends_agree_and_one_sample_has_the_bits_of_its_batch(name, rng):
+    robot = load(name)
+    q = random_joints(robot, rng, 9)
+    for kernel in (robot.engine.forward, robot.engine.jacobian):
+        outputs, status = kernel(NONE, q)
+        assert status is None
+        slow, codes = PlainCode(kernel.program).run(NONE, [q], len(q), 4)
+        good = codes[:, 0] == 0.0
+        assert good.any()
+        for fast, plain in zip(outputs, slow, strict=True):
+            size = max(1.0, np.abs(fast).max())
+            np.testing.assert_allclose(fast[good], plain[good], rtol=1e-13, atol=1e-13 * size)
+        for k in range(len(q)):
+            single, _ = kernel(NONE, q[k].copy())
+            for fast, one in zip(outputs, single, strict=True):
+                np.testing.assert_array_equal(one, fast[k])
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 12])
+def test_sparse_factors_solve_as_numpy_does(size, rng):
+    for _ in range(5):
+        full = rng.normal(size=(size, size)) * (rng.random((size, size)) < 0.5)
+        full += np.eye(size)[rng.permutation(size)] * 3.0
+        right = rng.normal(size=size)
+        objects = full.astype(object)
+        lu = SparseLU(objects, full[None])
+        np.testing.assert_allclose(
+            lu.solve(right).astype(float), np.linalg.solve(full, right), rtol=1e-9, atol=1e-10
+        )
+        np.testing.assert_allclose(
+            lu.solve_transposed(right).astype(float), np.linalg.solve(full.T, right),
+            rtol=1e-9, atol=1e-10,
+        )  # fmt: skip
+        assert float(lu.inverse_determinant) * np.linalg.det(full) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_independent_rows_are_a_basis_of_all_rows(rng):
+    base = rng.normal(size=(3, 4, 6))
+    mixed = np.einsum("ij,kjl->kil", rng.normal(size=(9, 4)), base)
+    chosen = independent_rows(mixed)
+    assert len(chosen) == 4
+    assert (np.linalg.matrix_rank(mixed[:, chosen]) == 4).all()
+
+
+PROGRAM = """
+import logging, sys
+logging.basicConfig(level=logging.WARNING, format="%(message)s")
+from pkm_twin import load
+robot = load("delta")
+print(robot.forward([0.1, 0.2, 0.3]).tolist(), robot.jacobian([0.1, 0.2, 0.3]).tolist())
+"""
+
+
+def start(folder):
+    environment = {k: v for k, v in os.environ.items() if k != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
+    environment |= {"PKM_TWIN_CACHE": str(folder), "PYTHONPATH": os.pathsep.join(sys.path)}
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM], env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def finished(process):
+    out, error = process.communicate(timeout=250)
+    assert process.returncode == 0, error
+    return out, error.splitlines()
+
+
+@compiled
+def test_the_cache_is_an_optimisation(tmp_path):
+    """Two at once, then damaged files, then no folder at all: the same numbers every time."""
+    folder = tmp_path / "cache"
+    first, second = [finished(p) for p in [start(folder), start(folder)]]
+    assert first == second and not first[1]
+    stored = sorted(folder.iterdir())
+    assert len(stored) == 2
+    whole = [path.read_bytes() for path in stored]
+    for damaged in (whole[0][:100], b"", b"\0" * len(whole[0]), whole[0][:-1] + b"\1"):
+        stored[0].write_bytes(damaged)
+        assert finished(start(folder)) == first
+        assert [path.read_bytes() for path in sorted(folder.iterdir())] == whole
+    blocked = tmp_path / "file"
+    blocked.write_text("no folder")
+    out, lines = finished(start(blocked))
+    assert out == first[0]
+    assert len(lines) == 1 and "compiled programs are not kept" in lines[0]
