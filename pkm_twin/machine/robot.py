@@ -90,14 +90,9 @@ def check_angles(angle: float, path: str) -> None:
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
     field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
-<<<<<<< HEAD
     units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
     entries = [(n, Array, schema.vector(joints, unit=u, **field)) for n, u in units.items()]
-    return dataclasses.make_dataclass("Friction", entries, frozen=True, eq=False)
-=======
-    entries = [(n, Array, schema.vector(joints, **field)) for n in ("viscous", "coulomb")]
     return _section("Friction", entries, joints)
->>>>>>> main
 
 
 @remembered

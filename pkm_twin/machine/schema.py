@@ -4,7 +4,7 @@
 A mechanism declares its schema as frozen dataclasses whose fields are made by the functions below.
 A field's metadata hold its ``check``, its ``key`` in the file, its ``unit`` (``{joint}``,
 ``{effort}`` and ``{rotor}`` stand for those of the actuated joints), its ``bound`` in words, its
-``default``, and of a nested section its ``section``.
+``default``, of a nested section its ``section``, and of names to sections that of the ``entries``.
 
 May import: numpy, yaml, the standard library.
 """
@@ -183,7 +183,7 @@ def text(*, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, value, "a non-empty text")
         return value
 
-    return _field(check, default)
+    return _field(check, default, "a non-empty text")
 
 
 def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
@@ -194,7 +194,7 @@ def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, value, "a mapping of names to entries")
         return {name: build(kind, entry, _join(field, name)) for name, entry in value.items()}
 
-    return _field(check, default)
+    return _field(check, default, "a mapping of names to entries", entries=kind)
 
 
 def flag(*, default: Any = dataclasses.MISSING) -> Any:
@@ -411,9 +411,11 @@ def units(kind: type, data: Mapping[str, Any], words: Mapping[str, str]) -> dict
     result: dict[str, Any] = {}
     for key, value in data.items():
         metadata = fields.get(key, {})
-        nested = metadata.get("section")
+        nested, entries = metadata.get("section"), metadata.get("entries")
         if nested is not None and isinstance(value, Mapping):
             result[key] = units(nested, value, words)
+        elif entries is not None:
+            result[key] = {name: units(entries, entry, words) for name, entry in value.items()}
         else:
             result[key] = metadata.get("unit", "").format_map(words)
     return result
@@ -434,10 +436,11 @@ def _field(
     *,
     key: str | None = None,
     kind: type | None = None,
+    entries: type | None = None,
 ) -> Any:
     metadata = {
         "check": check, "key": key, "unit": unit, "bound": bound, "default": default,
-        "section": kind,
+        "section": kind, "entries": entries,
     }  # fmt: skip
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata=metadata)

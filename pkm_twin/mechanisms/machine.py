@@ -35,12 +35,8 @@ from pkm_twin.machine.graph import (
     rotation_about_z,
     unit,
 )
-<<<<<<< HEAD
-from pkm_twin.machine.members import Beam, Structure, Tube, compliances
-=======
 from pkm_twin.machine.joint_map import JointMapEntry
-from pkm_twin.machine.members import Beam, Structure, Tube
->>>>>>> main
+from pkm_twin.machine.members import Beam, Structure, Tube, compliances
 from pkm_twin.machine.robot import (
     Payload,
     Robot,

@@ -8,6 +8,7 @@ import inspect
 import sys
 from pathlib import Path
 
+from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.members import Tube
 from pkm_twin.machine.robot import Payload, friction_of, limits_of
 from pkm_twin.machine.schema import plain
@@ -41,6 +42,7 @@ example in [new_machine.md](new_machine.md). `friction` and `limits` stand at th
 | `origin` | m | 3 numbers: the platform's reference point at home | the platform's com |
 | `pose` |  | of x, y, z, roll, pitch, yaw as many as the mobility | the first that will do |
 | `bodies`, `joints`, `rods` |  | mappings of names to entries | none |
+| `joint_map` |  | a mapping of names to entries | none |
 | `limbs` |  | one section or a list: `azimuths` (rad), `bodies`, `joints`, `rods` | none |
 
 What stands in `limbs` is given for azimuth 0, copied and turned about base z by each azimuth, its
@@ -49,6 +51,8 @@ names with _1, _2 and so on; bodies of the section itself are the copy's, others
 
 FRICTION = "At the actuated joints, against the rate: viscous by its amount, Coulomb by its sign."
 LIMITS = "What nodes and commands refuse or warn of; without them there is no limit."
+JOINT_MAP = """Between a controller's numbers and the model's: its name for the joint, and
+controller = offset + sign * ratio * model."""
 GRAVITY = """### `gravity`
 
 Acceleration of free fall in base axes, m/s2; default [0, 0, -9.81]."""
@@ -63,7 +67,7 @@ def default(field):
     if value is None:
         return "none"
     if value == {}:
-        return "its own defaults"
+        return "none" if field.metadata["entries"] else "its own defaults"
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(plain(value)).replace("'", "")
@@ -123,6 +127,7 @@ def page():
     parts.append(table("`payload`", Payload))
     parts.append(table("`friction`, by actuated joint (here three)", friction_of(3), FRICTION))
     parts.append(table("`limits`, by actuated joint (here three)", limits_of(3), LIMITS))
+    parts.append(table("`joint_map.NAME`, by actuated joint", JointMapEntry, JOINT_MAP))
     parts.append(table("Tube", Tube))
     parts.append(GRAVITY)
     return "\n\n".join(parts) + "\n"
