@@ -391,7 +391,9 @@ def replace(section_value: T, changes: Mapping[str, object], path: str) -> T:
 
 
 def plain(value: Any) -> Any:
-    """Dataclasses, arrays and tuples as mappings and lists."""
+    """Dataclasses, arrays and tuples as mappings and lists, in mappings too."""
+    if isinstance(value, Mapping):
+        return {name: plain(entry) for name, entry in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):
