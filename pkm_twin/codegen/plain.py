@@ -158,7 +158,7 @@ class PlainCode:
             values, (residual, *branch) = values[:at], values[at:]
             if not (residual <= RESIDUAL**2 and all(value > 0.0 for value in branch)):
                 return nothing, (1.0, reached)
-        if not all(map(math.isfinite, values)):
+        if not all(map(math.isfinite, [*values, *(v for row in inputs for v in row)])):
             return nothing, (2.0, reached)
         return self._split(values), (0.0, reached)
 
@@ -211,6 +211,8 @@ class PlainCode:
             for value in branch:
                 good = good & (value > 0.0)
         finite = np.ones(count, bool)
+        for row in inputs:
+            finite &= np.isfinite(row).all(-1)
         for value in values:
             finite &= np.isfinite(value)
         code = np.where(good, np.where(finite, 0.0, 2.0), 1.0)

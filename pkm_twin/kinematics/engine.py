@@ -11,6 +11,7 @@ May import: numpy, pkm_twin's machine and codegen, this package, the standard li
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -266,6 +267,8 @@ class Engine:
         last = np.inf
         for _ in range(12):
             values, table, _ = self._look(x, q)
+            if not (np.isfinite(values).all() and np.isfinite(table).all()):
+                return None
             step = np.asarray(np.linalg.lstsq(table, -values, rcond=RANK)[0], np.float64)
             size = float(np.abs(step).max(initial=0.0))
             if not size < 0.5 * last:
@@ -276,40 +279,41 @@ class Engine:
             last = max(size, 1e-13)
         return None
 
+    def reach(
+        self, q: Array, limit: float = 1.0, precision: float = 1e-4
+    ) -> tuple[float, Array, float]:
+        """How far the straight way from home to q leads without passing a singularity.
+
+        :param limit: part of the way beyond which nothing is looked for.
+        :returns: the part of the way, the unknowns there, and the closures' least reciprocal
+            condition on it.
+        """
+        home = self.graph.home
+        x, done = np.array(self.tree.home, float), 0.0
+        side, least = self._regularity(x, home)
+        step = 1 / 8
+        while step > precision and done < 1.0:
+            way = min(1.0, done + step)
+            there = home + way * (q - home)
+            new = self._closed(there, x)
+            # Beyond a singularity is another assembly.
+            sign, measure = (0.0, 0.0) if new is None else self._regularity(new, there)
+            if new is None or sign != side or way > limit:
+                step /= 8
+                continue
+            x, done, least = new, way, min(least, measure)
+        return done, x, least
+
     def ending(self, q: Array, reached: float) -> tuple[str, float, float | None]:
         """Why no assembly is found beyond a part of the straight way from home to q.
 
         :returns: the part that falls short the most, by how much (m), and None; or, where there is
             an assembly behind a singularity, the closures' least reciprocal condition on the way.
         """
-        home = self.graph.home
-        x, done = np.array(self.tree.home, float), 0.0
-        side, least = self._regularity(x, home)
-        step = 1 / 8
-        while step > 1e-4 and done < 1.0:
-            way = min(1.0, done + step)
-            there = home + way * (q - home)
-            new = self._closed(there, x)
-            # Beyond a singularity is another assembly.
-            sign, measure = (0.0, 0.0) if new is None else self._regularity(new, there)
-            if new is None or sign != side or way > max(reached, 1e-12) + 1 / 8:
-                step /= 8
-                continue
-            x, done, least = new, way, min(least, measure)
+        _, x, least = self.reach(q, max(reached, 1e-12) + 1 / 8)
         part, miss = self._shortest(x, q)
         # Where nothing falls short there is an assembly, but the way does not lead to it.
         return part, miss, least if miss < 1e-9 * self.tree.size else None
-
-    def assembled(self, q: Array) -> Array | None:
-        """Unknowns of a state that 64 steps lead to from home; None where they do not."""
-        x: Array | None = np.array(self.tree.home, float)
-        for way in np.arange(1, 65) / 64:
-            x = (
-                None
-                if x is None
-                else self._closed(self.graph.home + way * (q - self.graph.home), x)
-            )
-        return x
 
     def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
         """Sign of the determinant of the kept closures, and their reciprocal condition."""
@@ -320,6 +324,8 @@ class Engine:
         """The closure that misses the most where all together miss the least, and by how much."""
         values, table, _ = self._look(x, q)
         for _ in range(20):
+            if not (np.isfinite(values).all() and np.isfinite(table).all()):
+                return self._parts[0], math.inf
             damped = table.T @ table + 1e-6 * np.eye(table.shape[1])
             step = np.asarray(np.linalg.solve(damped, -table.T @ values), np.float64)
             step *= min(1.0, 0.2 / max(float(np.abs(step).max(initial=0.0)), 1e-300))

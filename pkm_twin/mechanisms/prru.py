@@ -37,7 +37,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.codegen.expressions import Objects, absolute, cos, maximum, sin, sqrt
+from pkm_twin.codegen.expressions import Objects, absolute, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
@@ -45,7 +45,14 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
 from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import Inverse, Robot, check_azimuths, length, mass
+from pkm_twin.machine.robot import (
+    SINGULARITY_BOUND,
+    Inverse,
+    Robot,
+    check_azimuths,
+    length,
+    mass,
+)
 
 Array = NDArray[np.float64]
 
@@ -204,12 +211,11 @@ class Prru(Robot):
 
     def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
         """The slider farthest from the mean height: it has to come back the most."""
-        if reached < 1.0:
-            back = (1.0 - reached) * np.abs(q - q.mean())
+        way, x, _ = self.engine.reach(q, precision=1e-9)
+        if way < 1.0:
+            back = (1.0 - way) * np.abs(q - q.mean())
             return int(back.argmax()), float(back.max())
-        x = self.engine.assembled(q)
-        if x is None:
-            return None
+        del reached
         rises = np.array([float(v) for v in self.branch(self.engine.at(x.tolist(), q)[0])])
         # The first slider that has passed its platform joint, where inverse has another branch.
         limb = int((rises <= 0.0).argmax())
@@ -221,6 +227,8 @@ class Prru(Robot):
         corners, norm = self._corners(pose)
         l, sign = g.limb_length, self._sign  # noqa: E741
         q, misses, out, up = [], [], [], []
+        # Where gamma is not told, nothing is: the pose is singular.
+        told = maximum(0.0, minimum(1.0, norm / SINGULARITY_BOUND - 1.0))
         for i, corner in enumerate(corners):
             e, _ = self._directions(i)
             aside = corner @ e + g.base_radius
@@ -228,7 +236,7 @@ class Prru(Robot):
             out.append(aside)
             up.append(rise)
             q.append(corner[2] - rise)
-            misses.append(absolute(aside) - l)
+            misses.append((absolute(aside) - l) * told)
         # Side k of the platform's triangle from joint k to k + 1: its change by both swings.
         before: list[Any] = []
         after: list[Any] = []
@@ -242,8 +250,7 @@ class Prru(Robot):
         sides = [np.cos(g.azimuths[k] - g.azimuths[(k + 1) % 3]) for k in range(3)]
         scale = np.sqrt(np.prod([2 * g.platform_radius**2 * (1 - side) for side in sides]))
         measure = determinant * float(-sign / (2 * l**3 * scale))
-        # Where gamma is not told, there is no measure either.
-        return Inverse(q, misses, measure * (norm / maximum(norm, 1e-9)))
+        return Inverse(q, misses, measure * told)
 
     def grid(self) -> PoseGrid:
         """Tilts about the vertical axis, in tilt-and-torsion angles without torsion."""
