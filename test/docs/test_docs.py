@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from pkm_twin import robot_names
 from test.docs import architecture, engine, parameters
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -76,3 +77,10 @@ def test_the_arrows_of_the_picture_go_down():
     for here, there in pairs:
         if {here, there} != {"machine", "kinematics"}:
             assert places[there][1] < places[here][1], f"{here} imports {there}"
+
+
+def test_every_robot_has_its_picture():
+    """Else `make pages` draws it."""
+    for name in robot_names():
+        assert (DOCS / "gallery" / f"robot_{name}.png").stat().st_size, name
+        assert f"robot_{name}.png" in (DOCS / "gallery.md").read_text(encoding="utf-8")
