@@ -50,12 +50,12 @@ _NONE: Final = np.zeros(0)
 
 def length(**options: Any) -> Any:
     """Field: a length above zero, m."""
-    return schema.number(above=0.0, at_most=MAX_LENGTH, **options)
+    return schema.number(above=0.0, at_most=MAX_LENGTH, unit="m", **options)
 
 
 def mass(**options: Any) -> Any:
     """Field: a mass of zero or more, kg."""
-    return schema.number(at_least=0.0, at_most=MAX_MASS, **options)
+    return schema.number(at_least=0.0, at_most=MAX_MASS, unit="kg", **options)
 
 
 def check_azimuths(azimuths: Array, path: str) -> None:
@@ -72,7 +72,7 @@ class Payload:
     """A body fixed to the platform: com from its reference point, inertia about the com."""
 
     mass: float = mass(default=0.0)
-    com: Array = schema.vector(3, default=[0, 0, 0])
+    com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
 
 
@@ -90,7 +90,8 @@ def check_angles(angle: float, path: str) -> None:
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
     field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
-    entries = [(n, Array, schema.vector(joints, **field)) for n in ("viscous", "coulomb")]
+    units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
+    entries = [(n, Array, schema.vector(joints, unit=u, **field)) for n, u in units.items()]
     return _section("Friction", entries, joints)
 
 
@@ -99,9 +100,9 @@ def limits_of(joints: int) -> Any:
     """Schema of limits of so many actuated joints; absent is None, one value stands for all."""
     above: dict[str, Any] = {"above": 0.0, "infinite": True, "spread": True, "default": None}
     entries = [
-        ("position", Any, schema.interval(count=joints, default=None)),
-        ("velocity", Any, schema.vector(joints, **above)),
-        ("effort", Any, schema.vector(joints, **above)),
+        ("position", Any, schema.interval(count=joints, unit="{joint}", default=None)),
+        ("velocity", Any, schema.vector(joints, unit="{joint}/s", **above)),
+        ("effort", Any, schema.vector(joints, unit="{effort}", **above)),
     ]
     return _section("Limits", entries, joints)
 
@@ -175,7 +176,7 @@ class Robot:
     """The name that the robot was loaded by."""
     payload: Payload = schema.section(Payload, default={})
     friction: Coefficients = schema.section(friction_of(3), default={})
-    gravity: Array = schema.vector(3, default=[0, 0, -9.81])
+    gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])
     limits: JointLimits = schema.section(limits_of(3), default={})
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
 
@@ -382,6 +383,11 @@ class Robot:
         """The parameters by section, as plain data."""
         fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
         return {name: schema.plain(getattr(self, name)) for name in fields}
+
+    def parameter_units(self) -> dict[str, Any]:
+        """Units of the same, by section; empty where a parameter has none."""
+        words = {"joint": self.joint_unit, "effort": self.effort_unit}
+        return schema.units(type(self), self.parameter_sections(), words)
 
     @cached_property
     def controller(self) -> JointMap:

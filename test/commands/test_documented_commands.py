@@ -16,6 +16,7 @@ from pkm_twin.apps.cli import app
 from test.commands.conftest import DELTA, REPOSITORY, rewrite
 
 NOT_RUN = {
+    r"pkm-twin .*\b(my_delta|converted)\..*": "of a file that the page writes: test/docs runs them",
     r"pkm-twin play .*": "needs ROS: test_player runs it over the real middleware",
     r"pkm-twin atlas .* --scheduler .*": "needs a Dask cluster: test/atlas/test_run.py has one",
     r"pkm-twin atlas \w+ [\w-]+( --wrench \w+)?( --html)?( --out \S+)?( --html)?": "minutes: the "
