@@ -340,9 +340,26 @@ class Engine:
         return [row.part for row in self.at(self.tree.home, self.graph.home)[1]]
 
     def shortest_pose(self, pose: Array) -> tuple[str, float]:
-        """The closure that misses the most on the way to a pose, and by how much, m."""
-        del pose
-        return self.graph.actuated[0], 0.0
+        """The closure that misses the most where the platform is held in a pose.
+
+        :returns: its joint or rod, and by how much it misses, m.
+        """
+        walk = self.kernel("pose walk", _pose_walk)
+        x = np.array([*self.tree.home, *self.graph.home], float)
+        still = np.zeros(self.tree.unknown_rates + self.joints)
+        (values, flat, _), _ = walk(_NO_PARAMETERS, x, pose, still)
+        names = self._parts
+        for _ in range(40):
+            if not (np.isfinite(values).all() and np.isfinite(flat).all()):
+                return names[0], math.inf
+            table = flat.reshape(len(values), -1)
+            damped = table.T @ table + 1e-6 * np.eye(table.shape[1])
+            step = np.asarray(np.linalg.solve(damped, -table.T @ values), np.float64)
+            step *= min(1.0, 0.2 / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+            (_, _, x), _ = walk(_NO_PARAMETERS, x, pose, step)
+            (values, flat, _), _ = walk(_NO_PARAMETERS, x, pose, still)
+        misses = np.abs(values[: len(names)])
+        return names[int(misses.argmax())], float(misses.max()) * self.tree.size
 
     # As programs.
 
@@ -546,6 +563,36 @@ def _walk(t: Traced) -> Program:
         "moved": t.lift(motion.retracted(t.x, move / scales)),
     }
     sizes = {UNKNOWNS: len(tree.home), "q": t.joints, "move": tree.unknown_rates}
+    return Program(sizes, 0, outputs)
+
+
+def _pose_walk(t: Traced) -> Program:
+    """The same of a pose, the actuated joints unknown too."""
+    engine, tree, tape = t.engine, t.tree, t.tape
+    size, free = len(tree.home), tree.unknown_rates
+    everything = tape.inputs(UNKNOWNS, size + t.joints)
+    goal = tape.inputs("pose", len(engine.coordinates))
+    motion = Motion(tree, everything[:size], everything[size:])
+    rows = motion.closures()
+    equations = poses.rows(engine.coordinates, motion, goal)
+    table = np.vstack([np.hstack(matrices(tree, rows)), engine._pose_rows(motion, goal)])
+    # The pose weighs more, so that what falls short is a closure.
+    scales = [row.scale for row in rows] + [100.0 * scale for scale in engine._pose_scales]
+    columns = [*tree.scales, *(engine._drive_scale(name) for name in engine.graph.actuated)]
+    entries = [
+        scale * entry / column
+        for scale, line in zip(scales, table, strict=True)
+        for entry, column in zip(line, columns, strict=True)
+    ]
+    values = [row.value for row in rows] + [value for value, _ in equations]
+    move = tape.inputs("move", free + t.joints) / np.array(columns)
+    moved = [*motion.retracted(everything[:size], move[:free]), *(everything[size:] + move[free:])]
+    outputs = {
+        "values": t.lift([s * v for s, v in zip(scales, values, strict=True)]),
+        "table": t.lift(entries),
+        "moved": t.lift(moved),
+    }
+    sizes = {UNKNOWNS: size + t.joints, "pose": len(goal), "move": free + t.joints}
     return Program(sizes, 0, outputs)
 
 
