@@ -17,6 +17,7 @@ from test.commands.conftest import DELTA, REPOSITORY, rewrite
 
 NOT_RUN = {
     r"pkm-twin .*\b(my_delta|converted)\..*": "of a file that the page writes: test/docs runs them",
+    r"pkm-twin guard-check.*": "needs ROS and a running node: test/nodes has one",
     r"pkm-twin play .*": "needs ROS: test_player runs it over the real middleware",
     r"pkm-twin atlas .* --scheduler .*": "needs a Dask cluster: test/atlas/test_run.py has one",
     r"pkm-twin atlas \w+ [\w-]+( --wrench \w+)?( --html)?( --out \S+)?( --html)?": "minutes: the "
@@ -27,7 +28,7 @@ NOT_RUN = {
 ENDS = {"pkm-twin recover damaged.mcap saved.mcap": 3}
 """Exit codes other than 0, as the page says."""
 SHELL = (">", ">>", "<", "|", "&&", ";", "2>")
-INLINE_NAMES = r"ROBOT|FILE|BAG|COMMAND|KIND|HOST| N\b"
+INLINE_NAMES = r"ROBOT|FILE|BAG|TOPIC|COMMAND|KIND|HOST| N\b"
 """Words that stand for something in running text; a line to type has none."""
 
 
