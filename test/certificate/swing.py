@@ -23,7 +23,7 @@ from delta_dynamics.virtual_work import forward_dynamics
 from pkm_twin import Robot
 from test.certificate.lagrange import energies
 from test.certificate.machines import build
-from test.conftest import parameters_of
+from test.support.robots import parameters_of
 
 DURATION = 10.0
 SAMPLES = 20

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import yaml
+from support.robots import parameters_of, random_joints
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
@@ -17,7 +18,6 @@ from stiffness_monitor.beams import assemble
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
 from stiffness_monitor.statics import frame_compliance
 from stiffness_monitor.structure import structural_model
-from test.conftest import parameters_of, random_joints
 
 ROBOTS = ("delta", "delta_cu", "prru", "upr_rpu")
 DELTAS = ("delta", "delta_cu")
