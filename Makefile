@@ -8,7 +8,7 @@ SECONDS ?= 60
 SEED ?= 1
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bags bench certificate fuzz soak scale clean help
+.PHONY: demo test lint types unit bags bench certificate fuzz soak scale pages clean help
 
 help:
 	@echo "make demo         set up .venv, run both nodes on the recorded bags, table and picture in out/"
@@ -19,6 +19,7 @@ help:
 	@echo "make fuzz         every bit of a bag; files, command lines and both nodes at random (SECONDS, SEED)"
 	@echo "make soak         ten million poses, and both nodes in all weathers, in flat memory (MINUTES)"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
+	@echo "make pages        docs/parameters.md from the schemas, pictures of imports and of robots"
 	@echo "make clean        remove .venv, out and caches"
 
 # One stamp a set of extras, made anew when the requirements change.
@@ -68,6 +69,12 @@ soak: $(VENV)/test.stamp
 
 scale: $(VENV)/test.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.atlas.scale docs/scale.md
+
+pages: $(VENV)/test.stamp
+	$(BIN)/python -m test.docs.parameters docs/parameters.md
+	$(BIN)/python -m test.docs.engine docs/engine.md
+	$(BIN)/python -m test.docs.architecture docs/architecture.png
+	$(BIN)/python -m test.docs.robots docs/gallery
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

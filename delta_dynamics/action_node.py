@@ -40,6 +40,7 @@ class EffortAction:
         self._node, self._controller, self._efforts = node, controller, efforts
         self._client = ActionClient(node, FollowJointTrajectory, controller)
         self._handles: dict[bytes, Any] = {}
+        self._waiting: dict[bytes, Any] = {}
         self._server = ActionServer(
             node,
             FollowJointTrajectory,
@@ -50,7 +51,17 @@ class EffortAction:
             cancel_callback=self._cancel,
         )
 
+    def deactivated(self) -> None:
+        """The node answers nothing more: goals that wait for their efforts end here.
+
+        What the controller has already is the controller's.
+        """
+        for goal in list(self._waiting.values()):
+            self._abort(goal, "the node was deactivated")
+
     def _accepted(self, goal: Any) -> None:
+        self._waiting[_key(goal)] = goal
+
         def refused(error: MessageError) -> None:
             self._abort(goal, f"the twin refused the trajectory, {error.reason}: {error}")
 
@@ -76,6 +87,7 @@ class EffortAction:
         elif not self._client.server_is_ready():
             self._abort(goal, f"no controller serves {self._controller}")
         else:
+            del self._waiting[_key(goal)]
             self._client.send_goal_async(
                 goal.request, feedback_callback=lambda m: goal.publish_feedback(m.feedback)
             ).add_done_callback(lambda future: self._answered(goal, future.result()))
@@ -88,7 +100,7 @@ class EffortAction:
                 "command interface it takes no efforts)",
             )
             return
-        self._handles[bytes(goal.goal_id.uuid)] = handle
+        self._handles[_key(goal)] = handle
         if goal.is_cancel_requested:
             handle.cancel_goal_async()
         handle.get_result_async().add_done_callback(
@@ -96,7 +108,7 @@ class EffortAction:
         )
 
     def _cancel(self, goal: Any) -> CancelResponse:
-        handle = self._handles.get(bytes(goal.goal_id.uuid))
+        handle = self._handles.get(_key(goal))
         if handle is not None:
             handle.cancel_goal_async()
         return CancelResponse.ACCEPT
@@ -110,7 +122,8 @@ class EffortAction:
 
     def _finish(self, goal: Any, status: int, result: Any) -> None:
         """End a goal as the controller has ended it."""
-        self._handles.pop(bytes(goal.goal_id.uuid), None)
+        self._handles.pop(_key(goal), None)
+        self._waiting.pop(_key(goal), None)
 
         def end(goal: Any) -> Any:
             if status == GoalStatus.STATUS_SUCCEEDED:
@@ -125,3 +138,7 @@ class EffortAction:
 
     def _never_begun(self, goal: Any) -> Any:
         raise NotImplementedError("goals end by what the controller says")
+
+
+def _key(goal: Any) -> bytes:
+    return bytes(goal.goal_id.uuid)

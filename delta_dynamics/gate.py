@@ -64,7 +64,7 @@ class Gate:
             max_age=round(s.deadline * SECOND),
         )
         self._reader = JointReader(self.robot)
-        self._limits = _effort_limits(self.robot)
+        self._limits = effort_limits(self.robot)
         self._last_stamp = 0
         self._last_arrival = 0
         self._state: tuple[int, Array] | None = None
@@ -73,7 +73,7 @@ class Gate:
         """Take a robot with another payload, gravity or limits, between two messages."""
         self.robot = robot
         self._reader = JointReader(robot)
-        self._limits = _effort_limits(robot)
+        self._limits = effort_limits(robot)
 
     def reset(self) -> None:
         """The clock jumped: stamps of before say nothing about those to come."""
@@ -150,7 +150,7 @@ class Gate:
         return int(bad.argmax()) if bad.any() else None
 
 
-def _effort_limits(robot: Robot) -> Array:
+def effort_limits(robot: Robot) -> Array:
     """The robot's effort limits, shape (n,), infinite where it has none."""
     efforts = getattr(getattr(robot, "limits", None), "effort", None)
     return np.full(len(robot.joint_names), np.inf) if efforts is None else np.asarray(efforts)

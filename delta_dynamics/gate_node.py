@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from delta_dynamics.gate import Gate, GateSettings
+from delta_dynamics.gate import Gate, GateSettings, effort_limits
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.machine.robot import Robot
@@ -144,9 +144,7 @@ class CommandGate(health.TwinNode):
     def _declare_robot(self, settings: GateSettings) -> None:
         """Effort limits of every robot; the payload where its weight is borne."""
         robot = self._gate.robot
-        limits: Any = getattr(robot, "limits").effort  # noqa: B009
-        if limits is None:
-            limits = np.full(len(robot.joint_names), np.inf)
+        limits = effort_limits(robot)
         text = "a torque beyond is not forwarded"
         unit = "N m or N, one a joint"
         values = {"effort_limits": self.declare("effort_limits", limits.tolist(), text, unit=unit)}
@@ -157,7 +155,9 @@ class CommandGate(health.TwinNode):
                 default = value.tolist() if isinstance(value, np.ndarray) else value
                 text = f"the robot's {name}, by default its file's"
                 values[name] = self.declare(name, default, text, unit=unit)
-        robot = _changed(robot, values)
+        # Not every robot's file has a place for what is not given.
+        given = {k: v for k, v in values.items() if k in self._parameter_overrides}
+        robot = _changed(robot, given)
         if settings.on_stop == "gravity":
             # Refused here where the robot has no masses; and compiled before it is needed.
             zeros = np.zeros(len(robot.joint_names))

@@ -25,7 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eig  # type: ignore[import-untyped]
 from scipy.optimize import minimize  # type: ignore[import-untyped]
 
-from delta_dynamics.virtual_work import body_mass_matrix, inverse_dynamics, mass_matrix
+from delta_dynamics.terms import frictionless
+from delta_dynamics.virtual_work import body_mass_matrix, mass_matrix
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.pose_grid import zero_torsion
 from pkm_twin.machine.robot import Robot
@@ -38,7 +39,6 @@ STRETCHED: Final = 1e-6
 """Least singular value of the pose's Jacobian, of its greatest or of one, that is inverted."""
 
 _NONE: Final = np.zeros(3)
-_FREE: Final = {"viscous": 0.0, "coulomb": 0.0}
 _STARTS: Final = 256
 """Directions that a descent begins from, best first, where no solution in closed form is known."""
 _DESCENTS: Final = 24
@@ -154,7 +154,7 @@ def max_driving_force(
     _inverse_root(robot, platform)
     rates = np.sqrt(2 * _energy(energy) / _form(platform, x))[..., None] * x
     motion = joint_motion(robot, pose, rates, acceleration)
-    forces = inverse_dynamics(robot.changed(friction=_FREE), *motion)
+    forces = frictionless(robot, *motion)
     return np.asarray(np.abs(forces).max(-1), np.float64)
 
 
@@ -174,17 +174,15 @@ def max_driving_force_range(
     where = np.asarray(pose, np.float64)
     platform, _ = energy_matrices(robot, where)
     back = np.sqrt(2 * _energy(energy)) * _inverse_root(robot, platform)
-    free = robot.changed(friction=_FREE)
-    start = joint_motion(free, where, _NONE, acceleration)
-    constant = inverse_dynamics(free, *start)
-    weightless = free.changed(gravity=[0.0, 0.0, 0.0])
+    start = joint_motion(robot, where, _NONE, acceleration)
+    constant = frictionless(robot, *start)
     size, count = where.shape[-1], constant.shape[-1]
     pairs = list(itertools.combinations(range(size), 2))
     units = np.eye(size)
     mixed = np.array([units[j] + units[k] for j, k in pairs]).reshape(-1, size)
     probes = np.einsum("...ij,kj->...ki", back, np.concatenate([units, mixed]))
-    motion = joint_motion(weightless, where[..., None, :], probes, np.zeros(size))
-    moved = inverse_dynamics(weightless, *motion)
+    motion = joint_motion(robot, where[..., None, :], probes, np.zeros(size))
+    moved = frictionless(robot, *motion, weight=False)
     forms = np.zeros((*constant.shape, size, size))
     for j in range(size):
         forms[..., j, j] = moved[..., j, :]

@@ -152,7 +152,9 @@ class DeltaDynamics(health.TwinNode):
         self._last_heard = 0
 
     def deactivated(self) -> None:
-        """A stream that ran is stopped."""
+        """A stream that ran is stopped; goals that wait are ended."""
+        if self._action is not None:
+            self._action.deactivated()
         if self._last_heard:
             self._stop("inactive", "the node was deactivated")
 

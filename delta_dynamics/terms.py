@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.virtual_work import torques
-from pkm_twin.machine.inertia import FRICTION, GRAVITY, Layout
+from pkm_twin.machine.inertia import GRAVITY, Layout
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -40,6 +40,31 @@ class Terms:
         """Sum of all, shape (..., n): what ``inverse_dynamics`` gives."""
         own = self.gravity + self.inertia + self.velocity
         return own + self.payload + self.friction + self.external
+
+
+def frictionless(
+    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, weight: bool = True
+) -> Array:
+    """Actuator efforts without friction of any joint, shape (..., n), N m or N.
+
+    :param weight: False leaves gravity out, too.
+    """
+    layout = Layout(robot.engine.tree)
+    p = _without(robot.inertial, layout.friction)
+    if not weight:
+        p = _without(p, layout.part(GRAVITY))
+    kernel = torques(robot)
+    (tau,), status = kernel(p, q, qd, qdd, np.zeros(6))
+    if status is not None:
+        robot.refuse_joints(status, q, (qd, qdd))
+    return tau
+
+
+def _without(p: Array, part: slice | NDArray[np.intp]) -> Array:
+    """Inputs with some of them zero."""
+    result = p.copy()
+    result[part] = 0.0
+    return result
 
 
 def dynamics_terms(
@@ -77,18 +102,11 @@ def dynamics_terms(
         return tau
 
     layout = Layout(robot.engine.tree)
-    rubs = [layout.part(k) for k in FRICTION]
 
-    def without(p: Array, *parts: slice) -> Array:
-        result = p.copy()
-        for part in parts:
-            result[part] = 0.0
-        return result
-
-    held = without(robot.inertial, *rubs)
-    empty = without(robot.own_inertial, *rubs)
-    weightless = without(empty, layout.part(GRAVITY))
-    rubbing = without(robot.own_inertial, layout.part(GRAVITY))
+    held = _without(robot.inertial, layout.friction)
+    empty = _without(robot.own_inertial, layout.friction)
+    weightless = _without(empty, layout.part(GRAVITY))
+    rubbing = _without(robot.own_inertial, layout.part(GRAVITY))
 
     velocity = efforts(weightless, rate, still, none)
     return Terms(

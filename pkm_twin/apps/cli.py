@@ -160,7 +160,15 @@ Platform = Annotated[
 
 
 @app.command()
-def info(robot: RobotName, platform: Platform = None, as_json: Json = False) -> None:
+def info(
+    robot: RobotName,
+    platform: Platform = None,
+    as_json: Json = False,
+    picture: Annotated[
+        Optional[Path],  # noqa: UP045  typer reads it
+        typer.Option(help="draw the robot at home into this file, .png or .svg"),
+    ] = None,
+) -> None:
     """Print all of a robot, with units.
 
     Dimensions, masses, limits, home pose, mobility, and which reactions rigid bodies do not
@@ -169,7 +177,12 @@ def info(robot: RobotName, platform: Platform = None, as_json: Json = False) -> 
     from pkm_twin import load
     from pkm_twin.apps.describe import describe, lines
 
-    data = describe(load(robot, platform=platform))
+    loaded = load(robot, platform=platform)
+    data = describe(loaded)
+    if picture is not None:
+        from pkm_twin.apps import drawing
+
+        drawing.picture(loaded, picture)
     if as_json:
         # JSON has no infinity: a free axis is null.
         print_json(_finite(data))

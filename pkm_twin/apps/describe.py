@@ -11,29 +11,6 @@ from delta_dynamics import reactions
 from pkm_twin.apps.recorded import why_no_torques
 from pkm_twin.machine.robot import Robot
 
-UNITS = {
-    # Fractions of a length and plain numbers first: their names end as those of lengths do.
-    "arm_com": "of the arm, from its pivot",
-    "link_com": "of the link, from the slider's joint",
-    "shear_factor": "",
-    "base_radius": "m",
-    "platform_radius": "m",
-    "arm_length": "m",
-    "forearm_length": "m",
-    "limb_length": "m",
-    "azimuths": "rad",
-    "mass": "kg",
-    "inertia": "kg m2",
-    "com": "m",
-    "gravity": "m/s2",
-    "youngs_modulus": "Pa",
-    "shear_modulus": "Pa",
-    "diameter": "m",
-    "joint_angle": "rad",
-    "density": "kg/m3",
-    "width": "m",
-}
-
 
 def summary(robot: Robot) -> str:
     """One line that tells a robot from its siblings."""
@@ -64,6 +41,7 @@ def describe(robot: Robot) -> dict[str, Any]:
         "redundant_closures": robot.engine.mobility.redundant,
         "singularity_at_home": float(robot.singularity(q)),
         "parameters": robot.parameter_sections(),
+        "parameter_units": robot.parameter_units(),
     }
 
 
@@ -102,40 +80,19 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
             "; ".join(data["overconstrained"]) or "no: rigid bodies determine every reaction",
         ),
     ]
-    units = UNITS | _joint_units(data["joint_unit"], data["effort_unit"])
     for section, value in data["parameters"].items():
-        if section not in ("mechanism", "name", "joints"):
-            rows += _rows(section, value, units)
+        if section not in ("mechanism", "name") and not (
+            section == "joints" and isinstance(value, list)
+        ):
+            rows += _rows(section, value, data["parameter_units"].get(section, ""))
     return rows
 
 
-def _rows(name: str, value: Any, units: dict[str, str]) -> list[tuple[str, str]]:
+def _rows(name: str, value: Any, unit: Any) -> list[tuple[str, str]]:
     """A parameter, or a section's parameters under its name."""
     if isinstance(value, dict):
-        return [row for key, item in value.items() for row in _rows(f"{name}: {key}", item, units)]
-    section, _, key = name.rpartition(": ")
-    named = section if section == "joints_compliance" else key
-    return [(name, "none" if value is None else f"{_number(value)} {_unit(named, units)}".strip())]
-
-
-def _joint_units(joint: str, effort: str | None) -> dict[str, str]:
-    """Units that depend on whether the actuated joints turn or slide."""
-    rate = f"{joint}/s"
-    units = {
-        "position": joint,
-        "velocity": rate,
-        "limb_length": "m",
-        "joints_compliance": "m/N (3), rad/(N m) (3)",
-    }
-    if effort is not None:
-        units |= {"effort": effort, "coulomb": effort, "viscous": f"{effort} per {rate}"}
-    return units
-
-
-def _unit(key: str, units: dict[str, str]) -> str:
-    if key in units:
-        return units[key]
-    return next((unit for end, unit in units.items() if key.endswith(f"_{end}")), "")
+        return [row for k, item in value.items() for row in _rows(f"{name}: {k}", item, unit[k])]
+    return [(name, "none" if value is None else f"{_number(value)} {unit}".strip())]
 
 
 def _number(value: Any) -> str:

@@ -273,14 +273,16 @@ def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str
         raise _choice_error(bag, f"no joint states in the bag{aside}", "no joint states")
     for name in filled:
         _require_definition(bag, name)
-    seen = _names_on(bag, filled, set(robot.joint_names))
-    fit = [name for name in filled if set(robot.joint_names) <= seen[name]]
+    # As the controller calls them, which recorded them.
+    joints = robot.controller.names
+    seen = _names_on(bag, filled, set(joints))
+    fit = [name for name in filled if set(joints) <= seen[name]]
     for name in filled:
         if name not in fit:
             left_out[name] = f"joints {', '.join(sorted(seen[name])) or 'none'}"
     if not fit:
         name = filled[0]
-        missing = next(joint for joint in robot.joint_names if joint not in seen[name])
+        missing = next(joint for joint in joints if joint not in seen[name])
         raise _choice_error(
             bag,
             f"no topic has all joints of {robot.name}: on {name} joint {missing!r} is missing, "

@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.atlas import plots
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -34,14 +38,27 @@ def pyplot() -> Any:
     return pyplot
 
 
-def axes_or_new(ax: Any, size: tuple[float, float] = (7, 5.5)) -> Any:
+def subplots(*shape: int, **options: Any) -> tuple[Figure, Any]:
+    """A new figure and its axes, as ``pyplot.subplots`` has them."""
+    figure, axes = pyplot().subplots(*shape, **options)
+    return figure, axes
+
+
+def new_figure(**options: Any) -> Figure:
+    """A new figure without axes."""
+    figure: Figure = pyplot().figure(**options)
+    return figure
+
+
+def axes_or_new(ax: Axes | None, size: tuple[float, float] = (7, 5.5)) -> Axes:
     """The axes given, or those of a new figure of a size (inches)."""
     if ax is not None:
         return ax
-    return pyplot().subplots(figsize=size, layout="constrained")[1]
+    drawn: Axes = subplots(figsize=size, layout="constrained")[1]
+    return drawn
 
 
-def contours(ax: Any, x: Array, y: Array, values: Array, label: str, **options: Any) -> None:
+def contours(ax: Axes, x: Array, y: Array, values: Array, label: str, **options: Any) -> None:
     """A field as steps of colour on axes of equal scale, with its colour bar."""
     from matplotlib import ticker
 
@@ -57,7 +74,7 @@ def contours(ax: Any, x: Array, y: Array, values: Array, label: str, **options: 
     bar(ax, drawn, label, ticks=ticker.MaxNLocator(8, steps=[1, 2, 5, 10]))
 
 
-def bar(ax: Any, drawn: Any, label: str, **options: Any) -> Any:
+def bar(ax: Axes, drawn: Any, label: str, **options: Any) -> Any:
     """A colour bar as high as its axes, which the figure's own would not be at equal scale."""
     bar = ax.figure.colorbar(drawn, cax=ax.inset_axes((1.04, 0.0, 0.045, 1.0)), **options)
     bar.set_label(label)

@@ -39,6 +39,8 @@ SPARSE: Final = 4
 """Every how many rays and rungs the distance to a singularity is looked at."""
 JOINT_STATES: Final = 2**14
 """Joint states, evenly spread between the limits, whose poses bound a workspace."""
+CLIMBERS: Final = 32
+"""States from which the ends of a workspace of many coordinates are looked for."""
 COARSE: Final = 33
 """Poses along each coordinate of the grid that bounds a workspace."""
 FULL: Final = 3
@@ -119,9 +121,37 @@ def _from_joints(robot: Robot) -> Array:
     corners = np.stack(np.meshgrid(*[[0.0, 0.5, 1.0]] * count, indexing="ij"), -1)
     inner = qmc.Halton(count, scramble=False).random(JOINT_STATES)
     share = np.concatenate([corners.reshape(-1, count), inner])
-    poses, good = try_forward(robot, limits[:, 0] + share * np.ptp(limits, axis=1))
-    poses = poses[good]
-    return poses[reachable(robot, poses, -math.inf)]
+    q = limits[:, 0] + share * np.ptp(limits, axis=1)
+    poses, good = try_forward(robot, q)
+    good[good] = reachable(robot, poses[good], -math.inf)
+    poses, q = poses[good], q[good]
+    if len(robot.pose_names) > FULL and len(q):
+        # States so few are far apart where joints are many.
+        ends = [
+            _farthest(robot, limits, q[np.argsort(-sign * poses[:, k])[:CLIMBERS]], k, sign)
+            for k in range(poses.shape[1])
+            for sign in (-1.0, 1.0)
+        ]
+        poses = np.concatenate([poses, *ends])
+    return poses
+
+
+def _farthest(robot: Robot, limits: Array, q: Array, k: int, sign: float) -> Array:
+    """Poses uphill of joint states (c, n) in pose coordinate k times a sign.
+
+    :param limits: of the joints, shape (n, 2).
+    """
+    low, high = limits.T
+    best, _ = try_forward(robot, q)
+    for step in np.repeat(0.5 ** np.arange(1, 9), 3):
+        rates, known = robot.try_jacobian(q)
+        uphill = np.where(known[:, None], sign * np.sign(rates[:, k]), 0.0)
+        tried = np.clip(q + step * (high - low) * uphill, low, high)
+        poses, good = try_forward(robot, tried)
+        good[good] = reachable(robot, poses[good], -math.inf)
+        good &= sign * (poses[:, k] - best[:, k]) > 0.0
+        q, best = np.where(good[:, None], tried, q), np.where(good[:, None], poses, best)
+    return best
 
 
 def turns(count: int) -> Array:

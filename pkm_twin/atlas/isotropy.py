@@ -14,7 +14,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,11 @@ from pkm_twin.atlas.sweep import Chunk, Field, Kind, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import distance_unit, reachable, singularity_at, try_inverse
 from pkm_twin.machine.robot import Robot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from xarray import Dataset
 
 Array = NDArray[np.float64]
 
@@ -314,7 +319,7 @@ def sphere_image(values: Array, polar: Array, turn: Array) -> Array:
     return np.asarray(image, np.float64)
 
 
-def spheres(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
+def spheres(atlas: Dataset, index: str = "eta", ax: Axes | None = None) -> Axes:
     """Spheres of directions over the grid of poses, coloured by an index.
 
     :param index: ``eta`` or ``force``.
@@ -380,8 +385,9 @@ def spheres(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
         ax.set_xticks([])
         ax.set_yticks([])
     else:
-        for label, name in ((ax.set_xlabel, names[0]), (ax.set_ylabel, names[1])):
-            label(f"{name} ({atlas[name].attrs['units']})")
+        x_label, y_label = (f"{name} ({atlas[name].attrs['units']})" for name in names)
+        ax.set_xlabel(x_label)
+        ax.set_ylabel(y_label)
         side = float(np.ptp(first)) / 2 + 1.2 * radius
         middle = float(first.mean()), float(second.mean())
         ax.set_xlim(middle[0] - side, middle[0] + side)
@@ -407,7 +413,7 @@ def _room(first: Array, scale: float, second: Array, j: int, ring: float) -> flo
     return 0.48 * out * 2 * math.sin(math.pi / shown) if j else math.inf
 
 
-def _rings(ax: Any, azimuths: Array, tilts: Array, scale: float, ring: float) -> float:
+def _rings(ax: Axes, azimuths: Array, tilts: Array, scale: float, ring: float) -> float:
     """Circles of equal tilt with their names; returns the picture's half width."""
     turn = np.linspace(0, 2 * np.pi, 181)
     for tilt in tilts[1:]:
@@ -436,7 +442,7 @@ def _rings(ax: Any, azimuths: Array, tilts: Array, scale: float, ring: float) ->
     return outermost + ring
 
 
-def _triad(atlas: Any, ax: Any) -> None:
+def _triad(atlas: Dataset, ax: Axes) -> None:
     """Where the spheres' axes point, in the lower left corner."""
     right, up = _view()
     inset = ax.inset_axes((0.01, 0.01, 0.18, 0.18))
@@ -444,17 +450,20 @@ def _triad(atlas: Any, ax: Any) -> None:
     for k, name in enumerate(names):
         tip = np.array([right[k], up[k]])
         inset.annotate(
-            "", tip, (0.0, 0.0), arrowprops={"arrowstyle": "->", "color": "black", "lw": 1.0}
+            "",
+            tuple(tip.tolist()),
+            (0.0, 0.0),
+            arrowprops={"arrowstyle": "->", "color": "black", "lw": 1.0},
         )
         side = "center" if abs(tip[0]) < 0.3 else "left" if tip[0] > 0 else "right"
-        inset.text(*(1.12 * tip + (0.0, 0.1 * tip[1])), name, ha=side, va="center", fontsize=9)
+        inset.text(1.12 * tip[0], 1.22 * tip[1], name, ha=side, va="center", fontsize=9)
     inset.set_xlim(-1.9, 1.3)
     inset.set_ylim(-1.4, 1.8)
     inset.set_aspect("equal")
     inset.axis("off")
 
 
-def _rates(atlas: Any) -> tuple[str, ...]:
+def _rates(atlas: Dataset) -> tuple[str, ...]:
     return tuple(f"d{name}/dt" for name in atlas.attrs["pose"].split())
 
 
@@ -465,7 +474,7 @@ def _view() -> tuple[Array, Array]:
     return right, np.cross(VIEW, right)
 
 
-def spread_over_poses(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
+def spread_over_poses(atlas: Dataset, index: str = "eta", ax: Axes | None = None) -> Axes:
     """How far an index differs over the sphere at each pose: greatest less least."""
     ax = figures.axes_or_new(ax)
     names = atlas[index].dims[:2]
@@ -506,24 +515,25 @@ def spread_over_poses(atlas: Any, index: str = "eta", ax: Any = None) -> Any:
         norm=colors.LogNorm() if index == "force" else None,
     )
     ax.set_aspect("equal")
-    for label, name in ((ax.set_xlabel, names[0]), (ax.set_ylabel, names[1])):
-        label(f"{name} ({atlas[name].attrs['units']})")
+    x_label, y_label = (f"{name} ({atlas[name].attrs['units']})" for name in names)
+    ax.set_xlabel(x_label)
+    ax.set_ylabel(y_label)
     bar = figures.bar(ax, mesh, f"{what} ({unit})")
     if index == "force":
         figures.plain_ticks(bar)
     return ax
 
 
-def _spheres_eta(atlas: Any) -> Any:
+def _spheres_eta(atlas: Dataset) -> Figure:
     return _spheres(atlas, "eta")
 
 
-def _spheres_force(atlas: Any) -> Any:
+def _spheres_force(atlas: Dataset) -> Figure:
     return _spheres(atlas, "force")
 
 
-def _spheres(atlas: Any, index: str) -> Any:
-    figure, ax = figures.pyplot().subplots(figsize=(10.6, 8.6), layout="constrained")
+def _spheres(atlas: Dataset, index: str) -> Figure:
+    figure, ax = figures.subplots(figsize=(10.6, 8.6), layout="constrained")
     spheres(atlas, index, ax)
     if index == "eta":
         what = "the platform's part of the kinetic energy, by direction of the pose rates"
@@ -534,8 +544,8 @@ def _spheres(atlas: Any, index: str) -> Any:
     return figure
 
 
-def _spreads(atlas: Any) -> Any:
-    figure, axes = figures.pyplot().subplots(1, 2, figsize=(12, 4.8), layout="constrained")
+def _spreads(atlas: Dataset) -> Figure:
+    figure, axes = figures.subplots(1, 2, figsize=(12, 4.8), layout="constrained")
     titles = ("the platform's part of the kinetic energy", f"largest driving {_effort(atlas)}")
     for index, title, ax in zip(("eta", "force"), titles, axes, strict=True):
         spread_over_poses(atlas, index, ax)
@@ -544,11 +554,11 @@ def _spreads(atlas: Any) -> Any:
     return figure
 
 
-def _effort(atlas: Any) -> str:
+def _effort(atlas: Dataset) -> str:
     return "force" if atlas.force.attrs["units"] == "N" else "torque"
 
 
-def at_height(atlas: Any) -> str:
+def at_height(atlas: Dataset) -> str:
     """Robot and height of an isotropy atlas, as text."""
     settings = json.loads(atlas.attrs["settings"])
     return f"{atlas.attrs['robot']} at {settings['height_name']} = {settings['height']:.3f} m"
@@ -557,12 +567,12 @@ def at_height(atlas: Any) -> str:
 # Page
 
 
-def title(atlas: Any) -> str:
+def title(atlas: Dataset) -> str:
     """What the page shows, in a line."""
     return f"Dynamic isotropy of {at_height(atlas)}"
 
 
-def page(atlas: Any) -> Any:
+def page(atlas: Dataset) -> Any:
     """Spheres of an isotropy atlas that turn; a menu chooses eta_KE or F_max."""
     graph = require("plotly.graph_objects", "atlas")
     names = atlas.eta.dims[:2]
@@ -646,7 +656,7 @@ class _Balls:
     polar: bool
 
 
-def _balls(part: Any) -> _Balls:
+def _balls(part: Dataset) -> _Balls:
     names = part.eta.dims[:2]
     polar = names == ("azimuth", "tilt")
     first, second = (part[name].values for name in names)

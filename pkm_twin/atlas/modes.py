@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,11 @@ from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
 from stiffness_monitor.structure import Member, StructuralModel, structural_model
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from xarray import Dataset
 
 Array = NDArray[np.float64]
 
@@ -243,7 +248,9 @@ def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:
 # Figures
 
 
-def frequency(atlas: Any, mode: int = 1, z: float | None = None, ax: Any = None) -> Any:
+def frequency(
+    atlas: Dataset, mode: int = 1, z: float | None = None, ax: Axes | None = None
+) -> Axes:
     """One natural frequency across the axis at one height.
 
     :param mode: 1 is the lowest.
@@ -260,7 +267,7 @@ def frequency(atlas: Any, mode: int = 1, z: float | None = None, ax: Any = None)
     return ax
 
 
-def across(atlas: Any, values: Array) -> tuple[Array, Array, Array, tuple[str, str]]:
+def across(atlas: Dataset, values: Array) -> tuple[Array, Array, Array, tuple[str, str]]:
     """A field of a modes atlas in the plane across the axis: x, y, the field, and axes' labels.
 
     :param values: shape (distance, azimuth); of any unit.
@@ -278,13 +285,13 @@ def across(atlas: Any, values: Array) -> tuple[Array, Array, Array, tuple[str, s
     return x, y, closed, (f"{first} ({unit})", f"{second} ({unit})")
 
 
-def frequency_range(atlas: Any, ax: Any = None) -> Any:
+def frequency_range(atlas: Dataset, ax: Axes | None = None) -> Axes:
     """Least and greatest frequency of every mode over the height."""
     ax = figures.axes_or_new(ax)
     for k, mode in enumerate(atlas.mode.values.tolist()):
         values = atlas.frequency.sel(mode=mode)
         low, high = (values.reduce(f, ("distance", "azimuth")).values for f in (np.min, np.max))
-        style = {
+        style: dict[str, Any] = {
             "color": figures.LINES[k % len(figures.LINES)],
             "ls": ("-", "--")[k % 2],
             "lw": 1.5,
@@ -303,7 +310,7 @@ def frequency_range(atlas: Any, ax: Any = None) -> Any:
     return ax
 
 
-def deformed(atlas: Any, mode: int) -> tuple[Array, Array]:
+def deformed(atlas: Dataset, mode: int) -> tuple[Array, Array]:
     """Nodes of a mode shape, enlarged, and how far each moves; (nodes, 3), m, and (nodes,).
 
     The second is over the largest of all nodes.
@@ -315,13 +322,13 @@ def deformed(atlas: Any, mode: int) -> tuple[Array, Array]:
     return rest + scale * moved, far / far.max()
 
 
-def grounded(atlas: Any) -> NDArray[np.int64]:
+def grounded(atlas: Dataset) -> NDArray[np.int64]:
     """Nodes on the ground, by index: the ends that one line alone meets."""
     nodes, lines = np.unique(atlas.line.values, return_counts=True)
     return np.asarray(nodes[lines == 1], np.int64)
 
 
-def largest_shares(atlas: Any, mode: int, kind: str = "strain", most: int = 3) -> str:
+def largest_shares(atlas: Dataset, mode: int, kind: str = "strain", most: int = 3) -> str:
     """Which parts hold most of a mode's energy, as text.
 
     :param kind: ``strain`` or ``kinetic``.
@@ -332,7 +339,7 @@ def largest_shares(atlas: Any, mode: int, kind: str = "strain", most: int = 3) -
     return ", ".join(f"{names[k]} {100 * shares[k]:.0f} %" for k in order if shares[k] >= 0.005)
 
 
-def shape_pose(atlas: Any) -> str:
+def shape_pose(atlas: Dataset) -> str:
     """The pose of the stored shapes, as text."""
     units = atlas.shape_pose.attrs["units"].split(", ")
     parts = []
@@ -345,10 +352,10 @@ def shape_pose(atlas: Any) -> str:
     return ", ".join(parts)
 
 
-def mode_shape(atlas: Any, mode: int = 1, ax: Any = None) -> Any:
+def mode_shape(atlas: Dataset, mode: int = 1, ax: Any = None) -> Any:
     """The frame at rest in grey and in a mode, enlarged, on 3-D axes; colour: how far it moves."""
     if ax is None:
-        figure = figures.pyplot().figure(figsize=(6, 6), layout="constrained")
+        figure = figures.new_figure(figsize=(6, 6), layout="constrained")
         ax = figure.add_subplot(projection="3d")
     from matplotlib import ticker
     from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
@@ -391,16 +398,16 @@ def mode_shape(atlas: Any, mode: int = 1, ax: Any = None) -> Any:
     return ax
 
 
-def _frequency_plane(atlas: Any) -> Any:
-    figure, axes = figures.pyplot().subplots(2, 3, figsize=(14.5, 8.2), layout="constrained")
+def _frequency_plane(atlas: Dataset) -> Figure:
+    figure, axes = figures.subplots(2, 3, figsize=(14.5, 8.2), layout="constrained")
     for mode, ax in zip(atlas.mode.values.tolist(), axes.ravel(), strict=False):
         frequency(atlas, mode, ax=ax)
     figure.suptitle(f"{atlas.attrs['robot']}: natural frequencies, actuators locked")
     return figure
 
 
-def _frequency_range(atlas: Any) -> Any:
-    figure, ax = figures.pyplot().subplots(figsize=(8, 5), layout="constrained")
+def _frequency_range(atlas: Dataset) -> Figure:
+    figure, ax = figures.subplots(figsize=(8, 5), layout="constrained")
     frequency_range(atlas, ax)
     figure.suptitle(
         f"{atlas.attrs['robot']}: natural frequencies over the largest cylinder, actuators locked"
@@ -408,10 +415,10 @@ def _frequency_range(atlas: Any) -> Any:
     return figure
 
 
-def _mode_shapes(atlas: Any) -> Any:
+def _mode_shapes(atlas: Dataset) -> Figure:
     from matplotlib import cm, colors
 
-    figure, axes = figures.pyplot().subplots(
+    figure, axes = figures.subplots(
         2, 3, figsize=(12.5, 8), layout="constrained", subplot_kw={"projection": "3d"}
     )
     for mode, ax in zip(atlas.mode.values.tolist(), axes.ravel(), strict=False):
@@ -429,12 +436,12 @@ def _mode_shapes(atlas: Any) -> Any:
 # Page
 
 
-def title(atlas: Any) -> str:
+def title(atlas: Dataset) -> str:
     """What the page shows, in a line."""
     return f"Modes of {atlas.attrs['robot']}"
 
 
-def page(atlas: Any) -> Any:
+def page(atlas: Dataset) -> Any:
     """Mode shapes that swing, and the frequency over the workspace; a menu chooses the mode."""
     graph = require("plotly.graph_objects", "atlas")
     plots = require("plotly.subplots", "atlas")
@@ -573,7 +580,7 @@ def page(atlas: Any) -> Any:
     return figure
 
 
-def _discs(atlas: Any) -> tuple[dict[str, Any], tuple[str, str]]:
+def _discs(atlas: Dataset) -> tuple[dict[str, Any], tuple[str, str]]:
     """Discs of a modes atlas, one a height, as vertices and triangles, and names of x and y."""
     heights = atlas.z.values
     x, y, _, labels = across(atlas, atlas.frequency.values[0, :, :, 0])
@@ -592,7 +599,7 @@ def _discs(atlas: Any) -> tuple[dict[str, Any], tuple[str, str]]:
     return mesh, labels
 
 
-def _vertices(atlas: Any, values: Array) -> NDArray[np.float32]:
+def _vertices(atlas: Dataset, values: Array) -> NDArray[np.float32]:
     """A field (z, distance, azimuth) of a modes atlas at the vertices of its discs."""
     return pages.short(np.concatenate([across(atlas, f)[2].ravel() for f in values]))
 
@@ -647,7 +654,7 @@ def _players(mode: int) -> list[dict[str, Any]]:
     ]
 
 
-def _notes(atlas: Any, mode: int) -> list[dict[str, Any]]:
+def _notes(atlas: Dataset, mode: int) -> list[dict[str, Any]]:
     """Heads of the two plots of a mode."""
     hertz = float(atlas.shape_frequency.sel(mode=mode))
     texts = (

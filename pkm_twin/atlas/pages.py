@@ -6,12 +6,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.atlas.extras import require
+
+if TYPE_CHECKING:
+    from xarray import Dataset
 
 Array = NDArray[np.float64]
 
@@ -243,7 +246,7 @@ def aspect(ranges: list[list[float]], longest: float) -> dict[str, float]:
     return {axis: longest * side / max(sides) for axis, side in zip("xyz", sides, strict=True)}
 
 
-def thinned(atlas: Any, most: dict[str, int]) -> Any:
+def thinned(atlas: Dataset, most: dict[str, int]) -> Dataset:
     """Every n-th sample along the named dimensions, so that at most these many are left."""
     return atlas.isel(
         {

@@ -8,9 +8,11 @@ does not grow with the sweep.
 
 from __future__ import annotations
 
+import functools
 import logging
 import multiprocessing
 import os
+import pickle
 import signal
 from asyncio import CancelledError
 from collections.abc import Callable, Iterator, Sequence
@@ -142,6 +144,8 @@ def on_cores(
 def _pool(sweep: Sweep, work: Work, workers: int, folder: Path) -> Iterator[int]:
     # Not forked: the parent has threads (the progress bar's, numba's).
     context = multiprocessing.get_context("spawn")
+    # Once, and here: a pool that cannot pass its work on waits for ever.
+    packed = pickle.dumps(sweep)
     pool = ProcessPoolExecutor(workers, mp_context=context)
     queue = iter(work)
     flying: set[Future[int]] = set()
@@ -149,7 +153,7 @@ def _pool(sweep: Sweep, work: Work, workers: int, folder: Path) -> Iterator[int]
         while True:
             for index, chunk in queue:
                 with _without_interrupts(), one_blas_thread_for_children():
-                    flying.add(pool.submit(_keep, sweep, chunk, folder, index))
+                    flying.add(pool.submit(_keep, packed, chunk, folder, index))
                 if len(flying) >= IN_FLIGHT * workers:
                     break
             if not flying:
@@ -237,9 +241,16 @@ def compute(sweep: Sweep, chunk: Chunk, version: str) -> Values:
         raise PkmTwinError(str(error)) from None
 
 
-def _keep(sweep: Sweep, chunk: Chunk, folder: Path, index: int) -> int:
-    save_part(folder, index, compute(sweep, chunk, pkm_twin.__version__))
+def _keep(packed: bytes, chunk: Chunk, folder: Path, index: int) -> int:
+    save_part(folder, index, compute(_unpacked(packed), chunk, pkm_twin.__version__))
     return index
+
+
+@functools.lru_cache(1)
+def _unpacked(packed: bytes) -> Sweep:
+    # Once a process: what the robot derives for its first chunk serves all.
+    sweep: Sweep = pickle.loads(packed)  # noqa: S301  from the parent
+    return sweep
 
 
 def _some(queue: Iterator[tuple[int, Chunk]], count: int) -> Iterator[tuple[int, Chunk]]:

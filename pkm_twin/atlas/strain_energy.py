@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +23,11 @@ from pkm_twin.atlas.sweep import Chunk, Field, Kind, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.compliance import strain_energy
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from xarray import Dataset
 
 Array = NDArray[np.float64]
 
@@ -258,8 +263,12 @@ def _sweep(
 
 
 def plane(
-    atlas: Any, variable: str = "energy", z: float | None = None, ax: Any = None, **options: Any
-) -> Any:
+    atlas: Dataset,
+    variable: str = "energy",
+    z: float | None = None,
+    ax: Axes | None = None,
+    **options: Any,
+) -> Axes:
     """One field of a strain-energy atlas over the plane of beta and gamma at one height.
 
     :param variable: ``energy``, or the name of an element for its factor.
@@ -291,7 +300,7 @@ def plane(
     return ax
 
 
-def global_factors(atlas: Any, ax: Any = None) -> Any:
+def global_factors(atlas: Dataset, ax: Axes | None = None) -> Axes:
     """Global strain-energy factors, beside the paper's where it prints them."""
     ax = figures.axes_or_new(ax)
     names = [str(name) for name in atlas.element.values]
@@ -312,7 +321,7 @@ def global_factors(atlas: Any, ax: Any = None) -> Any:
     return ax
 
 
-def stack(atlas: Any, ax: Any = None, layers: int = 6) -> Any:
+def stack(atlas: Dataset, ax: Any = None, layers: int = 6) -> Any:
     """Total energy on slices of the regular workspace, stacked by height, on 3-D axes."""
     if ax is None:
         ax = (
@@ -356,22 +365,22 @@ def stack(atlas: Any, ax: Any = None, layers: int = 6) -> Any:
     return ax
 
 
-def _energy_plane(atlas: Any) -> Any:
-    figure, ax = figures.pyplot().subplots(figsize=(7, 6), layout="constrained")
+def _energy_plane(atlas: Dataset) -> Figure:
+    figure, ax = figures.subplots(figsize=(7, 6), layout="constrained")
     plane(atlas, ax=ax)
     figure.suptitle(f"{load_case(atlas)}: total strain energy")
     return figure
 
 
-def _energy_slices(atlas: Any) -> Any:
-    figure = figures.pyplot().figure(figsize=(8, 6.2), layout="constrained")
+def _energy_slices(atlas: Dataset) -> Figure:
+    figure = figures.new_figure(figsize=(8, 6.2), layout="constrained")
     stack(atlas, figure.add_subplot(projection="3d"))
     figure.suptitle(f"{load_case(atlas)}: total strain energy over the regular workspace")
     return figure
 
 
-def _factor_plane(atlas: Any) -> Any:
-    figure, axes = figures.pyplot().subplots(3, 3, figsize=(13.5, 10), layout="constrained")
+def _factor_plane(atlas: Dataset) -> Figure:
+    figure, axes = figures.subplots(3, 3, figsize=(13.5, 10), layout="constrained")
     height = float(atlas.z[nearest_height(atlas, None)])
     for name, ax in zip(atlas.element.values, axes.T.ravel(), strict=True):
         plane(atlas, str(name), ax=ax, least=0.0)
@@ -380,14 +389,14 @@ def _factor_plane(atlas: Any) -> Any:
     return figure
 
 
-def _global(atlas: Any) -> Any:
-    figure, ax = figures.pyplot().subplots(figsize=(9, 4.5), layout="constrained")
+def _global(atlas: Dataset) -> Figure:
+    figure, ax = figures.subplots(figsize=(9, 4.5), layout="constrained")
     global_factors(atlas, ax)
     figure.suptitle(f"{load_case(atlas)}: global strain-energy factors")
     return figure
 
 
-def nearest_height(atlas: Any, z: float | None) -> int:
+def nearest_height(atlas: Dataset, z: float | None) -> int:
     """Index of the height nearest to z; default -0.6 m, or the middle where that is outside."""
     heights = atlas.z.values
     if z is None:
@@ -395,12 +404,12 @@ def nearest_height(atlas: Any, z: float | None) -> int:
     return int(np.abs(heights - z).argmin())
 
 
-def wrench_of(atlas: Any) -> tuple[float, ...]:
+def wrench_of(atlas: Dataset) -> tuple[float, ...]:
     """The wrench that made a strain-energy atlas, N and N m."""
     return tuple(json.loads(atlas.attrs["settings"])["wrench"])
 
 
-def load_case(atlas: Any) -> str:
+def load_case(atlas: Dataset) -> str:
     """Robot and wrench of a strain-energy atlas, as text."""
     wrench = wrench_of(atlas)
     name = "".join(f"{name} = " for name, value in WRENCHES.items() if tuple(value) == wrench)
@@ -408,7 +417,7 @@ def load_case(atlas: Any) -> str:
     return f"{atlas.attrs['robot']} under {name}({numbers}) N, N m"
 
 
-def lateral_of(atlas: Any) -> tuple[str, str]:
+def lateral_of(atlas: Dataset) -> tuple[str, str]:
     """Names of the two tilts, at azimuth 0 and a quarter turn."""
     first, second = atlas.attrs["lateral"].split()
     return first, second
@@ -417,12 +426,12 @@ def lateral_of(atlas: Any) -> tuple[str, str]:
 # Page
 
 
-def title(atlas: Any) -> str:
+def title(atlas: Dataset) -> str:
     """What the page shows, in a line."""
     return f"Strain energy of {load_case(atlas)}"
 
 
-def page(atlas: Any) -> Any:
+def page(atlas: Dataset) -> Any:
     """Slices of a strain-energy atlas.
 
     A menu chooses total energy or an element's factor, a slider one height or all.

@@ -11,13 +11,17 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 import pkm_twin
 from pkm_twin.machine.robot import Robot
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from xarray import Dataset
 
 Array = NDArray[np.float64]
 Values = dict[str, NDArray[Any]]
@@ -163,9 +167,9 @@ class Kind:
     """
 
     name: str
-    figures: Mapping[str, Callable[[Any], Any]]
-    page: Callable[[Any], Any]
-    title: Callable[[Any], str]
+    figures: Mapping[str, Callable[[Dataset], Figure]]
+    page: Callable[[Dataset], Any]
+    title: Callable[[Dataset], str]
     help: str
 
 

@@ -18,7 +18,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,11 @@ from pkm_twin.kinematics.workspace import (
     singularity_at,
 )
 from pkm_twin.machine.robot import Robot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from xarray import Dataset
 
 Array = NDArray[np.float64]
 
@@ -331,7 +336,9 @@ def workspace_sweep(
 # Figures
 
 
-def section(atlas: Any, ax: Any = None, upright: bool = True, z: float | None = None) -> Any:
+def section(
+    atlas: Dataset, ax: Axes | None = None, upright: bool = True, z: float | None = None
+) -> Axes:
     """A section through the workspace, coloured by the distance to a singularity.
 
     What limb interference takes away is hatched.
@@ -386,7 +393,7 @@ def section(atlas: Any, ax: Any = None, upright: bool = True, z: float | None = 
     return ax
 
 
-def closest(atlas: Any, ax: Any = None, upright: bool = True) -> Any:
+def closest(atlas: Dataset, ax: Axes | None = None, upright: bool = True) -> Axes:
     """Where limbs come closest: least clearance over the pose parameter that is not shown.
 
     :param upright: over the second parameter across the axis, else over z.
@@ -408,7 +415,7 @@ def closest(atlas: Any, ax: Any = None, upright: bool = True) -> Any:
     return ax
 
 
-def clearance_over_height(atlas: Any, ax: Any = None) -> Any:
+def clearance_over_height(atlas: Dataset, ax: Axes | None = None) -> Axes:
     """Least and greatest clearance of the limbs at each height, also of poses where they meet."""
     ax = figures.axes_or_new(ax)
     upwards = atlas.attrs["height"]
@@ -426,7 +433,7 @@ def clearance_over_height(atlas: Any, ax: Any = None) -> Any:
     return ax
 
 
-def _plane_of(atlas: Any, upright: bool) -> tuple[str, str, str]:
+def _plane_of(atlas: Dataset, upright: bool) -> tuple[str, str, str]:
     """Pose coordinates to the right and up in a section, and the one that it cuts."""
     one, other = atlas.attrs["lateral"].split()
     height = atlas.attrs["height"]
@@ -436,7 +443,7 @@ def _plane_of(atlas: Any, upright: bool) -> tuple[str, str, str]:
     return (other, one, height) if tilting else (one, other, height)
 
 
-def _mesh(atlas: Any, ax: Any, first: str, second: str, values: Array, **options: Any) -> Any:
+def _mesh(atlas: Dataset, ax: Axes, first: str, second: str, values: Array, **options: Any) -> Any:
     """A field over two pose parameters, with their names at the axes; NaN is left out."""
     x, y = (figures.in_degrees(atlas[name])[0] for name in (first, second))
     for label, name in ((ax.set_xlabel, first), (ax.set_ylabel, second)):
@@ -444,7 +451,7 @@ def _mesh(atlas: Any, ax: Any, first: str, second: str, values: Array, **options
     return ax.pcolormesh(x, y, np.ma.masked_invalid(values), shading="nearest", **options)
 
 
-def _hatch(atlas: Any, ax: Any, first: str, second: str, gap: Array, what: str) -> list[Any]:
+def _hatch(atlas: Dataset, ax: Axes, first: str, second: str, gap: Array, what: str) -> list[Any]:
     """Hatch where limbs are too near, and what to put into the legend for it."""
     near = np.nan_to_num(gap, nan=np.inf) <= _least_clearance(atlas)
     if not near.any():
@@ -459,7 +466,7 @@ def _hatch(atlas: Any, ax: Any, first: str, second: str, gap: Array, what: str) 
     ]
 
 
-def _clearance(atlas: Any, ufunc: Any, kept: list[str]) -> Array:
+def _clearance(atlas: Dataset, ufunc: Any, kept: list[str]) -> Array:
     """Least (fmin) or greatest (fmax) clearance, m, over all dimensions but ``kept``.
 
     Slab by slab, as the file is stored. NaN where no pose is.
@@ -473,17 +480,17 @@ def _clearance(atlas: Any, ufunc: Any, kept: list[str]) -> Array:
     return np.stack(list(slabs)) if first in kept else np.asarray(functools.reduce(ufunc, slabs))
 
 
-def _least_clearance(atlas: Any) -> float:
+def _least_clearance(atlas: Dataset) -> float:
     """What a reachable pose's clearance is above, m."""
     return float(json.loads(atlas.attrs["settings"])["least_clearance"])
 
 
-def _near(atlas: Any) -> str:
+def _near(atlas: Dataset) -> str:
     bound = _least_clearance(atlas)
     return f"are within {1e3 * bound:g} mm" if bound > 0.0 else "meet"
 
 
-def _legend_above(ax: Any, handles: list[Any]) -> None:
+def _legend_above(ax: Axes, handles: list[Any]) -> None:
     """A legend in room of its own above what is drawn."""
     if not handles:
         return
@@ -492,7 +499,7 @@ def _legend_above(ax: Any, handles: list[Any]) -> None:
     ax.legend(handles=handles, loc="upper right", fontsize=8)
 
 
-def circle_radii(atlas: Any, ax: Any = None) -> Any:
+def circle_radii(atlas: Dataset, ax: Axes | None = None) -> Axes:
     """Radius of the largest circle about the axis over the height."""
     ax = figures.axes_or_new(ax)
     rad = atlas.circle.attrs["units"] == "rad"
@@ -511,14 +518,14 @@ def circle_radii(atlas: Any, ax: Any = None) -> Any:
     return ax
 
 
-def middle_height(atlas: Any) -> float:
+def middle_height(atlas: Dataset) -> float:
     """Middle of the largest cylinder, m."""
     low, high = float(atlas.cylinder_low), float(atlas.cylinder_high)
     heights = atlas[atlas.attrs["height"]]
     return (low + high) / 2 if math.isfinite(low) else float(heights.mean())
 
 
-def _workspace(atlas: Any) -> Any:
+def _workspace(atlas: Dataset) -> Figure:
     return _upright(atlas) if "circle" in atlas else _sections(atlas)
 
 
@@ -537,7 +544,7 @@ class Plane:
     fields: Mapping[str, Array]
 
 
-def planes(atlas: Any) -> list[Plane]:
+def planes(atlas: Dataset) -> list[Plane]:
     """Every pair of coordinates of an atlas without an axis, through the home pose."""
     names = ("singularity", "clearance", "joint_angle")
     fields = [name for name in names if name in atlas]
@@ -564,7 +571,7 @@ def planes(atlas: Any) -> list[Plane]:
 
 
 def _plane(
-    atlas: Any,
+    atlas: Dataset,
     pair: tuple[str, str],
     shown: Sequence[tuple[Array, str]],
     held: Mapping[str, float],
@@ -581,7 +588,7 @@ def _plane(
     return Plane(pair, (one, other), (first, second), ", ".join(others), fields)
 
 
-def _units(atlas: Any) -> dict[str, str]:
+def _units(atlas: Dataset) -> dict[str, str]:
     """Units of the pose coordinates."""
     if atlas.singularity.dims == _SLICED:
         return dict(zip(atlas.coordinate.values, atlas.unit.values, strict=True))
@@ -592,7 +599,7 @@ def _degrees(values: Array, unit: str) -> tuple[Array, str]:
     return (np.degrees(values), "deg") if unit == "rad" else (values, unit)
 
 
-def plane(shown: Plane, greatest: float, ax: Any = None) -> Any:
+def plane(shown: Plane, greatest: float, ax: Axes | None = None) -> Axes:
     """Distance to a singularity over two pose coordinates, or over the only one.
 
     :param greatest: value of the last colour.
@@ -622,12 +629,12 @@ def plane(shown: Plane, greatest: float, ax: Any = None) -> Any:
     return ax
 
 
-def _sections(atlas: Any) -> Any:
+def _sections(atlas: Dataset) -> Figure:
     """Every pair of coordinates through the home pose."""
     shown = planes(atlas)
     columns = min(len(shown), 5 if len(shown) > 4 else 3)
     rows = math.ceil(len(shown) / columns)
-    figure, axes = figures.pyplot().subplots(
+    figure, axes = figures.subplots(
         rows, columns, figsize=(5.2 * columns, 4.2 * rows), layout="constrained", squeeze=False
     )
     greatest = float(atlas.singularity.max())
@@ -642,9 +649,9 @@ def _sections(atlas: Any) -> Any:
     return figure
 
 
-def _upright(atlas: Any) -> Any:
+def _upright(atlas: Dataset) -> Figure:
     known = "clearance" in atlas
-    figure, axes = figures.pyplot().subplots(
+    figure, axes = figures.subplots(
         1 + known,
         3,
         figsize=(16, 9.5 if known else 5),
@@ -678,12 +685,12 @@ def _upright(atlas: Any) -> Any:
 # Page
 
 
-def title(atlas: Any) -> str:
+def title(atlas: Dataset) -> str:
     """What the page shows, in a line."""
     return f"Workspace of {atlas.attrs['robot']}"
 
 
-def page(atlas: Any) -> Any:
+def page(atlas: Dataset) -> Any:
     """The reachable poses: slices of three coordinates, or one picture for each two."""
     return (
         _page_of_slices(atlas)
@@ -699,7 +706,7 @@ _LABELS: Final = {
 }
 
 
-def _page_of_slices(atlas: Any) -> Any:
+def _page_of_slices(atlas: Dataset) -> Any:
     dims = atlas.singularity.dims
     upwards = atlas.attrs["height"] or dims[2]
     one, other = (name for name in dims if name != upwards)
@@ -725,7 +732,7 @@ def _page_of_slices(atlas: Any) -> Any:
     )
 
 
-def _page_of_planes(atlas: Any) -> Any:
+def _page_of_planes(atlas: Dataset) -> Any:
     graph = require("plotly.graph_objects", "atlas")
     figure = graph.Figure()
     shown = planes(atlas)

@@ -349,11 +349,17 @@ class _Writer:
         if program.equations is not None:
             residual = out.run([program.equations.residual], values)[0]
             good = b.and_(good, b.fcmp_ordered("<=", residual, out.number(RESIDUAL**2)))
+            for value in out.run(list(program.equations.branch), values):
+                good = b.and_(good, b.fcmp_ordered(">", value, out.number(0.0)))
         total = None
         for row in rows.values():
             for value in row:
                 size = out.call("fabs", value)
                 total = size if total is None else b.fadd(total, size)
+        # Inputs that no output hangs on have to be numbers, too.
+        for name in program.inputs:
+            for value in values[name]:
+                total = b.fadd(total, b.fmul(value, out.number(0.0)))
         finite = b.fcmp_ordered("<", total, out.number(math.inf))
         code = b.select(good, b.select(finite, out.number(0.0), out.number(2.0)), out.number(1.0))
         good = b.and_(good, finite)

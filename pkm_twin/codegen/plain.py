@@ -91,8 +91,10 @@ class PlainCode:
             names[UNKNOWNS] = len(equations.home)
         self._names = list(names)
         results = [e for row in program.outputs.values() for e in row]
+        self._judged = 0
         if equations is not None:
-            results.append(equations.residual)
+            results += [equations.residual, *equations.branch]
+            self._judged = 1 + len(equations.branch)
         self._results = self._compiled(results, names)
         self._correction = self._start = None
         if equations is not None:
@@ -152,10 +154,11 @@ class PlainCode:
         except (ZeroDivisionError, ValueError, OverflowError):
             return nothing, (2.0 if reached == 1.0 else 1.0, reached)
         if q is not None:
-            *values, residual = values
-            if not residual <= RESIDUAL**2:
+            at = len(values) - self._judged
+            values, (residual, *branch) = values[:at], values[at:]
+            if not (residual <= RESIDUAL**2 and all(value > 0.0 for value in branch)):
                 return nothing, (1.0, reached)
-        if not all(map(math.isfinite, values)):
+        if not all(map(math.isfinite, [*values, *(v for row in inputs for v in row)])):
             return nothing, (2.0, reached)
         return self._split(values), (0.0, reached)
 
@@ -202,8 +205,14 @@ class PlainCode:
             named[UNKNOWNS] = list(x)
         values = [np.broadcast_to(v, count) for v in self._results[1](**named)]
         if q is not None:
-            good = good & (values.pop() <= RESIDUAL**2)
+            at = len(values) - self._judged
+            values, (residual, *branch) = values[:at], values[at:]
+            good = good & (residual <= RESIDUAL**2)
+            for value in branch:
+                good = good & (value > 0.0)
         finite = np.ones(count, bool)
+        for row in inputs:
+            finite &= np.isfinite(row).all(-1)
         for value in values:
             finite &= np.isfinite(value)
         code = np.where(good, np.where(finite, 0.0, 2.0), 1.0)

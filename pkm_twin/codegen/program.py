@@ -65,6 +65,8 @@ class Equations:
     """Of the equations, over that at home."""
     residual: Expression
     """Square of the residual of all equations, of unit one."""
+    branch: Sequence[Expression] = ()
+    """Above zero in the mechanism's own branch, at the target."""
 
     @property
     def least(self) -> float:
@@ -106,7 +108,7 @@ class Program:
         rows = [e for row in self.outputs.values() for e in row]
         q = self.equations
         if q is not None:
-            rows += [*(q.start or ()), *q.results, q.residual]
+            rows += [*(q.start or ()), *q.results, q.residual, *q.branch]
         return rows
 
     @property

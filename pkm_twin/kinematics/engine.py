@@ -11,6 +11,7 @@ May import: numpy, pkm_twin's machine and codegen, this package, the standard li
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -30,6 +31,7 @@ from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine.graph import FREEDOMS, Array, Graph
 from pkm_twin.machine.tree import Tree
 
+_NO_PARAMETERS: Final = np.zeros(0)
 RANK: Final = 1e-9
 """Part of a matrix's largest singular value below which one counts as zero."""
 SAMPLES: Final = 6
@@ -37,6 +39,10 @@ SAMPLES: Final = 6
 
 Start = Callable[[Objects], Mapping[str, Sequence[Any]]]
 """A mechanism's closed form of passive tree joints by q, from inner to outer body, beside home."""
+
+
+Branch = Callable[[Motion], Sequence[Any]]
+"""A mechanism's numbers that are above zero in its own branch, of the motion."""
 
 
 @dataclass(frozen=True)
@@ -59,13 +65,17 @@ class Engine:
     """Kinematics of a graph, and the compiled programs of it, each made when it is first used."""
 
     def __init__(
-        self, graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None
+        self,
+        graph: Graph,
+        coordinates: Sequence[Coordinate],
+        start: Start | None = None,
+        branch: Branch | None = None,
     ) -> None:
         self.graph, self.coordinates = graph, tuple(coordinates)
         self.tree = Tree(graph)
-        self._start = start
+        self._start, self._branch = start, branch
         self._kernels: dict[str, Kernel] = {}
-        text = repr((graph.key, self.coordinates, start is not None))
+        text = repr((graph.key, self.coordinates, start is not None, branch is not None))
         self.key = hashlib.sha256(text.encode()).hexdigest()
 
     # On numbers.
@@ -242,55 +252,114 @@ class Engine:
                 table[i, k if kind == "u" else n + k] = value
         return table
 
+    def _look(self, x: Array, q: Array, move: Array | None = None) -> tuple[Array, Array, Array]:
+        """Closures and their derivatives by the unknowns, of unit one; and the unknowns moved.
+
+        :param move: of unit one, shape (unknown rates,).
+        """
+        walk = self.kernel("walk", _walk)
+        step = np.zeros(self.tree.unknown_rates) if move is None else move
+        (values, table, moved), _ = walk(_NO_PARAMETERS, x, q, step)
+        return values, table.reshape(len(values), -1), moved
+
+    def _closed(self, q: Array, x: Array) -> Array | None:
+        """As :meth:`close`, compiled."""
+        last = np.inf
+        for _ in range(12):
+            values, table, _ = self._look(x, q)
+            if not (np.isfinite(values).all() and np.isfinite(table).all()):
+                return None
+            step = np.asarray(np.linalg.lstsq(table, -values, rcond=RANK)[0], np.float64)
+            size = float(np.abs(step).max(initial=0.0))
+            if not size < 0.5 * last:
+                return None
+            x = self._look(x, q, step)[2]
+            if size < 1e-12:
+                return x if float(np.abs(values).max(initial=0.0)) < 1e-9 else None
+            last = max(size, 1e-13)
+        return None
+
+    def reach(
+        self, q: Array, limit: float = 1.0, precision: float = 1e-4
+    ) -> tuple[float, Array, float]:
+        """How far the straight way from home to q leads without passing a singularity.
+
+        :param limit: part of the way beyond which nothing is looked for.
+        :returns: the part of the way, the unknowns there, and the closures' least reciprocal
+            condition on it.
+        """
+        home = self.graph.home
+        x, done = np.array(self.tree.home, float), 0.0
+        side, least = self._regularity(x, home)
+        step = 1 / 8
+        while step > precision and done < 1.0:
+            way = min(1.0, done + step)
+            there = home + way * (q - home)
+            new = self._closed(there, x)
+            # Beyond a singularity is another assembly.
+            sign, measure = (0.0, 0.0) if new is None else self._regularity(new, there)
+            if new is None or sign != side or way > limit:
+                step /= 8
+                continue
+            x, done, least = new, way, min(least, measure)
+        return done, x, least
+
     def ending(self, q: Array, reached: float) -> tuple[str, float, float | None]:
         """Why no assembly is found beyond a part of the straight way from home to q.
 
         :returns: the part that falls short the most, by how much (m), and None; or, where there is
             an assembly behind a singularity, the closures' least reciprocal condition on the way.
         """
-        home = self.graph.home
-        x, done = np.array(self.tree.home, float), 0.0
-        side, least = self._regularity(x, home)
-        step = 1 / 8
-        while step > 1e-4 and done < 1.0:
-            way = min(1.0, done + step)
-            there = home + way * (q - home)
-            new = self.close(there, x)
-            # Beyond a singularity is another assembly.
-            sign, measure = (0.0, 0.0) if new is None else self._regularity(new, there)
-            if new is None or sign != side or way > max(reached, 1e-12) + 1 / 8:
-                step /= 8
-                continue
-            x, done, least = new, way, min(least, measure)
+        _, x, least = self.reach(q, max(reached, 1e-12) + 1 / 8)
         part, miss = self._shortest(x, q)
         # Where nothing falls short there is an assembly, but the way does not lead to it.
         return part, miss, least if miss < 1e-9 * self.tree.size else None
 
     def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
         """Sign of the determinant of the kept closures, and their reciprocal condition."""
-        matrix = self._scaled(self.at(x.tolist(), q)[1])[0][self.kept]
+        matrix = self._look(x, q)[1][self.kept]
         return float(np.linalg.slogdet(matrix)[0]), _reciprocal(matrix)
 
     def _shortest(self, x: Array, q: Array) -> tuple[str, float]:
         """The closure that misses the most where all together miss the least, and by how much."""
+        values, table, _ = self._look(x, q)
         for _ in range(20):
-            motion, rows = self.at(x.tolist(), q)
-            value = np.array([row.scale * float(row.value) for row in rows])
-            ju, _ = self._scaled(rows)
-            left = np.linalg.lstsq(
-                ju.T @ ju + 1e-6 * np.eye(ju.shape[1]), -ju.T @ value, rcond=None
-            )[0]
-            left *= min(1.0, 0.2 / max(float(np.abs(left).max(initial=0.0)), 1e-300))
-            x = np.array([float(v) for v in motion.retracted(x, left / np.array(self.tree.scales))])
-        _, rows = self.at(x.tolist(), q)
-        value = np.array([row.scale * float(row.value) for row in rows])
-        worst = int(np.abs(value).argmax())
-        return rows[worst].part, float(abs(value[worst])) * self.tree.size
+            if not (np.isfinite(values).all() and np.isfinite(table).all()):
+                return self._parts[0], math.inf
+            damped = table.T @ table + 1e-6 * np.eye(table.shape[1])
+            step = np.asarray(np.linalg.solve(damped, -table.T @ values), np.float64)
+            step *= min(1.0, 0.2 / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+            x = self._look(x, q, step)[2]
+            values, table, _ = self._look(x, q)
+        worst = int(np.abs(values).argmax())
+        return self._parts[worst], float(abs(values[worst])) * self.tree.size
+
+    @cached_property
+    def _parts(self) -> list[str]:
+        """The joint or rod of every closure."""
+        return [row.part for row in self.at(self.tree.home, self.graph.home)[1]]
 
     def shortest_pose(self, pose: Array) -> tuple[str, float]:
-        """The closure that misses the most on the way to a pose, and by how much, m."""
-        del pose
-        return self.graph.actuated[0], 0.0
+        """The closure that misses the most where the platform is held in a pose.
+
+        :returns: its joint or rod, and by how much it misses, m.
+        """
+        walk = self.kernel("pose walk", _pose_walk)
+        x = np.array([*self.tree.home, *self.graph.home], float)
+        still = np.zeros(self.tree.unknown_rates + self.joints)
+        (values, flat, _), _ = walk(_NO_PARAMETERS, x, pose, still)
+        names = self._parts
+        for _ in range(40):
+            if not (np.isfinite(values).all() and np.isfinite(flat).all()):
+                return names[0], math.inf
+            table = flat.reshape(len(values), -1)
+            damped = table.T @ table + 1e-6 * np.eye(table.shape[1])
+            step = np.asarray(np.linalg.solve(damped, -table.T @ values), np.float64)
+            step *= min(1.0, 0.2 / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+            (_, _, x), _ = walk(_NO_PARAMETERS, x, pose, step)
+            (values, flat, _), _ = walk(_NO_PARAMETERS, x, pose, still)
+        misses = np.abs(values[: len(names)])
+        return names[int(misses.argmax())], float(misses.max()) * self.tree.size
 
     # As programs.
 
@@ -402,6 +471,7 @@ class Traced:
             self.lift(self.motion.retracted(self.x, step)),
             self._square(step, tree.scales), self._determinant(self.lu),
             self._square([r.value for r in self.rows], [r.scale for r in self.rows]),
+            () if engine._branch is None else self.lift(engine._branch(self.motion)),
         )  # fmt: skip
 
     def _ordered(self, values: Mapping[str, Sequence[Any]]) -> list[Any]:
@@ -472,6 +542,58 @@ class Traced:
                 pair.append(total)
             result.append((pair[0], pair[1]))
         return result
+
+
+def _walk(t: Traced) -> Program:
+    """The closures where they do not hold, for telling why."""
+    tree = t.tree
+    motion = Motion(tree, t.x, t.q)
+    rows = motion.closures()
+    table, _ = matrices(tree, rows)
+    move = t.tape.inputs("move", tree.unknown_rates)
+    scales = np.array(tree.scales)
+    entries = [
+        row.scale * e / c
+        for row, line in zip(rows, table, strict=True)
+        for e, c in zip(line, scales, strict=True)
+    ]
+    outputs = {
+        "values": t.lift([row.scale * row.value for row in rows]),
+        "table": t.lift(entries),
+        "moved": t.lift(motion.retracted(t.x, move / scales)),
+    }
+    sizes = {UNKNOWNS: len(tree.home), "q": t.joints, "move": tree.unknown_rates}
+    return Program(sizes, 0, outputs)
+
+
+def _pose_walk(t: Traced) -> Program:
+    """The same of a pose, the actuated joints unknown too."""
+    engine, tree, tape = t.engine, t.tree, t.tape
+    size, free = len(tree.home), tree.unknown_rates
+    everything = tape.inputs(UNKNOWNS, size + t.joints)
+    goal = tape.inputs("pose", len(engine.coordinates))
+    motion = Motion(tree, everything[:size], everything[size:])
+    rows = motion.closures()
+    equations = poses.rows(engine.coordinates, motion, goal)
+    table = np.vstack([np.hstack(matrices(tree, rows)), engine._pose_rows(motion, goal)])
+    # The pose weighs more, so that what falls short is a closure.
+    scales = [row.scale for row in rows] + [100.0 * scale for scale in engine._pose_scales]
+    columns = [*tree.scales, *(engine._drive_scale(name) for name in engine.graph.actuated)]
+    entries = [
+        scale * entry / column
+        for scale, line in zip(scales, table, strict=True)
+        for entry, column in zip(line, columns, strict=True)
+    ]
+    values = [row.value for row in rows] + [value for value, _ in equations]
+    move = tape.inputs("move", free + t.joints) / np.array(columns)
+    moved = [*motion.retracted(everything[:size], move[:free]), *(everything[size:] + move[free:])]
+    outputs = {
+        "values": t.lift([s * v for s, v in zip(scales, values, strict=True)]),
+        "table": t.lift(entries),
+        "moved": t.lift(moved),
+    }
+    sizes = {UNKNOWNS: size + t.joints, "pose": len(goal), "move": free + t.joints}
+    return Program(sizes, 0, outputs)
 
 
 def _forward(t: Traced) -> Program:
@@ -575,15 +697,19 @@ def _shared(key: str) -> dict[str, Engine]:
 
 
 def engine_of(
-    graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None, mark: str = ""
+    graph: Graph,
+    coordinates: Sequence[Coordinate],
+    start: Start | None = None,
+    branch: Branch | None = None,
+    mark: str = "",
 ) -> Engine:
     """The engine of a geometry: machines that differ in inertia or limits alone share it.
 
-    :param mark: text that tells a closed form from others.
+    :param mark: text that tells closed forms and branch rules from others.
     """
     store = _shared(f"{graph.key} {coordinates!r} {mark}")
     if "engine" not in store:
-        store["engine"] = Engine(graph, coordinates, start)
+        store["engine"] = Engine(graph, coordinates, start, branch)
     return store["engine"]
 
 

@@ -23,8 +23,7 @@ BODIES: Final = 0
 RODS: Final = 1
 GRAVITY: Final = 2
 ROTORS: Final = 5
-FRICTION: Final = (3, 4, 6)
-"""Parts of the inputs; friction is viscous, Coulomb, and of passive joints with their rotors."""
+"""Parts of the inputs, see :meth:`Layout.part`."""
 
 
 def ten_numbers(mass: float, com: Array, inertia: Array) -> Array:
@@ -89,6 +88,14 @@ class Layout:
         """Part k: 0 bodies, 1 rods, 2 gravity, 3 viscous, 4 Coulomb, 5 rotors, 6 passive."""
         a, b = self.starts[k : k + 2]
         return slice(int(a), int(b))
+
+    @property
+    def friction(self) -> NDArray[np.intp]:
+        """Indices of all friction, that of passive joints too."""
+        starts = self.starts
+        passive = np.arange(starts[6], starts[7])
+        rubs = passive[np.arange(len(passive)) % 3 < 2]
+        return np.concatenate([np.arange(starts[3], starts[5]), rubs]).astype(np.intp)
 
     def body(self, name: str) -> slice:
         """The ten numbers of a body."""

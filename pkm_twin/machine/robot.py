@@ -25,6 +25,7 @@ from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.kinematics.engine import Engine, Traced, engine_of
+from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.passive import passive_names, passive_program
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine import schema
@@ -49,12 +50,12 @@ _NONE: Final = np.zeros(0)
 
 def length(**options: Any) -> Any:
     """Field: a length above zero, m."""
-    return schema.number(above=0.0, at_most=MAX_LENGTH, **options)
+    return schema.number(above=0.0, at_most=MAX_LENGTH, unit="m", **options)
 
 
 def mass(**options: Any) -> Any:
     """Field: a mass of zero or more, kg."""
-    return schema.number(at_least=0.0, at_most=MAX_MASS, **options)
+    return schema.number(at_least=0.0, at_most=MAX_MASS, unit="kg", **options)
 
 
 def check_azimuths(azimuths: Array, path: str) -> None:
@@ -71,7 +72,7 @@ class Payload:
     """A body fixed to the platform: com from its reference point, inertia about the com."""
 
     mass: float = mass(default=0.0)
-    com: Array = schema.vector(3, default=[0, 0, 0])
+    com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
 
 
@@ -89,8 +90,9 @@ def check_angles(angle: float, path: str) -> None:
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
     field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
-    entries = [(n, Array, schema.vector(joints, **field)) for n in ("viscous", "coulomb")]
-    return dataclasses.make_dataclass("Friction", entries, frozen=True, eq=False)
+    units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
+    entries = [(n, Array, schema.vector(joints, unit=u, **field)) for n, u in units.items()]
+    return _section("Friction", entries, joints)
 
 
 @remembered
@@ -98,11 +100,27 @@ def limits_of(joints: int) -> Any:
     """Schema of limits of so many actuated joints; absent is None, one value stands for all."""
     above: dict[str, Any] = {"above": 0.0, "infinite": True, "spread": True, "default": None}
     entries = [
-        ("position", Any, schema.interval(count=joints, default=None)),
-        ("velocity", Any, schema.vector(joints, **above)),
-        ("effort", Any, schema.vector(joints, **above)),
+        ("position", Any, schema.interval(count=joints, unit="{joint}", default=None)),
+        ("velocity", Any, schema.vector(joints, unit="{joint}/s", **above)),
+        ("effort", Any, schema.vector(joints, unit="{effort}", **above)),
     ]
-    return dataclasses.make_dataclass("Limits", entries, frozen=True, eq=False)
+    return _section("Limits", entries, joints)
+
+
+def _section(name: str, entries: list[tuple[str, Any, Any]], joints: int) -> Any:
+    """A section's class for so many joints; what it makes passes between processes."""
+
+    def reduce(self: Any) -> tuple[Any, ...]:
+        return _rebuilt, (name, joints, [getattr(self, entry[0]) for entry in entries])
+
+    return dataclasses.make_dataclass(
+        name, entries, frozen=True, eq=False, namespace={"__reduce__": reduce}
+    )
+
+
+def _rebuilt(name: str, joints: int, values: list[Any]) -> Any:
+    schema_of = friction_of if name == "Friction" else limits_of
+    return schema_of(joints)(*values)
 
 
 class JointLimits(Protocol):
@@ -158,7 +176,7 @@ class Robot:
     """The name that the robot was loaded by."""
     payload: Payload = schema.section(Payload, default={})
     friction: Coefficients = schema.section(friction_of(3), default={})
-    gravity: Array = schema.vector(3, default=[0, 0, -9.81])
+    gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])
     limits: JointLimits = schema.section(limits_of(3), default={})
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
 
@@ -166,6 +184,7 @@ class Robot:
     changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
     has_start: ClassVar[bool] = False
     has_inverse: ClassVar[bool] = False
+    has_branch: ClassVar[bool] = False
 
     @classmethod
     def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
@@ -214,9 +233,16 @@ class Robot:
         """Closed form of the inverse, where ``has_inverse``."""
         raise NotImplementedError
 
-    def unreachable_limb(self, q: Array) -> tuple[int, float] | None:
-        """Limb and miss (m) of joint positions without an assembly, shape (n,); None: unknown."""
-        del q
+    def branch(self, motion: Motion) -> Sequence[Any]:
+        """Numbers that are above zero in the branch of ``forward``, where ``has_branch``."""
+        raise NotImplementedError
+
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
+        """Limb and miss (m) of joint positions without an assembly, shape (n,); None: unknown.
+
+        :param reached: part of the straight way from home up to which there is one.
+        """
+        del q, reached
         return None
 
     @cached_property
@@ -259,7 +285,9 @@ class Robot:
     def engine(self) -> Engine:
         """The engine of the robot's geometry, shared by all robots that have the same."""
         start = self.start if self.has_start else None
-        return engine_of(self.graph, self.coordinates, start, self.mechanism)
+        branch = self.branch if self.has_branch else None
+        mark = f"{self.mechanism} {self.closed_key}"
+        return engine_of(self.graph, self.coordinates, start, branch, mark)
 
     @cached_property
     def calls(self) -> dict[str, Any]:
@@ -304,6 +332,16 @@ class Robot:
         """
         return self.engine
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy in another process is made from: all but what is derived and kept."""
+        derived = {
+            name
+            for part in type(self).__mro__
+            for name, value in vars(part).items()
+            if isinstance(value, cached_property)
+        }
+        return {name: value for name, value in vars(self).items() if name not in derived}
+
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the actuated joints, in the order of q."""
@@ -345,6 +383,11 @@ class Robot:
         """The parameters by section, as plain data."""
         fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
         return {name: schema.plain(getattr(self, name)) for name in fields}
+
+    def parameter_units(self) -> dict[str, Any]:
+        """Units of the same, by section; empty where a parameter has none."""
+        words = {"joint": self.joint_unit, "effort": self.effort_unit}
+        return schema.units(type(self), self.parameter_sections(), words)
 
     @cached_property
     def controller(self) -> JointMap:
@@ -525,13 +568,14 @@ class Robot:
         if status is not None:
             self.refuse_joints(status, q)
         n = self.joints_count
-        return [m.reshape(*m.shape[:-1], -1, n) for m in (rates, twist)]
+        return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in (rates, twist)]
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Pose rates per joint rate (..., m, n), NaN where there is no assembly; which are good."""
         (rates, _), status = self.engine.jacobian(_NONE, q)
         good = np.ones(rates.shape[:-1], bool) if status is None else status[..., 0] == 0.0
-        return rates.reshape(*rates.shape[:-1], -1, self.joints_count), np.asarray(good)
+        n = self.joints_count
+        return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), np.asarray(good)
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Second derivative of the pose in time, shape (..., m)."""
@@ -634,7 +678,7 @@ class Robot:
             raise _not_finite("joint state", index)
         place = np.asarray(q, float)
         sample = np.broadcast_to(place, (*batch, place.shape[-1]))[index]
-        limb = self.unreachable_limb(sample)
+        limb = self.unreachable_limb(sample, reached)
         if limb is not None:
             raise UnreachableError("joint state", self.limb_names[limb[0]], index, limb[1])
         part, miss, measure = self.engine.ending(sample, reached)

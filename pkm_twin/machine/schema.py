@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameter files: strict YAML to frozen dataclasses, each refusal naming field and bound.
 
-A mechanism declares its schema as frozen dataclasses whose fields carry a check made by the
-functions below. May import: numpy, yaml, the standard library.
+A mechanism declares its schema as frozen dataclasses whose fields are made by the functions below.
+A field's metadata hold its ``check``, its ``key`` in the file, its ``unit`` (``{joint}``,
+``{effort}`` and ``{rotor}`` stand for those of the actuated joints), its ``bound`` in words, its
+``default``, of a nested section its ``section``, and of names to sections that of the ``entries``.
+
+May import: numpy, yaml, the standard library.
 """
 
 from __future__ import annotations
@@ -99,6 +103,7 @@ def number(
     above: float = -math.inf,
     at_least: float = -math.inf,
     at_most: float = math.inf,
+    unit: str = "",
     default: Any = dataclasses.MISSING,
 ) -> Any:
     """Field: one finite number within bounds."""
@@ -106,7 +111,7 @@ def number(
     def check(field: str, value: Any) -> float:
         return _number(field, value, above, at_least, at_most)
 
-    return _field(check, default)
+    return _field(check, default, "number" + _bound(above, at_least, at_most), unit)
 
 
 def vector(
@@ -117,6 +122,7 @@ def vector(
     infinite: bool = False,
     spread: bool = False,
     key: str | None = None,
+    unit: str = "",
     default: Any = dataclasses.MISSING,
 ) -> Any:
     """Field: ``size`` numbers, read-only array; with ``spread`` one number stands for all.
@@ -135,10 +141,13 @@ def vector(
             ]
         )
 
-    return _field(check, default, key)
+    bound = f"{size} numbers" + _bound(above, at_least, math.inf, infinite)
+    if spread:
+        bound += "; one stands for all"
+    return _field(check, default, bound, unit, key=key)
 
 
-def many(*, default: Any = dataclasses.MISSING) -> Any:
+def many(*, unit: str = "", default: Any = dataclasses.MISSING) -> Any:
     """Field: one number or more, read-only array."""
 
     def check(field: str, value: Any) -> Array:
@@ -146,10 +155,10 @@ def many(*, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, value, "a list of numbers")
         return frozen([_number(f"{field}[{i}]", item) for i, item in enumerate(value)])
 
-    return _field(check, default)
+    return _field(check, default, "one number or more", unit)
 
 
-def matrix(rows: int, columns: int, *, default: Any = dataclasses.MISSING) -> Any:
+def matrix(rows: int, columns: int, *, unit: str = "", default: Any = dataclasses.MISSING) -> Any:
     """Field: ``rows`` lists of ``columns`` numbers, read-only array."""
 
     def check(field: str, value: Any) -> Array:
@@ -163,7 +172,7 @@ def matrix(rows: int, columns: int, *, default: Any = dataclasses.MISSING) -> An
             ]
         )
 
-    return _field(check, default)
+    return _field(check, default, f"{rows} lists of {columns} numbers", unit)
 
 
 def text(*, default: Any = dataclasses.MISSING) -> Any:
@@ -174,7 +183,7 @@ def text(*, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, value, "a non-empty text")
         return value
 
-    return _field(check, default)
+    return _field(check, default, "a non-empty text")
 
 
 def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
@@ -185,7 +194,7 @@ def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, value, "a mapping of names to entries")
         return {name: build(kind, entry, _join(field, name)) for name, entry in value.items()}
 
-    return _field(check, default)
+    return _field(check, default, "a mapping of names to entries", entries=kind)
 
 
 def flag(*, default: Any = dataclasses.MISSING) -> Any:
@@ -196,7 +205,7 @@ def flag(*, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, value, "true or false")
         return value
 
-    return _field(check, default)
+    return _field(check, default, "true or false")
 
 
 def words(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
@@ -212,7 +221,7 @@ def words(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, list(value), "different names")
         return tuple(value)
 
-    return _field(check, default)
+    return _field(check, default, f"different ones of {', '.join(allowed)}")
 
 
 def checked(field: Any, path: str, value: Any) -> Any:
@@ -221,7 +230,11 @@ def checked(field: Any, path: str, value: Any) -> Any:
 
 
 def interval(
-    *, above: float = -math.inf, count: int = 0, default: Any = dataclasses.MISSING
+    *,
+    above: float = -math.inf,
+    count: int = 0,
+    unit: str = "",
+    default: Any = dataclasses.MISSING,
 ) -> Any:
     """Field: ``[min, max]``; with ``count`` one for all or one each, shape (count, 2)."""
 
@@ -239,7 +252,8 @@ def interval(
             return frozen([pair(f"{field}[{i}]", v) for i, v in enumerate(items)])
         return frozen([pair(field, value)] * count if count else pair(field, value))
 
-    return _field(check, default)
+    bound = "[min, max]" + _bound(above)
+    return _field(check, default, f"{bound}, or {count} of them" if count else bound, unit)
 
 
 def inertia(*, positive: bool, default: Any = dataclasses.MISSING) -> Any:
@@ -277,7 +291,9 @@ def inertia(*, positive: bool, default: Any = dataclasses.MISSING) -> Any:
             )
         return frozen((matrix + matrix.T) / 2)
 
-    return _field(check, default)
+    least = "above zero" if positive else "zero or more"
+    bound = f"3 numbers or 3x3, symmetric, principal moments {least}, triangle rule"
+    return _field(check, default, bound, "kg m2")
 
 
 def names(size: int, *, default: Any = dataclasses.MISSING) -> Any:
@@ -292,7 +308,7 @@ def names(size: int, *, default: Any = dataclasses.MISSING) -> Any:
             raise ParameterError(field, value, "different names")
         return tuple(items)
 
-    return _field(check, default)
+    return _field(check, default, f"{size} different names")
 
 
 def choice(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
@@ -303,7 +319,7 @@ def choice(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
             raise UnknownNameError(field, value, allowed)
         return str(value)
 
-    return _field(check, default)
+    return _field(check, default, " or ".join(allowed))
 
 
 def choices(size: int, *allowed: str, default: Any = dataclasses.MISSING) -> Any:
@@ -316,7 +332,7 @@ def choices(size: int, *allowed: str, default: Any = dataclasses.MISSING) -> Any
                 raise UnknownNameError(f"{field}[{i}]", item, allowed)
         return tuple(items)
 
-    return _field(check, default)
+    return _field(check, default, f"{size} words, each {' or '.join(allowed)}")
 
 
 def section(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
@@ -325,7 +341,7 @@ def section(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
     def check(field: str, value: Any) -> Any:
         return build(kind, value, field)
 
-    return _field(check, default)
+    return _field(check, default, "a section", kind=kind)
 
 
 def build(kind: type[T], data: object, path: str = "") -> T:
@@ -375,12 +391,36 @@ def replace(section_value: T, changes: Mapping[str, object], path: str) -> T:
 
 
 def plain(value: Any) -> Any:
-    """Dataclasses, arrays and tuples as mappings and lists."""
+    """Dataclasses, arrays and tuples as mappings and lists, in mappings too."""
+    if isinstance(value, Mapping):
+        return {name: plain(entry) for name, entry in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):
         return value.tolist()
     return list(value) if isinstance(value, tuple) else value
+
+
+def units(kind: type, data: Mapping[str, Any], words: Mapping[str, str]) -> dict[str, Any]:
+    """Units of a section's plain data by key, of nested sections as mappings; no unit is empty.
+
+    :param kind: the section's schema.
+    :param words: what stands for ``{joint}`` and ``{effort}`` in them.
+    """
+    fields: dict[str, Mapping[Any, Any]] = {}
+    for f in dataclasses.fields(kind):
+        fields |= {f.name: f.metadata, f.metadata.get("key") or f.name: f.metadata}
+    result: dict[str, Any] = {}
+    for key, value in data.items():
+        metadata = fields.get(key, {})
+        nested, entries = metadata.get("section"), metadata.get("entries")
+        if nested is not None and isinstance(value, Mapping):
+            result[key] = units(nested, value, words)
+        elif entries is not None:
+            result[key] = {name: units(entries, entry, words) for name, entry in value.items()}
+        else:
+            result[key] = metadata.get("unit", "").format_map(words)
+    return result
 
 
 def frozen(values: object) -> Array:
@@ -390,13 +430,40 @@ def frozen(values: object) -> Array:
     return array
 
 
-def _field(check: Check, default: Any, key: str | None = None) -> Any:
-    metadata = {"check": check, "key": key}
+def _field(
+    check: Check,
+    default: Any,
+    bound: str,
+    unit: str = "",
+    *,
+    key: str | None = None,
+    kind: type | None = None,
+    entries: type | None = None,
+) -> Any:
+    metadata = {
+        "check": check, "key": key, "unit": unit, "bound": bound, "default": default,
+        "section": kind, "entries": entries,
+    }  # fmt: skip
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata=metadata)
     if isinstance(default, (list, dict)):
         return dataclasses.field(metadata=metadata, default_factory=lambda: check("", default))
     return dataclasses.field(metadata=metadata, default=default)
+
+
+def _bound(
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    infinite: bool = False,
+) -> str:
+    """Bounds in words, to stand behind what they bound."""
+    words = f" above {above:g}" if above > -math.inf else ""
+    if at_least > -math.inf:
+        words += f", at least {at_least:g}"
+    if at_most < math.inf:
+        words += f", at most {at_most:g}"
+    return words + (", or .inf" if infinite else "")
 
 
 def _number(
@@ -407,15 +474,7 @@ def _number(
     at_most: float = math.inf,
     infinite: bool = False,
 ) -> float:
-    bound = "a finite number"
-    if above > -math.inf:
-        bound += f" above {above:g}"
-    if at_least > -math.inf:
-        bound += f", at least {at_least:g}"
-    if at_most < math.inf:
-        bound += f", at most {at_most:g}"
-    if infinite:
-        bound += ", or .inf"
+    bound = "a finite number" + _bound(above, at_least, at_most, infinite)
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise ParameterError(field, value, bound)
     try:

@@ -231,15 +231,24 @@ def _control(robot: ET.Element, tree: UrdfTree) -> None:
     control = ET.SubElement(robot, "ros2_control", name=tree.name, type="system")
     hardware = ET.SubElement(control, "hardware")
     ET.SubElement(hardware, "plugin").text = "mock_components/GenericSystem"
-    home = {joint.name: joint.home for joint in tree.joints}
+    joints = {joint.name: joint for joint in tree.joints}
     for name in tree.actuated:
         element = ET.SubElement(control, "joint", name=name)
         for interface in ("position", "effort"):
             ET.SubElement(element, "command_interface", name=interface)
         position = ET.SubElement(element, "state_interface", name="position")
-        ET.SubElement(position, "param", name="initial_value").text = _text([home[name]])
+        start = _start(joints[name].home, joints[name].drive)
+        ET.SubElement(position, "param", name="initial_value").text = _text([start])
         for interface in ("velocity", "effort"):
             ET.SubElement(element, "state_interface", name=interface)
+
+
+def _start(home: float, drive: UrdfDrive) -> float:
+    """Where mock hardware begins: at home, or amid the limits where these leave home out."""
+    limits = drive.position
+    if limits is None or limits[0] <= home <= limits[1]:
+        return home
+    return (limits[0] + limits[1]) / 2
 
 
 def _text(values: Iterable[float], least: float = 1e-12) -> str:

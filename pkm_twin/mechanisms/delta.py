@@ -51,7 +51,7 @@ class Geometry:
     platform_radius: float = length()
     arm_length: float = length()
     forearm_length: float = length()
-    azimuths: Array = schema.vector(3)
+    azimuths: Array = schema.vector(3, unit="rad")
     closures: tuple[str, ...] = schema.choices(3, "rod", "rcu")
 
     def verify(self, path: str) -> None:
@@ -68,9 +68,11 @@ class Inertia:
     platform_mass: float = mass()
     arm_mass: float = mass()
     forearm_mass: float = mass()
-    arm_com: float = schema.number(at_least=0.0, at_most=1.0, default=0.5)
-    arm_inertia: float | None = schema.number(at_least=0.0, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, default=0.0)
+    arm_com: float = schema.number(
+        at_least=0.0, at_most=1.0, unit="of the arm, from its pivot", default=0.5
+    )
+    arm_inertia: float | None = schema.number(at_least=0.0, unit="kg m2", default=None)
+    rotor_inertia: float = schema.number(at_least=0.0, unit="kg m2", default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +93,13 @@ class Members:
     parallelogram_width: float = length()
     rcu_forearm: Tube | None = schema.section(Tube, default=None)
     platform_inertia: Array | None = schema.inertia(positive=True, default=None)
-    drive_compliance: float = schema.number(at_least=0.0, at_most=1.0, default=0.0)
-    elbow_compliance: float = schema.number(at_least=0.0, at_most=1.0, default=0.0)
-    platform_joint_compliance: float = schema.number(at_least=0.0, at_most=1.0, default=0.0)
+    drive_compliance: float = schema.number(
+        at_least=0.0, at_most=1.0, unit="rad/(N m)", default=0.0
+    )
+    elbow_compliance: float = schema.number(at_least=0.0, at_most=1.0, unit="m/N", default=0.0)
+    platform_joint_compliance: float = schema.number(
+        at_least=0.0, at_most=1.0, unit="m/N", default=0.0
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -247,7 +253,7 @@ class Delta(Robot):
             misses.append(maximum(short, far))
         return Inverse(q, misses)
 
-    def unreachable_limb(self, q: Array) -> tuple[int, float] | None:
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
         """The limb that stands apart from the two closest elbows, of rods that do not meet."""
         g = self.geometry
         if "rcu" in g.closures:

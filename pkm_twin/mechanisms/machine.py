@@ -36,7 +36,7 @@ from pkm_twin.machine.graph import (
     unit,
 )
 from pkm_twin.machine.joint_map import JointMapEntry
-from pkm_twin.machine.members import Beam, Structure, Tube
+from pkm_twin.machine.members import Beam, Structure, Tube, compliances
 from pkm_twin.machine.robot import (
     Payload,
     Robot,
@@ -61,8 +61,8 @@ class MemberSpec:
     ``section``: with the body's mass along the bar; without one the body is rigid.
     """
 
-    start: Array = schema.vector(3, key="from")
-    end: Array = schema.vector(3, key="to")
+    start: Array = schema.vector(3, key="from", unit="m")
+    end: Array = schema.vector(3, key="to", unit="m")
     section: Tube | None = schema.section(Tube, default=None)
     radius: float | None = length(default=None)
 
@@ -86,7 +86,7 @@ class BodySpec:
     """Mass (kg), centre of mass (m) and inertia about it (kg m2), base axes at home."""
 
     mass: float = mass(default=0.0)
-    com: Array | None = schema.vector(3, default=None)
+    com: Array | None = schema.vector(3, unit="m", default=None)
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
     member: MemberSpec | None = schema.section(MemberSpec, default=None)
 
@@ -100,17 +100,17 @@ class BodySpec:
 class FrictionSpec:
     """Friction of one joint: N m s/rad or N s/m, and N m or N."""
 
-    viscous: float = schema.number(at_least=0.0, default=0.0)
-    coulomb: float = schema.number(at_least=0.0, default=0.0)
+    viscous: float = schema.number(at_least=0.0, unit="{effort} per {joint}/s", default=0.0)
+    coulomb: float = schema.number(at_least=0.0, unit="{effort}", default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class LimitSpec:
     """Limits of one actuated joint: position [min, max], rate, effort."""
 
-    position: Array | None = schema.interval(default=None)
-    velocity: float | None = schema.number(above=0.0, default=None)
-    effort: float | None = schema.number(above=0.0, default=None)
+    position: Array | None = schema.interval(unit="{joint}", default=None)
+    velocity: float | None = schema.number(above=0.0, unit="{joint}/s", default=None)
+    effort: float | None = schema.number(above=0.0, unit="{effort}", default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +119,9 @@ class DriveSpec:
     or belt of ``lead`` metres a turn; reflected to the joint it is ``rotor_inertia``.
     """
 
-    inertia: float = schema.number(at_least=0.0)
-    ratio: float | None = schema.number(above=0.0, default=None)
-    lead: float | None = schema.number(above=0.0, default=None)
+    inertia: float = schema.number(at_least=0.0, unit="kg m2")
+    ratio: float | None = schema.number(above=0.0, unit="turns a turn", default=None)
+    lead: float | None = schema.number(above=0.0, unit="m a turn", default=None)
 
     def verify(self, path: str) -> None:
         """One of the two."""
@@ -139,20 +139,28 @@ class DriveSpec:
 
 @dataclass(frozen=True, eq=False)
 class JointSpec:
-    """A joint between an inner and an outer body, see the module's and the graph's words."""
+    """A joint between an inner and an outer body, through the point ``at`` (m) at home.
+
+    Its number is the motion of the outer body against the inner one, along or about ``axis``, and
+    ``home`` at home. ``axes``: of a universal joint, the first fixed in the inner body, the second
+    in the outer one. A ``translation`` is three slides along base axes. ``limits`` are those of
+    actuated joints. ``rotor_inertia``: of the drive, reflected to the joint, inertia without
+    weight; or ``drive``, which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a
+    screw's or belt's ``lead`` (joints that slide). ``compliance``: in the joint's own axes.
+    """
 
     type: str = schema.choice(*FREEDOMS)
     between: tuple[str, ...] = schema.names(2)
-    at: Array | None = schema.vector(3, default=None)
+    at: Array | None = schema.vector(3, unit="m", default=None)
     axis: Array | None = schema.vector(3, default=None)
     axes: Array | None = schema.matrix(2, 3, default=None)
     actuated: bool = schema.flag(default=False)
-    home: float = schema.number(default=0.0)
+    home: float = schema.number(unit="{joint}", default=0.0)
     limits: LimitSpec | None = schema.section(LimitSpec, default=None)
     friction: FrictionSpec | None = schema.section(FrictionSpec, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, default=0.0)
+    rotor_inertia: float = schema.number(at_least=0.0, unit="{rotor}", default=0.0)
     drive: DriveSpec | None = schema.section(DriveSpec, default=None)
-    compliance: Array | None = schema.vector(6, at_least=0.0, infinite=True, default=None)
+    compliance: Array | None = compliances(default=None)
 
     def verify(self, path: str) -> None:
         """The axes that its type has, and a point where there has to be one."""
@@ -206,7 +214,7 @@ class RodSpec:
     """A thin even straight bar with a ball joint at each end: points (m), mass (kg)."""
 
     between: tuple[str, ...] = schema.names(2)
-    ends: Array = schema.matrix(2, 3)
+    ends: Array = schema.matrix(2, 3, unit="m")
     mass: float = mass(default=0.0)
     section: Tube | None = schema.section(Tube, default=None)
     radius: float | None = length(default=None)
@@ -217,6 +225,8 @@ KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "ro
 _KEYS: Final = (
     "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs", "joint_map",
 )  # fmt: skip
+_TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
+_SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
 _TURNED: Final = ("com", "at", "axis", "axes", "ends")
 
 
@@ -325,6 +335,18 @@ class Machine(Robot):
     def parameter_sections(self) -> dict[str, Any]:
         """The machine written out, limbs turned."""
         return robot_description(self)
+
+    def parameter_units(self) -> dict[str, Any]:
+        """Units of the same, of each joint by its own type."""
+        sections = self.parameter_sections()
+        result = schema.units(type(self), sections, {}) | {"origin": "m"}
+        for kind, spec in KINDS.items():
+            result[kind] = {}
+            for name, entry in sections.get(kind, {}).items():
+                slides = FREEDOMS.get(entry.get("type", ""), "") == "P"
+                words = _SLIDING if slides else _TURNING
+                result[kind][name] = schema.units(spec, entry, words)
+        return result
 
     def home(self) -> Array:
         """The pose at home, shape (m,)."""
@@ -465,7 +487,7 @@ def _written_out(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
                 raise UnknownNameError(f"{path}{key}", key, ("azimuths", *KINDS))
         azimuths = schema.checked(schema.many(), f"{path}azimuths", section.get("azimuths"))
         for i, azimuth in enumerate(azimuths):
-            check_angles(azimuth, f"{path}azimuths[{i}]")
+            check_angles(float(azimuth), f"{path}azimuths[{i}]")
         own = set(_section(section, "bodies", path))
         checked: dict[str, dict[str, Any]] = {
             kind: {

@@ -29,6 +29,7 @@ paper has each link's mass at its slider joint, which ``link_com: 0`` gives.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Final
@@ -36,14 +37,22 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.codegen.expressions import Objects, absolute, cos, maximum, sin, sqrt
+from pkm_twin.codegen.expressions import Objects, absolute, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
 from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import Inverse, Robot, check_azimuths, length, mass
+from pkm_twin.machine.robot import (
+    SINGULARITY_BOUND,
+    Inverse,
+    Robot,
+    check_azimuths,
+    length,
+    mass,
+)
 
 Array = NDArray[np.float64]
 
@@ -59,7 +68,7 @@ class Geometry:
     base_radius: float = length()
     platform_radius: float = length()
     limb_length: float = length()
-    azimuths: Array = schema.vector(3)
+    azimuths: Array = schema.vector(3, unit="rad")
     branch: str = schema.choice("above", "below")
 
     def verify(self, path: str) -> None:
@@ -89,12 +98,14 @@ class Inertia:
     lower_link_mass: float = mass()
     upper_link_mass: float = mass()
     platform_mass: float = mass()
-    link_com: float = schema.number(at_least=0.0, at_most=1.0, default=0.5)
-    lower_link_inertia: Array | None = schema.vector(2, at_least=0.0, default=None)
-    upper_link_inertia: Array | None = schema.vector(2, at_least=0.0, default=None)
-    platform_com: Array = schema.vector(3, default=[0, 0, 0])
+    link_com: float = schema.number(
+        at_least=0.0, at_most=1.0, unit="of the link, from the slider's joint", default=0.5
+    )
+    lower_link_inertia: Array | None = schema.vector(2, at_least=0.0, unit="kg m2", default=None)
+    upper_link_inertia: Array | None = schema.vector(2, at_least=0.0, unit="kg m2", default=None)
+    platform_com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
     platform_inertia: Array | None = schema.inertia(positive=False, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, default=0.0)
+    rotor_inertia: float = schema.number(at_least=0.0, unit="kg", default=0.0)
 
     def verify(self, path: str) -> None:
         """Axial moments within the triangle rule."""
@@ -130,6 +141,7 @@ class Prru(Robot):
     )  # fmt: skip
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"limb {limb}" for limb in LIMBS)
     has_inverse: ClassVar[bool] = True
+    has_branch: ClassVar[bool] = True
 
     @property
     def size(self) -> float:
@@ -188,12 +200,35 @@ class Prru(Robot):
         centre = [planes[k] @ np.array(off, dtype=object) for k in range(2)]
         return [np.array([*centre, pose[0]], dtype=object) + arm for arm in arms], norm
 
+    def branch(self, motion: Motion) -> Sequence[Any]:
+        """Height of every platform joint over its slider, on the branch's side."""
+        rises = []
+        for limb in LIMBS:
+            foot, head = (self.graph.joints[f"{w} joint {limb}"].at for w in ("slider", "platform"))
+            upper = f"upper link {limb}"
+            rises.append((motion.point(upper, head) - motion.point(upper, foot))[2] * self._sign)
+        return rises
+
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
+        """The slider farthest from the mean height: it has to come back the most."""
+        way, x, _ = self.engine.reach(q, precision=1e-9)
+        if way < 1.0:
+            back = (1.0 - way) * np.abs(q - q.mean())
+            return int(back.argmax()), float(back.max())
+        del reached
+        rises = np.array([float(v) for v in self.branch(self.engine.at(x.tolist(), q)[0])])
+        # The first slider that has passed its platform joint, where inverse has another branch.
+        limb = int((rises <= 0.0).argmax())
+        return limb, float(-rises[limb])
+
     def solved(self, pose: Objects) -> Inverse:
         """Slider heights (equation 9), and the closure's determinant by the swings, 1 at level."""
         g = self.geometry
         corners, norm = self._corners(pose)
         l, sign = g.limb_length, self._sign  # noqa: E741
         q, misses, out, up = [], [], [], []
+        # Where gamma is not told, nothing is: the pose is singular.
+        told = maximum(0.0, minimum(1.0, norm / SINGULARITY_BOUND - 1.0))
         for i, corner in enumerate(corners):
             e, _ = self._directions(i)
             aside = corner @ e + g.base_radius
@@ -201,7 +236,7 @@ class Prru(Robot):
             out.append(aside)
             up.append(rise)
             q.append(corner[2] - rise)
-            misses.append(absolute(aside) - l)
+            misses.append((absolute(aside) - l) * told)
         # Side k of the platform's triangle from joint k to k + 1: its change by both swings.
         before: list[Any] = []
         after: list[Any] = []
@@ -215,8 +250,7 @@ class Prru(Robot):
         sides = [np.cos(g.azimuths[k] - g.azimuths[(k + 1) % 3]) for k in range(3)]
         scale = np.sqrt(np.prod([2 * g.platform_radius**2 * (1 - side) for side in sides]))
         measure = determinant * float(-sign / (2 * l**3 * scale))
-        # Where gamma is not told, there is no measure either.
-        return Inverse(q, misses, measure * (norm / maximum(norm, 1e-9)))
+        return Inverse(q, misses, measure * told)
 
     def grid(self) -> PoseGrid:
         """Tilts about the vertical axis, in tilt-and-torsion angles without torsion."""

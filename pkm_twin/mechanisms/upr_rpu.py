@@ -40,7 +40,7 @@ from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
-from pkm_twin.machine.members import Beam, Section, Structure, disc
+from pkm_twin.machine.members import Beam, Section, Structure, compliances, disc, modulus
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import Inverse, LimbElements, Robot, length, mass
 
@@ -74,9 +74,9 @@ class Geometry:
 class Members:
     """Round bars: moduli (Pa), diameters (m), and the shear factor A / A_shear."""
 
-    youngs_modulus: float = schema.number(at_least=1e3, at_most=1e14)
-    shear_modulus: float = schema.number(at_least=1e3, at_most=1e14)
-    diameter: Array = schema.vector(3, above=0.0, spread=True)
+    youngs_modulus: float = modulus()
+    shear_modulus: float = modulus()
+    diameter: Array = schema.vector(3, above=0.0, spread=True, unit="m")
     shear_factor: float = schema.number(at_least=0.0, at_most=10.0, default=1.0)
 
     def verify(self, path: str) -> None:
@@ -94,10 +94,10 @@ class JointsCompliance:
     axis, w from A to B. Entries about an axis of the joint are free (.inf); 0 is rigid.
     """
 
-    upr_revolute: Array = schema.vector(6, at_least=0.0, infinite=True)
-    upr_universal: Array = schema.vector(6, at_least=0.0, infinite=True)
-    rpu_universal: Array = schema.vector(6, at_least=0.0, infinite=True)
-    rpu_revolute: Array = schema.vector(6, at_least=0.0, infinite=True)
+    upr_revolute: Array = compliances()
+    upr_universal: Array = compliances()
+    rpu_universal: Array = compliances()
+    rpu_revolute: Array = compliances()
 
     def verify(self, path: str) -> None:
         """Free exactly where the joint turns; a number in every direction that carries load."""
@@ -123,11 +123,11 @@ class Inertia:
     a thin disc of the platform's radius about its origin.
     """
 
-    density: float = schema.number(above=0.0, at_most=1e5)
+    density: float = schema.number(above=0.0, at_most=1e5, unit="kg/m3")
     platform_mass: float = mass()
-    platform_com: Array = schema.vector(3, default=[0, 0, 0])
+    platform_com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
     platform_inertia: Array | None = schema.inertia(positive=False, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, default=0.0)
+    rotor_inertia: float = schema.number(at_least=0.0, unit="kg", default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +137,8 @@ class Limits:
     Absent is None: no limit.
     """
 
-    limb_length: Array | None = schema.interval(above=0.0, count=3, default=None)
-    joint_angle: float | None = schema.number(above=0.0, at_most=math.pi, default=None)
+    limb_length: Array | None = schema.interval(above=0.0, count=3, unit="m", default=None)
+    joint_angle: float | None = schema.number(above=0.0, at_most=math.pi, unit="rad", default=None)
 
     @property
     def position(self) -> Array | None:
@@ -281,7 +281,7 @@ class UprRpu(Robot):
         values["R joint 3"] = [beta - turned(2)]
         return values
 
-    def unreachable_limb(self, q: Array) -> tuple[int, float] | None:
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
         """The limb of the wrong length, and by how much."""
         a, b = self._radii
         for i in range(3):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import pickle
 import resource
 import signal
 import subprocess
@@ -14,7 +15,7 @@ import time
 
 import pytest
 
-from pkm_twin import load
+from pkm_twin import load, robot_names
 from pkm_twin.atlas import run as running
 from pkm_twin.atlas.extras import MissingExtraError
 from pkm_twin.atlas.isotropy import isotropy_sweep
@@ -78,6 +79,18 @@ def test_a_killed_process_costs_time_not_results(strain, tmp_path):
 
     assert same(path, run(sweep, tmp_path / "a.nc", workers=2, progress=progress))
     assert killed
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_robots_pass_between_processes(name):
+    """Also after they have derived what they keep."""
+    robot = load(name)
+    home = robot.home()
+    robot.singularity(robot.inverse(home))
+    copy = pickle.loads(pickle.dumps(robot))
+    assert copy.name == robot.name
+    assert (copy.inverse(home) == robot.inverse(home)).all()
+    assert (copy.home() == home).all()
 
 
 def test_isotropy_on_processes(small_atlases, tmp_path):

@@ -400,6 +400,20 @@ class TestTopics:
         out = tmp_path / "t.csv"
         assert twin("torques", "delta_cu", bag, "--no-picture", "--out", out).code == 0
 
+    def test_joints_are_those_of_the_controller(self, twin, tmp_path, variant):
+        names = {"arm_1": "motor_a", "arm_2": "motor_b", "arm_3": "motor_c"}
+        variant("delta_cu", joint_map={model: {"name": name} for model, name in names.items()})
+
+        def renamed(topic, message, time):
+            if topic == JOINTS:
+                message.name = [names[name] for name in message.name]
+            return message
+
+        bag = rewrite(DELTA, tmp_path / "named.mcap", renamed, seconds=0.3)
+        robot = tmp_path / "delta_cu_variant.yaml"
+        assert twin("check", bag, "--robot", robot).code == 0
+        assert "'arm_1' is missing" in twin("check", bag).one_line_error()
+
     def test_a_topic_can_be_named(self, twin, tmp_path):
         bag = with_others(DELTA, tmp_path / "all.mcap")
         assert twin("check", bag, "--topic", JOINTS).code == 0

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from pkm_twin import load, robot_names
-from pkm_twin.apps.recorded import why_no_torques
 from stiffness_monitor import compliance, strain_energy
 from test.commands.conftest import REPOSITORY
 
@@ -87,17 +86,25 @@ class TestInfo:
         )
         assert "-0.0000" not in result.out
         robot = load(name)
-        for section in ("geometry", "limits"):
-            for field in vars(getattr(robot, section)):
-                assert rows[f"{section}: {field}"], field
-        assert rows["geometry: base_radius"].endswith(" m")
-        if not why_no_torques(robot):
-            assert rows["inertia: platform_mass"].endswith(" kg")
-            if robot.limits.effort is not None:
-                assert rows["limits: effort"].endswith(f" {robot.effort_units[0]}")
-            # A fraction of a length, not a length.
-            com = rows.get("inertia: arm_com") or rows["inertia: link_com"]
-            assert " of the " in com
+        units = robot.parameter_units()
+
+        def shown(row, value, unit):
+            if isinstance(value, dict):
+                for key, item in value.items():
+                    shown(f"{row}: {key}", item, unit[key])
+            elif value is None:
+                assert rows[row] == "none"
+            else:
+                # A long cell goes on in the next line.
+                assert rows[row].endswith(unit) or len(rows[row]) > 40, row
+
+        for section, value in robot.parameter_sections().items():
+            if isinstance(value, dict):
+                shown(section, value, units[section])
+        assert rows["gravity"].endswith(" m/s2")
+        if robot.limits.effort is not None and "limits" in units:
+            assert units["limits"]["effort"] == robot.effort_units[0]
+        assert rows["pose"] and rows["actuated joints"].count("(") == len(robot.joint_names)
 
 
 def test_overconstraint_is_named(twin):

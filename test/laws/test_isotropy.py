@@ -7,6 +7,7 @@ from support import robots
 from support.robots import loaded, loaded_like, random_joints
 
 from delta_dynamics import (
+    dynamics_terms,
     energy,
     energy_matrices,
     energy_transfer,
@@ -104,7 +105,7 @@ def test_a_payload_moves_with_the_platform(name, rng):
 def test_energy_transfer_range_holds_all_samples_and_is_attained(name, robot, rng):
     pose = robot.forward(random_joints(robot, rng, 20))
     ends = energy_transfer_range(robot, pose)
-    samples = energy_transfer(robot, pose[:, None], sphere_directions(2000))
+    samples = energy_transfer(robot, pose[:, None], sphere_directions(8000))
     assert (samples >= ends.least[:, None] * (1 - 1e-12)).all()
     assert (samples <= ends.greatest[:, None] * (1 + 1e-12)).all()
     np.testing.assert_allclose(samples.min(-1), ends.least, rtol=1e-2)
@@ -125,8 +126,7 @@ def test_max_driving_force_is_inverse_dynamics_at_the_energy(name, robot, rng):
     platform, _ = energy_matrices(robot, pose)
     length = np.sqrt(2 * amount / np.einsum("ni,nij,nj->n", direction, platform, direction))
     motion = joint_motion(robot, pose, length[:, None] * direction, acceleration)
-    free = robot.changed(friction={"viscous": 0.0, "coulomb": 0.0})
-    tau = inverse_dynamics(free, *motion)
+    tau = inverse_dynamics(robot, *motion) - dynamics_terms(robot, *motion).friction
     np.testing.assert_allclose(force, np.abs(tau).max(-1), rtol=1e-11)
     # The velocity part is even, and direction counts without its length.
     np.testing.assert_allclose(

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from xml.etree import ElementTree as ET
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -74,6 +76,16 @@ def test_masses_sum_to_the_robot_s(robot):
     parts = [*graph.bodies.values(), *graph.rods.values()]
     expected = sum(part.mass for part in parts) + 0.3
     assert sum(i.mass for i in model.inertias) == pytest.approx(expected, rel=1e-13)
+
+
+def test_mock_hardware_begins_inside_the_limits(robot):
+    joints = ET.fromstring(robot_urdf(robot)).find("ros2_control").findall("joint")
+    assert [joint.get("name") for joint in joints] == list(robot.joint_names)
+    start = np.array([float(joint.find("state_interface/param").text) for joint in joints])
+    limits = robot.limits.position
+    if limits is not None:
+        assert (limits[:, 0] <= start).all()
+        assert (start <= limits[:, 1]).all()
 
 
 def test_the_text_is_the_same_each_time(robot):

@@ -9,10 +9,13 @@ pytest.importorskip("control_msgs", reason="control_msgs is not installed")
 
 from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 
 from delta_dynamics import inverse_dynamics
-from test.nodes.twin import MODULE, ROBOT, trajectory
+from test.nodes.harness import SECOND
+from test.nodes.twin import MAKE, MODULE, ROBOT, trajectory
 
 PATIENCE = 90.0
 
@@ -141,6 +144,20 @@ def test_a_controller_that_refuses_efforts_is_named(client, controller):
     assert status == GoalStatus.STATUS_ABORTED
     assert "/controller/follow_joint_trajectory refused" in result.error_string
     assert "effort command interface" in result.error_string
+
+
+def test_goals_that_wait_for_their_efforts_end_with_the_node_s_activity(client, controller):
+    before = len(controller.goals)
+    q = np.full((50_000, 3), 0.1)
+    times = [i * SECOND // 1000 for i in range(len(q))]
+    client.send(MAKE.trajectory(ROBOT.joint_names, times, q, 0.0 * q, 0.0 * q))
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert client.peer.call(ChangeState, "/planned/change_state", request).success
+    status, result = client.ended()
+    assert status == GoalStatus.STATUS_ABORTED
+    assert result.error_string == "the node was deactivated"
+    assert len(controller.goals) == before
 
 
 def test_a_controller_that_is_not_there_is_named(peer, launch):

@@ -16,13 +16,20 @@ STEP = SECOND // 1000
 WINDOW = 5
 MAKE = Maker(Plain())
 MACHINES = REPOSITORY / "test" / "machine" / "machines"
-NAMES = {"slider_crank": 1, "five_bar": 2, "linear_delta": 3, "rrr3_planar": 3, "stewart": 6}
+JOINTS = {
+    MACHINES / "slider_crank.yaml": 1,
+    "five_bar": 2,
+    "linear_delta": 3,
+    MACHINES / "rrr3_planar.yaml": 3,
+    "upr_rpu": 3,
+    "stewart": 6,
+}
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=JOINTS, ids=lambda name: getattr(name, "stem", name))
 def robot(request):
-    robot = load(MACHINES / f"{request.param}.yaml")
-    assert len(robot.joint_names) == NAMES[request.param]
+    robot = load(request.param)
+    assert len(robot.joint_names) == JOINTS[request.param]
     return robot
 
 

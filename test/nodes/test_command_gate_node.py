@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin import load, robot_names
 from test.nodes.harness import SECOND, counts_of, one_line_refusal, values_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
@@ -201,6 +202,17 @@ def test_a_bad_configuration_is_refused_in_one_line(launch, parameters, named):
     line = one_line_refusal(launch(GATE, *parameters))
     assert line.startswith("refused to start: ")
     assert named in line
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_every_robot_has_a_gate(heard, launch, name):
+    process = launch(GATE, f"mechanism:={name}", arguments=("-r", f"__node:=of_{name}"))
+    count = len(load(name).joint_names)
+    topic = f"/of_{name}/commands"
+    heard.hear(Float64MultiArray, topic)
+    heard.until(lambda: heard.received(topic), 60.0)
+    assert list(heard.received(topic)[0].data) == [0.0] * count
+    process.stop()
 
 
 def test_without_a_name_it_waits_for_the_node_of_the_default_name(heard, launch):

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/parameters.md out of the schemas: ``python -m test.docs.parameters docs/parameters.md``."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import sys
+from pathlib import Path
+
+from pkm_twin.machine.joint_map import JointMapEntry
+from pkm_twin.machine.members import Tube
+from pkm_twin.machine.robot import Payload, friction_of, limits_of
+from pkm_twin.machine.schema import plain
+from pkm_twin.mechanisms import delta, machine, prru, upr_rpu
+
+HEAD = """# Parameters
+
+Every key of a robot's YAML with its unit, what is allowed, and its default. SI units, angles in
+rad, z up. A key that is not listed, a value of another type and one out of its bound are refused by
+name. Of two units the first is that of joints that turn, the second that of joints that slide;
+`pkm-twin info ROBOT` prints a robot's values with the units of its own joints.
+
+Written by `make pages`.
+"""
+UNITS = {
+    "{effort} per {joint}/s": "N m s/rad or N s/m",
+    "{joint}/s": "rad/s or m/s",
+    "{joint}": "rad or m",
+    "{effort}": "N m or N",
+    "{rotor}": "kg m2 or kg",
+}
+MACHINE = """## `mechanism: machine`
+
+Any machine as a graph of bodies, joints and rods, every vector in base axes at the home pose; by
+example in [new_machine.md](new_machine.md). `friction` and `limits` stand at the joints.
+
+| key | unit | allowed | default |
+|---|---|---|---|
+| `mechanism` |  | machine | required |
+| `platform` |  | a body's name: it carries the tool | platform |
+| `origin` | m | 3 numbers: the platform's reference point at home | the platform's com |
+| `pose` |  | of x, y, z, roll, pitch, yaw as many as the mobility | the first that will do |
+| `bodies`, `joints`, `rods` |  | mappings of names to entries | none |
+| `joint_map` |  | a mapping of names to entries | none |
+| `limbs` |  | one section or a list: `azimuths` (rad), `bodies`, `joints`, `rods` | none |
+
+What stands in `limbs` is given for azimuth 0, copied and turned about base z by each azimuth, its
+names with _1, _2 and so on; bodies of the section itself are the copy's, others are not."""
+
+
+FRICTION = "At the actuated joints, against the rate: viscous by its amount, Coulomb by its sign."
+LIMITS = "What nodes and commands refuse or warn of; without them there is no limit."
+JOINT_MAP = """Between a controller's numbers and the model's: its name for the joint, and
+controller = offset + sign * ratio * model."""
+GRAVITY = """### `gravity`
+
+Acceleration of free fall in base axes, m/s2; default [0, 0, -9.81]."""
+TABLE = "| key | unit | allowed | default |\n|---|---|---|---|"
+
+
+def default(field):
+    """A field's default as the file would write it."""
+    value = field.metadata["default"]
+    if value is dataclasses.MISSING:
+        return "required"
+    if value is None:
+        return "none"
+    if value == {}:
+        return "none" if field.metadata["entries"] else "its own defaults"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(plain(value)).replace("'", "")
+
+
+def rows(kind, prefix=""):
+    """A row a key, nested sections behind the key that holds them."""
+    for field in dataclasses.fields(kind):
+        data = field.metadata
+        if "check" not in data:
+            continue
+        key = prefix + (data["key"] or field.name)
+        unit = UNITS.get(data["unit"], data["unit"])
+        bound = "a [tube](#tube)" if data["section"] is Tube else data["bound"]
+        yield f"| `{key}` | {unit} | {bound} | {default(field)} |"
+        if data["section"] is not None and data["section"] is not Tube:
+            yield from rows(data["section"], f"{key}.")
+
+
+def table(title, kind, text=None):
+    """A section of keys with what its class says about them."""
+    said = inspect.cleandoc(kind.__doc__ if text is None else text).replace("``", "`")
+    return f"### {title}\n\n{said}\n\n{TABLE}\n" + "\n".join(rows(kind))
+
+
+def page():
+    """The whole page."""
+    parts = [HEAD.rstrip()]
+    for module, name in ((delta.Delta, "delta"), (prru.Prru, "prru"), (upr_rpu.UprRpu, "upr_rpu")):
+        fields = {f.name: f for f in dataclasses.fields(module) if "check" in f.metadata}
+        parts.append(f"## `mechanism: {name}`")
+        top = [f for f in fields.values() if f.metadata["section"] is None]
+        lines = [TABLE]
+        for field in top:
+            unit = UNITS.get(field.metadata["unit"], field.metadata["unit"])
+            lines.append(
+                f"| `{field.name}` | {unit} | {field.metadata['bound']} | {default(field)} |"
+            )
+        parts.append("\n".join(lines))
+        common = {"payload", "friction"} | ({"limits"} if name != "upr_rpu" else set())
+        optional = [k for k, f in fields.items() if f.metadata["default"] in (None, {})]
+        for key, field in fields.items():
+            if field.metadata["section"] is not None and key not in common:
+                note = " (may be left out)" if key in optional else ""
+                parts.append(table(f"`{key}`{note}", field.metadata["section"]))
+        shared = ", ".join(f"`{key}`" for key in fields if key in common)
+        parts.append(f"And {shared}, which may be left out: see below.")
+    parts.append(MACHINE)
+    for title, kind in (
+        ("`bodies.NAME`", machine.BodySpec),
+        ("`joints.NAME`", machine.JointSpec),
+        ("`rods.NAME`", machine.RodSpec),
+    ):
+        parts.append(table(title, kind))
+    parts.append("And `payload` and `gravity`, as everywhere.")
+    parts.append("## In every file")
+    parts.append(table("`payload`", Payload))
+    parts.append(table("`friction`, by actuated joint (here three)", friction_of(3), FRICTION))
+    parts.append(table("`limits`, by actuated joint (here three)", limits_of(3), LIMITS))
+    parts.append(table("`joint_map.NAME`, by actuated joint", JointMapEntry, JOINT_MAP))
+    parts.append(table("Tube", Tube))
+    parts.append(GRAVITY)
+    return "\n\n".join(parts) + "\n"
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_text(page(), encoding="utf-8")

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages that are generated are as their generators write them; blocks to type do what is said."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pkm_twin import robot_names
+from test.docs import architecture, engine, parameters
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def blocks(page):
+    """Language, text and file name of each fenced block; a name stands in the line before it."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    for before, language, block in re.findall(r"([^\n]*)\n\n```(\w+)\n(.*?)```", text, re.DOTALL):
+        named = re.search(r"`([\w.]+)`:$", before)
+        yield language, block, named and named[1]
+
+
+def run(language, block, folder):
+    """What a block prints."""
+    shell = f'pkm-twin() {{ "{sys.executable}" -m pkm_twin.apps.cli "$@"; }}\nset -e\n{block}'
+    command = ["bash", "-c", shell] if language == "bash" else [sys.executable, "-c", block]
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": f"{DOCS.parent}{os.pathsep}."},
+    )
+    assert done.returncode == 0, f"{block}\n{done.stderr}"
+    return done.stdout
+
+
+@pytest.mark.timeout(900)
+def test_a_new_machine_from_an_empty_file_to_torques(tmp_path):
+    printed, ran = "", 0
+    for language, block, name in blocks("new_machine.md"):
+        if name:
+            (tmp_path / name).write_text(block)
+        elif language == "text":
+            assert printed.strip() == block.strip()
+        else:
+            printed = run(language, block, tmp_path)
+            ran += 1
+    assert ran >= 7
+    lines = (tmp_path / "my_delta.yaml").read_text().splitlines()
+    assert len(lines) <= 30
+    for made in ("my_delta.png", "torques.csv", "loaded.csv", "converted.yaml"):
+        assert (tmp_path / made).stat().st_size
+
+
+def test_the_parameters_page_is_that_of_the_schemas():
+    """Else `make pages` writes it anew."""
+    assert (DOCS / "parameters.md").read_text(encoding="utf-8") == parameters.page()
+
+
+def test_the_sizes_of_the_engine_are_todays():
+    """Else `make pages` writes them anew."""
+    page = (DOCS / "engine.md").read_text(encoding="utf-8")
+    assert engine.rewritten(page) == page
+
+
+def test_the_arrows_of_the_picture_go_down():
+    places = architecture.PLACES
+    pairs = architecture.arrows()
+    assert {name for pair in pairs for name in pair} == set(places)
+    for here, there in pairs:
+        if {here, there} != {"machine", "kinematics"}:
+            assert places[there][1] < places[here][1], f"{here} imports {there}"
+
+
+def test_every_robot_has_its_picture():
+    """Else `make pages` draws it."""
+    for name in robot_names():
+        assert (DOCS / "gallery" / f"robot_{name}.png").stat().st_size, name
+        assert f"robot_{name}.png" in (DOCS / "gallery.md").read_text(encoding="utf-8")
