@@ -31,7 +31,7 @@ def variant(tmp_path):
             else:
                 data[section] = values
         path = tmp_path / f"{name}_variant.yaml"
-        path.write_text(yaml.safe_dump(data))
+        path.write_text(yaml.safe_dump(data, sort_keys=False))
         return load(path), data
 
     return make
