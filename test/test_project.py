@@ -105,7 +105,10 @@ def test_commands_and_make_targets_exist():
     commands = get_command(app).commands
     assert {line[1] for line in twin} == set(commands)
     for _, name, *words in twin:
-        options = {o for parameter in commands[name].params for o in parameter.opts}
+        command = commands[name]
+        inner = getattr(command, "commands", {})
+        parts = [command, *(inner[word] for word in words if word in inner)]
+        options = {o for part in parts for parameter in part.params for o in parameter.opts}
         named = {word.strip("[]") for word in words if word.strip("[").startswith("--")} - {"--"}
         assert named <= options, name
     makefile = (REPOSITORY / "Makefile").read_text(encoding="utf-8")

@@ -240,3 +240,12 @@ class TestEnds:
     def test_version(self, twin):
         result = twin("--version")
         assert result.code == 0 and result.out.startswith("pkm-twin")
+
+
+def test_a_picture_that_cannot_be_written_is_one_line(twin, tmp_path):
+    for path, why in ((tmp_path / "none" / "a.png", "No such file"), (tmp_path / "a.foo", "'foo'")):
+        result = twin("info", "five_bar", "--picture", str(path))
+        assert (result.code, result.out) == (1, "")
+        assert why in result.err
+        assert str(path) in result.err
+        assert len(result.err.strip().splitlines()) == 1
