@@ -22,8 +22,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import eig  # type: ignore[import-untyped]
-from scipy.optimize import minimize  # type: ignore[import-untyped]
 
 from delta_dynamics.terms import frictionless
 from delta_dynamics.virtual_work import body_mass_matrix, mass_matrix
@@ -377,6 +375,8 @@ def _common_points(conic: Array, curve: Array) -> Array:
     first, last = np.eye(n * degree, k=n), np.eye(n * degree)
     first[-n:] = np.hstack(list(-sylvester[:-1]))
     last[-n:, -n:] = sylvester[-1]
+    from scipy.linalg import eig  # type: ignore[import-untyped]
+
     u = eig(first, last, right=False)
     u = u[np.isfinite(u)].real
     c, b, a = (np.polynomial.polynomial.polyvander(u, len(conic) - 1) @ conic).T
@@ -407,6 +407,9 @@ def _descended(forms: Array, start: Array) -> Array:
             "jac": lambda x: np.append(2 * x[:size], 0.0),
         },
     )
+    # Here, as it is half of what a node's start would take.
+    from scipy.optimize import minimize  # type: ignore[import-untyped]
+
     found = minimize(
         lambda x: x[size],
         np.append(start, _largest(g, start)),

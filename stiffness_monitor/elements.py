@@ -22,6 +22,7 @@ from pkm_twin.machine.robot import Robot
 TIE: Final = 1e-9
 """Two energies tie where they differ by less than this part of the larger one."""
 _TINY: Final = 1e-300
+_FLOOR: Final = 1e-30
 
 
 def compliance_kernel(robot: Robot) -> Kernel:
@@ -121,7 +122,8 @@ def _cholesky(matrix: list[list[Any]]) -> tuple[list[list[Any]], Any]:
     for j in range(n):
         pivot = matrix[j][j] - sum((v * v for v in root[j][:j]), 0.0)
         least = minimum(least, pivot / maximum(matrix[j][j], _TINY))
-        root[j][j] = sqrt(maximum(pivot, _TINY))
+        # A factor of what is refused has to stay finite, for its measure to say why.
+        root[j][j] = sqrt(maximum(pivot, maximum(_FLOOR * matrix[j][j], _TINY)))
         for i in range(j + 1, n):
             value = matrix[i][j]
             for k in range(j):

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 
-MAX_FILE_SIZE: Final = 64 * 1024
+MAX_FILE_SIZE: Final = 256 * 1024
 """Largest parameter file that is read, bytes; the shipped ones are below 4 kB."""
 MAX_SIZE: Final = 1e18
 """Beyond every quantity of a machine in SI units; products of such numbers stay finite."""

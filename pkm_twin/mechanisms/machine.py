@@ -536,7 +536,7 @@ def _graph(data: Mapping[str, Any], specs: Mapping[str, Mapping[str, Any]]) -> G
     platform = data.get("platform", "platform")
     if not bodies:
         raise ParameterError("bodies", None, "the machine's bodies, by name")
-    if platform not in bodies:
+    if not isinstance(platform, str) or platform not in bodies:
         raise UnknownNameError("platform", platform, bodies)
     origin = data.get("origin")
     place = (

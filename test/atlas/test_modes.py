@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from pkm_twin import load
-from pkm_twin.atlas.modes import frame_edges, modes_sweep
+from pkm_twin.atlas.modes import modes_sweep, structure_edges
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.members import framed
 from stiffness_monitor import reachable
 from stiffness_monitor.modes import modes, natural_frequencies
+from stiffness_monitor.structure import structural_model
 
 ROBOTS = pytest.mark.parametrize("name", ["prru", "delta_cu", "upr_rpu"])
 
@@ -99,10 +99,10 @@ def test_lines_join_the_whole_frame(name, small_atlases):
 
 def test_the_rim_of_a_platform_does_not_cross_itself_in_any_order_of_the_members():
     robot = load("delta_cu")
-    frame = framed(robot).frame(robot.home())
+    model = structural_model(robot, robot.home())
     found = modes(robot, robot.home(), 1)
-    shuffled = replace(frame, members=(*frame.members[::2], *frame.members[1::2]))
-    lines = frame_edges(shuffled, found.nodes)
+    shuffled = replace(model, parts=(*model.parts[::2], *model.parts[1::2]))
+    lines = structure_edges(shuffled, found.nodes)
     spokes = [b for a, b in lines.tolist() if a == 0]
     flat = found.positions[spokes, :2]
     steps = np.diff(np.unwrap(np.arctan2(flat[:, 1], flat[:, 0])))

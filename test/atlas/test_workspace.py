@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.robots import parameters_of
 
 from pkm_twin import load
 from pkm_twin.atlas import workspace
@@ -13,9 +14,9 @@ from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace import workspace_sweep
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.workspace import clearance, singularity_at
+from pkm_twin.kinematics.clearance import clearance
+from pkm_twin.kinematics.workspace import singularity_at
 from stiffness_monitor import reachable, regular_workspace
-from test.conftest import parameters_of
 
 ROBOTS = ("prru", "delta_cu", "upr_rpu")
 TURN = np.linspace(0, 2 * np.pi, 1001)

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.robots import parameters_of, random_joints
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from stiffness_monitor import strain_energy
-from test.conftest import parameters_of, random_joints
 from test.nodes.harness import Domain, end_with_parent
 
 pytestmark = pytest.mark.benchmark_run

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from pkm_twin.machine.joints import platform_motion
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.reactions import reactions
@@ -62,36 +61,37 @@ def compare_case(case: Case, exact: int) -> Figures:
     figures = Figures(machines=1)
     robot, data = case.robot, case.data
     got = inverse_dynamics(robot, case.q, case.qd, case.qdd, case.wrench)
-    platform = platform_motion(robot, case.q)
-    motion = platform_motion(robot, case.q, case.qd)
+    place_of, _ = robot.platform(case.q)
+    twist = np.einsum("kij,kj->ki", robot.platform_jacobian(case.q), case.qd)
     joint = reactions(robot, case.q, case.qd, case.qdd, case.wrench)
     drag = friction(data, case.qd)
     figures.balances["residual"] = joint.residual.tolist()
+    rotors = np.array([robot.graph.joints[name].rotor_inertia for name in robot.joint_names])
+    reaching = got - drag - rotors * case.qdd
     figures.balances["efforts"] = [
-        difference(one, other) for one, other in zip(joint.efforts, got - drag, strict=True)
+        difference(one, other) for one, other in zip(joint.efforts, reaching, strict=True)
     ]
 
     engine, mechanics, source = engine_of(data), tree(data), energies(data)
     stored = energy(robot, case.q, case.qd).total
-    spin = _spin(motion.axes, motion.axes_rate)
     for k in range(len(case.q)):
         state = case.q[k], case.qd[k], case.qdd[k]
         full = engine.state(*state)
         effort = engine.actuator_effort(full, case.wrench[k])[0] + engine.friction(case.qd[k])
         place = engine.platform_placement(full.q).translation
-        _note(figures, "Pinocchio", got[k], effort, platform.position[k], place)
+        _note(figures, "Pinocchio", got[k], effort, place_of[k], place)
 
         effort = mechanics.inverse_dynamics(*state, case.wrench[k]) + drag[k]
-        _note(figures, "MuJoCo", got[k], effort, platform.position[k], mechanics.platform()[0])
+        _note(figures, "MuJoCo", got[k], effort, place_of[k], mechanics.platform()[0])
 
         if k >= exact:
             continue
         result = source.solve(*state, case.wrench[k])
         effort = result.effort + drag[k]
-        _note(figures, "Lagrange", got[k], effort, platform.position[k], result.platform)
+        _note(figures, "Lagrange", got[k], effort, place_of[k], result.platform)
         # The twin's efforts and velocities against the rate of the other route's energy.
         shares = (got[k] - drag[k]) * case.qd[k]
-        load = case.wrench[k, :3] @ motion.velocity[k] + case.wrench[k, 3:] @ spin[k]
+        load = case.wrench[k] @ twist[k]
         scale = np.abs(shares).sum() + abs(load)
         figures.balances["power"].append(
             float(abs(shares.sum() + load - result.energy_rate) / scale)
@@ -111,8 +111,3 @@ def _note(
 ) -> None:
     figures.efforts[route].append(difference(got, effort))
     figures.places[route].append(float(np.abs(mine - place).max()))
-
-
-def _spin(axes: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Angular velocity from the axes and their rates: half the sum of axis x rate."""
-    return 0.5 * np.cross(axes, rates, axis=-2).sum(-1)

@@ -16,7 +16,7 @@ from pkm_twin import load
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor import compliance
 from stiffness_monitor.structure import structural_model
-from test.conftest import parameters_of
+from test.support.robots import parameters_of
 from test.validation.calculix import Mesh, solid_compliance
 from test.validation.test_upr_rpu_paper import LOAD, TABLE_1
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pkm_twin.machine.joints import platform_motion
 from scipy.integrate import solve_ivp
 
 from bags.recording.pinocchio_models import DeltaEngine, LoopEngine, PrruEngine
@@ -23,7 +22,7 @@ from delta_dynamics.virtual_work import forward_dynamics
 from pkm_twin import Robot
 from test.certificate.lagrange import energies
 from test.certificate.machines import build
-from test.conftest import parameters_of
+from test.support.robots import parameters_of
 
 DURATION = 10.0
 SAMPLES = 20
@@ -145,9 +144,7 @@ def _twin(
         return np.concatenate([y[3:], forward_dynamics(robot, y[:3], y[3:], effort)])
 
     states = _sampled(rates, np.concatenate([start.q, start.qd]))
-    platform = platform_motion(robot, states[:, :3], states[:, 3:], np.zeros((len(states), 3)))
-    axes = np.broadcast_to(platform.axes, (len(states), 3, 3))
-    places = list(zip(platform.position, axes, strict=True))
+    places = list(zip(*robot.platform(states[:, :3]), strict=True))
     return states[:, :3], states[:, 3:], places
 
 

@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
+from support.robots import random_joints
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.errors import UnreachableError
-from test.conftest import random_joints
 
 ROBOTS = ["delta", "delta_cu"]
 
@@ -132,9 +132,9 @@ def test_miss_is_the_distance_to_the_reach(name):
 def test_forward_out_of_reach_names_the_limb_apart(variant):
     robot, _ = variant(
         "delta",
-        geometry={"base_radius": 0.5, "arm_length": 0.1, "forearm_length": 0.4},
+        geometry={"base_radius": 0.4, "arm_length": 0.1, "forearm_length": 0.4},
     )
     with pytest.raises(UnreachableError) as caught:
         robot.forward([0.0, 0.0, 0.0])
     # Equal arms: the elbows' circumcircle is the base circle and an arm, less the platform's.
-    assert caught.value.miss == pytest.approx(0.5 + 0.1 - 0.051 - 0.4)
+    assert caught.value.miss == pytest.approx(0.4 + 0.1 - 0.051 - 0.4)

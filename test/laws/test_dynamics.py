@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from support.bodies import bodies
+from support.bodies import bodies, rubs
 from support.robots import (
     FREE,
     both_ways,
@@ -45,7 +45,9 @@ def test_power_is_the_rate_of_energy(name, robot, rng):
 
     h = 2e-4
     rate = (8 * (total(h) - total(-h)) - (total(2 * h) - total(-2 * h))) / (12 * h)
-    power = np.sum(inverse_dynamics(robot, q, qd, qdd) * qd, -1)
+    tau = inverse_dynamics(robot, q, qd, qdd)
+    tau -= sum(rub.efforts for rub in rubs(robot, bodies(robot, q, qd, qdd), q, qd))
+    power = np.sum(tau * qd, -1)
     np.testing.assert_allclose(power, rate, rtol=1e-7, atol=1e-8 * np.abs(rate).max())
 
 
@@ -59,7 +61,7 @@ def test_efforts_are_the_virtual_work_of_all_bodies(name, robot, rng):
     expected += np.einsum("nbij,nbi->nj", all_.angular, all_.moment)
     expected -= np.einsum("nkj,nk->nj", robot.platform_jacobian(q), wrench)
     expected += robot.friction.viscous * qd + robot.friction.coulomb * np.sign(qd)
-    expected += rotors(robot) * qdd
+    expected += rotors(robot) * qdd + sum(rub.efforts for rub in rubs(robot, all_, q, qd))
     size = np.maximum(1.0, np.abs(expected).max())
     np.testing.assert_allclose(
         inverse_dynamics(robot, q, qd, qdd, wrench), expected, rtol=1e-11, atol=1e-11 * size
@@ -164,10 +166,12 @@ def test_broadcasts_and_takes_any_layout(name, robot, rng):
 @pytest.mark.parametrize("which", range(4))
 def test_values_that_are_not_finite_are_refused(name, robot, rng, bad, which):
     values = [x[0] for x in states(robot, rng, 1)] + [np.zeros(6)]
-    values[which] = values[which].copy()
-    values[which][1] = bad
-    with pytest.raises(ValueError, match="finite"):
-        inverse_dynamics(robot, *values)
+    for k in range(len(values[which])):
+        refused = list(values)
+        refused[which] = values[which].copy()
+        refused[which][k] = bad
+        with pytest.raises(ValueError, match="finite"):
+            inverse_dynamics(robot, *refused)
 
 
 def test_refused_poses_name_sample_and_limb_or_measure(name, robot, rng):
@@ -223,14 +227,32 @@ print(json.dumps({{"compiled": kernels.compiled(), "tau": tau.tolist(), "one": o
         np.testing.assert_allclose(slow[word], fast[word], rtol=1e-12, atol=1e-12 * max(1, scale))
 
 
+def heavier_sections(data, times):
+    """Sections of a robot's file with every mass, and the inertia beside it, so many times."""
+
+    def scaled(value):
+        if isinstance(value, list):
+            return [scaled(v) for v in value]
+        return times * value if isinstance(value, float | int) else value
+
+    def walked(place):
+        if not isinstance(place, dict):
+            return place
+        return {
+            k: scaled(v) if k.endswith("mass") or k in ("density", "inertia") else walked(v)
+            for k, v in place.items()
+        }
+
+    if "inertia" in data:
+        masses = ("mass", "density")
+        return {"inertia": {k: times * v for k, v in data["inertia"].items() if k.endswith(masses)}}
+    return {k: walked(data[k]) for k in ("bodies", "rods", "limbs") if k in data}
+
+
 @pytest.mark.parametrize("heavier", [0.5, 3.0])
 def test_machines_of_one_geometry_keep_their_own_masses(name, variant, heavier, rng):
     """Two robots share compiled programs; masses, rotors and friction are each its own."""
-    data = parameters_of(name)["inertia"]
-    masses = {k: heavier * v for k, v in data.items() if k.endswith("mass") or k == "density"}
-    if not masses:
-        pytest.fail(f"{name}: a file with inertia that names no mass")
-    robot, (other, _) = load(name), variant(name, inertia=masses)
+    robot, (other, _) = load(name), variant(name, **heavier_sections(parameters_of(name), heavier))
     assert other.engine is robot.engine
     q, qd, qdd = states(robot, rng, 10)
     for machine in (robot, other, robot):

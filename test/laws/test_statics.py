@@ -6,13 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
+from support.robots import parameters_of, random_joints
 
 from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from stiffness_monitor import compliance, stiffness, strain_energy
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.statics import frame_energies
-from test.conftest import parameters_of, random_joints
 
 ROBOTS = ("delta", "delta_cu", "prru")
 NAMES = pytest.mark.parametrize("name", ROBOTS)

@@ -5,7 +5,8 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from support.robots import MASSLESS, loaded, massive, random_motion
+from support.bodies import bodies, rubs
+from support.robots import FREE, MASSLESS, loaded, massive, random_motion
 
 from delta_dynamics import Terms, dynamics_terms, inverse_dynamics, mass_matrix
 from pkm_twin import load
@@ -43,12 +44,6 @@ def test_each_term_has_its_own_cause_and_power(name, rng):
     close(dynamics_terms(up, q, qd, qdd).gravity, -2 * one.gravity)
 
 
-def tolerance(robot, terms):
-    """Rates of passive joints come from differences; without friction there is nothing of them."""
-    rubs = any(joint.loaded for joint in robot.graph.joints.values())
-    return (1e-7 if rubs else 1e-12) * np.abs(terms.velocity).max()
-
-
 @massive
 def test_terms_against_what_they_stand_for(name, rng):
     robot = loaded(name)
@@ -57,8 +52,8 @@ def test_terms_against_what_they_stand_for(name, rng):
     bare = robot.changed(payload={"mass": 0.0, "inertia": [0.0] * 3})
     close(terms.inertia, np.einsum("nij,nj->ni", mass_matrix(bare, q), qdd), 1e-11)
     rubbing = robot.friction.viscous * qd + robot.friction.coulomb * np.sign(qd)
-    rubbing += passive_friction(robot, q, qd)
-    np.testing.assert_allclose(terms.friction, rubbing, atol=tolerance(robot, terms))
+    rubbing += sum(rub.efforts for rub in rubs(robot, bodies(robot, q, qd, qdd), q, qd))
+    np.testing.assert_allclose(terms.friction, rubbing, atol=1e-12 * np.abs(terms.velocity).max())
     jacobian = robot.platform_jacobian(q)
     close(terms.external, -np.einsum("nij,ni->nj", jacobian, wrench), 1e-11)
     added = inverse_dynamics(robot, q, qd, qdd) - inverse_dynamics(bare, q, qd, qdd)
@@ -67,40 +62,15 @@ def test_terms_against_what_they_stand_for(name, rng):
 
 @massive
 def test_absent_causes_give_exact_zeros(name, rng):
-    robot = load(name)
+    robot = load(name).changed(friction=FREE, payload={"mass": 0.0, "inertia": [0.0] * 3})
     q, qd, qdd, _ = random_motion(robot, rng, 20)
     terms = dynamics_terms(robot, q, qd, qdd)
-    rubs = (
-        robot.friction.viscous.any()
-        or robot.friction.coulomb.any()
-        or any(joint.loaded for joint in robot.graph.joints.values())
-    )
-    laden = robot.payload.mass > 0.0
-    for absent in ("external", *(() if rubs else ("friction",)), *(() if laden else ("payload",))):
+    for absent in ("payload", "external"):
         assert not getattr(terms, absent).any()
+    passive = rubs(robot, bodies(robot, q, qd, qdd), q, qd)
+    assert terms.friction.any() == bool(passive)
     still = dynamics_terms(robot.changed(gravity=[0, 0, 0]), q, 0 * qd, 0 * qd)
     assert not still.total.any()
-
-
-def passive_friction(robot, q, qd):
-    """Efforts against the friction of passive joints, by their rates: virtual work."""
-    step = 1e-6
-    values = np.zeros_like(q)
-    names = robot.passive_joints
-    unit = [
-        (robot.passive(q + step * e) - robot.passive(q - step * e)) / (2 * step)
-        for e in np.eye(len(robot.joint_names))
-    ]
-    columns = np.stack(unit, -1)
-    for joint in robot.graph.joints.values():
-        if joint.loaded and (joint.viscous or joint.coulomb):
-            if joint.name not in names:
-                pytest.skip("the friction of a cut joint has no number of its own")
-            column = columns[..., names.index(joint.name), :]
-            rate = np.einsum("nj,nj->n", column, qd)
-            load = joint.viscous * rate + joint.coulomb * np.sign(rate)
-            values = values + load[:, None] * column
-    return values
 
 
 @massive

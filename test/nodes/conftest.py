@@ -6,11 +6,11 @@ import os
 import numpy as np
 import pytest
 import yaml
+from support.robots import parameters_of
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from stiffness_monitor import compliance, strain_energy
-from test.conftest import parameters_of
 from test.nodes.harness import Domain, Maker, NodeProcess, Peer, Plain, Ros
 
 

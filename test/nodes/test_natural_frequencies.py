@@ -4,11 +4,11 @@
 import numpy as np
 import pytest
 import yaml
+from support.robots import parameters_of
 
 from pkm_twin import load
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.modes import natural_frequencies
-from test.conftest import parameters_of
 from test.nodes.harness import SECOND, Maker, Ros, one_line_refusal
 
 pytest.importorskip("rclpy", exc_type=ImportError)

@@ -19,6 +19,7 @@ from pkm_twin.codegen.kernels import STEPS
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine, Traced
+from pkm_twin.machine.graph import BASE, Joint
 
 Array = NDArray[np.float64]
 
@@ -108,6 +109,62 @@ def bodies(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Bodies:
         joined(angular[..., own, :, :], swing / square[..., None]),
         joined(matrix, third[..., None] * thin),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Rub:
+    """Friction of a passive joint in motion.
+
+    ``axis`` and ``point`` of the joint, shape (..., 3); ``rate`` of the joint per actuated joint's,
+    (..., n); ``effort`` that moves it along the axis, from its inner to its outer body, (...).
+    """
+
+    joint: Joint
+    axis: Array
+    point: Array
+    rate: Array
+    effort: Array
+
+    @property
+    def efforts(self) -> Array:
+        """What the actuators spend on it, shape (..., n)."""
+        return self.rate * self.effort[..., None]
+
+    @property
+    def turns(self) -> bool:
+        """Whether it turns; else it slides."""
+        return self.joint.kind == "revolute"
+
+
+def rubs(robot: Robot, moved: Bodies, q: Array, qd: Array) -> list[Rub]:
+    """Friction of all passive joints, of the bodies' motion and of where the axes are."""
+    rotations, origins = robot.placements(q)
+    at = robot.engine.tree.at
+    result = []
+    for joint in robot.graph.joints.values():
+        if joint.actuated or not (joint.viscous or joint.coulomb or joint.rotor_inertia):
+            continue
+        assert joint.kind in ("revolute", "prismatic") and not joint.rotor_inertia, joint.name
+        home = joint.axes[0]
+        axis = home if joint.inner == BASE else rotations[joint.inner] @ home
+        outer = joint.outer
+        point = origins[outer] + rotations[outer] @ (joint.at - at[outer])
+        apart = np.zeros((*q.shape[:-1], 3, q.shape[-1]))
+        for body, side in ((joint.inner, -1.0), (outer, 1.0)):
+            if body == BASE:
+                continue
+            k = moved.names.index(body)
+            turn = moved.angular[..., k, :, :]
+            if joint.kind == "revolute":
+                apart += side * turn
+                continue
+            arm = (point - moved.com[..., k, :])[..., None]
+            apart += side * (moved.linear[..., k, :, :] + np.cross(turn, arm, axis=-2))
+        rate = np.einsum("...i,...ij->...j", np.broadcast_to(axis, point.shape), apart)
+        speed = np.sum(rate * qd, -1)
+        effort = joint.viscous * speed + joint.coulomb * np.sign(speed)
+        result.append(Rub(joint, np.broadcast_to(axis, point.shape), point, rate, effort))
+    return result
 
 
 @lru_cache(maxsize=8)

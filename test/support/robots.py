@@ -80,26 +80,28 @@ def joint_range(robot: Robot) -> tuple[Array, Array]:
     return robot.graph.home, np.array(half)
 
 
-def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
+def random_joints(
+    robot: Robot, rng: np.random.Generator, count: int, clear: float = CLEAR
+) -> Array:
     """Joint positions inside the middle of the limits that can be assembled, shape (count, n).
 
-    Clear of singularities by CLEAR.
+    Clear of singularities by that measure.
     """
     middle, half = joint_range(robot)
     kept = np.empty((0, len(middle)))
     for _ in range(100):
         drawn = rng.uniform(middle - half, middle + half, (max(count, 1), len(middle)))
         rates, good = robot.try_jacobian(drawn)
-        good[good] = robot.singularity_of(rates[good]) > CLEAR
+        good[good] = robot.singularity_of(rates[good]) > clear
         kept = np.concatenate([kept, drawn[good]])
         if len(kept) >= count:
             return kept[:count]
     raise AssertionError(f"{robot.name}: of 100 draws {len(kept)} joint states can be assembled")
 
 
-def random_poses(robot: Robot, rng: np.random.Generator, count: int) -> Array:
+def random_poses(robot: Robot, rng: np.random.Generator, count: int, clear: float = CLEAR) -> Array:
     """Poses of such joint states, shape (count, m)."""
-    return robot.forward(random_joints(robot, rng, count))
+    return robot.forward(random_joints(robot, rng, count, clear))
 
 
 def joint_units_of_size(robot: Robot) -> Array:

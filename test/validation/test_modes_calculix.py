@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.robots import parameters_of
 
 from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.structure import structural_model
-from test.conftest import parameters_of
 from test.validation.calculix import ABSENT, CCX, frequencies
 
 pytestmark = pytest.mark.skipif(CCX is None, reason=ABSENT)

@@ -120,12 +120,10 @@ def delta_reactions(data, q, qd, qdd, wrench):
     placements = {n: engine.data.oMi[k] for k, n in enumerate(engine.model.names)}
     result = {}
     row = 0
-    for k, (limb, closure) in enumerate(zip(LIMBS, data["geometry"]["closures"], strict=True)):
+    for limb, closure in zip(LIMBS, data["geometry"]["closures"], strict=True):
         arm = placements[f"arm {limb}"]
-        base = found[f"arm {limb}"].copy()
-        # The rotor's inertia acts on the bearing in the twin, and beside the tree in Pinocchio.
-        base[3:] += data["inertia"]["rotor_inertia"] * qdd[k] * arm.rotation[:, 1]
-        result[f"base joint {limb}"] = base, arm.translation
+        # The rotor's inertia stays in the drive, as Pinocchio's is beside the tree.
+        result[f"base joint {limb}"] = found[f"arm {limb}"], arm.translation
         rods = [""] if closure == "rcu" else [" a", " b"]
         places = [placements[f"forearm {limb}{rod}"].translation for rod in rods]
         elbow = np.mean(places, 0)

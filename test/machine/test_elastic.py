@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Elastic machines in the graph form: beside the Delta's own file, and on springs in the drives."""
+
+import numpy as np
+import pytest
+import yaml
+
+from pkm_twin import load
+from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.clearance import clearance
+from pkm_twin.machine.catalogue import config_folder
+from stiffness_monitor import compliance, strain_energy
+from stiffness_monitor.modes import natural_frequencies
+
+POSES = [[0.02, 0.03, -0.33], [-0.05, 0.0, -0.36]]
+
+
+def written(data, folder):
+    path = folder / "elastic.yaml"
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    return load(path)
+
+
+def tube(members):
+    return {
+        "youngs_modulus": members.youngs_modulus,
+        "shear_modulus": members.shear_modulus,
+        "density": members.density,
+        "outer_diameter": members.outer_diameter,
+    }
+
+
+@pytest.fixture
+def delta_in_the_graph_form(tmp_path):
+    """The shipped Delta with both rods of every parallelogram, arms and rods elastic."""
+    delta = load("delta")
+    g, m, members = delta.geometry, delta.inertia, delta.members
+    q = np.full(3, 0.3)
+    origin = delta.forward(q)
+    square = m.platform_mass * g.platform_radius**2
+    data = {
+        "mechanism": "machine",
+        "origin": origin.tolist(),
+        "pose": ["x", "y", "z"],
+        "bodies": {
+            "platform": {
+                "mass": m.platform_mass,
+                "com": origin.tolist(),
+                "inertia": [square / 4, square / 4, square / 2],
+            }
+        },
+        "joints": {},
+        "rods": {},
+    }
+    for i, azimuth in enumerate(g.azimuths.tolist()):
+        out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        along = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        pivot = g.base_radius * out
+        arm = np.cos(q[i]) * out - np.sin(q[i]) * np.array([0.0, 0.0, 1.0])
+        tip = pivot + g.arm_length * arm
+        corner = origin + g.platform_radius * out
+        about = m.arm_mass * g.arm_length**2 / 12
+        data["bodies"][f"arm_{i}"] = {
+            "mass": m.arm_mass,
+            "com": ((pivot + tip) / 2).tolist(),
+            "inertia": (about * (np.eye(3) - np.outer(arm, arm))).tolist(),
+            "member": {"from": pivot.tolist(), "to": tip.tolist(), "section": tube(members.arm)},
+        }
+        data["joints"][f"motor_{i}"] = {
+            "type": "revolute",
+            "between": ["base", f"arm_{i}"],
+            "at": pivot.tolist(),
+            "axis": along.tolist(),
+            "actuated": True,
+            "home": float(q[i]),
+        }
+        for side in (-0.5, 0.5):
+            aside = side * members.parallelogram_width * along
+            data["rods"][f"rod_{i}_{'ab'[side > 0]}"] = {
+                "between": [f"arm_{i}", "platform"],
+                "ends": [(tip + aside).tolist(), (corner + aside).tolist()],
+                "mass": m.forearm_mass / 2,
+                "section": tube(members.forearm),
+            }
+    return delta, written(data, tmp_path)
+
+
+def test_the_graph_form_of_a_delta_is_as_stiff(delta_in_the_graph_form):
+    delta, machine = delta_in_the_graph_form
+    wrench = [3.0, -5.0, 20.0, 0.1, 0.2, -0.3]
+    for pose in POSES:
+        expected = compliance(delta, pose)
+        size = np.abs(expected).max()
+        np.testing.assert_allclose(compliance(machine, pose), expected, atol=1e-12 * size)
+        np.testing.assert_allclose(
+            natural_frequencies(machine, pose), natural_frequencies(delta, pose), rtol=1e-9
+        )
+        assert clearance(machine, pose) == pytest.approx(clearance(delta, pose), abs=1e-12)
+        own, other = strain_energy(delta, pose, wrench), strain_energy(machine, pose, wrench)
+        assert other.total == pytest.approx(own.total, rel=1e-10)
+
+
+@pytest.mark.parametrize("name", ["stewart", "rps3"])
+def test_springs_in_the_drives_alone_give_the_jacobians_compliance(name, tmp_path):
+    """Rigid bodies on elastic drives: C = J c J', whatever closes the loops."""
+    data = yaml.safe_load((config_folder() / f"{name}.yaml").read_text(encoding="utf-8"))
+    along = 1e-6
+    sections = [data, *(data["limbs"] if isinstance(data["limbs"], list) else [data["limbs"]])]
+    for section in sections:
+        for joint in section.get("joints", {}).values():
+            if joint.get("actuated"):
+                joint["compliance"] = [along, 0, 0, 0, 0, 0]
+    robot = written(data, tmp_path)
+    q = robot.graph.home + 0.02 * np.sin(np.arange(len(robot.joint_names)) + 1.0)
+    pose = robot.forward(q)
+    jacobian = robot.platform_jacobian(q)
+    expected = along * jacobian @ jacobian.T
+    if len(q) == 6:
+        found = compliance(robot, pose)
+        np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+        return
+    # What the limbs hold rigidly does not give at all: no compliance is positive definite.
+    with pytest.raises(ValueError, match=r"compliance|singular|positive"):
+        compliance(robot, pose)
+
+
+def test_a_rigid_machine_says_what_is_missing():
+    with pytest.raises(ParameterError, match="nothing is elastic") as caught:
+        compliance(load("stewart"), load("stewart").home())
+    assert caught.value.field == "bodies"
