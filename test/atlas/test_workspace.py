@@ -199,7 +199,7 @@ def test_without_members_there_is_no_clearance(tmp_path, monkeypatch):
     monkeypatch.setattr(workspace, "LAYERS", 15)
     robot = load("delta")
     whole = run(workspace_sweep(robot, 4000), tmp_path / "whole.nc", workers=1)
-    monkeypatch.setattr(type(robot), "radii", None)
+    monkeypatch.setattr(type(robot), "beams", ())
     bare = run(workspace_sweep(load("delta"), 4000), tmp_path / "bare.nc", workers=1)
     with open_atlas(whole) as one, open_atlas(bare) as other:
         assert set(one.variables) - set(other.variables) == {"clearance", "interference"}
