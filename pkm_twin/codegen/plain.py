@@ -177,7 +177,7 @@ class PlainCode:
                 if k == steps
                 else [a + part * (b - a) for a, b in zip(q.origin, goal, strict=True)]
             )
-            size, before = 1e300, 0.0
+            size, before = (q.before if steps == 1 else 1e300), 0.0
             for _ in range(TURNS):
                 *x, square, det = correction(**{**named, UNKNOWNS: x, q.target: target})
                 steady = before == 0.0 or (before <= CHANGE * det and det <= CHANGE * before)
@@ -242,7 +242,8 @@ class PlainCode:
                 else [a + part * (b - a) for a, b in zip(q.origin, goal, strict=True)]
             )
             moving = alive.copy()
-            size, before = np.full(count, 1e300), np.zeros(count)
+            size = np.full(count, q.before if steps == 1 else 1e300)
+            before = np.zeros(count)
             for _ in range(TURNS):
                 *new, square, det = correction(**{**named, UNKNOWNS: list(x), q.target: target})
                 moved = np.array([np.broadcast_to(v, count) for v in new])

@@ -23,6 +23,8 @@ TURNS: Final = 12
 """Most corrections a step."""
 CONTRACTION: Final = 0.25
 """Most that a correction may be of the one before it."""
+FIRST: Final = 0.3
+"""Most that the first correction of a guess may be, of unit one: a longer one may go elsewhere."""
 CHANGE: Final = 3.0
 """Most that the determinant may change by, as a factor, in one correction."""
 DIRECT: Final = 1e-3
@@ -65,6 +67,8 @@ class Equations:
     """Of the equations, over that at home."""
     residual: Expression
     """Square of the residual of all equations, of unit one."""
+    guessed: bool = False
+    """Whether the start is a guess, that may be nearer to another root."""
     branch: Sequence[Expression] = ()
     """Above zero in the mechanism's own branch, at the target."""
 
@@ -72,9 +76,15 @@ class Equations:
     def least(self) -> float:
         """Least determinant of a state that is reached at once.
 
-        A closed form of the start is in the right assembly; from home a step may lead to another.
+        A closed form of the start is in the right assembly; a guess may lead to another.
         """
-        return DIRECT if self.start is None else STEPPED
+        return DIRECT if self.start is None or self.guessed else STEPPED
+
+    @property
+    def before(self) -> float:
+        """Square of what the first correction of a single step has to contract from."""
+        known = self.start is not None and not self.guessed
+        return 1e300 if known else (FIRST / CONTRACTION) ** 2
 
     @property
     def results(self) -> list[Expression]:

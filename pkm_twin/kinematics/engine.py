@@ -29,7 +29,7 @@ from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine.graph import FREEDOMS, Array, Graph
-from pkm_twin.machine.tree import Tree
+from pkm_twin.machine.tree import Tree, snapped
 
 _NO_PARAMETERS: Final = np.zeros(0)
 RANK: Final = 1e-9
@@ -463,16 +463,27 @@ class Traced:
         engine, tree = self.engine, self.tree
         kept = engine.kept
         step = -self.lu.solve([self.rows[k].value for k in kept])
-        start = None
-        if engine._start is not None:
-            start = self.lift(self._ordered(engine._start(self.q)))
+        guessed = engine._start is None
+        start = self._along() if guessed else self._ordered(engine._start(self.q))  # type: ignore[misc]
         return Equations(
-            "q", tree.home, engine.graph.home.tolist(), start,
+            "q", tree.home, engine.graph.home.tolist(), self.lift(start),
             self.lift(self.motion.retracted(self.x, step)),
             self._square(step, tree.scales), self._determinant(self.lu),
-            self._square([r.value for r in self.rows], [r.scale for r in self.rows]),
+            self._square([r.value for r in self.rows], [r.scale for r in self.rows]), guessed,
             () if engine._branch is None else self.lift(engine._branch(self.motion)),
         )  # fmt: skip
+
+    def _along(self) -> list[Any]:
+        """Unknowns along the tangent at home: nearer than home itself."""
+        engine, tree = self.engine, self.tree
+        motion, rows = engine.at(tree.home, engine.graph.home)
+        ju, jq = (numbers(m)[engine.kept] for m in matrices(tree, rows))
+        slopes = (
+            snapped(np.asarray(-np.linalg.solve(ju, jq), np.float64))
+            if engine.kept
+            else np.zeros((0, self.joints))
+        )
+        return motion.retracted(tree.home, slopes @ (self.q - engine.graph.home))
 
     def _ordered(self, values: Mapping[str, Sequence[Any]]) -> list[Any]:
         """Unknowns of joints' values."""
