@@ -6,14 +6,13 @@ May import: numpy, pkm_twin's core, the standard library; never rclpy.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.expressions import PARAMETERS, Expression, Objects, ordered, sign
+from pkm_twin.codegen.expressions import PARAMETERS, Objects, sign
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
@@ -276,20 +275,7 @@ def _torques(t: Traced) -> Program:
         for k in range(n)
     ]
     sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
-    outputs = {"efforts": _told(t, t.lift(tau), wrench)}
-    return Program(sizes, layout.size, outputs, t.equations())
-
-
-def _told(t: Traced, efforts: Sequence[Expression], wrench: Objects) -> list[Expression]:
-    """Efforts that are not finite where an entry of the wrench is not, which may do no work."""
-    result = list(efforts)
-    used = {e.number for e in ordered(result)}
-    for entry in wrench:
-        if entry.number not in used:
-            # Zero of what is finite; written past the folding of zeros.
-            idle = t.tape.make("mul", entry, t.tape.constant(0.0))
-            result[0] = t.tape.make("add", result[0], idle)
-    return result
+    return Program(sizes, layout.size, {"efforts": t.lift(tau)}, t.equations())
 
 
 def _masses(t: Traced) -> Program:
