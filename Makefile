@@ -44,8 +44,9 @@ lint: $(VENV)/test.stamp
 types: $(VENV)/test.stamp
 	$(BIN)/mypy
 
+# Two at a time: a test that needs quiet waits for conditions, none for a clock.
 unit: $(VENV)/test.stamp
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2
 
 bags: $(VENV)/bags.stamp
 	$(BIN)/python -m bags.recording

@@ -85,6 +85,7 @@ setup(
             "psutil",
             "pytest",
             "pytest-timeout",
+            "pytest-xdist",
             "rosbags",
             "ruff",
             "threadpoolctl",

@@ -257,7 +257,9 @@ class Delta(Robot):
         """The limb that stands apart from the two closest elbows, of rods that do not meet."""
         g = self.geometry
         if "rcu" in g.closures:
-            return None
+            # Its elbow slides: what the other limbs leave open, it has to close.
+            _, miss, measure = self.engine.ending(q, reached)
+            return (g.closures.index("rcu"), miss) if measure is None else None
         centres = np.array(
             [self._elbow(i, q[i]) - g.platform_radius * self._directions(i)[0] for i in range(3)],
             float,

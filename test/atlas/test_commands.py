@@ -90,7 +90,7 @@ def test_interrupted_and_resumed(tmp_path):
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [
-        (["atlas", "upr_rpu", "isotropy"], 1, "masses"),
+        (["atlas", "five_bar", "isotropy"], 1, "three pose coordinates"),
         (["atlas", "delta", "strain-energy"], 1, "elastic"),
         (["atlas", "delta", "weather"], 1, "workspace"),
         (["atlas", "upr_rpu", "strain-energy", "--wrench", "1,2"], 2, "six numbers"),

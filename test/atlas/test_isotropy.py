@@ -86,7 +86,7 @@ def test_delta_leaves_out_what_its_arms_do_not_reach(small_atlases):
 def test_refusals():
     prru = load("prru")
     for robot, options in (
-        (load("upr_rpu"), {}),
+        (load("five_bar"), {}),
         (prru, {"points": 5}),
         (prru, {"energy": 0.0}),
         (prru, {"tilt": 2.0}),

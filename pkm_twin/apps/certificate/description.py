@@ -218,7 +218,8 @@ def read(description: Description) -> Machine:
         vector(data.get("gravity", STANDARD_GRAVITY)),
         platform,
         origin,
-        tuple(data["pose"]),
+        # A mechanism may have pose coordinates of its own: then places are compared alone.
+        tuple(data.get("pose", ())),
         bodies,
         joints,
         rods,
