@@ -323,6 +323,7 @@ class Delta(Robot):
             if g.closures[i] == "rod":
                 rods[forearm] = Rod(
                     forearm, arm, PLATFORM, array([foot, corner]), m.forearm_mass, array(along),
+                    0.0 if self.members is None else self.members.parallelogram_width,
                     joints=names, label=f"limb {limb}",
                 )  # fmt: skip
                 continue
