@@ -26,8 +26,13 @@ MAY = {
     "stiffness_monitor": CORE | MESSAGES | {"pkm_twin.streams"},
 }
 """Of the project, beside themselves; nodes and cores of nodes may import streams and ros."""
-NODES = {"delta_dynamics.node", "stiffness_monitor.node"}
-APPS_WITH_ROS = {"pkm_twin.apps.demo"}
+NODES = {
+    "delta_dynamics.node",
+    "delta_dynamics.action_node",
+    "delta_dynamics.gate_node",
+    "stiffness_monitor.node",
+}
+APPS_WITH_ROS = {"pkm_twin.apps.demo", "pkm_twin.apps.guard_check"}
 WITH_ROS = {"rclpy", "rcl_interfaces", "lifecycle_msgs"}
 
 

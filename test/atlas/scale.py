@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-import numba
+import llvmlite
 import psutil
 
 from pkm_twin import load
@@ -112,7 +112,7 @@ def page() -> str:
     return template.format(
         date=datetime.date.today().isoformat(),
         python=platform.python_version(),
-        numba=numba.__version__,
+        llvmlite=llvmlite.__version__,
         cores=psutil.cpu_count(),
         load_1=f"{load_1:.1f}",
         load_5=f"{load_5:.1f}",

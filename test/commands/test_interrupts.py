@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -80,7 +81,9 @@ with interrupts.first_signal(lambda: SystemExit(7)):
 def test_an_interrupted_command_has_its_own_exit_code(tmp_path):
     """Neither good nor bad: a script has to tell them apart."""
     path = tmp_path / "motion.csv"
-    os.mkfifo(path)
+    joints = [f"arm_{i}.position" for i in (1, 2, 3)]
+    rows = (f"{0.001 * k:.3f},0.1,0.2,0.3" for k in range(400_000))
+    path.write_text("\n".join([",".join(["time", *joints]), *rows]), encoding="utf-8")
     process = subprocess.Popen(
         [sys.executable, "-m", "pkm_twin.apps.cli", "torques", "delta_cu", str(path)],
         stdout=subprocess.PIPE,
@@ -88,9 +91,13 @@ def test_an_interrupted_command_has_its_own_exit_code(tmp_path):
         text=True,
         env=environment(),
     )
-    # Opens when the command reads, and never sends anything.
-    with path.open("w"):
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=20)
+    # As soon as it reads, which takes a while.
+    files = Path(f"/proc/{process.pid}/fd")
+    while process.poll() is None and not any(
+        os.path.realpath(link) == str(path.resolve()) for link in files.iterdir()
+    ):
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (130, "")
     assert "Traceback" not in err
