@@ -26,7 +26,8 @@ def robot_urdf(robot: Robot) -> str:
     """The robot as a URDF that parsers of trees read, see docs/urdf.md.
 
     Its joints are ``robot.joint_names`` and ``robot.passive_joints``; with their values the link
-    ``platform`` stands where ``robot.platform`` says, and the masses sum to the robot's.
+    ``platform`` stands where ``robot.platform`` says, and the masses sum to the robot's. A URDF
+    has no place for rotors, nor for friction in the joints that it cuts: both are left out.
     """
     engine, load = robot.engine, robot.payload
     tree = urdf_tree(
