@@ -142,7 +142,7 @@ def on_cores(
 
 
 def _pool(sweep: Sweep, work: Work, workers: int, folder: Path) -> Iterator[int]:
-    # Not forked: the parent has threads (the progress bar's, numba's).
+    # Not forked: the parent has threads (the progress bar's).
     context = multiprocessing.get_context("spawn")
     # Once, and here: a pool that cannot pass its work on waits for ever.
     packed = pickle.dumps(sweep)

@@ -54,7 +54,7 @@ TITLES = {
     "prru": "3-PRRU",
 }
 
-PACKAGES = ("numpy", "numba", "scipy", "pin", "mujoco", "mpmath")
+PACKAGES = ("numpy", "llvmlite", "scipy", "pin", "mujoco", "mpmath")
 
 
 class Judge:
