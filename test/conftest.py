@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+import signal
+
 import numpy as np
 import pytest
 import yaml
@@ -12,6 +14,10 @@ from support.robots import (  # noqa: F401
 )
 
 from pkm_twin import load
+
+# A background job of a shell ignores SIGINT, and so would every process started from here.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -437,7 +437,6 @@ def test_a_tree_whose_joints_are_all_driven_needs_no_closure(tmp_path):
     assert np.allclose(read_urdf(small(tmp_path))["joints"]["motor"]["axis"], Z)
 
 
-@pytest.mark.xfail(strict=False, reason="passive values do not count from the joints' home yet")
 def test_passive_joints_have_the_values_of_the_urdf(sketch, tmp_path):
     """With the robot's passive values Pinocchio closes the loops, away from home as well."""
     robot = Machine.from_data(read_urdf(sketch.save(tmp_path)), "sketch")
@@ -469,7 +468,6 @@ def sketch_home(robot, model, data, ends):
     return kept.oMf[model.getFrameId("platform")]
 
 
-@pytest.mark.xfail(strict=False, reason="load takes no URDF files yet")
 def test_load_takes_a_urdf(sketch, tmp_path):
     robot = load(str(sketch.save(tmp_path)), platform="platform")
     assert list(robot.joint_names) == sketch.actuated
