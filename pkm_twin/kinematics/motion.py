@@ -370,10 +370,6 @@ class Motion:
                         new[k + 4 + i] = x[k + 4 + i] + du[r + 3 + i]
         return new
 
-    def reaction_axes(self, joint: Joint) -> list[tuple[str, Any]]:
-        """Directions of a joint's reactions, by name: given ones, or along and across its axis."""
-        return [(d.name, self.direction(d.body, d.vector)) for d in reaction_directions(joint)]
-
 
 def reaction_directions(joint: Joint) -> tuple[Direction, ...]:
     """Three directions in which a joint's reactions are told, fixed in bodies."""

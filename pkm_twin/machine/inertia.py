@@ -19,11 +19,8 @@ from pkm_twin.machine.tree import Tree
 
 Objects = NDArray[Any]
 
-BODIES: Final = 0
-RODS: Final = 1
 GRAVITY: Final = 2
-ROTORS: Final = 5
-"""Parts of the inputs, see :meth:`Layout.part`."""
+"""Part of the inputs, see :meth:`Layout.part`."""
 
 
 def ten_numbers(mass: float, com: Array, inertia: Array) -> Array:

@@ -370,15 +370,6 @@ class Robot:
         """Unit of the efforts where the joints are of one kind, else ``N m or N``."""
         return _common(self.effort_units)
 
-    @property
-    def has_masses(self) -> bool:
-        """Whether the robot's file gives what dynamics need."""
-        try:
-            self.massive()
-        except ParameterError:
-            return False
-        return True
-
     def parameter_sections(self) -> dict[str, Any]:
         """The parameters by section, as plain data."""
         fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
