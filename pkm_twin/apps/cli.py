@@ -415,7 +415,7 @@ def check(
     of it can be saved with `pkm-twin recover`.
     """
     from pkm_twin.apps.check import Bounds, check_bag
-    from pkm_twin.apps.verdict import Verdict
+    from pkm_twin.apps.verdict import Verdict, items_table
     from pkm_twin.bags.reader import DamagedBagError
 
     carried = _load(payload, load_times)
@@ -436,14 +436,7 @@ def check(
     else:
         typer.echo(f"{report.topics}")
         typer.echo(f"payload: {report.load or 'the robot file alone'}")
-        table = Table(title=Text(f"{report.bag}: {report.robot}"))
-        for column in ("what", "value", "limit", "verdict"):
-            table.add_column(column)
-        colours = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
-        for item in report.items:
-            verdict = Text(item.verdict, style=colours[item.verdict])
-            table.add_row(item.what, Text(item.value), Text(item.bound), verdict)
-        table_console().print(table)
+        table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
         bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
         text = f"bad: {', '.join(bad)}" if bad else "good"
         typer.echo(text + (f"; not judged: {', '.join(unknown)}" if unknown else ""))

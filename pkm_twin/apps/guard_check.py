@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import time
@@ -13,11 +12,9 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from pkm_twin.apps.verdict import Item, Verdict
+from pkm_twin.apps.verdict import Item, Verdict, items_table
+from pkm_twin.console import print_json, table_console
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.ros.messages import stamp_of
 from pkm_twin.ros.signals import first_signal
@@ -272,16 +269,8 @@ def guard_check(
     """
     report = watch(topic, deadline, duration, wait, sim_time)
     if as_json:
-        typer.echo(json.dumps(report.as_json(), indent=2, allow_nan=False))
+        print_json(report.as_json())
     else:
-        table = Table(title=Text(report.topic))
-        for column in ("what", "value", "must be", "verdict"):
-            table.add_column(column)
-        colours = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
-        for item in report.items:
-            verdict = Text(item.verdict, style=colours[item.verdict])
-            table.add_row(item.what, Text(item.value), Text(item.bound), verdict)
-        console = Console()
-        (console if console.is_terminal else Console(width=140)).print(table)
+        table_console().print(items_table(report.topic, "must be", report.items))
     if not report.good:
         sys.exit(1)

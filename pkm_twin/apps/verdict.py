@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+
+from rich.table import Table
+from rich.text import Text
 
 
 class Verdict(StrEnum):
@@ -23,3 +27,15 @@ class Item:
     value: str
     bound: str
     verdict: Verdict
+
+
+def items_table(title: str, bound: str, items: Iterable[Item]) -> Table:
+    """Judged properties as a table; ``bound`` is the heading of their bounds."""
+    table = Table(title=Text(title))
+    for column in ("what", "value", bound, "verdict"):
+        table.add_column(column)
+    colours = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
+    for item in items:
+        verdict = Text(item.verdict, style=colours[item.verdict])
+        table.add_row(item.what, Text(item.value), Text(item.bound), verdict)
+    return table
