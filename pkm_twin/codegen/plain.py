@@ -171,12 +171,7 @@ class PlainCode:
             x = list(self._start[0](**{**named, UNKNOWNS: x}))
         least = q.least if steps == 1 else STEPPED
         for k in range(1, steps + 1):
-            part = progress(k / steps)
-            target = (
-                goal
-                if k == steps
-                else [a + part * (b - a) for a, b in zip(q.origin, goal, strict=True)]
-            )
+            target = q.ahead(goal, k, steps)
             size, before = (q.before if steps == 1 else 1e300), 0.0
             for _ in range(TURNS):
                 *x, square, det = correction(**{**named, UNKNOWNS: x, q.target: target})
@@ -235,12 +230,7 @@ class PlainCode:
         least = q.least if steps == 1 else STEPPED
         alive, reached = np.ones(count, bool), np.zeros(count)
         for k in range(1, steps + 1):
-            part = progress(k / steps)
-            target = (
-                goal
-                if k == steps
-                else [a + part * (b - a) for a, b in zip(q.origin, goal, strict=True)]
-            )
+            target = q.ahead(goal, k, steps)
             moving = alive.copy()
             size = np.full(count, q.before if steps == 1 else 1e300)
             before = np.zeros(count)
@@ -258,7 +248,7 @@ class PlainCode:
                 if not moving.any():
                     break
             alive &= ~moving
-            reached[alive] = part
+            reached[alive] = progress(k / steps)
             if not alive.any():
                 break
         return x, alive, reached

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from pkm_twin.codegen.expressions import PARAMETERS, SAMPLE, Expression, ordered
 from pkm_twin.errors import PkmTwinError
@@ -85,6 +85,13 @@ class Equations:
         """Square of what the first correction of a single step has to contract from."""
         known = self.start is not None and not self.guessed
         return 1e300 if known else (FIRST / CONTRACTION) ** 2
+
+    def ahead(self, goal: Sequence[Any], k: int, steps: int) -> Sequence[Any]:
+        """The target of step ``k``, 1 to ``steps``, on the way from the origin to ``goal``."""
+        if k == steps:
+            return goal
+        part = progress(k / steps)
+        return [a + part * (b - a) for a, b in zip(self.origin, goal, strict=True)]
 
     @property
     def results(self) -> list[Expression]:
