@@ -14,6 +14,18 @@ from rich.table import Table
 from rich.text import Text
 
 from pkm_twin.apps.guard_check import guard_check
+from pkm_twin.apps.options import (
+    BagPath,
+    BagTopics,
+    BeyondLimits,
+    Json,
+    LoadTimes,
+    OptionalRobot,
+    Payload,
+    Platform,
+    RobotName,
+    load_of,
+)
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
     flush_output,
@@ -25,7 +37,7 @@ from pkm_twin.console import (
     system_error,
     table_console,
 )
-from pkm_twin.errors import ParameterError, PkmTwinError, one_line
+from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
 app = typer.Typer(
@@ -35,41 +47,6 @@ app = typer.Typer(
 )
 
 REFUSED, SALVAGED = 1, 3
-
-RobotName = Annotated[
-    str, typer.Argument(help="a robot's name (see `pkm-twin robots`) or a YAML file")
-]
-Json = Annotated[bool, typer.Option("--json", help="machine-readable output")]
-OptionalRobot = Annotated[
-    Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-    typer.Option("--robot", help="name or YAML file; default: the one that the bag names"),
-]
-BagPath = Annotated[
-    Path, typer.Argument(help="a bag: an MCAP file or a rosbag2 folder", show_default=False)
-]
-BagTopics = Annotated[
-    list[str],
-    typer.Option(
-        "--topic", help="joint states or wrenches to read; default: by the robot's joint names"
-    ),
-]
-Payload = Annotated[
-    Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-    typer.Option(
-        help="MASS[,x,y,z] on the platform, kg and m from its reference point; default: what the "
-        "bag tells"
-    ),
-]
-LoadTimes = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(
-        help="FROM,TO[,FROM,TO...], s since the beginning, when --payload is held; default: always"
-    ),
-]
-BeyondLimits = Annotated[
-    bool,
-    typer.Option("--beyond-limits", help="compute outside the joints' limits too, and mark it"),
-]
 
 
 def _version(asked: bool) -> None:
@@ -151,12 +128,6 @@ def robots() -> None:
 
     for name in robot_names():
         typer.echo(f"{name:12} {summary(load(name))}")
-
-
-Platform = Annotated[
-    Optional[str],  # noqa: UP045  typer reads it
-    typer.Option(help="of a URDF, the link that carries the tool", show_default=False),
-]
 
 
 @app.command()
@@ -265,7 +236,7 @@ def torques(
     drawing = out.with_suffix(".png")
     for target in (out, drawing) if picture else (out,):
         refuse_existing(target, overwrite)
-    carried = _load(payload, load_times)
+    carried = load_of(payload, load_times)
     if is_bag(motion):
         data = motion_of_bag(motion, robot, topic, carried)
     elif topic:
@@ -418,7 +389,7 @@ def check(
     from pkm_twin.apps.verdict import Verdict, items_table
     from pkm_twin.bags.reader import DamagedBagError
 
-    carried = _load(payload, load_times)
+    carried = load_of(payload, load_times)
     try:
         with progress("reading", None) as update:
             report = check_bag(
@@ -535,21 +506,6 @@ def _finite(data: Any) -> Any:
     if isinstance(data, list):
         return [_finite(value) for value in data]
     return None if isinstance(data, float) and not np.isfinite(data) else data
-
-
-def _load(payload: str | None, times: str | None) -> Any:
-    """The payload that a command line tells of, None where it tells of none."""
-    from pkm_twin.apps.recorded import Load, parse_payload, parse_times
-
-    if payload is None:
-        if times is not None:
-            raise typer.BadParameter("--load-times needs --payload")
-        return None
-    try:
-        spans = () if times is None else parse_times(times)
-        return Load(*parse_payload(payload), spans)
-    except ParameterError as error:
-        raise typer.BadParameter(str(error)) from None
 
 
 def _pair(text: str) -> tuple[str, str]:
