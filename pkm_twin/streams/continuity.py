@@ -35,37 +35,9 @@ class _State:
     q: Array
     pose: Array
     rates: Array
-    clearance: float
-    """Lower bound of the singularity measure; ``greatest``: upper bound of the rates' norm."""
+    measure: float
+    """Of the distance to a singularity; ``greatest``: upper bound of the rates' norm."""
     greatest: float
-
-
-class Clearance:
-    """A lower bound of a Jacobian's reciprocal condition number, cheap along a stream.
-
-    No singular value moves farther than the matrix does (Weyl), so those of one matrix bound
-    those of all near it; they are taken anew only where the bound says too little.
-    """
-
-    def __init__(self) -> None:
-        self._near: tuple[Array, float, float] | None = None
-        self.greatest = math.inf
-        """Bound of the last matrix' greatest singular value."""
-
-    def at_least(self, rates: Array, wanted: float) -> float:
-        """A bound of the measure of ``rates`` (m, n): the measure itself where it is below."""
-        if self._near is not None and self._near[0].shape == rates.shape:
-            matrix, least, greatest = self._near
-            change = (rates - matrix).ravel()
-            moved = _length(change)
-            self.greatest = greatest + moved
-            bound = (least - moved) / self.greatest if self.greatest > 0.0 else 0.0
-            if bound >= wanted:
-                return bound
-        values = np.linalg.svd(rates, compute_uv=False)
-        least, self.greatest = values.item(-1), values.item(0)
-        self._near = rates, least, self.greatest
-        return least / self.greatest if self.greatest > 0.0 else 0.0
 
 
 class Continuity:
@@ -87,7 +59,6 @@ class Continuity:
         self._rows = robot.pose_scales
         self._matrix = robot.pose_scales[:, None]
         self._joints = robot.joint_scales
-        self._clearance = Clearance()
         self.reset()
 
     def reset(self) -> None:
@@ -108,8 +79,9 @@ class Continuity:
         """
         pose = self._rows * self.robot.forward(q)
         rates = self._matrix * self.robot.jacobian(q)
-        clearance = self._clearance.at_least(rates / self._joints, self.warn)
-        state = _State(stamp, q, pose, rates, clearance, self._clearance.greatest)
+        # The sum of squares bounds the greatest singular value, and costs no decomposition.
+        greatest = _length((rates / self._joints).ravel())
+        state = _State(stamp, q, pose, rates, float(self.robot.singularity(q)), greatest)
         if self._last is not None:
             self._check_jump(self._last, state)
         near = self._near_singularity(state)
@@ -117,16 +89,13 @@ class Continuity:
         return near
 
     def _near_singularity(self, state: _State) -> bool:
-        if state.clearance >= self.warn:
-            return False
-        measure = float(self.robot.singularity(state.q))
-        if not measure >= self.stop:
+        if not state.measure >= self.stop:
             raise MessageError(
                 "singular",
-                f"too close to a singularity or the edge of reach: measure {measure:.3g}, "
+                f"too close to a singularity or the edge of reach: measure {state.measure:.3g}, "
                 f"singularity_stop is {self.stop:g}",
             )
-        return measure < self.warn
+        return state.measure < self.warn
 
     def _check_jump(self, last: _State, state: _State) -> None:
         """No joint moves farther than its velocity limit allows, no pose than its rates tell."""
