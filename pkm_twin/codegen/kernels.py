@@ -90,8 +90,9 @@ class _Space:
         self.words[2] = p.ctypes.data
 
 
-def _take_none(*inputs: Any) -> Array | None:
-    raise TypeError(f"{len(inputs)} inputs go the way of a batch")
+def _take_none(*_: Any) -> Array | None:
+    """On plain Python every sample goes the way of a batch."""
+    return None
 
 
 @remembered
@@ -238,7 +239,7 @@ class Kernel:
         return [output[0] for output in outputs], None if status is None else status[0]
 
     def first_of_one(self, p: Array) -> Callable[..., Array | None]:
-        """The first output of one sample, as fast as can be; on plain Python it takes none.
+        """The first output of one sample, as fast as can be; on plain Python always None.
 
         The function takes arrays of doubles of exactly the inputs' shapes, (size,) each, else it
         raises TypeError or ValueError; it gives None where a sample is not good at once.

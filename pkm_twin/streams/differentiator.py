@@ -10,18 +10,21 @@ slope of the window, which is the acceleration half a window ago.
 A. Savitzky, M. J. E. Golay, Smoothing and differentiation of data by simplified least squares
 procedures, Analytical Chemistry 36 (1964), doi:10.1021/ac60214a047.
 
-May import: numpy, scipy, pkm_twin's core, the standard library.
+May import: numpy, pkm_twin's core, the standard library.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from functools import cache
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 
+from pkm_twin.codegen.expressions import Tape, sqrt
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.messages import SECOND
 
@@ -29,6 +32,7 @@ Array = NDArray[np.float64]
 
 LEAST_PIVOT: Final = 1e-4
 """Least diagonal entry of the normal equations' Cholesky factor; even stamps stay above 1e-2."""
+_NONE: Final = np.zeros(0)
 
 
 @dataclass
@@ -51,8 +55,8 @@ class Differentiator:
         # Since the first sample, ns: whole numbers, exact for a hundred days.
         self._stamps = np.zeros(2 * self._places)
         self._begin = 0
-        self._values = np.zeros((2 * self._places, 0))
-        self._fits = {carries: _Fit(self.order + (not carries), self.window) for carries in (0, 1)}
+        self._values = np.zeros((0, 2 * self._places))
+        self._fit: _Fit | None = None
         self._count = 0
 
     @property
@@ -80,29 +84,30 @@ class Differentiator:
         """
         carries = qd is not None
         values = q if qd is None else qd
-        if carries is not self._carries_velocity or len(values) != self._values.shape[1]:
+        if carries is not self._carries_velocity or len(values) != len(self._values):
             self.reset()
             self._carries_velocity = carries
-            self._values = np.zeros((2 * self._places, len(values)))
+            self._values = np.zeros((len(values), 2 * self._places))
+            self._fit = None
         if self._count == 0:
             self._begin = stamp
         slot = self._count % self._places
         twin = slot + self._places
         self._stamps[slot] = self._stamps[twin] = stamp - self._begin
-        self._values[slot] = self._values[twin] = values
+        self._values[:, slot] = self._values[:, twin] = values
         self._count += 1
         if self._count < self.window:
             return None
+        if self._fit is None:
+            self._fit = _Fit(self.order + (not carries), self.window, len(values))
         # The window ends at the newest sample's second place, or at its first.
         end = (slot if slot + 1 >= self.window else twin) + 1
         window = slice(end - self.window, end)
-        rows = self._values[window]
         at = self.window // 2 if self.middle else self.window - 1
-        coefficients, weights, seconds = self._fits[carries].solve(self._stamps[window], rows, at)
-        first = weights[0] @ coefficients / seconds
+        first, second = self._fit.derivatives(self._stamps[window], self._values[:, window], at)
         if qd is None:
-            return first, weights[1] @ coefficients / (seconds * seconds)
-        return (rows[at].copy() if self.middle else qd), first
+            return first, second
+        return (self._values[:, end - self.window + at].copy() if self.middle else qd), first
 
 
 class _Fit:
@@ -112,42 +117,78 @@ class _Fit:
     V V' c = V y of a degree up to 5 stay far from rounding.
     """
 
-    def __init__(self, degree: int, window: int) -> None:
-        self._powers = np.ones((degree + 1, window))
-        self._transposed = self._powers.T
-        self._times = self._powers[1]
-        self._steps = [tuple(self._powers[i : i + 2]) for i in range(1, degree)]
-        self._newest = _derivatives(degree, 1.0)
+    def __init__(self, degree: int, window: int, joints: int) -> None:
+        # Powers of t and the samples' values below each other: one product is all that is needed.
+        table = np.ones((degree + 1 + joints, window))
+        self._powers, self._values, self._transposed = table[: degree + 1], table[degree + 1 :], table.T
+        self._times = table[1]
+        self._steps = [tuple(table[i : i + 2]) for i in range(1, degree)]
+        self._sums = np.zeros((degree + 1, len(table)))
+        self._flat = self._sums.reshape(-1)
+        self._kernel = _kernel(degree, joints)
+        self._call = self._kernel.first_of_one(_NONE)
+        self._joints = joints
 
-    def solve(self, stamps: Array, values: Array, at: int) -> tuple[Array, Array, float]:
-        """The polynomials' coefficients (degree + 1, n) in t, and how to derive them at a sample.
+    def derivatives(self, stamps: Array, values: Array, at: int) -> tuple[Array, Array]:
+        """First and second derivative by time at a sample of the window, shape (n,) each.
 
-        :returns: coefficients, weights (2, degree + 1) of the first and the second derivative by
-            t, and the time that t counts in, s.
+        :param stamps: shape (window,), ns; ``values`` shape (n, window).
+        :raises MessageError: the stamps are too uneven.
         """
-        powers, times = self._powers, self._times
+        times = self._times
         newest = stamps.item(-1)
         half = 0.5 * (newest - stamps.item(0))
         np.subtract(stamps, newest - half, out=times)
         np.divide(times, half, out=times)
         for last, power in self._steps:
             np.multiply(last, times, out=power)
-        factor, coefficients, fault = dposv(powers @ self._transposed, powers @ values)
-        if fault or not min(factor.item(i, i) for i in range(len(powers))) > LEAST_PIVOT:
+        self._values[:] = values
+        np.dot(self._powers, self._transposed, out=self._sums)
+        place = np.array((times.item(at), SECOND / half))
+        result: Any = self._call(self._flat, place)
+        if result is None:
+            (result,), _ = self._kernel(_NONE, self._flat, place)
+        n = self._joints
+        if not min(result[2 * n :].tolist()) > LEAST_PIVOT:
             raise MessageError(
                 "uneven stamps", "the stamps of the window are too uneven to differentiate"
             )
-        last_sample = at == len(times) - 1
-        weights = self._newest if last_sample else _derivatives(len(powers) - 1, times.item(at))
-        return coefficients, weights, half / SECOND
+        return result[:n], result[n : 2 * n]
 
 
-def _derivatives(degree: int, t: float) -> Array:
-    """First and second derivative of the powers of t, shape (2, degree + 1)."""
-    k = np.arange(degree + 1)
-    return np.array(
-        [
-            k * t ** np.maximum(k - 1, 0),
-            k * (k - 1) * t ** np.maximum(k - 2, 0),
-        ]
-    )
+@cache
+def _kernel(degree: int, joints: int) -> Kernel:
+    """V V' and V y by row, and where to look (t, and how much of it a second is).
+
+    Gives the first and the second derivative by time, and the pivots of V V'.
+    """
+    return Kernel(lambda: _program(degree, joints), f"polynomial fit {degree} {joints}")
+
+
+def _program(degree: int, joints: int) -> Program:
+    tape, size = Tape(), degree + 1
+    sums = tape.inputs("sums", size * (size + joints)).reshape(size, size + joints)
+    t, rate = tape.inputs("place", 2)
+    factor = np.zeros((size, size), dtype=object)
+    for j in range(size):
+        for i in range(j, size):
+            rest = sums[i, j] - factor[i, :j] @ factor[j, :j]
+            factor[i, j] = sqrt(rest) if i == j else rest / factor[j, j]
+    powers = [tape.constant(1.0)]
+    for _ in range(degree):
+        powers.append(powers[-1] * t)
+    rows = []
+    for derivative in (1, 2):
+        # V V' w = d, by both triangles; then w' V y.
+        w = np.zeros(size, dtype=object)
+        for k in range(size):
+            slope = k if derivative == 1 else k * (k - 1)
+            d = float(slope) * powers[k - derivative] if slope else tape.constant(0.0)
+            w[k] = (d - factor[k, :k] @ w[:k]) / factor[k, k]
+        for k in reversed(range(size)):
+            w[k] = (w[k] - factor[k + 1 :, k] @ w[k + 1 :]) / factor[k, k]
+        scale = rate if derivative == 1 else rate * rate
+        rows += [scale * (w @ sums[:, size + j]) for j in range(joints)]
+    pivots = [factor[k, k] for k in range(size)]
+    outputs = {"result": [tape.lift(value) for value in [*rows, *pivots]]}
+    return Program({"sums": size * (size + joints), "place": 2}, 0, outputs)
