@@ -34,6 +34,8 @@ GOOD: Final = 0.0
 REFUSED: Final = 1.0
 NOT_FINITE: Final = 2.0
 
+_WRITERS: Final = ("codegen", "machine", "kinematics", "mechanisms", "streams")
+"""Folders beside this one whose sources write programs."""
 _F8: Final = np.dtype(np.float64)
 
 
@@ -57,7 +59,7 @@ def compiled() -> bool:
 def _sources() -> str:
     """What the package's formulas hang on: a changed file compiles anew."""
     root = Path(__file__).resolve().parents[1]
-    folders = [root / name for name in ("codegen", "machine", "kinematics", "mechanisms")]
+    folders = [root / name for name in _WRITERS]
     folders += [root.parent / name for name in ("delta_dynamics", "stiffness_monitor")]
     paths = sorted(path for place in folders for path in place.glob("*.py"))
     return cache.digest(*(path.read_text(encoding="utf-8") for path in paths))

@@ -118,13 +118,15 @@ class _Fit:
     """
 
     def __init__(self, degree: int, window: int, joints: int) -> None:
-        # Powers of t and the samples' values below each other: one product is all that is needed.
-        table = np.ones((degree + 1 + joints, window))
-        self._powers, self._values, self._transposed = table[: degree + 1], table[degree + 1 :], table.T
+        # Powers of time and the samples' values below each other: one product is all it needs.
+        size = degree + 1
+        table = np.ones((size + joints, window))
+        self._powers, self._values = table[:size], table[size:]
+        self._transposed = table.T
         self._times = table[1]
         self._steps = [tuple(table[i : i + 2]) for i in range(1, degree)]
-        self._sums = np.zeros((degree + 1, len(table)))
-        self._flat = self._sums.reshape(-1)
+        self._inputs = np.zeros(size * len(table) + 2)
+        self._sums = self._inputs[:-2].reshape(size, -1)
         self._kernel = _kernel(degree, joints)
         self._call = self._kernel.first_of_one(_NONE)
         self._joints = joints
@@ -135,19 +137,19 @@ class _Fit:
         :param stamps: shape (window,), ns; ``values`` shape (n, window).
         :raises MessageError: the stamps are too uneven.
         """
-        times = self._times
-        newest = stamps.item(-1)
-        half = 0.5 * (newest - stamps.item(0))
-        np.subtract(stamps, newest - half, out=times)
-        np.divide(times, half, out=times)
+        times, inputs = self._times, self._inputs
+        oldest, newest = stamps.item(0), stamps.item(-1)
+        middle = oldest + 0.5 * (newest - oldest)
+        np.subtract(stamps, middle, out=times)
         for last, power in self._steps:
             np.multiply(last, times, out=power)
         self._values[:] = values
         np.dot(self._powers, self._transposed, out=self._sums)
-        place = np.array((times.item(at), SECOND / half))
-        result: Any = self._call(self._flat, place)
+        inputs[-2] = stamps.item(at) - middle
+        inputs[-1] = newest - middle
+        result: Any = self._call(inputs)
         if result is None:
-            (result,), _ = self._kernel(_NONE, self._flat, place)
+            (result,), _ = self._kernel(_NONE, inputs)
         n = self._joints
         if not min(result[2 * n :].tolist()) > LEAST_PIVOT:
             raise MessageError(
@@ -158,26 +160,30 @@ class _Fit:
 
 @cache
 def _kernel(degree: int, joints: int) -> Kernel:
-    """V V' and V y by row, and where to look (t, and how much of it a second is).
+    """Sums over a window to derivatives.
 
-    Gives the first and the second derivative by time, and the pivots of V V'.
+    In: products of powers of time with each other and with the values, by row; the time to look
+    at and half the window, ns. Out: first and second derivative, by s; the pivots of V V'.
     """
     return Kernel(lambda: _program(degree, joints), f"polynomial fit {degree} {joints}")
 
 
 def _program(degree: int, joints: int) -> Program:
     tape, size = Tape(), degree + 1
-    sums = tape.inputs("sums", size * (size + joints)).reshape(size, size + joints)
-    t, rate = tape.inputs("place", 2)
+    count = size * (size + joints)
+    inputs = tape.inputs("sums", count + 2)
+    sums = inputs[:count].reshape(size, size + joints)
+    inverse = 1.0 / inputs[-1]
+    scales, powers = [tape.constant(1.0)], [tape.constant(1.0)]
+    for _ in range(degree):
+        scales.append(scales[-1] * inverse)
+        powers.append(powers[-1] * (inputs[-2] * inverse))
     factor = np.zeros((size, size), dtype=object)
     for j in range(size):
         for i in range(j, size):
-            rest = sums[i, j] - factor[i, :j] @ factor[j, :j]
+            rest = scales[i] * scales[j] * sums[i, j] - factor[i, :j] @ factor[j, :j]
             factor[i, j] = sqrt(rest) if i == j else rest / factor[j, j]
-    powers = [tape.constant(1.0)]
-    for _ in range(degree):
-        powers.append(powers[-1] * t)
-    rows = []
+    rows: list[Any] = []
     for derivative in (1, 2):
         # V V' w = d, by both triangles; then w' V y.
         w = np.zeros(size, dtype=object)
@@ -187,8 +193,9 @@ def _program(degree: int, joints: int) -> Program:
             w[k] = (d - factor[k, :k] @ w[:k]) / factor[k, k]
         for k in reversed(range(size)):
             w[k] = (w[k] - factor[k + 1 :, k] @ w[k + 1 :]) / factor[k, k]
-        scale = rate if derivative == 1 else rate * rate
-        rows += [scale * (w @ sums[:, size + j]) for j in range(joints)]
+        rate = float(SECOND) * inverse
+        w = w * scales * (rate if derivative == 1 else rate * rate)
+        rows += [w @ sums[:, size + j] for j in range(joints)]
     pivots = [factor[k, k] for k in range(size)]
     outputs = {"result": [tape.lift(value) for value in [*rows, *pivots]]}
-    return Program({"sums": size * (size + joints), "place": 2}, 0, outputs)
+    return Program({"sums": len(inputs)}, 0, outputs)

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One sample of a stream beside the one before: pose, its rates, and what they do not explain.
+
+May import: numpy, pkm_twin's codegen, this package.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pkm_twin.codegen.expressions import PARAMETERS, absolute
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics import pose as poses
+from pkm_twin.kinematics.engine import Engine, Traced
+
+
+def stream_kernel(engine: Engine) -> Kernel:
+    """Program of a sample: q (n) and the state of the sample before, to one row of numbers.
+
+    First the sample's own state: q (n), pose (m) and its rates per joint rate (m n, by row). Then
+    what a jump is told by (m): how far the pose is from where the rates lead. Parameters: what
+    makes lengths of pose coordinates (m); poses and rates are multiplied by it.
+
+    What the mean of both samples' rates predicts errs by the third power of the move; how much,
+    the change of the rates tells, and is taken off. So is half of what is predicted, for where the
+    rates turn between two samples.
+    """
+    return engine.kernel("stream", _stream)
+
+
+def _stream(t: Traced) -> Program:
+    n, m = t.joints, len(t.engine.coordinates)
+    scales = t.tape.inputs(PARAMETERS, m)
+    before = t.tape.inputs("before", n + m + m * n)
+    t.solve()
+    position, rotation = t.motion.platform()
+    pose = scales * np.array(poses.values(t.engine.coordinates, position, rotation), dtype=object)
+    columns = [poses.rates(t.engine.coordinates, rotation, v, w) for v, w in t.twists()]
+    rates = scales[:, None] * np.array(columns, dtype=object).T
+    last = before[n + m :].reshape(m, n)
+    move = t.q - before[:n]
+    predicted = 0.5 * ((rates + last) @ move)
+    bend = _sizes(rates - last) @ _sizes(move)
+    error = _sizes(pose - before[n : n + m] - predicted)
+    beyond = error - 0.5 * _sizes(predicted) - bend
+    row = t.lift([*t.q, *pose, *rates.ravel(), *beyond])
+    return Program({"q": n, "before": len(before)}, m, {"sample": row}, t.equations())
+
+
+def _sizes(values: Any) -> Any:
+    return np.array([absolute(value) for value in values.ravel()], object).reshape(values.shape)
