@@ -6,7 +6,6 @@ May import: numpy, pkm_twin's core, the standard library; never rclpy.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -30,38 +29,10 @@ over the time between their stamps and this slack for stamps that are off, s."""
 
 @dataclass(slots=True)
 class _State:
-    """A sample: q (n), pose (m) and rates (m n) as :func:`stream_kernel` gives them."""
+    """A sample, and its row of :func:`stream_kernel`."""
 
     stamp: int
     numbers: Array
-
-
-class Clearance:
-    """A lower bound of a Jacobian's reciprocal condition number, cheap along a stream.
-
-    No singular value moves farther than the matrix does (Weyl), so those of one matrix bound
-    those of all near it; they are taken anew only where the bound says too little.
-    """
-
-    def __init__(self) -> None:
-        self._near: tuple[Array, float, float] | None = None
-        self.greatest = math.inf
-        """Bound of the last matrix' greatest singular value."""
-
-    def at_least(self, rates: Array, wanted: float) -> float:
-        """A bound of the measure of ``rates`` (m, n): the measure itself where it is below."""
-        if self._near is not None and self._near[0].shape == rates.shape:
-            matrix, least, greatest = self._near
-            change = (rates - matrix).ravel()
-            moved = _length(change)
-            self.greatest = greatest + moved
-            bound = (least - moved) / self.greatest if self.greatest > 0.0 else 0.0
-            if bound >= wanted:
-                return bound
-        values = np.linalg.svd(rates, compute_uv=False)
-        least, self.greatest = values.item(-1), values.item(0)
-        self._near = rates, least, self.greatest
-        return least / self.greatest if self.greatest > 0.0 else 0.0
 
 
 class Continuity:
@@ -81,12 +52,11 @@ class Continuity:
         self._velocity = tuple(velocity)
         self._largest = MAX_MOVE * robot.size
         self._scales = robot.pose_scales
-        n, m = self._shape = len(robot.joint_names), len(self._scales)
-        self._size = n + m + m * n
-        self._nothing = np.zeros(self._size)
+        n, m = len(robot.joint_names), len(self._scales)
+        self._told = n + m + m * n
+        self._nothing = np.zeros(self._told + m + 1)
         self._kernel = stream_kernel(robot.engine)
         self._call = self._kernel.first_of_one(self._scales)
-        self._clearance = Clearance()
         self.reset()
 
     def reset(self) -> None:
@@ -112,26 +82,18 @@ class Continuity:
             (result,), status = self._kernel(self._scales, q, before)
             if status is not None:
                 self.robot.refuse_joints(status, q)
-        state = _State(stamp, result[: self._size])
+        state = _State(stamp, result)
+        *beyond, measure = result.tolist()[self._told :]
         if last is not None:
-            self._check_jump(last, state, result[self._size :].tolist())
-        near = self._near_singularity(q, state)
-        self._before, self._last = last, state
-        return near
-
-    def _near_singularity(self, q: Array, state: _State) -> bool:
-        n, m = self._shape
-        rates = state.numbers[n + m :].reshape(m, n) / self.robot.joint_scales
-        if self._clearance.at_least(rates, self.warn) >= self.warn:
-            return False
-        measure = float(self.robot.singularity(q))
+            self._check_jump(last, state, beyond)
         if not measure >= self.stop:
             raise MessageError(
                 "singular",
                 f"too close to a singularity or the edge of reach: measure {measure:.3g}, "
                 f"singularity_stop is {self.stop:g}",
             )
-        return measure < self.warn
+        self._before, self._last = last, state
+        return bool(measure < self.warn)
 
     def _check_jump(self, last: _State, state: _State, beyond: list[float]) -> None:
         """No joint moves farther than its velocity limit allows, no pose than its rates tell."""
@@ -154,6 +116,3 @@ class Continuity:
                 "joints did not: another assembly mode",
             )
 
-
-def _length(vector: Array) -> float:
-    return math.sqrt(float(vector @ vector))
