@@ -115,4 +115,3 @@ class Continuity:
                 f"{self.robot.pose_names[beyond.index(worst)]} of the platform jumped while the "
                 "joints did not: another assembly mode",
             )
-
