@@ -362,7 +362,8 @@ class DeltaDynamics(health.TwinNode):
     def _on_joint_state(self, data: bytes) -> None:
         core = self._feedforward
         self._last_heard = time.monotonic_ns()
-        with self._telling_stop():
+        running = not core.stream.stopped
+        try:
             try:
                 message = self._decode(data)
             except MessageError as error:
@@ -373,10 +374,10 @@ class DeltaDynamics(health.TwinNode):
                 return
             # The process may have stood still since.
             core.check_age(torques, self.now())
-        header = message.header.stamp
-        stamp = header.sec, header.nanosec
-        if core.settings.accept_zero_stamp:
-            stamp = divmod(torques.stamp, SECOND)
+        finally:
+            if running and core.stream.stopped:
+                self._send_stop()
+        stamp = divmod(torques.stamp, SECOND)
         self._torques.publish(self._effort_message.fill(core.sent(torques.effort), stamp))
         if torques.residual is not None:
             self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))

@@ -103,9 +103,13 @@ class Placed(Motion):
 
 def _singularity(t: Traced) -> Program:
     t.solve()
-    held, moved = _held(t), _moved(t)
-    outputs = {"measure": [t.tape.lift(minimum(held, moved))]}
+    outputs = {"measure": [t.tape.lift(singularity_measure(t))]}
     return Program({"q": t.joints}, 0, outputs, t.equations())
+
+
+def singularity_measure(t: Traced) -> Any:
+    """The measure of a solved motion, to write other programs with; rates are overwritten."""
+    return minimum(_held(t), _moved(t))
 
 
 def _held(t: Traced) -> Any:

@@ -267,7 +267,8 @@ class TwinNode(LifecycleNode):
 
     def now(self) -> int:
         """The ROS clock, ns."""
-        nanoseconds: int = self.get_clock().now().nanoseconds
+        # As Clock.now, without its objects: it is asked twice a sample.
+        nanoseconds: int = self.get_clock().handle.get_now().nanoseconds
         return nanoseconds
 
     def declare(
