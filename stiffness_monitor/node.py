@@ -6,7 +6,6 @@ Beside them the natural frequencies of the pose, which need joint states alone.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import sys
 from array import array
@@ -23,9 +22,11 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
 from pkm_twin import load
 from pkm_twin.bags.cdr import message_definition
-from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.ros import node as health
 from pkm_twin.ros.intake import JointStateDecoder
+from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench
+from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings
@@ -39,13 +40,17 @@ class StiffnessMonitor(health.TwinNode):
         robot = load(self.declare("mechanism", "upr_rpu", "robot: name or path", read_only=True))
         for kernel in kernels(robot):
             kernel.warm_up()
-        self._monitor = Monitor(robot, self._declare_settings())
-        self._platform_frame = self.declare(
+        settings = self._declare_settings()
+        given = self.declare(
             "platform_frame",
             "",
-            "frame of ~/deflection; empty: wrench_frame, or platform where that is base_frame",
+            "frame of ~/deflection; empty: wrench_frame, or platform where that is base_frame or "
+            "the sensor stands elsewhere",
             read_only=True,
         )
+        mounts = declare_mounts(self, given or PLATFORM)
+        self._platform_frame = given or ("" if mounts is None else PLATFORM)
+        self._monitor = Monitor(robot, settings, mounts)
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self._compliance = self.create_guarded_publisher(Float64MultiArray, "~/compliance")
         self._energy = self.create_guarded_publisher(DiagnosticArray, "~/strain_energy")
@@ -106,27 +111,20 @@ class StiffnessMonitor(health.TwinNode):
 
     def _declare_settings(self) -> Settings:
         d = Settings()
-        seconds: dict[str, Any] = {"unit": "s", "low": 0.0, "high": 3600.0}
-        frame = self.declare("wrench_frame", d.wrench_frame, "frame of the wrench", read_only=True)
-        base = self.declare("base_frame", d.base_frame, "name of the fixed frame", read_only=True)
-        for name, value in (("wrench_frame", frame), ("base_frame", base)):
-            if not value:
-                raise ParameterError(name, value, "a frame's name")
-        return Settings(
-            frame,
-            base,
-            self.declare(
-                "accept_empty_frame", d.accept_empty_frame, "an empty frame means wrench_frame"
+        return declare_wrench(
+            self,
+            base_frame=self.declare(
+                "base_frame", d.base_frame, "name of the fixed frame", read_only=True
             ),
-            self.declare(
+            max_state_age=self.declare(
                 "max_state_age", d.max_state_age, "from a wrench to the nearest joint state",
-                **seconds,
+                **SECONDS,
             ),
-            self.declare(
+            future_tolerance=self.declare(
                 "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
-                **seconds,
+                **SECONDS,
             ),
-            self.declare(
+            accept_zero_stamp=self.declare(
                 "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
             ),
         )  # fmt: skip
@@ -138,9 +136,7 @@ class StiffnessMonitor(health.TwinNode):
             for name, value in values.items():
                 if self.has_parameter(name):
                     self.check_parameter(name, value)
-            fields = {field.name for field in dataclasses.fields(Settings)}
-            settings = {name: value for name, value in values.items() if name in fields}
-            self._pending = dataclasses.replace(self._monitor.settings, **settings)
+            self._pending = changed(self._monitor.settings, values)
 
         return health.verdict(check)
 
