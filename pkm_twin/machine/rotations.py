@@ -16,11 +16,18 @@ Array = NDArray[np.float64]
 
 def about(axis: Array, angle: ArrayLike) -> Array:
     """Rotations by angles (...,), rad, about a unit vector (3,), shape (..., 3, 3)."""
-    x, y, z = axis
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    across = skew(np.asarray(axis, np.float64))
     sine, rest = np.sin(angle)[..., None, None], 1.0 - np.cos(angle)[..., None, None]
-    rotation: Array = np.eye(3) + sine * skew + rest * (skew @ skew)
+    rotation: Array = np.eye(3) + sine * across + rest * (across @ across)
     return rotation
+
+
+def skew(vectors: Array) -> Array:
+    """Matrices (..., 3, 3) that take the cross product of vectors (..., 3) with what follows."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    none = np.zeros_like(x)
+    rows = ((none, -z, y), (z, none, -x), (-y, x, none))
+    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def from_rpy(angles: Array) -> Array:
