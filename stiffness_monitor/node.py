@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import sys
 from array import array
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -30,6 +31,11 @@ from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings
+
+AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
+UPPER: Final = np.triu_indices(6)
+ENTRIES: Final = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER, strict=True))
+"""Names of the compliance's entries: of the displacement, and of the force or moment."""
 
 
 class StiffnessMonitor(health.TwinNode):
@@ -53,7 +59,10 @@ class StiffnessMonitor(health.TwinNode):
         self._monitor = Monitor(robot, settings, mounts)
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self._compliance = self.create_guarded_publisher(Float64MultiArray, "~/compliance")
+        # What has no stamp, or texts for numbers, has a sibling that plots can draw.
+        self._compliance_stamped = self.create_guarded_publisher(JointState, "~/compliance_stamped")
         self._energy = self.create_guarded_publisher(DiagnosticArray, "~/strain_energy")
+        self._energy_stamped = self.create_guarded_publisher(JointState, "~/strain_energy_stamped")
         self._dominant = self.create_guarded_publisher(String, "~/dominant_element")
         self._deflection = self.create_guarded_publisher(TransformStamped, "~/deflection")
         self._known = 0
@@ -65,6 +74,9 @@ class StiffnessMonitor(health.TwinNode):
         if rate > 0.0 and has_modes(robot):
             self._frequencies = self.create_guarded_publisher(
                 Float64MultiArray, "~/natural_frequencies"
+            )
+            self._frequencies_stamped = self.create_guarded_publisher(
+                JointState, "~/natural_frequencies_stamped"
             )
             self.create_guarded_timer(1.0 / rate, self._publish_frequencies)
         self.create_guarded_subscription(
@@ -156,11 +168,18 @@ class StiffnessMonitor(health.TwinNode):
     def _on_wrench(self, message: WrenchStamped) -> None:
         answer = self._monitor.wrench(message, self.now())
         stamp = Time(nanoseconds=answer.stamp).to_msg()
+        base = self._monitor.settings.base_frame
         self._compliance.publish(_matrix(answer.compliance))
+        entries = answer.compliance[UPPER].tolist()
+        self._compliance_stamped.publish(_named(stamp, base, ENTRIES, entries))
         energy = DiagnosticArray(status=[self._status(answer)])
         energy.header.stamp = stamp
-        energy.header.frame_id = self._monitor.settings.base_frame
+        energy.header.frame_id = base
         self._energy.publish(energy)
+        found = answer.energy
+        self._energy_stamped.publish(
+            _named(stamp, base, found.elements, found.factors.tolist(), found.energies.tolist())
+        )
         self._dominant.publish(String(data=answer.energy.dominant))
         deflection = _transform(answer)
         deflection.header.stamp = stamp
@@ -186,6 +205,9 @@ class StiffnessMonitor(health.TwinNode):
             MultiArrayDimension(label="frequency", size=len(values), stride=len(values))
         ]
         self._frequencies.publish(message)
+        stamp = Time(nanoseconds=self._known).to_msg()
+        names = [f"mode_{k + 1}" for k in range(len(values))]
+        self._frequencies_stamped.publish(_named(stamp, "", names, values.tolist()))
 
     def _status(self, answer: Answer) -> DiagnosticStatus:
         """Factors, energy, pose and frame; factors are absent where no load makes energy."""
@@ -206,6 +228,19 @@ class StiffnessMonitor(health.TwinNode):
             hardware_id=robot.name,
             values=[KeyValue(key=key, value=value) for key, value in pairs.items()],
         )
+
+
+def _named(
+    stamp: Any,
+    frame: str,
+    names: Sequence[str],
+    values: Sequence[float],
+    efforts: Sequence[float] = (),
+) -> JointState:
+    """Numbers by name, stamped: the message of names and numbers that plots know."""
+    message = JointState(name=list(names), position=array("d", values), effort=array("d", efforts))
+    message.header.stamp, message.header.frame_id = stamp, frame
+    return message
 
 
 def _matrix(values: NDArray[np.float64]) -> Float64MultiArray:
