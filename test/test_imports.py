@@ -30,6 +30,7 @@ NODES = {
     "delta_dynamics.node",
     "delta_dynamics.action_node",
     "delta_dynamics.gate_node",
+    "delta_dynamics.sim_node",
     "stiffness_monitor.node",
 }
 APPS_WITH_ROS = {"pkm_twin.apps.demo", "pkm_twin.apps.guard_check"}
