@@ -41,6 +41,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{NAME}/examples", sorted(glob("examples/*.py") + glob("examples/*.md"))),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py") + glob("launch/*.yaml"))),
     ],
     install_requires=[
@@ -106,6 +107,7 @@ setup(
             "delta_dynamics = pkm_twin.apps.nodes:delta_dynamics",
             "command_gate = pkm_twin.apps.nodes:command_gate",
             "stiffness_monitor = pkm_twin.apps.nodes:stiffness_monitor",
+            "machine_sim = pkm_twin.apps.nodes:machine_sim",
             "pkm-twin = pkm_twin.apps.cli:main",
         ],
     },

@@ -124,11 +124,10 @@ class Simulation:
     """
 
     def __init__(self, robot: Robot, settings: MachineSettings, start: int) -> None:
-        low_high = robot.limits.position
-        if low_high is not None:
-            for name, q, (low, high) in zip(
-                robot.joint_names, settings.start, low_high, strict=True
-            ):
+        bounds = robot.limits.position
+        if bounds is not None:
+            places = zip(robot.joint_names, settings.start, bounds, strict=True)
+            for name, q, (low, high) in places:
                 if not low <= q <= high:
                     raise ParameterError(f"start, {name}", float(q), f"{low:g} to {high:g}")
         self.robot, self.settings = robot, settings
@@ -136,7 +135,7 @@ class Simulation:
         """Effort commands, and what has stopped the machine."""
         self.trajectories = StreamMonitor(trip_count=2**62, recovery_count=1)
         self.saturations = 0
-        self.now = self._epoch = start
+        self.now = start
         self._reader = JointReader(robot, with_effort=True)
         self._begin()
 
@@ -166,6 +165,11 @@ class Simulation:
     def time(self) -> float:
         """Since the machine's start, s."""
         return (self.now - self._begun) / SECOND
+
+    def skip(self, nanoseconds: int) -> None:
+        """The clock goes on and the machine does not: whoever runs it stood still."""
+        self.now += nanoseconds
+        self._begun += nanoseconds
 
     def commands(self, message: Any) -> None:
         """Efforts as std_msgs/Float64MultiArray, the controller's, in the robot's order.

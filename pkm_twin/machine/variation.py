@@ -54,10 +54,10 @@ def varied(
     """The robot with masses, inertias, friction and lengths of its file drawn anew.
 
     Every number gets a factor 1 + s d of its own, an inertia one for all entries, with d
-    standard normal within three deviations or uniform between -1 and 1. Joints and rods of a machine
-    that is described by their places are each shifted by s d of the platform's radius along each
-    axis instead. What a parameter file leaves to be derived (as rods' inertias) follows. Limits and
-    payload stay; angles and directions too.
+    standard normal within three deviations or uniform between -1 and 1. The joints and rods of a
+    machine that is described by their places are each shifted by s d of the platform's radius
+    along each axis instead. What a parameter file leaves to be derived (as rods' inertias)
+    follows. Limits and payload stay; angles and directions too.
 
     :param spread: s by kind, see :data:`KINDS`; a kind that is left out stays.
     :param seed: of the draws; the same on every machine.
