@@ -51,11 +51,15 @@ def machine(peer, launch):
 
 
 def answer(peer, data):
-    """Command, and the joint state that follows it."""
+    """Command, and the joint state that follows it; a period gone alone may lie between."""
     states = peer.received("/joint_states")
     last = stamp_of(states[-1]) if states else 0
     peer.send(COMMANDS, Float64MultiArray(data=data))
-    peer.until(lambda: states and stamp_of(states[-1]) > last)
+
+    def answered():
+        return stamp_of(states[-1]) > last and list(states[-1].effort) == data
+
+    peer.until(answered)
     return states[-1]
 
 
@@ -73,7 +77,8 @@ def test_lockstep_gives_the_core_s_numbers(peer, machine):
         ),
         stamp_of(peer.received("/joint_states")[-1]),
     )
-    effort = inverse_dynamics(ROBOT, HOME, np.zeros(3), np.zeros(3)) + [0.3, -0.2, 0.1]
+    weight = inverse_dynamics(ROBOT, HOME, np.zeros(3), np.zeros(3))
+    effort = weight + np.array([0.3, -0.2, 0.1])
     for k in range(50):
         state = answer(peer, effort.tolist())
         core.commands(Float64MultiArray(data=effort.tolist()))
