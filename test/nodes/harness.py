@@ -150,13 +150,14 @@ def end_with_parent():
 class NodeProcess:
     """``python -m MODULE --ros-args -p ...`` in a session of its own, output kept.
 
-    ``arguments`` are further ROS arguments; ``code`` is run instead of the module.
+    ``arguments`` are further ROS arguments; ``code`` is run instead of the module, or ``script``,
+    a path and its own arguments.
     """
 
-    def __init__(self, domain, module, *parameters, arguments=(), code=None):
+    def __init__(self, domain, module, *parameters, arguments=(), code=None, script=None):
         self._output = tempfile.TemporaryFile("w+")  # noqa: SIM115
         flags = [flag for parameter in parameters for flag in ("-p", parameter)]
-        run = ["-m", module] if code is None else ["-c", code]
+        run = script or (["-m", module] if code is None else ["-c", code])
         self.process = subprocess.Popen(
             [sys.executable, *run, "--ros-args", *flags, *arguments],
             stdout=self._output,
