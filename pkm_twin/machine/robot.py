@@ -88,10 +88,16 @@ def check_angles(angle: float, path: str) -> None:
 
 @remembered
 def friction_of(joints: int) -> Any:
-    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
-    field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
+    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign.
+
+    ``offset``: what the drive needs beside, whatever the motion.
+    """
+    field: dict[str, Any] = {"spread": True, "default": [0.0] * joints}
     units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
-    entries = [(n, Array, schema.vector(joints, unit=u, **field)) for n, u in units.items()]
+    entries = [
+        (n, Array, schema.vector(joints, unit=u, at_least=0.0, **field)) for n, u in units.items()
+    ]
+    entries.append(("offset", Array, schema.vector(joints, unit="{effort}", **field)))
     return _section("Friction", entries, joints)
 
 

@@ -98,10 +98,14 @@ class BodySpec:
 
 @dataclass(frozen=True, eq=False)
 class FrictionSpec:
-    """Friction of one joint: N m s/rad or N s/m, and N m or N."""
+    """Friction of one joint: N m s/rad or N s/m, and N m or N.
+
+    ``offset``: what an actuated joint's drive needs beside, whatever the motion.
+    """
 
     viscous: float = schema.number(at_least=0.0, unit="{effort} per {joint}/s", default=0.0)
     coulomb: float = schema.number(at_least=0.0, unit="{effort}", default=0.0)
+    offset: float = schema.number(unit="{effort}", default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +185,10 @@ class JointSpec:
         steps = FREEDOMS[self.type]
         if self.actuated and steps not in ("R", "P"):
             raise ParameterError(f"{path}.actuated", self.type, "a revolute or prismatic joint")
+        if self.friction is not None and self.friction.offset and not self.actuated:
+            raise ParameterError(
+                f"{path}.friction.offset", self.friction.offset, "0 at a joint that is not actuated"
+            )
         if self.rotor_inertia and self.drive is not None:
             raise ParameterError(f"{path}.drive", "given", "either drive or rotor_inertia")
         for key in ("limits", "friction", "rotor_inertia", "drive", "home"):
@@ -265,6 +273,7 @@ class Machine(Robot):
             "friction": friction_of(n)(
                 viscous=array([graph.joints[j].viscous for j in drives]),
                 coulomb=array([graph.joints[j].coulomb for j in drives]),
+                offset=array([_offset(specs["joints"][j]) for j in drives]),
             ),
             "limits": limits_of(n)(
                 position=_together([v.position for v in limits], [-math.inf, math.inf]),
@@ -455,6 +464,10 @@ def _together(values: list[Any], absent: Any) -> Array | None:
     if all(value is None for value in values):
         return None
     return array([absent if value is None else value for value in values])
+
+
+def _offset(joint: JointSpec) -> float:
+    return 0.0 if joint.friction is None else joint.friction.offset
 
 
 def _section(data: Mapping[str, Any], key: str, path: str) -> Mapping[str, Any]:
