@@ -21,15 +21,13 @@ from delta_dynamics.virtual_work import Forces
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
-from pkm_twin.machine.graph import FREEDOMS, Joint, Rod
-from pkm_twin.machine.inertia import loaded_joints, ten_numbers, transport
+from pkm_twin.machine.graph import Joint, Rod
+from pkm_twin.machine.inertia import TEN, loaded_joints, ten_numbers, transport
 from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.shared import TEN_UNITS, drive_units
 
 Array = NDArray[np.float64]
 
-TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-"""A body's parameters: mass, kg; first moments, kg m; inertia, kg m2."""
-TEN_UNITS: Final = ("kg", *["kg m"] * 3, *["kg m2"] * 6)
 DRIVE: Final = ("viscous", "coulomb", "offset", "rotor_inertia")
 """An actuated joint's parameters; a passive one that is loaded has no offset."""
 PAYLOAD: Final = "payload"
@@ -160,9 +158,7 @@ def _columns(robot: Robot) -> list[tuple[str, str]]:
         return [(f"{owner}.{what}", unit) for what, unit in zip(TEN, TEN_UNITS, strict=True)]
 
     def joint(name: str, whats: Sequence[str]) -> list[tuple[str, str]]:
-        slides = FREEDOMS[graph.joints[name].kind] == "P"
-        effort, rate, rotor = ("N", "N s/m", "kg") if slides else ("N m", "N m s/rad", "kg m2")
-        units = dict(zip(DRIVE, (rate, effort, effort, rotor), strict=True))
+        units = drive_units(graph, name)
         return [(f"{name}.{what}", units[what]) for what in whats]
 
     result = [column for body in tree.links for column in ten(body)]

@@ -19,6 +19,8 @@ from pkm_twin.machine.tree import Tree
 
 Objects = NDArray[Any]
 
+TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+"""Names of a body's ten numbers: mass, kg; first moments, kg m; inertia, kg m2."""
 PARTS: Final = (
     "bodies", "rods", "gravity", "viscous", "coulomb", "offset", "rotors", "passive",
 )  # fmt: skip
