@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,7 @@ class FileParameters:
     def slices(self) -> tuple[slice, ...]:
         """Where each group's parameters stand."""
         ends = np.cumsum([0, *(len(group.names) for group in self.groups)])
-        return tuple(slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True))
+        return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
 
     @cached_property
     def cones(self) -> tuple[tuple[slice, Array], ...]:
