@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import yaml
 
 from pkm_twin.apps import cli
 from pkm_twin.bags.reader import BagWriter, open_bag
@@ -63,14 +62,6 @@ def process():
         return Result(done.returncode, done.stdout, done.stderr)
 
     return run
-
-
-def massless(path):
-    """A 2UPR-RPU whose file has no masses."""
-    data = yaml.safe_load((REPOSITORY / "config/upr_rpu.yaml").read_text())
-    del data["inertia"]
-    path.write_text(yaml.safe_dump(data))
-    return path
 
 
 def rewrite(source, target, change=None, begin=0.0, seconds=2.0, metadata=None, topics=None):

@@ -291,23 +291,34 @@ class TestLoad:
                 if array.status[0].name == "/late"
             )
 
-        late.peer.until(told, repeat=lambda: at_pace(late, 20, 5e-3, position=(0.125, 0.2, 0.3)))
+        late.peer.until(told, repeat=lambda: at_pace(late, 5, 5e-3, position=(0.125, 0.2, 0.3)))
 
     def test_a_trajectory_that_overflows_the_model_stops_the_stream(self, fleet):
-        late = running(fleet["late"])
-        late.since([at_pace(late, 9)[0]])
-        torques = late.received("joint_torques")
-        torques.clear()
-        rows = [tuple(Q)] * 3
-        late.peer.send(
-            "/late/joint_trajectory",
-            MAKE.trajectory(NAMES, [0, STEP, SECOND], rows, stamp=late.stamp()),
-        )
-        late.peer.until(lambda: any(map(is_zeros, torques)))
-        array = late.diagnostics(lambda a: a.status[0].level == b"\x02")
-        assert array.status[0].message.startswith("stopped: non-finite result")
-        assert sum(map(is_zeros, torques)) == 1
-        assert late.received("joint_trajectory_ff") == []
+        late = fleet["late"]
+        # Silence shall not stop the stream first, nor good samples that wait end the stop.
+        assert late.set(stale_after=60.0).successful
+        try:
+            running(late)
+            assert late.set(recovery_count=1000).successful
+            before = counts_of(late.diagnostics(), "stopped")
+            torques = late.received("joint_torques")
+            torques.clear()
+            rows = [tuple(Q)] * 3
+            last, _ = at_pace(late, 50, position=(0.125, 0.2, 0.3))
+            late.peer.send(
+                "/late/joint_trajectory",
+                MAKE.trajectory(NAMES, [0, STEP, 60 * SECOND], rows, stamp=last),
+            )
+            late.peer.until(lambda: any(map(is_zeros, torques)))
+            array = count_settled(late)
+            assert array.status[0].level == b"\x02"
+            assert array.status[0].message.startswith("stopped: non-finite result")
+            assert counts_of(array, "stopped") == before | {"non-finite result": 1}
+            # Nothing after it, however many samples waited.
+            assert [is_zeros(m) for m in torques].index(True) == len(torques) - 1
+            assert late.received("joint_trajectory_ff") == []
+        finally:
+            assert late.set(recovery_count=2, stale_after=5.0).successful
 
 
 class TestClocks:

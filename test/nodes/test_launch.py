@@ -10,8 +10,6 @@ import contextlib
 import os
 import re
 import signal
-import subprocess
-import tempfile
 from importlib.util import find_spec
 
 import numpy as np
@@ -19,7 +17,7 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics
-from test.nodes.harness import REPOSITORY, end_with_parent
+from test.nodes.harness import REPOSITORY, Process
 
 LAUNCH = REPOSITORY / "launch"
 FILES = ("twin", "cell", "control")
@@ -121,26 +119,11 @@ def mock_hardware(names, positions):
     )
 
 
-class Launched:
-    """``ros2 launch FILE ARGUMENTS`` in a session of its own."""
+class Launched(Process):
+    """``ros2 launch FILE ARGUMENTS``."""
 
     def __init__(self, domain, name, arguments):
-        self._output = tempfile.TemporaryFile("w+")  # noqa: SIM115
-        self.process = subprocess.Popen(
-            ["ros2", "launch", str(LAUNCH / f"{name}.launch.py"), *arguments],
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            cwd=tempfile.gettempdir(),
-            env=domain.environment(),
-            start_new_session=True,
-            preexec_fn=end_with_parent,
-        )
-
-    @property
-    def output(self):
-        self._output.seek(0)
-        return self._output.read()
+        super().__init__(domain, ["ros2", "launch", str(LAUNCH / f"{name}.launch.py"), *arguments])
 
     def started(self, node):
         """Process ids of a node, in the order of its starts."""
@@ -148,15 +131,10 @@ class Launched:
         return [int(number) for number in re.findall(pattern, self.output)]
 
     def close(self):
-        """As Ctrl-C in a terminal; what is left after that is killed."""
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGINT)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(30.0)
+        """As Ctrl-C in a terminal; what the launch leaves behind is killed."""
+        super().close()
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
-        self._output.close()
 
 
 @pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
@@ -189,7 +167,7 @@ class TestRunning:
         """Wait until exactly these nodes are there."""
 
         def so():
-            assert process.process.poll() is None, process.output
+            assert process.alive(), process.output
             return self.nodes(peer) == sorted(names)
 
         peer.until(so, PATIENCE)
@@ -311,7 +289,7 @@ class TestRunning:
         )
 
         def ready():
-            assert process.process.poll() is None, process.output
+            assert process.alive(), process.output
             return client.server_is_ready() and peer.received(state)
 
         try:
@@ -362,13 +340,13 @@ class TestRunning:
     )
     def test_a_bad_argument_is_refused_by_name(self, launched, name, argument, said):
         process = launched(name, argument)
-        assert process.process.wait(PATIENCE) == 1
+        assert process.wait(PATIENCE) == 1
         assert said in process.output
 
     def test_ctrl_c_ends_all_of_it_cleanly(self, launched, peer):
         process = launched("twin", "command_gate:=true")
         self.until_nodes(peer, process, *(f"/{node}" for node in NODES))
         process.process.send_signal(signal.SIGINT)
-        process.process.wait(PATIENCE)
+        process.wait(PATIENCE)
         assert process.output.count("process has finished cleanly") == 3
         assert "Traceback" not in process.output

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 import yaml
-from support.robots import parameters_of
+from support.robots import massless, parameters_of
 
 from pkm_twin import load
 from stiffness_monitor import compliance, strain_energy
@@ -23,16 +23,6 @@ POSE = np.array([-0.7, 0.2, -0.15])
 Q = ROBOT.inverse(POSE)
 RATE = 5.0
 WRENCH = (1.0, 0.0, -50.0, 0.0, 0.0, 0.0)
-
-
-@pytest.fixture(scope="module")
-def massless(tmp_path_factory):
-    """The same machine from a file without inertia."""
-    data = parameters_of("upr_rpu")
-    del data["inertia"]
-    path = tmp_path_factory.mktemp("massless") / "massless.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return path
 
 
 class Talk:
@@ -123,8 +113,9 @@ def test_a_machine_without_elastic_members_is_refused(launch, tmp_path):
 
 
 @pytest.mark.parametrize("case", ["off", "massless"])
-def test_no_frequencies_when_off_or_without_masses(case, peer, launch, massless):
-    choice = "frequencies_rate:=0.0" if case == "off" else f"mechanism:={massless}"
+def test_no_frequencies_when_off_or_without_masses(case, peer, launch, tmp_path):
+    light = massless(tmp_path / "light.yaml")
+    choice = "frequencies_rate:=0.0" if case == "off" else f"mechanism:={light}"
     talk = Talk(peer, launch, f"still_{case}", choice)
     peer.until(lambda: len(talk.received("deflection")) > 20, 90.0, talk.send)
     talk.run(0.5)

@@ -10,6 +10,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,6 @@ def has(robot: Robot, ask: str) -> bool:
 
 
 MASSIVE = [name for name in robot_names() if has(load(name), "massive")]
-MASSLESS = [name for name in robot_names() if name not in MASSIVE]
 ELASTIC = [name for name in robot_names() if has(load(name), "structure")]
 
 every_robot = pytest.mark.parametrize("name", robot_names())
@@ -53,6 +53,14 @@ def parameters_of(name: str) -> dict[str, Any]:
     """The plain parameter mapping of a shipped robot."""
     data: dict[str, Any] = yaml.safe_load((config_folder() / f"{name}.yaml").read_text())
     return data
+
+
+def massless(path: Path) -> Path:
+    """A 2UPR-RPU whose file has no masses, written there."""
+    data = parameters_of("upr_rpu")
+    del data["inertia"]
+    path.write_text(yaml.safe_dump(data))
+    return path
 
 
 def loaded(name: str) -> Robot:
