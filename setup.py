@@ -79,6 +79,7 @@ setup(
             "hypothesis",
             "mcap-ros2-support",
             "mpmath",
+            "mujoco",
             "mypy",
             "pin",
             "plotly",

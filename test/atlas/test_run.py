@@ -301,11 +301,9 @@ def test_a_full_disk_costs_no_finished_chunk(limit, tmp_path):
     assert "File too large" in ended.stderr
     assert not out.exists()
     assert not list(tmp_path.rglob("*.tmp"))
-    again = subprocess.run(
-        [*COMMAND, *SWEEP, "--no-picture", "--out", str(out)], env=environment(), timeout=300
-    )
-    assert again.returncode == 0
-    assert not Parts(out, strain_energy_sweep(load("upr_rpu"), "P2", 20_000)).folder.exists()
+    sweep = strain_energy_sweep(load("upr_rpu"), "P2", 20_000)
+    run(sweep, out, workers=1)
+    assert not Parts(out, sweep).folder.exists()
 
 
 def test_a_killed_scheduler_is_one_error_and_costs_no_finished_chunk(strain, tmp_path):
