@@ -293,9 +293,7 @@ def test_the_regular_workspace_ends_where_limbs_meet(variant):
     assert touched.sum() >= 3
     turn = np.arange(72) * (2 * np.pi / 72)
     for height, radius in zip(narrow.z[touched], narrow.radius[touched], strict=True):
-        poses = np.column_stack(
-            (np.full(72, height), radius * np.cos(turn), radius * np.sin(turn))
-        )
+        poses = np.column_stack((np.full(72, height), radius * np.cos(turn), radius * np.sin(turn)))
         assert clearance(robot, poses).min() == pytest.approx(0.0, abs=1e-7)
 
 

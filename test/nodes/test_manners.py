@@ -242,7 +242,7 @@ class TestLongTrajectories:
             0.3 * np.cos(waves) * [3.0, -4.0, 5.0],
             -0.3 * np.sin(waves) * [9.0, 16.0, 25.0],
         ]
-        stamp = twin.stamp()
+        stamp = twin.begin()
         message = MAKE.trajectory(NAMES, [i * STEP for i in range(self.points)], *rows, stamp=stamp)
         answered(twin)
         answers = twin.received("joint_trajectory_ff")
@@ -263,7 +263,7 @@ class TestLongTrajectories:
         before = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0)
         count = 40
         for _ in range(count):
-            message = trajectory(count=2000, stamp=twin.stamp())
+            message = trajectory(count=2000, stamp=twin.begin())
             for point, time in zip(message.points, range(2000), strict=True):
                 point.time_from_start.sec, point.time_from_start.nanosec = divmod(
                     time * STEP * 100, SECOND
