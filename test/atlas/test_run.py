@@ -286,7 +286,6 @@ def limited(path, limit):
         env=environment(),
         capture_output=True,
         text=True,
-        timeout=300,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )
 

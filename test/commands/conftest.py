@@ -26,7 +26,6 @@ def process():
             [sys.executable, "-m", "pkm_twin.apps.cli", *map(str, arguments)],
             capture_output=True,
             text=True,
-            timeout=120,
             cwd=folder,
             env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
         )

@@ -23,7 +23,7 @@ except ImportError:  # The tests of the pure cores run without ROS.
     rclpy = None
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-DEADLINE = 60.0
+DEADLINE = 240.0
 """How long a condition is waited for, s: no verdict but for what will never be so."""
 SECOND = 10**9
 

@@ -139,7 +139,7 @@ def running(twin):
         assert twin.process.alive(), twin.process.output
         at_pace(twin, 12)
 
-    twin.peer.until(lambda: any(not is_zeros(m) for m in torques), 90.0, send)
+    twin.peer.until(lambda: any(not is_zeros(m) for m in torques), repeat=send)
     return twin
 
 
@@ -241,7 +241,7 @@ class TestLoad:
         node = twin.peer.node
         heard = node.count_subscribers("/late/joint_torques")
         listener = launch(None, code=LISTENER)
-        twin.peer.until(lambda: node.count_subscribers("/late/joint_torques") > heard, 60.0)
+        twin.peer.until(lambda: node.count_subscribers("/late/joint_torques") > heard)
         listener.process.send_signal(signal.SIGSTOP)
         try:
             # Ten times as many as the queue of the one that stands still holds.
@@ -354,7 +354,7 @@ class TestClocks:
     def test_no_torque_is_made_across_a_jump_of_the_clock(self, fleet):
         timed = fleet["timed"]
         timed.peer.talk(Clock, "/clock")
-        timed.peer.until(timed.peer.matched, 90.0)
+        timed.peer.until(timed.peer.matched)
         self.tick(timed, self.start)
         assert self.stream(timed, self.start, 20) == list(range(WINDOW - 1, 20))
         # Back, as when a bag begins anew: the window is filled anew. By as little as stamps may be
@@ -459,7 +459,7 @@ class TestNeighbours:
         namesake = launch(MODULE, arguments=remap)
         try:
             line = "2 nodes have this name"
-            quick.peer.until(lambda: line in text_of(quick.diagnostics()), 90.0)
+            quick.peer.until(lambda: line in text_of(quick.diagnostics()))
         finally:
             namesake.close()
         self.told(quick, lambda text: line not in text)
@@ -497,7 +497,7 @@ class TestNeighbours:
         torques = quick.received("joint_torques")
         sender = launch(None, code=SENDER)
         torques.clear()
-        quick.peer.until(lambda: sum(not is_zeros(m) for m in torques) > 20, 60.0)
+        quick.peer.until(lambda: sum(not is_zeros(m) for m in torques) > 20)
         sender.process.kill()
         sender.wait()
         quick.peer.until(lambda: is_zeros(torques[-1]))

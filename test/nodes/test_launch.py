@@ -26,8 +26,6 @@ NODES = {
     "stiffness_monitor": "stiffness_monitor/node.py",
     "command_gate": "delta_dynamics/gate_node.py",
 }
-PATIENCE = 90.0
-"""How long a loaded machine may take to start several nodes, s."""
 
 
 def literal(name, variable):
@@ -170,7 +168,7 @@ class TestRunning:
             assert process.alive(), process.output
             return self.nodes(peer) == sorted(names)
 
-        peer.until(so, PATIENCE)
+        peer.until(so)
 
     def parameter(self, peer, node, name):
         from rcl_interfaces.srv import GetParameters
@@ -191,7 +189,7 @@ class TestRunning:
         process = launched("twin", "namespace:=left", "command_gate:=true", "robot:=prru")
         names = [f"/left/{node}" for node in NODES]
         self.until_nodes(peer, process, *names)
-        peer.until(lambda: "/left/wrench" in self.subscribed(peer), PATIENCE)
+        peer.until(lambda: "/left/wrench" in self.subscribed(peer))
         assert {topic for topic in self.subscribed(peer) if not topic.startswith("/left/")} == set()
         assert "/left/joint_states" in self.subscribed(peer)
         for name in names:
@@ -229,7 +227,7 @@ class TestRunning:
         self.until_nodes(peer, process, "/delta_dynamics", "/command_gate")
         (gate,) = process.started("command_gate")
         os.kill(gate, signal.SIGKILL)
-        peer.until(lambda: len(process.started("command_gate")) == 2, PATIENCE)
+        peer.until(lambda: len(process.started("command_gate")) == 2)
         (dynamics,) = process.started("delta_dynamics")
         os.kill(dynamics, signal.SIGKILL)
         peer.until(lambda: f"process has died [pid {dynamics}, exit code -9" in process.output)
@@ -240,12 +238,12 @@ class TestRunning:
         process = launched("twin", "stiffness_monitor:=false")
         self.until_nodes(peer, process, "/delta_dynamics")
         os.kill(process.started("delta_dynamics")[0], signal.SIGKILL)
-        peer.until(lambda: len(process.started("delta_dynamics")) == 2, PATIENCE)
+        peer.until(lambda: len(process.started("delta_dynamics")) == 2)
 
     def test_the_log_level_is_passed_on(self, launched, peer):
         process = launched("twin", "stiffness_monitor:=false", "log_level:=error")
         self.until_nodes(peer, process, "/delta_dynamics")
-        peer.until(lambda: "/joint_states" in self.subscribed(peer), PATIENCE)
+        peer.until(lambda: "/joint_states" in self.subscribed(peer))
         assert "robot delta_cu" not in process.output
 
     def test_a_cell_keeps_its_machines_apart(self, launched, peer):
@@ -253,7 +251,7 @@ class TestRunning:
         names = [f"/{space}/{node}" for space in "ab" for node in list(NODES)[:2]]
         self.until_nodes(peer, process, *names)
         both = {f"/{space}/joint_states" for space in "ab"}
-        peer.until(lambda: both <= self.subscribed(peer), PATIENCE)
+        peer.until(lambda: both <= self.subscribed(peer))
         assert "/joint_states" not in self.subscribed(peer)
         assert self.parameter(peer, "/a/delta_dynamics", "mechanism") == "delta_cu"
         assert self.parameter(peer, "/b/delta_dynamics", "mechanism") == "prru"
@@ -293,7 +291,7 @@ class TestRunning:
             return client.server_is_ready() and peer.received(state)
 
         try:
-            peer.until(ready, PATIENCE)
+            peer.until(ready)
             peer.received(state).clear()
             sent = trajectory(count=5)
             # The controller takes none that does not end at rest.
@@ -303,7 +301,7 @@ class TestRunning:
                 goal = client.send_goal_async(FollowJointTrajectory.Goal(trajectory=sent))
                 peer.until(goal.done)
                 result = goal.result().get_result_async()
-                peer.until(result.done, PATIENCE)
+                peer.until(result.done)
                 return result.result()
 
             last = answer()
@@ -340,13 +338,13 @@ class TestRunning:
     )
     def test_a_bad_argument_is_refused_by_name(self, launched, name, argument, said):
         process = launched(name, argument)
-        assert process.wait(PATIENCE) == 1
+        assert process.wait() == 1
         assert said in process.output
 
     def test_ctrl_c_ends_all_of_it_cleanly(self, launched, peer):
         process = launched("twin", "command_gate:=true")
         self.until_nodes(peer, process, *(f"/{node}" for node in NODES))
         process.process.send_signal(signal.SIGINT)
-        process.wait(PATIENCE)
+        process.wait()
         assert process.output.count("process has finished cleanly") == 3
         assert "Traceback" not in process.output

@@ -250,7 +250,7 @@ class TestLongTrajectories:
         answers.clear()
         torques.clear()
         twin.peer.send(f"/{twin.name}/joint_trajectory", message)
-        twin.peer.until(lambda: answers, 120.0, lambda: twin.stream(1))
+        twin.peer.until(lambda: answers, repeat=lambda: twin.stream(1))
         # Of the states that were sent meanwhile.
         assert len(torques) > 3
         picked = slice(None, None, 997)
@@ -275,7 +275,7 @@ class TestLongTrajectories:
             busy = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0) - before
             return len(answers) + busy >= count
 
-        twin.peer.until(all_told, 120.0)
+        twin.peer.until(all_told)
         answers.clear()
 
 

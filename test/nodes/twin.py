@@ -72,7 +72,7 @@ class Twin:
             self.send_state(state(stamp=self.stamp(), effort=(0.0, 0.0, 0.0)))
 
         topics = ("joint_trajectory_ff", "joint_torques", "torque_residual", "commands")
-        self.peer.until(lambda: all(self.received(t) for t in topics), 90.0, repeat)
+        self.peer.until(lambda: all(self.received(t) for t in topics), repeat=repeat)
         self.settle()
         return self
 
