@@ -451,7 +451,7 @@ class TestAnything:
     """Whatever the file says: a robot, or a ParameterError; never another exception."""
 
     relaxed = settings(
-        max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+        max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
     )
 
     def judge(self, loader, content):

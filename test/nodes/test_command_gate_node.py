@@ -5,6 +5,7 @@ import signal
 
 import numpy as np
 import pytest
+from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
@@ -204,7 +205,7 @@ def test_a_bad_configuration_is_refused_in_one_line(launch, parameters, named):
     assert named in line
 
 
-@pytest.mark.parametrize("name", robot_names())
+@pytest.mark.parametrize("name", partly_long(robot_names(), "five_bar", "upr_rpu", "stewart"))
 def test_every_robot_has_a_gate(heard, launch, name):
     process = launch(GATE, f"mechanism:={name}", arguments=("-r", f"__node:=of_{name}"))
     count = len(load(name).joint_names)

@@ -10,6 +10,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,12 @@ CLEAR = 0.2
 """Least singularity measure of random states: nearer to one, no tolerance is the law's own."""
 FREE = {"viscous": 0.0, "coulomb": 0.0}
 """Friction section without friction."""
+
+
+def partly_long(names: Iterable[Any], *kept: Any) -> list[Any]:
+    """Parameters of a kind: those that are kept are run by default, the others by `make long`."""
+    marks = pytest.mark.long
+    return [name if name in kept else pytest.param(name, marks=marks) for name in names]
 
 
 def has(robot: Robot, ask: str) -> bool:
