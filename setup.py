@@ -82,6 +82,7 @@ setup(
             "hypothesis",
             "mcap-ros2-support",
             "mpmath",
+            "mujoco",
             "mypy",
             "pin",
             "plotly",
