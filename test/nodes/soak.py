@@ -287,58 +287,65 @@ def write(folder, summary, watched, ages):
     pyplot.close(figure)
 
 
+TEXT = """## Long run
+
+Printed by `make soak MINUTES={minutes:g}`: two `delta_dynamics`, one of them fed a looping bag by
+the player, `stiffness_monitor` and `command_gate`, at 1 kHz as far as the machine let the sender
+({sent:,} joint states, one in a hundred bad, and a fifth as many wrenches). Meanwhile
+{parameters:,} requests for parameters, good and bad, {trajectory:,} trajectories of 500 points,
+{suspend:,} suspensions of {suspension:g} s (SIGSTOP, SIGCONT) of a node, and {kill:,} kills of the
+player. The first fifth is warm-up. `stale_after` and the gate's `deadline` were {stale:g} s.
+
+![Memory, descriptors, threads and ages of a long run](soak.png)
+
+{nodes}
+
+Ages from a state's stamp to the answer's publication, on a machine whose two cores did much other
+work: what is left waiting in a queue is answered up to its age's bound, and no later.
+
+{ages}
+
+Age is looked at just before a torque is published. Only a process that the machine holds up between
+the two sends an older one, and the topic's deadline then tells.
+"""
+
+
 def section(summary):
     """The figures as a part of the page on faults."""
-    happened = summary["happened"]
-    lines = [
-        "## Long run",
-        "",
-        f"Printed by `make soak MINUTES={summary['minutes']:g}`: two `delta_dynamics`, one of them fed "
-        "a looping bag by the",
-        "player, `stiffness_monitor` and `command_gate`, all at 1 kHz (wrenches at 200 Hz), one joint "
-        "state in a",
-        f"hundred bad; meanwhile {happened['parameters']:,} requests for parameters, good and bad, "
-        f"{happened['trajectory']:,} trajectories of 500 points,",
-        f"{happened['suspend']:,} suspensions of {SUSPENSION:g} s (SIGSTOP, SIGCONT) of a node and "
-        f"{happened['kill']:,} kills of the player. The first fifth is warm-up.",
-        f"`stale_after` and the gate's `deadline` were {STALE:g} s.",
-        "",
-        "![Memory, descriptors, threads and ages of a long run](soak.png)",
-        "",
-        "| node | memory, first third (MiB) | last third | slope (KiB an hour) | descriptors | threads |",
-        "|---|---|---|---|---|---|",
+    nodes = [
+        "| node | memory, first third (MiB) | last third | slope (KiB an hour) "
+        "| descriptors | threads |",
+        "|---" * 6 + "|",
     ]
     for name, node in summary["nodes"].items():
         memory = node["memory, bytes"]
-        first, last, slope = (
-            memory["first"] / 2**20, memory["last"] / 2**20, memory["per hour"] / 2**10,
-        )  # fmt: skip
+        mebibytes = [memory[part] / 2**20 for part in ("first", "last")]
         counts = [
             f"{node[what]['first']:g} to {node[what]['last']:g}"
             for what in ("descriptors", "threads")
         ]
-        lines.append(
-            f"| {name} | {first:.2f} | {last:.2f} | {slope:+.0f} | {counts[0]} | {counts[1]} |"
+        nodes.append(
+            f"| {name} | {mebibytes[0]:.2f} | {mebibytes[1]:.2f} | "
+            f"{memory['per hour'] / 2**10:+.0f} | {counts[0]} | {counts[1]} |"
         )
-    lines += [
-        "",
-        "Ages from a state's stamp to the answer's publication, on a machine that did other work too:",
-        "",
+    ages = [
         f"| answers | count | {' | '.join(QUANTILES)} (ms) | older than {STALE:g} s |",
-        "|---|---|" + "---|" * len(QUANTILES) + "---|",
+        "|---" * (3 + len(QUANTILES)) + "|",
     ]
     for what, found in summary["ages, s"].items():
         values = " | ".join(f"{1e3 * found[q]:.2f}" for q in QUANTILES)
-        older = found["older than stale_after"]
-        lines.append(f"| {what} | {found['count']:,} | {values} | {older} |")
-    lines += [
-        "",
-        f"{summary['joint states sent']:,} joint states were sent. Age is looked at just before a torque is "
-        "published; only a process that",
-        "is suspended within those microseconds can send an older one, which lifespan and deadline of "
-        "the topic then tell.",
-    ]
-    return "\n".join(lines)
+        ages.append(
+            f"| {what} | {found['count']:,} | {values} | {found['older than stale_after']} |"
+        )
+    return TEXT.format(
+        minutes=summary["minutes"],
+        sent=summary["joint states sent"],
+        suspension=SUSPENSION,
+        stale=STALE,
+        nodes="\n".join(nodes),
+        ages="\n".join(ages),
+        **summary["happened"],
+    )
 
 
 def main():
