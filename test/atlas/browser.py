@@ -130,6 +130,19 @@ class Browser:
             assert time.monotonic() < end, f"never true: {script}"
             time.sleep(0.05)
 
+    def slow_down(self, seconds: float) -> None:
+        """From the next page on, let so much time pass between frames.
+
+        Without a graphics card a scene that is drawn all the time leaves time for nothing else.
+        """
+        script = (
+            "window.requestAnimationFrame = call => setTimeout("
+            f"() => call(performance.now()), {1e3 * seconds:g});"
+            "window.cancelAnimationFrame = clearTimeout;"
+        )
+        self.call("Page.enable")
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+
     def open(self, path: Path) -> None:
         """Go to a file of this machine."""
         self.visit(path.resolve().as_uri())
@@ -146,3 +159,16 @@ class Browser:
     def move(self, x: float, y: float) -> None:
         """Put the mouse to a place, in pixels of the window."""
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+
+    def click(self, element: str) -> None:
+        """Press and release the mouse on the middle of an element, given by a script."""
+        box = f"(() => {{ const b = ({element}).getBoundingClientRect();"
+        x, y = self.run(f"{box} return [b.x + b.width / 2, b.y + b.height / 2]; }})()")
+        self.move(x, y)
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def press(self, key: str) -> None:
+        """Press and release a key, by its name (ArrowRight)."""
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key)

@@ -24,8 +24,8 @@ from test.atlas.browser import Browser, find_browser
 
 SIZE = (1440, 900)
 CLOSE = "document.querySelectorAll('[class*=Notification] button').forEach(b => b.click())"
-TAB = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText === '%s').click()"
-SETTLED = 6.0
+TAB = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText === '%s')"
+SETTLED = 10.0
 """Seconds that a browser without a graphics card gets to draw what it was sent."""
 
 
@@ -77,10 +77,10 @@ def take(browser: Browser, name: str, path: Path) -> None:
         tab = prepare(page)
         browser.visit(f"http://127.0.0.1:{listening.getsockname()[1]}/")
         browser.until("!!document.getElementById('singularity')")
-        browser.run(TAB % tab)
         time.sleep(SETTLED)
+        browser.click(TAB % tab)
         browser.run(CLOSE)
-        time.sleep(1.0)
+        time.sleep(SETTLED)
         path.write_bytes(browser.picture())
 
 
@@ -91,6 +91,7 @@ def main(folder: Path, names: tuple[str, ...]) -> None:
         print("no browser here: the pictures of `pkm-twin view` stay as they are")
         return
     with Browser(program, SIZE) as browser:
+        browser.slow_down(0.5)
         for name in names:
             take(browser, name, folder / f"{name}.png")
 

@@ -70,19 +70,19 @@ def view(
     from pkm_twin.apps.view.panels import BagPanel, LivePanel
 
     with ExitStack() as stack:
-        listening = stack.enter_context(listen(host, port))
+        door_socket = stack.enter_context(listen(host, port))
         machine = load(robot, platform=platform)
         timeline = None if bag is None else _timeline(bag, robot, topic, carried)
         model = Model(machine)
-        server = stack.enter_context(serving(door, listening))
+        server = stack.enter_context(serving(door, door_socket))
         page = Page(server, model)
         if timeline is not None:
             BagPanel(page, timeline)
         if live:
             heard = Live(machine)
-            stack.enter_context(_listening(heard, namespace))
+            stack.enter_context(listening(heard, namespace))
             LivePanel(page, heard)
-        name, number = listening.getsockname()[:2]
+        name, number = door_socket.getsockname()[:2]
         shown = f"[{name}]" if ":" in name else name
         asked = "?token=TOKEN" if token else ""
         typer.echo(f"{machine.name}: http://{shown}:{number}/{asked}  (Ctrl-C ends)")
@@ -99,7 +99,7 @@ def _timeline(bag: Path, robot: str, topic: list[str], carried: Any) -> Any:
 
 
 @contextmanager
-def _listening(live: Any, namespace: str) -> Iterator[None]:
+def listening(live: Any, namespace: str) -> Iterator[None]:
     """Messages of the nodes in a namespace reach ``live`` while the block lasts."""
     from pkm_twin.apps.view.live import TOPICS
     from pkm_twin.ros.listener import listening_node, subscribe_best_effort

@@ -88,6 +88,7 @@ class Model:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self._settings = Settings()
+        self._angles = has_joint_angles(robot)
         self._why: dict[str, str] = {}
         home = robot.home()
         self.start = State(robot.inverse(home), home)
@@ -111,10 +112,11 @@ class Model:
     def joint_ranges(self) -> tuple[Range, ...]:
         """Of q: the limits; where there are none, a turn, or the machine's size, about home."""
         robot, graph = self.robot, self.robot.graph
-        free = {"rad": math.pi, "m": graph.size / 2}
+        free = {"rad": 3.15, "m": _round(graph.size) / 2}
         rows = []
         for k, (name, unit) in enumerate(zip(robot.joint_names, robot.joint_units, strict=True)):
-            low, high = graph.home[k] - free[unit], graph.home[k] + free[unit]
+            middle = round(float(graph.home[k]), 1)
+            low, high = middle - free[unit], middle + free[unit]
             if robot.limits.position is not None:
                 limits = robot.limits.position[k]
                 low, high = (
@@ -132,7 +134,8 @@ class Model:
         random = np.random.default_rng(0).random((SAMPLES, robot.joints_count))
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=robot.joints_count)))
         poses, good = robot.try_forward(low + (high - low) * np.concatenate([corners, random]))
-        found = np.concatenate([poses[good], [self.start.pose]])
+        kept = [pose for pose in poses[good] if not self._angle_beyond(pose)]
+        found = np.array([*kept, self.start.pose])
         rows = []
         for k, (name, unit) in enumerate(zip(robot.pose_names, robot.pose_units, strict=True)):
             least, most = float(found[:, k].min()), float(found[:, k].max())
@@ -200,8 +203,9 @@ class Model:
         return _refused(state, angle) if angle else replace(state, q=q, pose=pose, refusal="")
 
     def _angle_beyond(self, pose: Array) -> str:
+        """What passive joint is beyond its bound at a pose, in words; empty where none is."""
         bound = getattr(self.robot.limits, "joint_angle", None)
-        if bound is None or not has_joint_angles(self.robot):
+        if bound is None or not self._angles:
             return ""
         angles = self.robot.limit_angles(pose)
         most = 0.0 if angles is None else float(angles.max())
@@ -258,8 +262,8 @@ def _grade(value: float, bad: float, warn: float) -> Grade:
 
 
 def _step(span: float) -> float:
-    """A power of ten, some 200 to 2000 of it in the span."""
-    return float(10.0 ** math.floor(math.log10(max(span, 1e-9) / 200)))
+    """A power of ten, 400 to 4000 of it in the span."""
+    return float(10.0 ** math.floor(math.log10(max(span, 1e-9) / 400)))
 
 
 def _round(value: float) -> float:

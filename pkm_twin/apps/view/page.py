@@ -69,7 +69,8 @@ class Page:
 
     def __init__(self, server: Any, model: Model) -> None:
         self.server, self.model, self.state = server, model, model.start
-        self.stage = Stage(server, Scene(model.robot), model.start.q)
+        lowest = min((r.low for r in model.pose_ranges if r.name == "z"), default=0.0)
+        self.stage = Stage(server, Scene(model.robot), model.start.q, lowest)
         self.moving: list[Moving] = []
         self._asked: dict[str, Callable[[], None]] = {}
         self._wake = threading.Event()

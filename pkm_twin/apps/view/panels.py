@@ -21,9 +21,9 @@ COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E
 SPEEDS: Final = ("0.25", "0.5", "1", "2", "4")
 WIDTH: Final = 400
 """Of the panel, pixels."""
-_NO_POINTS: Final = {"show": False}
 MARKED: Final = 0.25
 """How often the curves' mark of the present moves while a bag plays, s."""
+_NO_POINTS: Final = {"show": False}
 
 
 class BagPanel:
@@ -43,9 +43,9 @@ class BagPanel:
             at, twin, residual = timeline.curves()
             named = (("torque of the twin", twin), ("residual: measured less twin", residual))
             self._charts = [
-                (_chart(page, title, at, values, mark=True), at)
+                (_chart(page, title, at, values, mark=True), at, values)
                 for title, values in named
-                if values is not None
+                if values is not None and len(at) > 1
             ]
         page.ask(self._time.on_update, "time", self._go)
         page.ask(self._play.on_click, "play", self._play_or_pause)
@@ -76,8 +76,8 @@ class BagPanel:
         page.become(state)
         if not self.busy or time.monotonic() - self._marked > MARKED:
             self._marked = time.monotonic()
-            for chart, times in self._charts:
-                chart.data = (*chart.data[:-1], _mark(times, at.time))
+            for chart, times, values in self._charts:
+                chart.data = (*chart.data[:-1], _mark(times, values, at.time))
 
     def _play_or_pause(self) -> None:
         if self.busy:
@@ -117,7 +117,7 @@ class LivePanel:
         panel = gui.add_panel()
         with panel.add_tab("Live"):
             self._heard = gui.add_html("")
-            nothing = np.full((2, page.model.robot.joints_count), np.nan)
+            nothing = np.zeros((2, page.model.robot.joints_count))
             self._charts = {
                 name: _chart(page, f"{name}, the last {SPAN:g} s", np.array([-SPAN, 0.0]), nothing)
                 for name in TRACES
@@ -151,26 +151,24 @@ def _chart(page: Page, title: str, times: Array, values: Array, *, mark: bool = 
     robot = page.model.robot
     series = [uplot.Series(label="t, s")]
     series += [
-        uplot.Series(
-            label=name, stroke=COLOURS[k % len(COLOURS)], width=1.5, points={"show": False}
-        )
+        uplot.Series(label=name, stroke=COLOURS[k % len(COLOURS)], width=1.5, points=_NO_POINTS)
         for k, name in enumerate(robot.joint_names)
     ]
     curves = list(map(np.ascontiguousarray, values.T))
     if mark:
-        series.append(uplot.Series(label="now", stroke="#222222", points={"show": True, "size": 9}))
-        curves.append(_mark(times, 0.0))
+        series.append(uplot.Series(label="now", stroke="#555555", width=1, points=_NO_POINTS))
+        curves.append(_mark(times, values, 0.0))
     return page.server.gui.add_uplot(
         (times, *curves),
         tuple(series),
         title=f"{title}, {robot.effort_unit}",
         scales={"x": uplot.Scale(time=False)},
-        height=230,
+        height=185,
     )
 
 
-def _mark(times: Array, now: float) -> Array:
-    """A curve that is one spot, on zero at the time shown."""
-    result = np.full(len(times), np.nan)
-    result[int(np.argmin(np.abs(times - now)))] = 0.0
+def _mark(times: Array, values: Array, now: float) -> Array:
+    """A curve along the bottom with a spike at the time shown: charts draw no upright lines."""
+    result = np.full(len(times), float(values.min()))
+    result[int(np.argmin(np.abs(times - now)))] = float(values.max())
     return result

@@ -152,7 +152,7 @@ class Scene:
         posture, graph = Posture(self.robot, q), self.robot.graph
         colours = share_colours(shares or {})
         origin = posture.place(graph.platform, graph.origin)
-        moved = np.zeros(6) if deflection is None else deflection
+        moved = np.zeros(6) if deflection is None else np.array(deflection)
         turn = Rotation.from_rotvec(moved[3:])
 
         def place(spot: Place, held: bool) -> Array:

@@ -24,9 +24,10 @@ LOOK: Final = np.array([0.62, -0.95, 0.42])
 class Stage:
     """A machine on a server; all who look at it see the same."""
 
-    def __init__(self, server: Any, scene: Scene, q: Array) -> None:
+    def __init__(self, server: Any, scene: Scene, q: Array, lowest: float) -> None:
+        """:param lowest: where the platform may go at least, z in m: the ground is below."""
         self._server, self._scene = server, scene
-        self._ground()
+        self._ground(lowest)
         self._plates()
         self._machine(q)
         size, draw = scene.size, server.scene
@@ -36,27 +37,35 @@ class Stage:
         }
         self._element = draw.add_label("/element", "", anchor="bottom-center", visible=False)
         self._arrows = draw.add_arrows(
-            "/wrench", np.zeros((2, 2, 3)), np.array([FORCE, MOMENT], np.uint8),
+            "/wrench", np.zeros((2, 2, 3)), _linear(np.array([FORCE, MOMENT])),
             shaft_radius=0.008 * size, head_radius=0.02 * size, head_length=0.05 * size,
             visible=False,
         )  # fmt: skip
 
-    def _ground(self) -> None:
+    def _ground(self, lowest: float) -> None:
         draw, size = self._server.scene, self._scene.size
         draw.set_up_direction("+z")
-        # Bright enough to read, dim enough that colours keep theirs.
-        draw.configure_environment_map("studio", environment_intensity=0.35)
+        # Lights of its own: a lit face has just the colour that it was given.
+        draw.configure_default_lights(False)
+        draw.configure_environment_map(None)
+        draw.add_light_ambient("/lights/all", intensity=1.5)
+        for name, place in (("key", LOOK + np.array([-0.4, 0.0, 0.6])), ("back", -LOOK)):
+            bright = 1.7 if name == "key" else 0.4
+            draw.add_light_directional(
+                f"/lights/{name}", intensity=bright, position=tuple(place.tolist()),
+                cast_shadow=name == "key",
+            )  # fmt: skip
         low, high = self._scene.box()
         middle, reach = (low + high) / 2, float((high - low).max())
         cell = 10.0 ** np.floor(np.log10(reach))
         draw.add_grid(
             "/grid", width=6 * reach, height=6 * reach, cell_size=cell / 2, section_size=cell,
             cell_color=(222, 225, 229), section_color=(186, 192, 200), fade_distance=7 * reach,
-            position=(0.0, 0.0, float(min(low[2], 0.0)) - 0.06 * size),
+            position=(0.0, 0.0, float(min(low[2], 0.0, lowest)) - 0.06 * size),
             plane_color=(248, 249, 250), plane_opacity=1.0,
         )  # fmt: skip
         camera = self._server.initial_camera
-        camera.position = tuple((middle + 1.45 * reach * LOOK).tolist())
+        camera.position = tuple((middle + 1.25 * reach * LOOK).tolist())
         camera.look_at = tuple(middle.tolist())
         camera.up = (0.0, 0.0, 1.0)
         draw.add_frame("/base", **_axes(0.12 * size, size))
@@ -80,13 +89,14 @@ class Stage:
         (cylinder, cylinder_faces), (ball, ball_faces) = round_mesh()
         self._cylinders = draw.add_batched_meshes_simple(
             "/machine/bars", cylinder, cylinder_faces, shapes.cylinder_turns, shapes.cylinder_at,
-            batched_scales=shapes.cylinder_sizes, batched_colors=shapes.cylinder_colours,
+            batched_scales=shapes.cylinder_sizes, batched_colors=_linear(shapes.cylinder_colours),
             lod="off",
         )  # fmt: skip
         turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(shapes.ball_at), 1))
         self._balls = draw.add_batched_meshes_simple(
             "/machine/balls", ball, ball_faces, turns, shapes.ball_at,
-            batched_scales=shapes.ball_sizes, batched_colors=shapes.ball_colours, lod="off",
+            batched_scales=shapes.ball_sizes, batched_colors=_linear(shapes.ball_colours),
+            lod="off",
         )  # fmt: skip
 
     def draw(self, q: Array, deflection: Array, shares: Mapping[str, float], dominant: str) -> None:
@@ -99,9 +109,11 @@ class Stage:
         shapes = self._scene.shapes(q, deflection if moved else None, shares)
         bars, balls = self._cylinders, self._balls
         bars.batched_positions, bars.batched_wxyzs = shapes.cylinder_at, shapes.cylinder_turns
-        bars.batched_scales, bars.batched_colors = shapes.cylinder_sizes, shapes.cylinder_colours
+        bars.batched_scales = shapes.cylinder_sizes
+        bars.batched_colors = _linear(shapes.cylinder_colours)
         balls.batched_positions = shapes.ball_at
-        balls.batched_scales, balls.batched_colors = shapes.ball_sizes, shapes.ball_colours
+        balls.batched_scales = shapes.ball_sizes
+        balls.batched_colors = _linear(shapes.ball_colours)
         self._platform.position, self._platform.wxyz = shapes.platform_at, shapes.platform_turn
         for name, place in self._scene.drive_places(q).items():
             self._names[name].position = place
@@ -135,3 +147,10 @@ def _axes(length: float, size: float) -> dict[str, float]:
         "axes_radius": 0.004 * size,
         "origin_radius": 0.008 * size,
     }
+
+
+def _linear(colours: NDArray[Any]) -> NDArray[np.uint8]:
+    """Colours of a screen as amounts of light: viser takes those of batches so."""
+    part = np.asarray(colours) / 255.0
+    light = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+    return np.round(255 * light).astype(np.uint8)

@@ -92,11 +92,14 @@ class Timeline:
             None if self.measured is None else self.measured[k],
         )
 
-    def curves(self) -> tuple[Array, Array | None, Array | None]:
-        """Times (j,), the twin's efforts and the residual (j, n) at no more than POINTS of them."""
-        every = slice(None, None, -(-len(self.time) // POINTS))
-        twin = None if self.twin is None else self.twin[every]
-        residual = None
-        if twin is not None and self.measured is not None:
-            residual = self.measured[every] - twin
-        return self.time[every], twin, residual
+    def curves(self) -> tuple[Array, Array, Array | None]:
+        """Times (j,), the twin's efforts and the residual (j, n) where the twin has any.
+
+        No more than POINTS of them, evenly taken.
+        """
+        if self.twin is None:
+            return np.zeros(0), np.zeros((0, self.q.shape[1])), None
+        known = np.flatnonzero(~np.isnan(self.twin).any(1))
+        rows = known[:: max(1, -(-len(known) // POINTS))]
+        residual = None if self.measured is None else self.measured[rows] - self.twin[rows]
+        return self.time[rows], self.twin[rows], residual
