@@ -27,6 +27,7 @@ from pkm_twin.apps.options import (
     RobotName,
     load_of,
 )
+from pkm_twin.apps.view.command import view
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
     flush_output,
@@ -499,6 +500,7 @@ def certify(
 app.add_typer(atlases.app, name="atlas")
 app.command("calibrate")(calibrate_command)
 app.command()(guard_check)
+app.command()(view)
 app.command()(atlases.show)
 
 
