@@ -13,6 +13,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.apps.options import (
     BagPath,
@@ -497,6 +498,7 @@ def certify(
 
 app.add_typer(atlases.app, name="atlas")
 app.command()(guard_check)
+app.command()(fit)
 app.command()(atlases.show)
 
 

@@ -112,7 +112,7 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
     :raises ParameterError: a column is missing or misspelt, or a value is no finite number.
     """
     machine = load(robot)
-    columns = _read_columns(path)
+    columns = read_columns(path)
     known = [f"{joint}.{what}" for joint in machine.joint_names for what in INPUTS]
     for name in columns:
         joint, dot, what = name.rpartition(".")
@@ -250,7 +250,11 @@ def _write_parquet(columns: dict[str, Array], path: Path) -> None:
     parquet.write_table(pyarrow.table(columns), path)
 
 
-def _read_columns(path: Path) -> dict[str, Array]:
+def read_columns(path: Path) -> dict[str, Array]:
+    """Columns of a CSV by its header row, shape (rows,) each.
+
+    :raises ParameterError: no readable CSV of finite numbers.
+    """
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
