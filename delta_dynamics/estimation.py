@@ -226,6 +226,7 @@ def _nearest(
     if unknown.value is None:
         raise PkmTwinError(f"no possible masses and inertias near the data: {problem.status}")
     result = start + scales * z + moved @ np.asarray(unknown.value, np.float64)
+    result[np.abs(result) < 1e-9 * scales] = 0.0
     return _inside(result, start, cones)
 
 

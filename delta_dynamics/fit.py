@@ -2,9 +2,9 @@
 """The numbers of a robot's file from recordings of its motion and efforts.
 
 The last third of every recording is held out: it is judged, not fitted. Efforts may be late
-against positions, by up to some samples and alike in all joints: a drive that holds its torque for
-a period would else look like friction. How late is fitted beside, for each recording. Two windows of the
-differentiation are fitted; what they differ by counts as uncertainty beside the noise's.
+against positions, by some samples and alike in all joints: a drive that holds its torque for a
+period would else look like friction. How late is fitted beside, for each recording. Two windows of
+the differentiation are fitted; what they differ by counts as uncertainty beside the noise's.
 
 May import: numpy, pkm_twin's core, this package, the standard library.
 """
@@ -38,8 +38,8 @@ STILL: Final = 4.0
 """Deviations of a rate's noise below which a joint stands still."""
 SURE: Final = 0.2
 """A number that is known this much better than before is fitted."""
-STAYS: Final = 1e-6
-"""Change over the deviation before that is rounding's."""
+STAYS: Final = 1e-3
+"""Change over the deviation before that says nothing."""
 LATE: Final = 2.0
 """Samples by which efforts may well be late."""
 UNSURE: Final = 0.98

@@ -114,13 +114,10 @@ def fit_recordings(
     base = machine
     if "payload" in kinds:
         loads = [load for _, load in pairs if load is not None]
-        if loads and any(
-            load.on(machine).payload != loads[0].on(machine).payload for load in loads
-        ):
-            # Two payloads are not one section of a file.
+        # Two payloads are not one section of a file.
+        if len({(load.mass, load.com) for load in loads}) > 1:
             masses = ", ".join(f"{load.mass:g}" for load in loads)
-            if len({(load.mass, load.com) for load in loads}) > 1:
-                raise PkmTwinError(f"recordings with payloads of {masses} kg: fit one at a time")
+            raise PkmTwinError(f"recordings with payloads of {masses} kg: fit one at a time")
         base = loads[0].on(machine) if loads else machine
     made = []
     for recorded, load in pairs:
@@ -204,6 +201,7 @@ def as_json(result: Any) -> dict[str, Any]:
         "held_by_a_physical_bound": e.bound,
         "samples_fitted": result.samples,
         "outliers_replaced": result.outliers,
+        "efforts_late_s": list(result.delays),
         "parameters": [
             {
                 "key": number.name, "unit": number.unit, "before": number.before,
@@ -260,7 +258,8 @@ def _print(result: Any) -> None:
     typer.echo(f"condition number {e.condition:.3g} over {e.directions} combinations")
     if e.bound:
         typer.echo("the nearest possible masses and inertias: the data alone want impossible ones")
-    for judged in result.judged:
+    for judged, delay in zip(result.judged, result.delays, strict=True):
+        typer.echo(f"{judged.name}: efforts late by {1e3 * delay:.3g} ms")
         before, after = judged.rms(judged.before), judged.rms(judged.after)
         for k, joint in enumerate(result.robot.joint_names):
             typer.echo(
