@@ -48,6 +48,31 @@ def to_rpy(rotation: Array) -> Array:
     return np.array([roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0])])
 
 
+def from_quaternion(x: float, y: float, z: float, w: float) -> Array:
+    """The rotation of a quaternion, of unit length or not."""
+    n = x * x + y * y + z * z + w * w
+    v = np.array([x, y, z])
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation: Array = ((w * w - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) + 2.0 * w * skew) / n
+    return rotation
+
+
+def to_quaternion(rotation: Array) -> Array:
+    """Unit quaternion x, y, z, w (4,) of a rotation, w zero or more (Bar-Itzhack 2000, version 1).
+
+    The eigenvector of the greatest eigenvalue: no case is near-singular.
+    """
+    r = rotation
+    k = np.array([
+        [r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
+        [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
+        [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], r[1, 0] - r[0, 1]],
+        [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], np.trace(r)],
+    ])  # fmt: skip
+    quaternion: Array = np.linalg.eigh(k / 3.0)[1][:, -1]
+    return -quaternion if quaternion[3] < 0.0 else quaternion
+
+
 def across(axis: Array) -> Array:
     """A unit vector across another one, shape (3,)."""
     # Rounded, so that of two equal components the last bit does not choose.
