@@ -19,7 +19,9 @@ import pytest
 import pkm_twin
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-EXECUTABLES = {"delta_dynamics", "stiffness_monitor", "command_gate", "pkm-twin"}
+EXECUTABLES = {
+    "delta_dynamics", "stiffness_monitor", "command_gate", "machine_sim", "pkm-twin"
+}  # fmt: skip
 COLCON = Path(sys.executable).with_name("colcon")
 needs_colcon = pytest.mark.skipif(
     not COLCON.exists(), reason="colcon is not installed beside this Python"

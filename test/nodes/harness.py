@@ -195,12 +195,13 @@ class Process:
 class NodeProcess(Process):
     """``python -m MODULE --ros-args -p ...``
 
-    ``arguments`` are further ROS arguments; ``code`` is run instead of the module.
+    ``arguments`` are further ROS arguments; ``code`` is run instead of the module, or ``script``,
+    a path and its own arguments.
     """
 
-    def __init__(self, domain, module, *parameters, arguments=(), code=None):
+    def __init__(self, domain, module, *parameters, arguments=(), code=None, script=None):
         flags = [flag for parameter in parameters for flag in ("-p", parameter)]
-        run = ["-m", module] if code is None else ["-c", code]
+        run = script or (["-m", module] if code is None else ["-c", code])
         super().__init__(domain, [sys.executable, *run, "--ros-args", *flags, *arguments])
 
 
