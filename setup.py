@@ -17,6 +17,7 @@ setup(
         "pkm_twin",
         "pkm_twin.apps",
         "pkm_twin.apps.certificate",
+        "pkm_twin.apps.view",
         "pkm_twin.atlas",
         "pkm_twin.bags",
         "pkm_twin.codegen",
@@ -94,6 +95,7 @@ setup(
             "ruff",
             "threadpoolctl",
             "types-PyYAML",
+            "viser>=1.0",
             "wheel",
             "xarray",
             "yourdfpy",
@@ -103,6 +105,7 @@ setup(
         "bags": ["pin", "PyNiteFEA"],
         "certificate": ["mpmath", "mujoco", "pin", "pytest", "scipy"],
         "mjcf": ["mujoco"],
+        "view": ["viser>=1.0"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },
     entry_points={

@@ -29,6 +29,8 @@ TOLD: Final = 3.0
 """A direction is the data's where they tell it by this much better than the prior."""
 MODEL: Final = 1e-5
 """Part of the efforts that no model is better than: a direction that shows less is not seen."""
+WIDEN: Final = 1.1
+"""On all deviations: the residual's autocorrelation is itself an estimate."""
 PSD: Final = 1e-9
 """Least eigenvalue of a cone, over the sizes in it, that counts as not negative."""
 
@@ -144,20 +146,19 @@ def _covariance(
     samples, n, k = scaled.shape
     modes = (scaled.reshape(-1, k) @ vectors[:, kept]).reshape(samples, n, -1)
     modes = modes * (counts / noise**2)[..., None]
-    centred = residual - _mean(residual, counts)
-    centred = centred * counts
     pairs = np.maximum(counts.T @ counts, 1.0)
-    lags = min(samples // 4, max(10, round(4.0 * samples ** (1 / 3))))
+    lags = min(samples // 4, max(14, round(2.0 * samples ** (1 / 3))))
     meat = np.zeros((modes.shape[-1],) * 2)
     for lag in range(lags + 1):
-        taper = 1.0 - lag / (lags + 1.0)
-        ahead, behind = centred[lag:], centred[: samples - lag]
+        # Flat over the filter's own correlation, then falling (Politis, Romano, 1995).
+        taper = min(1.0, 2.0 * (1.0 - lag / (lags + 1.0)))
+        ahead, behind = residual[lag:], residual[: samples - lag]
         cross = taper * (behind.T @ ahead) / pairs
         part = np.einsum(
             "sia,ij,sjb->ab", modes[: samples - lag], cross, modes[lag:], optimize=True
         )
         meat += part if lag == 0 else part + part.T
-    meat *= samples * n / max(samples * n - int(np.sum(kept)), 1)
+    meat *= WIDEN**2 * samples * n / max(samples * n - int(np.sum(kept)), 1)
     inverse = 1.0 / values[kept]
     inner = inverse[:, None] * ((meat + meat.T) / 2) * inverse
     # Never surer than independent samples would be.
@@ -194,10 +195,9 @@ def _nearest(
 ) -> Array:
     """The possible parameters nearest to a solution, as the data and the prior measure it."""
     information = np.where(kept, values, 1.0)
-    root = np.sqrt(information)[:, None] * vectors.T
-    aim = root @ z
     if all(len(cone) == 1 and np.count_nonzero(cone) == 1 for _, cone in cones):
-        return _bounded(root, aim, start, scales, cones)
+        root = np.sqrt(information)[:, None] * vectors.T
+        return _bounded(root, root @ z, start, scales, cones)
     try:
         import cvxpy
     except ImportError:
@@ -205,38 +205,37 @@ def _nearest(
             "the data want a mass or an inertia that no body has, and the nearest possible one "
             "needs cvxpy: pip install 'pkm_twin[fit]'"
         ) from None
+    # In deviations from the solution: each counts alike, however much the data know of it.
+    moved = scales[:, None] * vectors / np.sqrt(information)
     unknown = cvxpy.Variable(len(z))
-    physical = start + cvxpy.multiply(scales, unknown)
+    physical = start + scales * z + moved @ unknown
     limits = []
     for where, cone in cones:
-        basis, unit = _facial(cone, scales[where])
+        basis = _reached(cone, scales[where])
         if basis.shape[1] == 1:
             row = np.einsum("ia,ijk,jb->k", basis, cone, basis)
-            limits.append((row / unit) @ physical[where] >= 0.0)
+            limits.append(row @ physical[where] >= 0.0)
             continue
         block = sum(
-            (basis.T @ cone[..., k] @ basis / unit) * physical[where.start + k]
+            (basis.T @ cone[..., k] @ basis) * physical[where.start + k]
             for k in range(cone.shape[-1])
         )
         limits.append((block + block.T) / 2 >> 0)
-    # The largest information stands for one: solvers dislike 1e12.
-    size = float(np.sqrt(information.max()))
-    problem = cvxpy.Problem(
-        cvxpy.Minimize(cvxpy.sum_squares((root / size) @ unknown - aim / size)), limits
-    )
+    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(unknown)), limits)
     problem.solve(solver=cvxpy.CLARABEL)
     if unknown.value is None:
         raise PkmTwinError(f"no possible masses and inertias near the data: {problem.status}")
-    result = start + scales * np.asarray(unknown.value, np.float64)
+    result = start + scales * z + moved @ np.asarray(unknown.value, np.float64)
+    result[np.abs(result) < 1e-9 * scales] = 0.0
     return _inside(result, start, cones)
 
 
-def _facial(cone: Array, scales: Array) -> tuple[Array, float]:
-    """Basis of what the cone's matrices reach: thin bodies have an edge of it; and its size."""
+def _reached(cone: Array, scales: Array) -> Array:
+    """Scaled basis of what the cone's matrices reach, shape (d, r)."""
     reach = np.concatenate([np.abs(cone[..., k] * scales[k]) for k in range(cone.shape[-1])], 1)
     used = reach.max(1) > 0.0
     basis = np.diag(1.0 / np.sqrt(np.where(used, reach.max(1), 1.0)))[:, used]
-    return np.asarray(basis, np.float64), 1.0
+    return np.asarray(basis, np.float64)
 
 
 def _bounded(root: Array, aim: Array, start: Array, scales: Array, cones: Cones) -> Array:

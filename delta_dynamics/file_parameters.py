@@ -66,15 +66,12 @@ class FileParameters:
         return tuple((where, cone) for where, group in pairs for cone in group.cones)
 
 
-def file_parameters(
-    robot: Robot, what: Sequence[Kind] = KINDS, *, per_copy: bool = False
-) -> FileParameters:
+def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameters:
     """The parameters of some kinds.
 
-    :param per_copy: each copy of a limb by itself.
     :raises ParameterError: the robot's file gives no masses.
     """
-    kept = [g for g in robot.shared_parameters(per_copy=per_copy) if g.kind in what]
+    kept = [g for g in robot.shared_parameters() if g.kind in what]
     place = {name: k for k, name in enumerate(parameter_names(robot))}
     tree = robot.engine.tree
     mixing = np.zeros((len(place), sum(len(group.names) for group in kept)))

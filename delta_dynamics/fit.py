@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers of a robot's file from recordings of its motion and efforts.
 
-The last third of every recording is held out: it is judged, not fitted. Two windows of the
-differentiation are fitted; what they differ by counts as uncertainty beside the noise's.
+The last third of every recording is held out: it is judged, not fitted. Efforts may be late
+against positions, by some samples and alike in all joints: a drive that holds its torque for a
+period would else look like friction. How late is fitted beside, for each recording. Two windows of
+the differentiation are fitted; what they differ by counts as uncertainty beside the noise's.
 
 May import: numpy, pkm_twin's core, this package, the standard library.
 """
@@ -36,6 +38,10 @@ STILL: Final = 4.0
 """Deviations of a rate's noise below which a joint stands still."""
 SURE: Final = 0.2
 """A number that is known this much better than before is fitted."""
+STAYS: Final = 1e-3
+"""Change over the deviation before that says nothing."""
+LATE: Final = 2.0
+"""Samples by which efforts may well be late."""
 UNSURE: Final = 0.98
 """One that is known no better than this is not excited."""
 
@@ -106,6 +112,8 @@ class Fit:
     filtering: tuple[Filtering, ...]
     outliers: int
     samples: int
+    delays: tuple[float, ...]
+    """How late the efforts are against the positions, s, by recording."""
 
     def of(self, status: Status) -> tuple[Number, ...]:
         """The numbers of a status."""
@@ -114,9 +122,10 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Filtered rows of one recording: time (k,), table (k, n, parameters), target, judged (k, n).
+    """Filtered rows of one recording: time (k,), table (k, n, parameters), target (k, n).
 
-    ``rest``: what the parameters that stay need.
+    ``rest``: what the parameters that stay need; ``counts``: what is judged; ``change``: of the
+    efforts in time, (k, n) each. ``period``: of the samples, s.
     """
 
     time: Array
@@ -124,12 +133,14 @@ class _Rows:
     target: Array
     rest: Array
     counts: Array
+    change: Array
     outliers: int
+    period: float
 
     def part(self, rows: slice) -> _Rows:
         return _Rows(
             self.time[rows], self.table[rows], self.target[rows], self.rest[rows],
-            self.counts[rows], self.outliers,
+            self.counts[rows], self.change[rows], self.outliers, self.period,
         )  # fmt: skip
 
 
@@ -138,17 +149,15 @@ def fit(
     recordings: Sequence[Recorded],
     what: Sequence[Kind] = KINDS,
     *,
-    per_copy: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Fit:
     """Fit some kinds of numbers of a robot's file.
 
     :param what: of ``friction``, ``rotor``, ``payload``, ``inertia``.
-    :param per_copy: each copy of a limb by itself.
     :param progress: called with the number of recordings that are worked on, twice each.
     :raises PkmTwinError: recordings that are too short, or that show nothing.
     """
-    parameters = file_parameters(robot, what, per_copy=per_copy)
+    parameters = file_parameters(robot, what)
     rows, filtering = [], []
     for i, recording in enumerate(recordings):
         made, how = _rows(robot, parameters, recording, None)
@@ -156,13 +165,13 @@ def fit(
         filtering.append(how)
         if progress is not None:
             progress(2 * i + 1)
-    result = _estimate(parameters, rows)
+    result, delays = _estimate(parameters, rows)
     other = []
     for i, (recording, how) in enumerate(zip(recordings, filtering, strict=True)):
         other.append(_rows(robot, parameters, recording, _next_window(how.window))[0])
         if progress is not None:
             progress(2 * i + 2)
-    again = _estimate(parameters, other)
+    again, _ = _estimate(parameters, other)
     result = _less_sure(result, again.values - result.values)
     numbers = tuple(n for group in _numbers(parameters, result) for n in group)
     if not result.directions or all(n.status == "not excited" for n in numbers):
@@ -177,7 +186,7 @@ def fit(
         judged.append(Judged(recording.name, end.time, end.target + end.rest, before, after))
     return Fit(
         robot, parameters, result, numbers, tuple(judged), tuple(filtering),
-        sum(made.outliers for made in rows), sum(_split(made) for made in rows),
+        sum(made.outliers for made in rows), sum(_split(made) for made in rows), delays,
     )  # fmt: skip
 
 
@@ -213,10 +222,10 @@ def _rows(
     parts = [_piece(robot, parameters, r.carried, track) for track in pieces]
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
-    outliers = _drop_outliers(parts, parameters, how.keep_every)
-    made = [part.filtered(track, how) for part, track in zip(parts, pieces, strict=True)]
-    joined = [np.concatenate([one[k] for one in made]) for k in range(5)]
-    return _Rows(*joined, outliers), how
+    first, outliers = _drop_outliers(parts, parameters, how.keep_every)
+    made = [part.filtered(first, track, how) for part, track in zip(parts, pieces, strict=True)]
+    joined = [np.concatenate([one[k] for one in made]) for k in range(6)]
+    return _Rows(*joined, outliers, pieces[0].period), how
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,19 +238,21 @@ class _Piece:
     moves: Array
     """1 where a joint moves, or where standing still is no matter, shape (k, n)."""
 
-    def filtered(self, track: Track, how: Filtering) -> tuple[Array, ...]:
+    def filtered(self, first: Array, track: Track, how: Filtering) -> tuple[Array, ...]:
+        """Time, table, target, rest, what counts and the efforts' change, all filtered alike."""
         samples = len(self.table)
+        change = np.gradient(self.rest + self.table @ first, track.period, axis=0)
         flat = np.concatenate(
-            [self.table.reshape(samples, -1), self.target, self.rest, self.moves,
+            [self.table.reshape(samples, -1), self.target, self.rest, self.moves, change,
              track.time[:, None]], 1,
         )  # fmt: skip
         smooth = low_pass(flat, track.period, how)
         n = self.target.shape[1]
-        ends = np.cumsum([self.table[0].size, n, n, n])
-        table, target, rest, moves, time = np.split(smooth, ends, 1)
+        ends = np.cumsum([self.table[0].size, n, n, n, n])
+        table, target, rest, moves, change, time = np.split(smooth, ends, 1)
         # Where standing still is in the filter's reach, friction's sign is not known.
         counts = (moves > 0.8).astype(np.float64)
-        return time[:, 0], table.reshape(len(table), n, -1), target, rest, counts
+        return time[:, 0], table.reshape(len(table), n, -1), target, rest, counts, change
 
 
 def _piece(robot: Robot, parameters: FileParameters, carried: Robot | None, track: Track) -> _Piece:
@@ -275,8 +286,13 @@ def _smooth(values: Array) -> Array:
     return np.concatenate([values[:1], inner, values[-1:]])
 
 
-def _drop_outliers(parts: list[_Piece], parameters: FileParameters, every: int) -> int:
-    """Efforts far from a first robust fit take its values; how many, none where they are many."""
+def _drop_outliers(
+    parts: list[_Piece], parameters: FileParameters, every: int
+) -> tuple[Array, int]:
+    """Efforts far from a first robust fit take its values, but not where they are many.
+
+    :returns: that fit's parameters, and how many efforts.
+    """
     table = np.concatenate([part.table[::every] for part in parts])
     target = np.concatenate([part.target[::every] for part in parts])
     scales = _scales(parameters, table, target)
@@ -291,7 +307,7 @@ def _drop_outliers(parts: list[_Piece], parameters: FileParameters, every: int) 
             continue
         part.target[far] = told[far]
         count += int(far.sum())
-    return count
+    return first, count
 
 
 def _scales(parameters: FileParameters, table: Array, target: Array) -> Array:
@@ -311,14 +327,33 @@ def _scales(parameters: FileParameters, table: Array, target: Array) -> Array:
     return scales
 
 
-def _estimate(parameters: FileParameters, rows: Sequence[_Rows]) -> Estimate:
+def _estimate(
+    parameters: FileParameters, rows: Sequence[_Rows]
+) -> tuple[Estimate, tuple[float, ...]]:
+    """Of the parameters, and how late the efforts of each recording are, s."""
     used = [made.part(slice(0, _split(made))) for made in rows]
     table, target, counts = (
         np.concatenate([getattr(made, name) for made in used])
         for name in ("table", "target", "counts")
     )
     scales = _scales(parameters, table, target)
-    return estimate(table, target, parameters.values, scales, parameters.cones, counts)
+    # Late by a delay is less the delay times the change.
+    late = [
+        np.concatenate(
+            [-made.change if i == j else 0.0 * made.change for j, made in enumerate(used)]
+        )
+        for i in range(len(used))
+    ]
+    k = len(scales)
+    found = estimate(
+        np.concatenate([table, np.stack(late, -1)], -1), target,
+        np.append(parameters.values, np.zeros(len(used))),
+        np.append(scales, [LATE * made.period for made in used]), parameters.cones, counts,
+    )  # fmt: skip
+    own = replace(
+        found, values=found.values[:k], covariance=found.covariance[:k, :k], prior=found.prior[:k]
+    )
+    return own, tuple(found.values[k:].tolist())
 
 
 def _less_sure(result: Estimate, change: Array) -> Estimate:
@@ -355,7 +390,7 @@ def _group(group: Shared, result: Estimate, where: slice) -> tuple[Number, ...]:
         status: Status = "combination"
         if share < SURE:
             status = "fitted"
-        elif share > UNSURE:
+        elif share > UNSURE and abs(value - before[key]) <= STAYS * usual:
             status, value = "not excited", before[key]
         numbers.append(Number(key, _unit(group, key), before[key], value, deviation, share, status))
     return tuple(numbers)

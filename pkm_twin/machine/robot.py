@@ -282,17 +282,16 @@ class Robot:
         """
         raise ParameterError("members", None, "a section with the elastic members")
 
-    def shared_inertia(self, *, per_copy: bool = False) -> tuple[Shared, ...]:
+    def shared_inertia(self) -> tuple[Shared, ...]:
         """What the file says of masses, as linear parameters.
 
-        :param per_copy: each copy of a limb by itself, where a file can tell.
         :raises ParameterError: the robot's file gives no masses.
         """
         raise NotImplementedError
 
     # What follows for all.
 
-    def shared_drives(self, *, per_copy: bool = False) -> tuple[Shared, ...]:
+    def shared_drives(self) -> tuple[Shared, ...]:
         """Friction of each actuated joint and the rotors, as linear parameters of the file."""
         graph, friction = self.graph, self.friction
         result = []
@@ -317,7 +316,7 @@ class Robot:
         )  # fmt: skip
         return tuple(result)
 
-    def shared_parameters(self, *, per_copy: bool = False) -> tuple[Shared, ...]:
+    def shared_parameters(self) -> tuple[Shared, ...]:
         """All that a fit of the robot's file may change: drives, payload, bodies and rods.
 
         :raises ParameterError: the robot's file gives no masses.
@@ -328,8 +327,7 @@ class Robot:
         payload = shared_payload(
             self.graph, load.mass, load.com, load.inertia, heavy, 0.3 * graph.size
         )
-        inertia = self.shared_inertia(per_copy=per_copy)
-        return (*self.shared_drives(per_copy=per_copy), payload, *inertia)
+        return (*self.shared_drives(), payload, *self.shared_inertia())
 
     @cached_property
     def graph(self) -> Graph:

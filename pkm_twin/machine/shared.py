@@ -81,6 +81,11 @@ def com_and_inertia(ten: Array, place: Array) -> tuple[Array, Array]:
         return place, np.zeros((3, 3))
     c = ten[1:4] / mass
     inertia = matrix_of(ten) - mass * (c @ c * np.eye(3) - np.outer(c, c))
+    # A solver stops beside the edge of what a body can be: its second moments are not negative.
+    values, vectors = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
+    if values[0] < 0.0:
+        second = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        inertia = np.trace(second) * np.eye(3) - second
     return place + c, inertia
 
 

@@ -349,9 +349,8 @@ class Delta(Robot):
         )
         return Graph(bodies, {**joints, **sliding}, rods, PLATFORM, array(platform))
 
-    def shared_inertia(self, *, per_copy: bool = False) -> tuple[Shared, ...]:
+    def shared_inertia(self) -> tuple[Shared, ...]:
         """One arm, one forearm, one platform; the limbs are alike in this file."""
-        del per_copy
         g, m, graph = self.geometry, self.inertia, self.graph
         reach = g.arm_length
         about = m.arm_mass * reach**2 / 12 if m.arm_inertia is None else m.arm_inertia
@@ -375,8 +374,8 @@ class Delta(Robot):
             mass, first, second = (float(v) for v in new)
             return {
                 ("inertia", "arm_mass"): mass,
-                ("inertia", "arm_com"): first / (mass * reach),
-                ("inertia", "arm_inertia"): second - first**2 / mass,
+                ("inertia", "arm_com"): min(1.0, max(0.0, first / (mass * reach))),
+                ("inertia", "arm_inertia"): max(0.0, second - first**2 / mass),
             }
 
         arm = Shared(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Final
@@ -370,8 +370,8 @@ class Machine(Robot):
         """The pose at home, shape (m,)."""
         return self.engine.home_pose.copy()
 
-    def shared_drives(self, *, per_copy: bool = False) -> tuple[Shared, ...]:
-        """Friction of each joint, and the rotors, one for the copies of a limb or each its own."""
+    def shared_drives(self) -> tuple[Shared, ...]:
+        """Friction of each joint, and the rotors, one for the copies of a limb."""
         graph, friction = self.graph, self.friction
         result: list[Shared] = []
         rotors: dict[Key, list[str]] = {}
@@ -393,32 +393,28 @@ class Machine(Robot):
                     )
                 )  # fmt: skip
             if joint.actuated or joint.rotor_inertia:
-                own = (*source.path, "rotor_inertia", *(tail if per_copy else ()))
-                rotors.setdefault(own, []).append(name)
+                rotors.setdefault(source.path, []).append(name)
         for path, names in rotors.items():
-            first = graph.joints[names[0]]
-            alone = len(names) == 1
-            result.append(
-                shared_number(
-                    "rotor",
-                    f"{names[0] if alone else self.sources['joints', names[0]].name}.rotor_inertia",
-                    drive_units(graph, names[0])["rotor_inertia"], first.rotor_inertia, math.nan,
-                    path, others=[f"{name}.rotor_inertia" for name in names],
-                )
+            first, drive = graph.joints[names[0]], self.specs["joints"][names[0]].drive
+            alone = names[0] if len(names) == 1 else self.sources["joints", names[0]].name
+            tail = ("rotor_inertia",) if drive is None else ("drive", "inertia")
+            one = shared_number(
+                "rotor", f"{alone}.rotor_inertia",
+                drive_units(graph, names[0])["rotor_inertia"], first.rotor_inertia, math.nan,
+                (*path, *tail), others=[f"{name}.rotor_inertia" for name in names],
             )  # fmt: skip
+            if drive is not None and drive.inertia > 0.0:
+                one = dataclasses.replace(one, keys=_behind_gear(one, drive.inertia))
+            result.append(one)
         return tuple(result)
 
-    def shared_inertia(self, *, per_copy: bool = False) -> tuple[Shared, ...]:
-        """Every body with a mass and every rod, one for all copies of a limb or each its own.
-
-        Each its own is told by a file without limbs, see ``parameter_sections``.
-        """
+    def shared_inertia(self) -> tuple[Shared, ...]:
+        """Every body with a mass and every rod, one for all copies of a limb."""
         groups: dict[Key, list[str]] = {}
         for kind, entries in (("bodies", self.graph.bodies), ("rods", self.graph.rods)):
             for name, entry in entries.items():
-                path = (kind, name) if per_copy else self.sources[kind, name].path
                 if entry.mass > 0.0:
-                    groups.setdefault(path, []).append(name)
+                    groups.setdefault(self.sources[kind, name].path, []).append(name)
         return tuple(self._shared_group(path, names) for path, names in groups.items())
 
     def _shared_group(self, path: Key, names: list[str]) -> Shared:
@@ -432,15 +428,11 @@ class Machine(Robot):
                 others=[f"{name}.mass" for name in names],
             )  # fmt: skip
         body = self.graph.bodies[names[0]]
-        shared = len(names) > 1 or first.path == path
-        turned = rotation_about_z(first.azimuth if shared else 0.0).T
+        turned = rotation_about_z(first.azimuth).T
         own = Body(alone, body.mass, array(turned @ body.com), turned @ body.inertia @ turned.T)
         return shared_body(
             alone, own, path,
-            {
-                name: rotation_about_z(self.sources[kind, name].azimuth) if shared else np.eye(3)
-                for name in names
-            },
+            {name: rotation_about_z(self.sources[kind, name].azimuth) for name in names},
             length=self._length_of(names[0]),
         )  # fmt: skip
 
@@ -545,6 +537,12 @@ class Machine(Robot):
             )
         beams = tuple(beam for beam in self.beams if beam.name in sections)
         return Structure(beams, sections, compliances)
+
+
+def _behind_gear(reflected: Shared, rotor: float) -> Callable[[Array], Mapping[Key, float]]:
+    """The rotor's own inertia for the one that is reflected to the joint."""
+    factor = rotor / float(reflected.values[0])
+    return lambda new: {key: factor * v for key, v in reflected.keys(new).items()}
 
 
 def _root(inertia: Array) -> Array:

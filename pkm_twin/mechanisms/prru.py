@@ -321,13 +321,12 @@ class Prru(Robot):
         )
         return Graph(bodies, joints, {}, PLATFORM, origin)
 
-    def shared_inertia(self, *, per_copy: bool = False) -> tuple[Shared, ...]:
+    def shared_inertia(self) -> tuple[Shared, ...]:
         """One slider, one pair of links, the platform; the limbs are alike in this file.
 
         The two links of a limb tell their masses apart by nothing but each other's spin: their
         moments along the limb are one parameter each, as their file's ``link_com`` is one.
         """
-        del per_copy
         m, graph = self.inertia, self.graph
         l = self.geometry.limb_length  # noqa: E741
         sliders, lower, upper = {}, {}, {}
@@ -366,11 +365,11 @@ class Prru(Robot):
 
         def keys(new: Array) -> dict[Key, float]:
             first, second, moment, about, *axial = (float(v) for v in new)
-            rest = about - moment**2 / (first + second)
+            rest = max(about - moment**2 / (first + second), sum(axial) / 2)
             return {
                 ("inertia", "lower_link_mass"): first,
                 ("inertia", "upper_link_mass"): second,
-                ("inertia", "link_com"): moment / ((first + second) * l),
+                ("inertia", "link_com"): min(1.0, max(0.0, moment / ((first + second) * l))),
                 ("inertia", "lower_link_inertia", 0): share * rest,
                 ("inertia", "lower_link_inertia", 1): axial[0],
                 ("inertia", "upper_link_inertia", 0): (1.0 - share) * rest,

@@ -419,12 +419,11 @@ class UprRpu(Robot):
             )  # fmt: skip
         return Graph(bodies, joints, {}, PLATFORM, origin)
 
-    def shared_inertia(self, *, per_copy: bool = False) -> tuple[Shared, ...]:
+    def shared_inertia(self) -> tuple[Shared, ...]:
         """The bars' density and the platform.
 
         :raises ParameterError: the robot's file gives no masses.
         """
-        del per_copy
         graph, inertia = self.massive().graph, self.inertia
         assert inertia is not None  # noqa: S101
         tubes = {

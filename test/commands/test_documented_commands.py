@@ -19,6 +19,7 @@ from test.commands.conftest import DELTA, REPOSITORY, rewrite
 NOT_RUN = {
     r"pkm-twin .*\b(my_delta|converted)\..*": "of a file that the page writes: test/docs runs them",
     r"pkm-twin guard-check.*": "needs ROS and a running node: test/nodes has one",
+    r"pkm-twin view .*": "serves until a signal: test/view runs it in a browser",
     r"pkm-twin play .*": "needs ROS: test_player runs it over the real middleware",
     r"pkm-twin atlas .* --scheduler .*": "needs a Dask cluster: test/atlas/test_run.py has one",
     r"pkm-twin atlas \w+ [\w-]+( --wrench \w+)?( --html)?( --out \S+)?( --html)?": "minutes: the "
