@@ -145,9 +145,7 @@ class _Fit:
         for block in range(self._blocks - 1, 0, -1):
             last = end - block * BLOCK
             part = slice(last - BLOCK, last), slice((last - BLOCK) * n, last * n)
-            (sums,), _ = self._sums(
-                _NONE, sums, stamps[part[0]], values[part[1]], weights, place
-            )
+            (sums,), _ = self._sums(_NONE, sums, stamps[part[0]], values[part[1]], weights, place)
             weights = self._all
         first = end - BLOCK
         inputs = sums, stamps[first:end], values[first * n : end * n], weights, place
