@@ -16,6 +16,7 @@ import typer
 from pkm_twin.apps.verdict import Item, Verdict, items_table
 from pkm_twin.console import print_json, table_console
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.ros.context import own_node
 from pkm_twin.ros.messages import stamp_of
 from pkm_twin.ros.signals import first_signal
 from pkm_twin.streams.arrivals import SECOND, Arrivals
@@ -160,21 +161,10 @@ def watch(
 @contextmanager
 def _node(sim_time: bool) -> Iterator[tuple[Any, Any]]:
     """A node, and a function that lets it take messages for some time, s."""
-    try:
-        import rclpy
+    with own_node("guard_check", "guard-check", sim_time=sim_time) as node:
         from rclpy.executors import SingleThreadedExecutor
-        from rclpy.parameter import Parameter
-        from rclpy.signals import SignalHandlerOptions
-    except ImportError as error:
-        raise PkmTwinError(
-            f"guard-check needs ROS 2: source its setup, or pip install pkm_twin[jazzy] ({error})"
-        ) from error
-    context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        clock = Parameter("use_sim_time", value=sim_time)
-        node = rclpy.create_node("guard_check", context=context, parameter_overrides=[clock])
-        executor = SingleThreadedExecutor(context=context)
+
+        executor = SingleThreadedExecutor(context=node.context)
         executor.add_node(node)
 
         def spin(seconds: float) -> None:
@@ -184,9 +174,6 @@ def _node(sim_time: bool) -> Iterator[tuple[Any, Any]]:
 
         yield node, spin
         executor.shutdown()
-        node.destroy_node()
-    finally:
-        context.try_shutdown()
 
 
 def _subscribe(node: Any, topic: str, take: Any) -> bool:
