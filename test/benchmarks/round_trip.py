@@ -73,7 +73,8 @@ class Client:
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
         self.publishers = {}
-        self.count, self.answered = dict.fromkeys(names, 0), dict.fromkeys(names)
+        self.sent, self.count = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
+        self.answered = dict.fromkeys(names)
         self.names = list(load("delta_cu").joint_names)
         for name in names:
             topic = f"/{name}/joint_states"
@@ -101,8 +102,10 @@ class Client:
             assert time.monotonic() < deadline, f"{name} did not come up"
             self.executor.spin_once(timeout_sec=0.1)
 
-    def send(self, name, phase):
-        """A joint state of now; its stamp."""
+    def send(self, name):
+        """The next joint state of an even motion, now; its stamp."""
+        phase = 2.0 * self.sent[name] * PERIOD
+        self.sent[name] += 1
         now = self.node.get_clock().now().to_msg()
         message = self.kind(name=self.names)
         message.header.stamp = now
@@ -120,7 +123,7 @@ class Client:
         for i in range(count):
             time.sleep(max(0.0, begin + i * PERIOD - time.perf_counter()))
             sent = time.perf_counter()
-            stamp = self.send(name, 2.0 * i * PERIOD)
+            stamp = self.send(name)
             while self.answered[name] != stamp and time.perf_counter() - sent < PATIENCE:
                 self.executor.spin_once(timeout_sec=PATIENCE / 4)
             if self.answered[name] == stamp:
@@ -137,7 +140,7 @@ class Client:
             due = begin + i * PERIOD
             while (left := due - time.perf_counter()) > 0:
                 self.executor.spin_once(timeout_sec=left)
-            stamp = self.send(name, 2.0 * i * PERIOD)
+            stamp = self.send(name)
         end = time.perf_counter() + 10.0
         while self.answered[name] != stamp and time.perf_counter() < end:
             self.executor.spin_once(timeout_sec=0.1)
@@ -145,10 +148,8 @@ class Client:
 
     def first_answer(self, name, begin):
         """Seconds from ``begin`` (perf_counter) to the first answer of a stream that runs."""
-        i = 0
         while self.answered[name] is None:
             assert time.perf_counter() - begin < 120, f"{name} does not answer"
-            self.send(name, 2.0 * i * PERIOD)
-            i += 1
+            self.send(name)
             self.executor.spin_once(timeout_sec=PERIOD)
         return time.perf_counter() - begin
