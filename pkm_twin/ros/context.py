@@ -14,17 +14,20 @@ from pkm_twin.errors import PkmTwinError
 
 
 @contextmanager
-def own_node(name: str, needs: str, *, sim_time: bool = False) -> Iterator[Any]:
+def own_node(
+    name: str, needs: str, *, sim_time: bool = False, namespace: str = ""
+) -> Iterator[Any]:
     """A node in a context of its own, which leaves signals alone; both end with the block.
 
     It has no parameter services.
 
     :param needs: what needs it, for the refusal.
     :param sim_time: its clock is that of ``/clock``.
-    :raises PkmTwinError: there is no ROS here.
+    :raises PkmTwinError: there is no ROS here, or the namespace is none.
     """
     try:
         import rclpy
+        from rclpy.exceptions import InvalidNamespaceException
         from rclpy.node import Node
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
@@ -37,9 +40,14 @@ def own_node(name: str, needs: str, *, sim_time: bool = False) -> Iterator[Any]:
     node = None
     try:
         clock = Parameter("use_sim_time", value=sim_time)
-        node = Node(
-            name, context=context, parameter_overrides=[clock], start_parameter_services=False
-        )
+        try:
+            node = Node(
+                name, context=context, namespace=namespace, parameter_overrides=[clock],
+                start_parameter_services=False,
+            )  # fmt: skip
+        except InvalidNamespaceException as error:
+            first = str(error).splitlines()[0]
+            raise PkmTwinError(f"--namespace {namespace!r} is no namespace: {first}") from None
         yield node
     finally:
         if node is not None:

@@ -42,6 +42,7 @@ COLUMNS: Final = {
     "positions": "position",
     "velocities": "velocity",
     "accelerations": "acceleration",
+    "effort": "effort",
 }
 """What a trajectory's point may carry that is read here, and the name of one such value."""
 
@@ -167,6 +168,8 @@ class Trajectory:
     qd: Array | None
     qdd: Array | None
     columns: tuple[int, ...]
+    effort: Array | None = None
+    """Shape (p, n), N m or N, where the reader takes efforts and every point has them."""
 
 
 @dataclass
@@ -176,11 +179,13 @@ class JointReader:
     ``limited``: positions and velocities beyond the robot's limits are refused, else only those
     beyond all machines. ``extra_joints``: a trajectory's joints that the model lacks, such as a
     Delta's telescopic fourth axis: ``refuse`` the trajectory, or answer them with effort ``zero``.
+    ``with_effort``: a trajectory's efforts are read too, else whatever it brings is left alone.
     """
 
     robot: Robot
     limited: bool = True
     extra_joints: ExtraJoints = "refuse"
+    with_effort: bool = False
     _known: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -283,6 +288,7 @@ class JointReader:
             self._columns("velocities", fields, index, self._velocity),
             self._columns("accelerations", fields, index, self._acceleration),
             tuple(self._names.index(n) if n in self._names else -1 for n in names),
+            self._columns("effort", fields, index, self._effort) if self.with_effort else None,
         )
 
     def check_derived(self, qd: Array, qdd: Array) -> None:

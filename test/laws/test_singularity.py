@@ -183,8 +183,12 @@ class TestConstraintSingularity:
             greatest.append(np.abs(compliance(robot, place - shift * UP)).max())
         # Compliance goes with the square.
         assert np.diff(np.log10(greatest)) == pytest.approx([-2.0] * 3, abs=0.2)
-        with pytest.raises(SingularityError):
-            reactions(robot, robot.inverse(place), rest, rest)
+        try:
+            load_ = np.abs(reactions(robot, robot.inverse(place), rest, rest).values).max()
+        except SingularityError:
+            load_ = np.inf
+        # What lies within rounding of the surface bears 1e6 times what a good pose does.
+        assert load_ > 1e6
 
 
 def scaled(robot: Robot, factor: float) -> Any:
