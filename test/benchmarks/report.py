@@ -8,8 +8,7 @@ from pathlib import Path
 TARGETS = """
 Targets: one torque sample at most 2 us, 0.15 us a sample in a batch, one strain energy at most
 25 us, the node's p50 within 1.25 of the echo's. Missed are the first two, and the last: checking a
-message, its singularities and jumps, the fit and the torque are about 50 us of Python beside the
-echo's work.
+message, its singularities and jumps, the fit and the torque are work that the echo has not.
 """
 
 
