@@ -75,7 +75,7 @@ MAX_TEXT: Final = 500
 MAX_TASKS: Final = 10
 """How much work may wait beside the callbacks."""
 
-SELDOM_PERIOD: Final = 0.05
+SELDOM_PERIOD: Final = 0.1
 SELDOM_TURNS: Final = 3
 """How often requests and events are looked for, s, and how many at a time at least."""
 LOOK: Final = 0.5
