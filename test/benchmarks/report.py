@@ -50,7 +50,8 @@ def main(source, target):
     for start in told.get("first answer", []):
         seconds = start["seconds"]
         lines.append(
-            f"- From the start of the process to the first torque of a running stream, caches warm: "
+            "- From the start of the process to the first torque of a running stream, caches "
+            "warm: "
             f"{statistics.median(seconds):.2f} s (median of {len(seconds)}, worst "
             f"{max(seconds):.2f})."
         )
