@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, cast
+from operator import gt
+from typing import Any, Final, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,8 +81,7 @@ class Settings:
         )
 
 
-@dataclass(frozen=True)
-class Torques:
+class Torques(NamedTuple):
     """Efforts for one joint state; ``residual`` is measured minus predicted, None if unmeasured.
 
     ``wrench``: the one that they bear, base axes at the platform's reference point, shape (6,).
@@ -399,20 +399,19 @@ def _gate(robot: Robot, policy: LimitPolicy, effort: Array) -> tuple[Array, bool
     """
     _require_finite(effort)
     limits = robot.limits.effort
-    saturated = limits is not None and _beyond(effort, limits)
-    if limits is not None and saturated:
-        if policy == "reject":
-            worst = np.unravel_index(np.argmax(np.abs(effort) / limits), effort.shape)
-            joint = int(worst[-1])
-            raise MessageError(
-                "effort limit",
-                f"effort of {robot.joint_names[joint]} is {effort[worst]:g}, "
-                f"allowed {limits[joint]:g}",
-            )
-        if policy == "clamp":
-            effort = np.clip(effort, -limits, limits)
-    _require_finite(effort)
-    return effort, saturated
+    if limits is None or not _beyond(effort, limits):
+        return effort, False
+    if policy == "reject":
+        worst = np.unravel_index(np.argmax(np.abs(effort) / limits), effort.shape)
+        joint = int(worst[-1])
+        raise MessageError(
+            "effort limit",
+            f"effort of {robot.joint_names[joint]} is {effort[worst]:g}, allowed {limits[joint]:g}",
+        )
+    if policy == "clamp":
+        effort = np.clip(effort, -limits, limits)
+        _require_finite(effort)
+    return effort, True
 
 
 def _require_finite(effort: Array) -> None:
@@ -424,8 +423,7 @@ def _require_finite(effort: Array) -> None:
 def _beyond(effort: Array, limits: Array) -> bool:
     """Whether an effort passes its limit; one sample, the stream's case, without numpy."""
     if effort.ndim == 1:
-        pairs = zip(effort.tolist(), limits.tolist(), strict=True)
-        return any(abs(value) > limit for value, limit in pairs)
+        return any(map(gt, map(abs, effort.tolist()), limits.tolist()))
     return bool((np.abs(effort) > limits).any())
 
 

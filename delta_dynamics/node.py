@@ -39,6 +39,7 @@ CHANGES = {
     "payload.inertia": ("payload", "inertia"),
     "friction.viscous": ("friction", "viscous"),
     "friction.coulomb": ("friction", "coulomb"),
+    "friction.offset": ("friction", "offset"),
     "gravity": ("gravity", ""),
     "effort_limits": ("limits", "effort"),
 }
@@ -49,6 +50,7 @@ UNITS = {
     "payload.inertia": "kg m2 about the com, 3 or 9 numbers",
     "friction.viscous": "N m s or N s/m, one a joint",
     "friction.coulomb": "N m or N, one a joint",
+    "friction.offset": "N m or N, one a joint",
     "gravity": "m/s2",
     "effort_limits": "N m or N, one a joint",
 }
@@ -413,7 +415,8 @@ class DeltaDynamics(health.TwinNode):
     def _on_joint_state(self, data: bytes) -> None:
         core = self._feedforward
         self._last_heard = time.monotonic_ns()
-        with self._telling_stop():
+        running = not core.stream.stopped
+        try:
             try:
                 message = self._decode(data)
             except MessageError as error:
@@ -424,10 +427,10 @@ class DeltaDynamics(health.TwinNode):
                 return
             # The process may have stood still since.
             core.check_age(torques, self.now())
-        header = message.header.stamp
-        stamp = header.sec, header.nanosec
-        if core.settings.accept_zero_stamp:
-            stamp = divmod(torques.stamp, SECOND)
+        finally:
+            if running and core.stream.stopped:
+                self._send_stop()
+        stamp = divmod(torques.stamp, SECOND)
         self._torques.publish(self._effort_message.fill(core.sent(torques.effort), stamp))
         if torques.residual is not None:
             self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))

@@ -43,6 +43,7 @@ def node(request, peer, launch):
         # The robot in whose file the masses are.
         "stiffness_monitor": ("mechanism:=delta_cu",),
         "machine_state": (),
+        "machine_sim": (),
     }
     process = launch(MODULES[name], *options[name])
 
@@ -50,8 +51,8 @@ def node(request, peer, launch):
         assert process.alive(), process.output
         return (name, "/") in peer.node.get_node_names_and_namespaces()
 
-    peer.until(found, 90.0)
-    peer.until(lambda: "joints" in process.output, 90.0)
+    peer.until(found)
+    peer.until(lambda: "joints" in process.output)
     return name
 
 
