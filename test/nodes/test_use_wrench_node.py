@@ -36,7 +36,7 @@ def test_torque_residual_and_stop(peer, launch):
         peer.hear(JointState, f"/bearing/{topic}")
     peer.talk(JointState, "/bearing/states")
     peer.talk(WrenchStamped, "/bearing/wrench")
-    peer.until(peer.matched, 90.0)
+    peer.until(peer.matched)
     torques, residuals = (
         peer.received(f"/bearing/{name}") for name in ("joint_torques", "torque_residual")
     )
@@ -57,7 +57,7 @@ def test_torque_residual_and_stop(peer, launch):
     def borne():
         return torques and residuals and np.allclose(torques[-1].effort, exact, atol=1e-6)
 
-    peer.until(borne, 90.0, send)
+    peer.until(borne, repeat=send)
     same = {stamp_of(m): m for m in torques}
     residual = next(m for m in reversed(residuals) if stamp_of(m) in same)
     assert np.allclose(residual.effort, MEASURED - np.array(same[stamp_of(residual)].effort))
@@ -66,7 +66,7 @@ def test_torque_residual_and_stop(peer, launch):
         array = peer.diagnostics("/bearing")
         return array if "no wrench" in array.status[0].message else None
 
-    array = peer.until(stopped, 90.0, lambda: send(wrench=False))
+    array = peer.until(stopped, repeat=lambda: send(wrench=False))
     assert array.status[0].level == b"\x02"
     assert counts_of(array, "stopped")["no wrench"] >= 1
     assert int(values_of(array)["wrenches taken"]) > 3
@@ -76,4 +76,4 @@ def test_torque_residual_and_stop(peer, launch):
         lambda: counts_of(peer.diagnostics("/bearing"), "wrenches rejected").get("future stamp")
     )
     torques.clear()
-    peer.until(lambda: torques, 90.0, send)
+    peer.until(lambda: torques, repeat=send)
