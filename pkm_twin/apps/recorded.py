@@ -33,6 +33,7 @@ TWIN_OUTPUTS: Final = (
     "torque_residual",
     "reactions",
     "machine_state",
+    "commands_stamped",
     "compliance_stamped",
     "strain_energy_stamped",
     "natural_frequencies_stamped",
