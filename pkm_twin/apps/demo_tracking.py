@@ -26,6 +26,7 @@ from pkm_twin.apps.demo_recorder import (
     STATE,
     TRAJECTORY,
     Recorder,
+    drain,
     process,
     wait_for,
 )
@@ -64,6 +65,8 @@ def run(
     command = [sys.executable, "-m"]
     # Played faster than the wall's time: nobody is pushed by a late torque here.
     twin = [*command, "delta_dynamics.node", "--ros-args", "-r", f"{TWIN}_ff:={INPUT}"]
+    # Trajectories alone are asked of it.
+    twin += ["-r", "joint_states:=/delta_dynamics/joint_states"]
     twin += ["-p", f"mechanism:={ROBOT}", "-p", "use_sim_time:=true"]
     machine = [*command, "delta_dynamics.sim_node", "--ros-args", "-p", f"mechanism:={ROBOT}"]
     machine += ["-p", "clock:=simulated", "-p", f"real_time_factor:={FACTOR}"]
@@ -85,6 +88,8 @@ def run(
                 "the path's end",
                 first,
             )
+    # What the recorder has not taken yet.
+    drain(executor, recorder)
     recorder.stop()
     node.destroy_subscription(states)
     node.destroy_client(reset)
