@@ -28,7 +28,7 @@ PERIOD = 1e-3
 
 @dataclass(frozen=True)
 class Run:
-    """One way along the path of a duration, s: times (s), errors (rad) and the drives' efforts (N m), (p, n)."""
+    """One way along the path: its duration and times, s; errors (rad) and efforts (N m), (p, n)."""
 
     duration: float
     time: Array
