@@ -25,6 +25,7 @@ setup(
         "pkm_twin.machine",
         "pkm_twin.mechanisms",
         "pkm_twin.ros",
+        "pkm_twin.state",
         "pkm_twin.streams",
         "delta_dynamics",
         "stiffness_monitor",
@@ -43,6 +44,7 @@ setup(
         (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
         (f"share/{NAME}/examples", sorted(glob("examples/*.py") + glob("examples/*.md"))),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py") + glob("launch/*.yaml"))),
+        (f"share/{NAME}/view", sorted(glob("launch/view/*"))),
     ],
     install_requires=[
         "matplotlib>=3.6",
@@ -107,6 +109,7 @@ setup(
             "delta_dynamics = pkm_twin.apps.nodes:delta_dynamics",
             "command_gate = pkm_twin.apps.nodes:command_gate",
             "stiffness_monitor = pkm_twin.apps.nodes:stiffness_monitor",
+            "machine_state = pkm_twin.apps.nodes:machine_state",
             "machine_sim = pkm_twin.apps.nodes:machine_sim",
             "pkm-twin = pkm_twin.apps.cli:main",
         ],

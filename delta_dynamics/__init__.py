@@ -13,6 +13,7 @@ from delta_dynamics.isotropy import (
     spread,
     tilted_pose,
 )
+from delta_dynamics.observer import MomentumObserver, platform_wrench
 from delta_dynamics.reactions import Reactions, least_norm_reactions, reactions
 from delta_dynamics.terms import Terms, dynamics_terms
 from delta_dynamics.virtual_work import (
@@ -28,6 +29,7 @@ __all__ = [
     "Energy",
     "Extremes",
     "JointMotion",
+    "MomentumObserver",
     "Reactions",
     "Terms",
     "dynamics_terms",
@@ -42,6 +44,7 @@ __all__ = [
     "mass_matrix",
     "max_driving_force",
     "max_driving_force_range",
+    "platform_wrench",
     "reactions",
     "sphere_directions",
     "spread",

@@ -22,6 +22,7 @@ MAY = {
     "pkm_twin.mechanisms": CORE,
     "pkm_twin.kinematics": CORE,
     "pkm_twin.streams": CORE | MESSAGES,
+    "pkm_twin.state": CORE | MESSAGES | {"pkm_twin.streams"},
     "delta_dynamics": CORE | MESSAGES | {"pkm_twin.streams"},
     "stiffness_monitor": CORE | MESSAGES | {"pkm_twin.streams"},
 }
@@ -32,6 +33,7 @@ NODES = {
     "delta_dynamics.gate_node",
     "delta_dynamics.sim_node",
     "stiffness_monitor.node",
+    "pkm_twin.state.node",
 }
 APPS_WITH_ROS = {
     "pkm_twin.apps.demo",

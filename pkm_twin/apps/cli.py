@@ -13,6 +13,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.apps.calibrate import calibrate_command
 from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.apps.options import (
     BagPath,
@@ -496,6 +497,7 @@ def certify(
 
 
 app.add_typer(atlases.app, name="atlas")
+app.command("calibrate")(calibrate_command)
 app.command()(guard_check)
 app.command()(atlases.show)
 

@@ -35,8 +35,6 @@ Mask = NDArray[np.bool_]
 RAYS: Final = 360
 REFINEMENTS: Final = 32
 BLOCK: Final = 16
-SPARSE: Final = 4
-"""Every how many rays and rungs the distance to a singularity is looked at."""
 JOINT_STATES: Final = 2**14
 """Joint states, evenly spread between the limits, whose poses bound a workspace."""
 CLIMBERS: Final = 32
@@ -201,19 +199,14 @@ def circles(
     step = largest_distance(robot) / steps
 
     def inside(height: float, distance: Array, azimuth: Array) -> Mask:
-        return reachable(robot, grid.polar_pose(height, distance, azimuth), least_clearance)
-
-    def clear(height: float, distance: Array, azimuth: Array) -> Mask:
         poses = grid.polar_pose(height, distance, azimuth)
-        return np.asarray(singularity_at(robot, poses) >= max(least, CLEAR))
+        kept = reachable(robot, poses, least_clearance)
+        kept[kept] = singularity_at(robot, poses[kept]) >= max(least, CLEAR)
+        return kept
 
     radius = np.zeros(len(z))
     for k, height in enumerate(z.tolist()):
-        reach = _free(functools.partial(inside, height), turn, step, steps)
-        # The measure changes slowly, so fewer rays and rungs tell where it is too small.
-        rungs = math.ceil(reach / step / SPARSE)
-        test = functools.partial(clear, height)
-        radius[k] = min(reach, _free(test, turn[::SPARSE], reach / max(rungs, 1), rungs))
+        radius[k] = _free(functools.partial(inside, height), turn, step, steps)
     return Reach(z, radius)
 
 

@@ -12,7 +12,8 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from operator import le
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,8 +89,7 @@ _MODEL: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
 """What makes the model's numbers of a controller's."""
 
 
-@dataclass(frozen=True)
-class JointSample:
+class JointSample(NamedTuple):
     """One joint state in the robot's joint order; None where the message carries nothing."""
 
     stamp: int
@@ -295,10 +295,8 @@ class JointReader:
         """Differentiated rates and accelerations keep the bounds of measured ones, (..., n)."""
         if qd.ndim == 1:
             # A stream's sample, without numpy.
-            rates = zip(qd.tolist(), self.highest_velocity, strict=True)
-            if all(abs(v) <= high for v, high in rates) and all(
-                abs(a) <= MAX_ACCELERATION for a in qdd.tolist()
-            ):
+            rates, seconds = map(abs, qd.tolist()), map(abs, qdd.tolist())
+            if all(map(le, rates, self.highest_velocity)) and max(seconds) <= MAX_ACCELERATION:
                 return
         for what, values, high in (
             ("velocity", qd, self._highest_velocity),
@@ -346,7 +344,7 @@ class JointReader:
             return None
         if len(values) != count:
             raise MessageError("length", f"{what}: {len(values)} values for {count} names")
-        picked = [float(values[i]) for i in index]
+        picked = [values[i] for i in index]
         if self._map is not None:
             picked = _MODEL[what](self._map, np.array(picked)).tolist()
         for i, (value, (low, high)) in enumerate(zip(picked, bounds, strict=True)):

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 LIMITED = 0.7
 """Part of the joint range that random states are drawn from."""
-CLEAR = 0.2
+CLEAR = 0.1
 """Least singularity measure of random states: nearer to one, no tolerance is the law's own."""
 FREE = {"viscous": 0.0, "coulomb": 0.0}
 """Friction section without friction."""
@@ -91,9 +91,8 @@ def random_joints(
     kept = np.empty((0, len(middle)))
     for _ in range(100):
         drawn = rng.uniform(middle - half, middle + half, (max(count, 1), len(middle)))
-        rates, good = robot.try_jacobian(drawn)
-        good[good] = robot.singularity_of(rates[good]) > clear
-        kept = np.concatenate([kept, drawn[good]])
+        measure, good = robot.try_singularity(drawn)
+        kept = np.concatenate([kept, drawn[good & (measure > clear)]])
         if len(kept) >= count:
             return kept[:count]
     raise AssertionError(f"{robot.name}: of 100 draws {len(kept)} joint states can be assembled")
