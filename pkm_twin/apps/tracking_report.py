@@ -97,18 +97,22 @@ def _runs(recording: Path, name: str) -> tuple[Run, Run]:
     messages = read_messages(recording, [f"/{name}/joint_states"])
     states = {stamp_of(m.message.header): m.message for m in messages}
     stamps = np.array(sorted(states))
+    moving = np.array([any(states[stamp].velocity) for stamp in stamps.tolist()])
+    # A trajectory begins with the last joint state that stands still.
+    starts = stamps[:-1][~moving[:-1] & moving[1:]]
+    topic = f"/{name}/machine_sim/joint_trajectory"
+    trajectories = [reader.trajectory(m.message, 0) for m in read_messages(recording, [topic])]
     found: dict[bool, Run] = {}
-    for record in read_messages(recording, [f"/{name}/machine_sim/joint_trajectory"]):
-        trajectory = reader.trajectory(record.message, 0)
+    for trajectory, start in zip(trajectories, starts.tolist(), strict=False):
         path = JointPath(trajectory)
-        end = trajectory.stamp + round(path.duration * SECOND)
-        during = stamps[(stamps > trajectory.stamp) & (stamps <= end)].tolist()
+        end = start + round(path.duration * SECOND)
+        during = stamps[(stamps > start) & (stamps <= end)].tolist()
         # In the machine's order of joints, the robot's.
         q = np.array([states[s].position for s in during])
-        times = (np.array(during) - trajectory.stamp) / SECOND
+        times = (np.array(during) - start) / SECOND
         wanted = np.array([path.at(t).q for t in times.tolist()])
         effort = np.array([states[s].effort for s in during])
         found[trajectory.effort is not None] = Run(path.duration, times, q - wanted, effort)
-    if len(found) != 2 or not all(len(run.time) for run in found.values()):
+    if len(found) != 2 or len(starts) != 2:
         raise BagError(f"{name}: {len(found)} of two runs were recorded", path=recording)
     return found[False], found[True]
