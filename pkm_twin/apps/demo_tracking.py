@@ -29,13 +29,10 @@ from pkm_twin.apps.demo_recorder import (
     process,
     wait_for,
 )
-from pkm_twin.apps.tracking_report import prefix
+from pkm_twin.apps.tracking_report import PERIOD, ROBOT, prefix
 from pkm_twin.ros.messages import SECOND, stamp_of
 
 SPREADS: Final = (0.01, 0.2)
-ROBOT: Final = "delta_cu"
-FACTOR: Final = 2.0
-"""Of simulated time: two seconds in one."""
 AMPLITUDES: Final = (0.5, -0.4, 0.6)
 """How far the joints go and come back, rad."""
 DURATION: Final = 0.8
@@ -73,7 +70,7 @@ def run(
     node = executor.get_nodes()[0]
     recorder.listen(prefix(spread), {"/joint_states": STATE, INPUT: TRAJECTORY})
     watch = _Watch()
-    states = node.create_subscription(JointState, "/joint_states", watch.take, 2000)
+    states = node.create_subscription(JointState, "/joint_states", watch.take, 10)
     depth = QoSProfile(depth=1)
     topics = {t: node.create_publisher(JointTrajectory, t, depth) for t in (INPUT, TWIN)}
     reset = node.create_client(Trigger, "/machine_sim/reset")
@@ -82,7 +79,7 @@ def run(
     twin = [*module, "delta_dynamics.node", "--ros-args", "-r", f"{TWIN}_ff:={INPUT}"]
     twin += ["-r", "joint_states:=/delta_dynamics/joint_states", "-p", f"mechanism:={ROBOT}"]
     machine = [*module, "delta_dynamics.sim_node", "--ros-args", "-p", f"mechanism:={ROBOT}"]
-    machine += ["-p", "clock:=simulated", "-p", f"real_time_factor:={FACTOR}"]
+    machine += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
     # A loaded computer catches up in bursts.
     machine += ["-p", f"spread:={spread}", "-p", f"{QUEUE}:=2000"]
     console.print(f"machine_sim at {100 * spread:g} % spread: PD, then with feedforward")

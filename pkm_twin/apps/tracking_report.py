@@ -22,8 +22,8 @@ Array = NDArray[np.float64]
 TIMES_BETTER = 5.0
 """How much smaller feedforward has to make the tracking error at the smallest spread."""
 ROBOT = "delta_cu"
-PERIOD = 1e-3
-"""Of the machine's joint states, s."""
+PERIOD = 2e-3
+"""Of the machine's joint states, s: what a loaded computer can still record."""
 
 
 @dataclass(frozen=True)
