@@ -39,6 +39,7 @@ CHANGES = {
     "payload.inertia": ("payload", "inertia"),
     "friction.viscous": ("friction", "viscous"),
     "friction.coulomb": ("friction", "coulomb"),
+    "friction.offset": ("friction", "offset"),
     "gravity": ("gravity", ""),
     "effort_limits": ("limits", "effort"),
 }
@@ -49,6 +50,7 @@ UNITS = {
     "payload.inertia": "kg m2 about the com, 3 or 9 numbers",
     "friction.viscous": "N m s or N s/m, one a joint",
     "friction.coulomb": "N m or N, one a joint",
+    "friction.offset": "N m or N, one a joint",
     "gravity": "m/s2",
     "effort_limits": "N m or N, one a joint",
 }

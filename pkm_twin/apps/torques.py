@@ -36,6 +36,8 @@ ENDINGS = (".csv", ".parquet")
 WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
+SHORTEST_STEP = 1e-9
+"""Between two of its times, s: what a bag's stamps resolve."""
 
 
 @dataclass(frozen=True)
@@ -127,23 +129,32 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
         needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
         raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
     time = columns["time"]
-    if not (np.diff(time) > 0).all():
-        raise ParameterError(f"{path}: time", "not rising", "strictly rising times")
+    if not (np.diff(time) >= SHORTEST_STEP).all():
+        raise ParameterError(
+            f"{path}: time", "not rising", f"rising times, {SHORTEST_STEP:g} s or more apart"
+        )
     qd, qdd = stack("velocity"), stack("acceleration")
     if (qd is None or qdd is None) and len(time) < 3:
         raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
-    rates = np.gradient(q, time, axis=0, edge_order=2) if qd is None else qd
+    rates = _differentiated(q, time) if qd is None else qd
     wrench = [columns.get(name, np.zeros(len(time))) for name in WRENCH_AXES]
     return Motion(
         machine,
         time,
         q,
         rates,
-        np.gradient(rates, time, axis=0, edge_order=2) if qdd is None else qdd,
+        _differentiated(rates, time) if qdd is None else qdd,
         np.stack(wrench, -1),
         load=carried,
         notes=() if carried is None else (f"payload: {carried}",),
     )
+
+
+def _differentiated(values: Array, time: Array) -> Array:
+    """Second-order differences on uneven times, shape (samples, n)."""
+    # What overflows is not finite, which the model refuses in one line.
+    with np.errstate(all="ignore"):
+        return np.gradient(values, time, axis=0, edge_order=2)
 
 
 def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str, Array]:

@@ -17,7 +17,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import qmc  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import (
@@ -115,6 +114,9 @@ def _from_joints(robot: Robot) -> Array:
     count = len(robot.joint_names)
     if limits is None or not np.isfinite(limits).all():
         return np.empty((0, len(robot.pose_names)))
+    # Not above: every process of a sweep would load it, which takes longer than many sweeps.
+    from scipy.stats import qmc  # type: ignore[import-untyped]
+
     # Extremes are mostly where joints are at a limit or in the middle.
     corners = np.stack(np.meshgrid(*[[0.0, 0.5, 1.0]] * count, indexing="ij"), -1)
     inner = qmc.Halton(count, scramble=False).random(JOINT_STATES)

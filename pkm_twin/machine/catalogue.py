@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
@@ -62,6 +63,15 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
         raise ParameterError("platform", platform, "none: the file names its own platform")
     else:
         data = schema.read_yaml(path)
+    return robot_of_data(data, path.stem)
+
+
+def robot_of_data(data: Mapping[str, Any], name: str) -> Robot:
+    """A robot of what a parameter file says.
+
+    :raises UnknownNameError: no such mechanism; the closest one is named.
+    :raises ParameterError: a key, type or value that is refused, by its dotted name.
+    """
     mechanism = data.get("mechanism")
     if mechanism is None:
         raise ParameterError("mechanism", None, f"one of {', '.join(sorted(CATALOGUE))}")
@@ -69,4 +79,4 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
         raise UnknownNameError("mechanism", mechanism, CATALOGUE)
     module, kind = CATALOGUE[mechanism].split(":")
     made: type[Robot] = getattr(importlib.import_module(module), kind)
-    return made.from_data(data, path.stem)
+    return made.from_data(data, name)

@@ -36,6 +36,7 @@ from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import position_box
+from pkm_twin.machine.shared import Shared, drive_units, shared_number, shared_payload
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -89,10 +90,16 @@ def check_angles(angle: float, path: str) -> None:
 
 @remembered
 def friction_of(joints: int) -> Any:
-    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
-    field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
+    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign.
+
+    ``offset``: what the drive needs beside, whatever the motion.
+    """
+    field: dict[str, Any] = {"spread": True, "default": [0.0] * joints}
     units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
-    entries = [(n, Array, schema.vector(joints, unit=u, **field)) for n, u in units.items()]
+    entries = [
+        (n, Array, schema.vector(joints, unit=u, at_least=0.0, **field)) for n, u in units.items()
+    ]
+    entries.append(("offset", Array, schema.vector(joints, unit="{effort}", **field)))
     return _section("Friction", entries, joints)
 
 
@@ -275,7 +282,52 @@ class Robot:
         """
         raise ParameterError("members", None, "a section with the elastic members")
 
+    def shared_inertia(self) -> tuple[Shared, ...]:
+        """What the file says of masses, as linear parameters.
+
+        :raises ParameterError: the robot's file gives no masses.
+        """
+        raise NotImplementedError
+
     # What follows for all.
+
+    def shared_drives(self) -> tuple[Shared, ...]:
+        """Friction of each actuated joint and the rotors, as linear parameters of the file."""
+        graph, friction = self.graph, self.friction
+        result = []
+        for k, joint in enumerate(graph.actuated):
+            units = drive_units(graph, joint)
+            for what in ("viscous", "coulomb", "offset"):
+                value = float(getattr(friction, what)[k])
+                name, path = f"{joint}.{what}", ("friction", what, k)
+                result.append(
+                    shared_number(
+                        "friction", name, units[what], value, math.nan, path, others=[name],
+                        signed=what == "offset",
+                    )
+                )  # fmt: skip
+        first, rotors = graph.actuated[0], [f"{j}.rotor_inertia" for j in graph.actuated]
+        result.append(
+            shared_number(
+                "rotor", "rotor_inertia", drive_units(graph, first)["rotor_inertia"],
+                graph.joints[first].rotor_inertia, math.nan, ("inertia", "rotor_inertia"),
+                others=rotors,
+            )
+        )  # fmt: skip
+        return tuple(result)
+
+    def shared_parameters(self) -> tuple[Shared, ...]:
+        """All that a fit of the robot's file may change: drives, payload, bodies and rods.
+
+        :raises ParameterError: the robot's file gives no masses.
+        """
+        graph, load = self.massive().graph, self.payload
+        masses = [body.mass for body in graph.bodies.values()]
+        heavy = max(graph.bodies[graph.platform].mass, 0.1 * sum(masses))
+        payload = shared_payload(
+            self.graph, load.mass, load.com, load.inertia, heavy, 0.3 * graph.size
+        )
+        return (*self.shared_drives(), payload, *self.shared_inertia())
 
     @cached_property
     def graph(self) -> Graph:

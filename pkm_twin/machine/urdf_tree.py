@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A graph and the single joints of its spanning tree as what the URDF writer takes.
 
-May import: numpy, this package's graph and URDF writer, the names of passive joints.
+May import: numpy, this package's graph, outline and URDF writer, the names of passive joints.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.kinematics.passive import Axis
-from pkm_twin.machine.bars import graph_bars
 from pkm_twin.machine.graph import BASE, Graph
+from pkm_twin.machine.outline import bars
 from pkm_twin.machine.urdf_write import (
     GROUND,
     PLATFORM,
@@ -93,10 +93,7 @@ def urdf_tree(
         tuple(bodies),
         tuple(singles),
         tuple(closures),
-        tuple(
-            UrdfCapsule(links[bar.part], bar.start[1], bar.end[1], bar.radius)
-            for bar in graph_bars(graph)
-        ),
+        tuple(_capsules(graph, links)),
         graph.actuated,
         links[graph.platform],
         graph.origin,
@@ -114,6 +111,12 @@ def _body(graph: Graph, axis: Axis, link: str) -> UrdfBody:
         inertia = rod.mass / 12.0 * (along @ along * np.eye(3) - np.outer(along, along))
         return UrdfBody(link, rod.mass, (rod.ends[0] + rod.ends[1]) / 2.0, inertia)
     return UrdfBody(link, 0.0, axis.point, np.zeros((3, 3)))
+
+
+def _capsules(graph: Graph, links: Mapping[str, str]) -> list[UrdfCapsule]:
+    return [
+        UrdfCapsule(links[bar.part], bar.start[1], bar.end[1], bar.radius) for bar in bars(graph)
+    ]
 
 
 def _link_names(names: Sequence[str]) -> dict[str, str]:

@@ -745,13 +745,19 @@ def verdict(check: Callable[[], object]) -> SetParametersResult:
     return SetParametersResult(successful=True)
 
 
+class _Executor(SingleThreadedExecutor):
+    """One whose making a signal may interrupt: rclpy's own end asks for what is not there then."""
+
+    _sigint_gc = None
+
+
 def spin(node: TwinNode, ended: Callable[[], bool] = lambda: False) -> None:
     """Run callbacks, and between them a step of what waits, until the context ends.
 
     :param ended: asked between two callbacks; true ends it too.
     """
     events = node.executor_kind == "events"
-    executor = EventsExecutor() if events else SingleThreadedExecutor()
+    executor = EventsExecutor() if events else _Executor()
     executor.add_node(node)
     # Without a bound the one waits for ever; with one the other makes a timer a message.
     patience = LOOK if events else None

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.machine import rotations
-from pkm_twin.machine.bars import graph_bars
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.members import Place
+from pkm_twin.machine.outline import robot_bars
 from pkm_twin.machine.robot import Robot
 from pkm_twin.state.state import State
 
@@ -107,7 +107,7 @@ class Scene:
 
     def __init__(self, robot: Robot, scales: Scales | None = None) -> None:
         self.robot, self.scales = robot, scales or Scales()
-        self.bars = graph_bars(robot.graph, robot.beams)
+        self.bars = robot_bars(robot)
         self._size = robot.graph.size
         bodies = {bar.element for bar in self.bars}
         self.joints = {

@@ -768,7 +768,7 @@ class TestAnything:
     """Whatever comes: a MessageError, or finite efforts; never another exception, never NaN."""
 
     relaxed = settings(
-        max_examples=500, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+        max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
     )
 
     @relaxed

@@ -49,8 +49,8 @@ def node(request, peer, launch):
         assert process.alive(), process.output
         return (name, "/") in peer.node.get_node_names_and_namespaces()
 
-    peer.until(found, 90.0)
-    peer.until(lambda: "joints" in process.output, 90.0)
+    peer.until(found)
+    peer.until(lambda: "joints" in process.output)
     return name
 
 
