@@ -22,9 +22,9 @@ from test.nodes.harness import REPOSITORY, Process
 LAUNCH = REPOSITORY / "launch"
 FILES = ("twin", "cell", "control")
 NODES = {
-    "delta_dynamics": "delta_dynamics/node.py",
-    "stiffness_monitor": "stiffness_monitor/node.py",
-    "command_gate": "delta_dynamics/gate_node.py",
+    "delta_dynamics": ("delta_dynamics/node.py",),
+    "stiffness_monitor": ("stiffness_monitor/node.py", "pkm_twin/ros/wrench.py"),
+    "command_gate": ("delta_dynamics/gate_node.py",),
 }
 
 
@@ -62,7 +62,8 @@ class TestText:
         parameters, arguments = literal("twin", "PARAMETERS"), literal("twin", "ARGUMENTS")
         assert set(parameters) == set(NODES) <= set(arguments)
         for node, names in parameters.items():
-            source = (REPOSITORY / NODES[node]).read_text(encoding="utf-8")
+            files = [REPOSITORY / file for file in NODES[node]]
+            source = "".join(file.read_text(encoding="utf-8") for file in files)
             assert all(f'"{name}"' in source for name in names)
             assert set(names) <= set(arguments)
 
