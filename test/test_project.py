@@ -21,6 +21,7 @@ MAY_IMPORT_ROS = {
     "delta_dynamics/node.py",
     "stiffness_monitor/node.py",
     "pkm_twin/ros/player.py",
+    "pkm_twin/ros/listener.py",
     "pkm_twin/ros/node.py",
     "pkm_twin/apps/demo.py",
     "pkm_twin/apps/guard_check.py",

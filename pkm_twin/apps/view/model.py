@@ -130,18 +130,18 @@ class Model:
     def pose_ranges(self) -> tuple[Range, ...]:
         """Of the pose: what joint states all over their ranges reach, rounded outwards."""
         robot = self.robot
-        low, high = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in _ENDS)
+        lows, highs = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in _ENDS)
         random = np.random.default_rng(0).random((SAMPLES, robot.joints_count))
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=robot.joints_count)))
-        poses, good = robot.try_forward(low + (high - low) * np.concatenate([corners, random]))
+        poses, good = robot.try_forward(lows + (highs - lows) * np.concatenate([corners, random]))
         kept = [pose for pose in poses[good] if not self._angle_beyond(pose)]
         found = np.array([*kept, self.start.pose])
         rows = []
         for k, (name, unit) in enumerate(zip(robot.pose_names, robot.pose_units, strict=True)):
             least, most = float(found[:, k].min()), float(found[:, k].max())
             step = _step(most - least)
-            ends = math.floor(least / step) * step, math.ceil(most / step) * step
-            rows.append(Range(name, unit, *(round(end, 12) for end in ends), step))
+            low, high = (round(end * step, 12) for end in (least // step, -(-most // step)))
+            rows.append(Range(name, unit, low, high, step))
         return tuple(rows)
 
     @cached_property

@@ -23,7 +23,6 @@ WIDTH: Final = 400
 """Of the panel, pixels."""
 MARKED: Final = 0.25
 """How often the curves' mark of the present moves while a bag plays, s."""
-_NO_POINTS: Final = {"show": False}
 
 
 class BagPanel:
@@ -149,14 +148,15 @@ def _chart(page: Page, title: str, times: Array, values: Array, *, mark: bool = 
     from viser import uplot
 
     robot = page.model.robot
+    points = uplot.Series_Points(show=False)
     series = [uplot.Series(label="t, s")]
     series += [
-        uplot.Series(label=name, stroke=COLOURS[k % len(COLOURS)], width=1.5, points=_NO_POINTS)
+        uplot.Series(label=name, stroke=COLOURS[k % len(COLOURS)], width=1.5, points=points)
         for k, name in enumerate(robot.joint_names)
     ]
     curves = list(map(np.ascontiguousarray, values.T))
     if mark:
-        series.append(uplot.Series(label="now", stroke="#555555", width=1, points=_NO_POINTS))
+        series.append(uplot.Series(label="now", stroke="#555555", width=1, points=points))
         curves.append(_mark(times, values, 0.0))
     return page.server.gui.add_uplot(
         (times, *curves),
