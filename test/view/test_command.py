@@ -134,7 +134,7 @@ def browser():
 SLIDER = "document.querySelectorAll('[role=slider]')[%d]"
 VALUE = SLIDER + ".getAttribute('aria-valuenow')"
 TEXT = "(document.getElementById('%s') || {}).innerText"
-LOAD = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText === 'Load')"
+TAB = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText === 'Move').focus()"
 
 
 def moved(browser, slider, key):
@@ -185,7 +185,8 @@ def test_a_slider_moves_the_machine_and_the_numbers_are_the_cores(browser):
         assert "limits" in read(browser, "refusal") or "unreachable" in read(browser, "refusal")
         assert read(browser, "q_0") == number(q[0])
         # A force of one step, and what it does.
-        browser.click(LOAD)
+        browser.run(TAB)
+        browser.press("ArrowRight")
         browser.until(f"{VALUE % 0} === '0'")
         wrench = np.zeros(6)
         wrench[0] = moved(browser, 0, "ArrowRight")
