@@ -41,7 +41,7 @@ class Bounds:
     rejected: float = 0.0
     """Messages that a node would refuse, part of all."""
     singularity: float = 1e-3
-    """Least reciprocal condition number of the scaled Jacobian."""
+    """Least distance to a singularity, 0 in one, 1 at best."""
 
 
 @dataclass(frozen=True)

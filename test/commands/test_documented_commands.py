@@ -10,6 +10,7 @@ import sys
 from functools import cache
 
 import pytest
+from support.command import Result
 from typer.main import get_command
 
 from pkm_twin.apps.cli import app
@@ -108,26 +109,28 @@ def folder(tmp_path_factory):
     return path
 
 
-@pytest.mark.timeout(900)
-def test_it_runs_as_it_stands(folder):
-    """In the order of the page, in one folder: a later line may use what an earlier one wrote."""
+def by_shell(line):
+    """A line that redirects or pipes, in processes of their own."""
     program = f"{shlex.quote(sys.executable)} -m pkm_twin.apps.cli"
+    shell = f'pkm-twin() {{ {program} "$@"; }}\n{line}'
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, env=environment)
+    return Result(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.mark.timeout(900)
+def test_it_runs_as_it_stands(folder, twin, monkeypatch):
+    """In the order of the page, in one folder: a later line may use what an earlier one wrote."""
+    monkeypatch.chdir(folder)
     done = set()
     for (page, line), block in commands().items():
         if not block or line in done or reason(line):
             continue
         done.add(line)
-        shell = f'pkm-twin() {{ {program} "$@"; }}\n{line}'
-        result = subprocess.run(
-            ["bash", "-c", shell],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-            check=False,
-        )
-        assert result.returncode == ENDS.get(line, 0), f"{page}: {line}\n{result.stderr}"
-        assert "Traceback" not in result.stderr
+        words = shlex.split(line)[1:]
+        result = by_shell(line) if set(words) & set(SHELL) else twin(*words)
+        assert result.code == ENDS.get(line, 0), f"{page}: {line}\n{result.err}"
+        assert "Traceback" not in result.err
     assert len(done) >= 8
 
 
