@@ -214,8 +214,11 @@ class Model:
         return f"a passive joint stands at {most:.6g} rad, limit {float(bound):g}"
 
     def loaded(self, state: State, wrench: ArrayLike) -> State:
-        """The state under another wrench, shape (6,), N and N m."""
-        return replace(state, wrench=np.array(wrench, np.float64), refusal="")
+        """The state under another wrench, shape (6,), N and N m; the old one where that is none."""
+        values = np.array(wrench, np.float64)
+        if not np.isfinite(values).all():
+            return _refused(state, "the wrench is not finite")
+        return replace(state, wrench=values, refusal="")
 
     def numbers(self, state: State) -> Numbers:
         """All that is known of a state; what fails at this place is said in ``why``."""

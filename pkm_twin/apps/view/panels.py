@@ -112,6 +112,7 @@ class LivePanel:
 
     def __init__(self, page: Page, live: Live) -> None:
         self._page, self._live = page, live
+        self._seen: tuple[dict[str, int], int] | None = None
         gui = page.server.gui
         panel = gui.add_panel()
         with panel.add_tab("Live"):
@@ -128,6 +129,10 @@ class LivePanel:
     def step(self) -> None:
         """Show what was heard last."""
         page, heard = self._page, self._live.heard()
+        news = (heard.counts, heard.refused)
+        if news == self._seen:
+            return
+        self._seen = news
         waiting = ", ".join(TOPICS[name][1] for name in TOPICS if not heard.counts.get(name))
         self._heard.content = texts.heard(page.model.robot, heard, waiting)
         for name, (times, values) in heard.traces.items():
