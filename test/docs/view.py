@@ -81,6 +81,7 @@ def take(browser: Browser, name: str, path: Path) -> None:
         if tab == "Load":
             browser.run(TAB)
             browser.press("ArrowRight")
+            browser.run("document.activeElement.blur()")
         browser.run(CLOSE)
         time.sleep(SETTLED)
         path.write_bytes(browser.picture())
