@@ -126,7 +126,7 @@ def browser():
     if program is None:
         pytest.skip("no browser: set PKM_TWIN_BROWSER to a Chromium")
     with Browser(program, (1000, 700)) as browser:
-        browser.slow_down(0.5)
+        browser.slow_down(1.0)
         browser.call("Network.enable")
         yield browser
 
@@ -160,6 +160,7 @@ def addresses(browser):
     return {urlsplit(url).hostname for url in asked if not url.startswith(("data:", "blob:"))}
 
 
+@pytest.mark.timeout(1800)  # without a graphics card, on a machine that has much else to do
 def test_a_slider_moves_the_machine_and_the_numbers_are_the_cores(browser):
     robot = load("delta_cu")
     with serving("delta_cu") as (_, address):
