@@ -95,7 +95,7 @@ setup(
             "ruff",
             "threadpoolctl",
             "types-PyYAML",
-            "viser>=1.0",
+            "viser>=1.1",
             "wheel",
             "xarray",
             "yourdfpy",
@@ -105,7 +105,7 @@ setup(
         "bags": ["pin", "PyNiteFEA"],
         "certificate": ["mpmath", "mujoco", "pin", "pytest", "scipy"],
         "mjcf": ["mujoco"],
-        "view": ["viser>=1.0"],
+        "view": ["viser>=1.1"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },
     entry_points={
