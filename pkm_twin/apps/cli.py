@@ -13,6 +13,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.apps.options import (
@@ -498,6 +499,7 @@ def certify(
 
 app.add_typer(atlases.app, name="atlas")
 app.command()(guard_check)
+app.command()(excite)
 app.command()(fit)
 app.command()(atlases.show)
 

@@ -63,7 +63,7 @@ def fit(
     """
     from pkm_twin.apps.fit_files import fitted_yaml, robot_text
 
-    kinds = _kinds(what)
+    kinds = kinds_of(what)
     page = out.with_suffix(".html")
     if out.suffix not in (".yaml", ".yml"):
         raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
@@ -139,7 +139,11 @@ def _away_from_changes(recorded: Any, load: Any) -> Any:
     )
 
 
-def _kinds(what: str) -> tuple[Any, ...]:
+def kinds_of(what: str) -> tuple[Any, ...]:
+    """The kinds of numbers in words with commas between.
+
+    :raises UnknownNameError: another word.
+    """
     from pkm_twin.machine.shared import KINDS
 
     words = tuple(word.strip() for word in what.split(","))
