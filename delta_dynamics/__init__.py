@@ -14,6 +14,7 @@ from delta_dynamics.isotropy import (
     spread,
     tilted_pose,
 )
+from delta_dynamics.observer import MomentumObserver, platform_wrench
 from delta_dynamics.reactions import Reactions, least_norm_reactions, reactions
 from delta_dynamics.regressor import (
     parameter_names,
@@ -36,6 +37,7 @@ __all__ = [
     "Energy",
     "Extremes",
     "JointMotion",
+    "MomentumObserver",
     "Reactions",
     "Terms",
     "base_parameters",
@@ -54,6 +56,7 @@ __all__ = [
     "parameter_names",
     "parameter_units",
     "parameter_values",
+    "platform_wrench",
     "reactions",
     "regressor",
     "sphere_directions",

@@ -111,8 +111,8 @@ def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
     middle, reach = (low + high) / 2, (high - low) / 2
     while len(kept) < count:
         drawn = rng.uniform(middle - share * reach, middle + share * reach, (2 * count, len(home)))
-        rates, good = robot.try_jacobian(drawn)
-        good[good] = robot.singularity_of(rates[good]) > CLEAR
+        measure, good = robot.try_singularity(drawn)
+        good = good & (measure > CLEAR)
         kept = np.concatenate([kept, drawn[good]])
         if good.mean() < 0.05:
             # Few joint positions together make an assembly: nearer to home more of them do.

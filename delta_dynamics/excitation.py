@@ -254,8 +254,8 @@ def _within(
 
 def _clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array) -> bool:
     """Assembly, singularity margin, workspace and efforts."""
-    rates, good = robot.try_jacobian(q)
-    if not good.all() or (robot.singularity_of(rates) < keep.singularity).any():
+    measure, good = robot.try_singularity(q)
+    if not good.all() or (measure < keep.singularity).any():
         return False
     # Passive joints and limbs that meet: dear, so at some of the states.
     if not reachable(robot, robot.forward(q[::THIN])).all():

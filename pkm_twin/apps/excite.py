@@ -100,9 +100,10 @@ def excite(
     time = np.arange(round(duration * rate) + 1) / rate
     time = time[time <= duration]
     motion = best.at(time)
-    names = machine.controller.names
+    own = machine.controller
+    commanded = (motion[0] * own.factors + own.offsets, *(m * own.factors for m in motion[1:]))
     facts = {"robot": machine.name, "source": "pkm-twin excite", "condition": best.condition}
-    _write_bag(out, names, time, motion, facts, overwrite)
+    _write_bag(out, own.names, time, commanded, facts, overwrite)
     columns = {"time": time}
     for i, joint in enumerate(machine.joint_names):
         for word, values in zip(("position", "velocity", "acceleration"), motion, strict=True):

@@ -61,7 +61,8 @@ def fit(
     What the motion does not show keeps the file's value and is named. --payload and --load-times
     tell of a payload that is known, or, with `payload` among what is fitted, when it is held.
     """
-    from pkm_twin.apps.fit_files import fitted_yaml, robot_text
+    from pkm_twin.apps.fit_files import fitted_yaml, robot_text, yaml_head
+    from pkm_twin.machine.edited import write_edited
 
     kinds = kinds_of(what)
     page = out.with_suffix(".html")
@@ -75,7 +76,7 @@ def fit(
         result = fit_recordings(machine, recordings, kinds, topic, carried, update)
     names = [path.name for path in recordings]
     try:
-        out.write_text(fitted_yaml(text, result, names), encoding="utf-8")
+        write_edited(out, yaml_head(result, names), fitted_yaml(text, result, names))
         if report:
             from pkm_twin.apps.fit_report import fit_page
 
@@ -168,7 +169,8 @@ def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tu
 
 def _of_csv(path: Path, machine: Any) -> Any:
     from delta_dynamics.fit import Recorded
-    from pkm_twin.apps.torques import WRENCH_AXES, read_columns
+    from pkm_twin.apps.columns import read_columns
+    from pkm_twin.apps.torques import WRENCH_AXES
 
     columns = read_columns(path)
     for what in ("position", "effort"):

@@ -35,6 +35,19 @@ def robot_names() -> list[str]:
     return sorted(path.stem for path in config_folder().glob("*.yaml"))
 
 
+def robot_path(robot: str | Path) -> Path:
+    """The file of a robot's name or path.
+
+    :raises UnknownNameError: no such name; the closest one is named.
+    """
+    text = str(robot)
+    if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
+        return Path(robot)
+    if text in robot_names():
+        return config_folder() / f"{text}.yaml"
+    raise UnknownNameError("robot", text, robot_names())
+
+
 def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     """A robot by its name in ``config/``, from a parameter file, or from a URDF with its loops.
 
@@ -43,13 +56,7 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     :raises UnknownNameError: no such name; the closest one is named.
     :raises ParameterError: a file, key, type or value that is refused, by its dotted name.
     """
-    text = str(robot)
-    if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
-        path = Path(robot)
-    elif text in robot_names():
-        path = config_folder() / f"{text}.yaml"
-    else:
-        raise UnknownNameError("robot", text, robot_names())
+    path = robot_path(robot)
     if path.suffix in TREES:
         data = read_urdf(path, platform=platform)
     elif platform is not None:

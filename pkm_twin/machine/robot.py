@@ -28,6 +28,7 @@ from pkm_twin.kinematics.engine import Engine, Traced, engine_of
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.passive import passive_names, passive_program
 from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import FREEDOMS, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
@@ -641,17 +642,27 @@ class Robot:
     def singularity(self, q: ArrayLike) -> Array:
         """How far a joint state is from a singularity: 0 in one, 1 at best, shape (...).
 
-        The reciprocal condition number of the Jacobian, its angles multiplied by the platform's
-        radius, so that units do not count. Goes to zero at singularities of either kind: where
-        the actuators lose the platform and where they lose a direction.
+        Of any kind: the actuators are locked and the platform or another body moves (constraint
+        singularities included), or joints move and the platform does not (the edge of reach); see
+        ``kinematics.singularity``. No unit or scale counts. Errors as :meth:`forward`.
         """
-        return self.singularity_of(self.jacobian(q))
+        one = self.call_one("singularity", self.singularity_kernel, _NONE, q)
+        if one is not None:
+            return np.asarray(one[0])
+        (measure,), status = self.singularity_kernel()(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        return np.asarray(measure[..., 0], np.float64)
 
-    def singularity_of(self, jacobian: Array) -> Array:
-        """The same of Jacobians, shape (..., m, n)."""
-        scaled = self.pose_scales[:, None] * jacobian / self.joint_scales
-        values = np.linalg.svd(scaled, compute_uv=False)
-        return np.asarray(values[..., -1] / values[..., 0], np.float64)
+    def singularity_kernel(self) -> Kernel:
+        """The same as a program, q to the measure (1)."""
+        return singularity_kernel(self.engine)
+
+    def try_singularity(self, q: ArrayLike) -> tuple[Array, Mask]:
+        """The measure (...), 0 where there is no assembly; which joint states have one."""
+        (measure,), status = self.singularity_kernel()(_NONE, q)
+        good = np.ones(measure.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+        return np.where(good, measure[..., 0], 0.0), np.asarray(good)
 
     @cached_property
     def passive_joints(self) -> tuple[str, ...]:

@@ -344,14 +344,7 @@ class Machine(Robot):
     @property
     def size(self) -> float:
         """Greatest distance of a joint on the platform from its reference point, m."""
-        g = self.graph
-        points = [j.at for j in g.joints.values() if g.platform in (j.inner, j.outer)]
-        for rod in g.rods.values():
-            points += [
-                e for e, b in zip(rod.ends, (rod.inner, rod.outer), strict=True) if b == g.platform
-            ]
-        far = max((float(np.linalg.norm(p - g.origin)) for p in points), default=0.0)
-        return far if far > 1e-6 * g.size else 0.1 * g.size
+        return self.graph.rim
 
     def make_graph(self) -> Graph:
         """The graph of the file."""

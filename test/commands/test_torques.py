@@ -7,10 +7,11 @@ import os
 
 import numpy as np
 import pytest
+from support.robots import massless
 
 from delta_dynamics import inverse_dynamics, reactions
 from pkm_twin import load
-from test.commands.conftest import DELTA, MILLING, STIFFNESS, massless, rewrite
+from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
 
 TERMS = ("gravity", "inertia", "velocity", "payload", "friction", "external")
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -143,8 +144,9 @@ def spoiled(change):
         (lambda c: [c.pop(f"arm_{i}.position") for i in (1, 2, 3)], "arm_1.position"),
         (lambda c: c.pop("arm_2.velocity"), "'arm_2.velocity'"),
         (lambda c: c.update({"arm_1.velocty": c.pop("arm_1.velocity")}), "did you mean"),
-        (lambda c: c["time"].reverse(), "strictly rising"),
-        (lambda c: c["time"].__setitem__(3, c["time"][2]), "strictly rising"),
+        (lambda c: c["time"].reverse(), "rising times"),
+        (lambda c: c["time"].__setitem__(3, c["time"][2]), "rising times"),
+        (lambda c: c["time"].__setitem__(3, c["time"][2] + 1e-12), "1e-09 s or more apart"),
         (lambda c: c["arm_1.position"].__setitem__(2, float("nan")), "line 4"),
         (lambda c: c["arm_1.position"].__setitem__(2, ""), "line 4"),
         (lambda c: c["arm_1.position"].__setitem__(2, "0,5"), "line 4"),
@@ -159,6 +161,17 @@ def test_bad_csv(twin, tmp_path, change, text):
     assert (result.code, result.out) == (1, "")
     assert text in result.one_line_error()
     assert [path.name for path in tmp_path.iterdir()] == ["bad.csv"]
+
+
+def test_differences_that_overflow_are_one_line(process, tmp_path):
+    columns = motion("delta")
+    for joint in (1, 2, 3):
+        del columns[f"arm_{joint}.velocity"], columns[f"arm_{joint}.acceleration"]
+    columns["arm_1.position"][:3] = -1e300, 0.0, 1e300
+    source = write(tmp_path / "fast.csv", columns)
+    result = process("torques", "delta", source, "--beyond-limits", "--out", tmp_path / "t.csv")
+    assert result.code == 1
+    assert "Warning" not in result.one_line_error()
 
 
 def test_an_unreachable_sample_is_counted_from_the_motions_beginning(twin, tmp_path):

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every fault has its tests, and the page on faults is that of the catalogue."""
+
+import pytest
+
+from test.faults.catalogue import TESTS, names_in, rows
+from test.faults.page import PAGE, write_section
+
+ROWS = rows()
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.number)
+def test_a_row_names_tests_that_are_there(row):
+    assert row.fault and row.answer and row.tests
+    for test in row.tests:
+        file, _, name = test.partition("::")
+        assert name in names_in(TESTS / file), test
+
+
+def test_numbers_are_given_once():
+    numbers = [row.number for row in ROWS]
+    assert len(set(numbers)) == len(numbers)
+
+
+def test_the_page_has_every_row_and_none_that_failed():
+    lines = PAGE.read_text(encoding="utf-8").splitlines()
+    for row in ROWS:
+        (line,) = [line for line in lines if line.startswith(f"| {row.number} | ")]
+        assert line.startswith(f"| {row.number} | {row.fault} | {row.answer} | ")
+        assert line.endswith("| pass |"), line
+
+
+def test_a_part_of_the_page_is_replaced_alone(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- x: begin -->\nold\n<!-- x: end -->\nb\n")
+    write_section("x", "new", page)
+    assert page.read_text() == "a\n<!-- x: begin -->\nnew\n<!-- x: end -->\nb\n"
+    with pytest.raises(ValueError, match="no part 'y'"):
+        write_section("y", "new", page)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything at random for as long as asked: ``python -m test.fuzz --seconds 60 --seed 1``.
+
+A kind holds when nothing but the package's own errors comes back, each of them one short printable
+line, and nothing is answered, or read, that should not be. Every kind leaves its figures in a
+folder; ``--page`` puts those that are there into docs/faults.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from test.faults.page import write_section
+from test.fuzz.bags import DamagedBags, DamagedSplits, NonsenseBags
+from test.fuzz.commands import Commands
+from test.fuzz.definitions import Cdr
+from test.fuzz.files import Csv, Metadata, Urdf, Yaml
+from test.fuzz.messages import Messages
+from test.fuzz.tally import Kind, run
+
+KINDS: tuple[type[Kind], ...] = (
+    Messages, DamagedBags, DamagedSplits, NonsenseBags, Cdr, Metadata, Yaml, Urdf, Csv, Commands,
+)  # fmt: skip
+NODES = "nodes.json"
+"""What test_fuzz.py leaves there."""
+INTRODUCTION = """## At random
+
+Printed by `make fuzz`: {total:,} examples, 500 from a seed, the seeds from the one in the table,
+and before them the corpus of what once fell (`test/fuzz/corpus`). A kind holds when nothing but
+the package's own errors comes back, each of them one short line; nothing is read that was not
+written; a torque, a forwarded command or a deflection comes of a sound message only, by rules that
+`test/fuzz/messages.py` has of its own, and is that of the model. One command line in a hundred runs
+as a process of its own. Times are those of a machine that did other work too.
+"""
+HEAD = (
+    "| kind | seed | examples | taken | refused, most often for | median | 99.9 % | slowest (ms) "
+    "| memory grown (MiB) | failed |\n" + "|---" * 10 + "|"
+)
+NODES_TEXT = """
+
+Real nodes over DDS, seed {seed}, {seconds:.0f} s: {sent}. All nodes alive, no exception;
+{torques:,} torques came back, each finite and with the stamp of a sound message; {requests:,}
+requests and {clocks:,} clocks were refused and counted.
+"""
+
+
+def section(figures: list[dict[str, Any]], nodes: dict[str, Any] | None) -> str:
+    """The figures as a part of the page."""
+    rows = []
+    for found in figures:
+        common = ", ".join(f"{why} {n:,}" for why, n in list(found["refused"].items())[:4])
+        times = " | ".join(
+            f"{1e3 * found[f'{which} (s)']:.2g}" for which in ("median", "99.9 %", "slowest")
+        )
+        rows.append(
+            f"| {found['kind']} | {found['seed']} | {found['examples']:,} | {found['taken']:,} | "
+            f"{common} | {times} | {found['memory grown (MiB)']:.1f} | {len(found['failures'])} |"
+        )
+    total = sum(found["examples"] for found in figures)
+    text = f"{INTRODUCTION.format(total=total)}\n{HEAD}\n" + "\n".join(rows)
+    if nodes is not None:
+        sent = ", ".join(f"{what} {n:,}" for what, n in nodes["sent"].items())
+        text += NODES_TEXT.format(**nodes | {"sent": sent})
+    return text
+
+
+def main() -> int:
+    """Run from a command line; 0 where everything held."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0, help="for all kinds together")
+    parser.add_argument("--seed", type=int, default=1, help="another seed, other examples")
+    parser.add_argument("--only", default="", help="kinds with this text in their name, by commas")
+    parser.add_argument("--count", type=int, default=0, help="examples a kind, instead of seconds")
+    parser.add_argument("--out", type=Path, default=Path("out/fuzz"), help="folder for the figures")
+    parser.add_argument(
+        "--page", action="store_true", help="only write what is there into the page"
+    )
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    files = [options.out / f"{kind.__name__}.json" for kind in KINDS]
+    if options.page:
+        nodes = options.out / NODES
+        figures = [json.loads(path.read_text()) for path in files if path.exists()]
+        found = json.loads(nodes.read_text()) if nodes.exists() else None
+        write_section("fuzz", section(figures, found))
+        return 0
+    asked = options.only.split(",")
+    kinds = [kind for kind in KINDS if any(word in kind.name for word in asked)]
+    failed = False
+    for kind in kinds:
+        target = options.out / f"{kind.__name__}.json"
+        with tempfile.TemporaryDirectory() as folder:
+            tally = run(
+                kind(Path(folder)),
+                options.seed,
+                seconds=options.seconds / len(kinds),
+                count=options.count,
+                keep=lambda tally, target=target: target.write_text(tally.as_json() + "\n"),
+            )
+        print(f"{kind.name}: {tally.examples:,} in {tally.spent:.0f} s, {tally.good:,} taken, "
+              f"{dict(tally.refused.most_common(6))}", flush=True)  # fmt: skip
+        for failure in tally.failures:
+            print(f"  FAILED {failure}", flush=True)
+        failed |= bool(tally.failures)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

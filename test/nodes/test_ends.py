@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node whose parent ignores signals, and one that is sent thousands of bad messages."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+import pytest
+
+from test.nodes.harness import DEADLINE, REPOSITORY, counts_of
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from diagnostic_msgs.msg import DiagnosticArray
+
+from test.nodes.twin import COMMON, MODULE, Twin, state
+
+
+def deaf():
+    """As a background job of a shell, or under nohup."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_a_node_whose_parent_ignores_them(domain, number):
+    with tempfile.TemporaryFile("w+") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", MODULE],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            cwd=tempfile.gettempdir(),
+            env=domain.environment(),
+            preexec_fn=deaf,
+        )
+        try:
+            end = time.monotonic() + DEADLINE
+            while not said(output) and time.monotonic() < end:
+                time.sleep(0.05)
+            process.send_signal(number)
+            assert process.wait(DEADLINE) == 0, said(output)
+        finally:
+            process.kill()
+            process.wait()
+        assert "Traceback" not in said(output)
+
+
+def test_a_signal_while_an_executor_is_made_leaves_no_traceback():
+    """A context that has ended by then: rclpy stops half-way, and its clean-up must not fail."""
+    script = """
+import rclpy
+from pkm_twin.ros import node
+rclpy.init()
+rclpy.get_default_context().shutdown()
+try:
+    node._Executor()
+except Exception as error:
+    print(type(error).__name__)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+    )
+    assert done.stdout.strip() and done.stderr == ""
+
+
+def said(output):
+    output.seek(0)
+    return output.read()
+
+
+def test_a_flood_of_refusals_is_a_line_a_second(peer, launch):
+    peer.hear(DiagnosticArray, "/diagnostics")
+    remap = ("-r", "__node:=flooded", "-r", "joint_states:=/flooded/states")
+    began = time.monotonic()
+    twin = Twin(peer, launch(MODULE, *COMMON, arguments=remap), "flooded")
+    peer.until(peer.matched, 90.0)
+    reasons = {
+        "length": {"position": [0.1]},
+        "duplicated joint": {"name": ["arm_1", "arm_1", "arm_2", "arm_3"]},
+    }
+
+    def flood():
+        for fields in reasons.values():
+            message = state(twin.stamp())
+            for field, value in fields.items():
+                setattr(message, field, value)
+            for _ in range(20):
+                twin.send_state(message)
+
+    counted = {}
+
+    def enough():
+        arrays = [a for a in peer.received("/diagnostics") if a.status[0].name == "/flooded"]
+        counted.update(counts_of(arrays[-1], "joint states rejected") if arrays else {})
+        return min(counted.get(reason, 0) for reason in reasons) > 500
+
+    peer.until(enough, repeat=flood)
+    seconds = time.monotonic() - began
+    for reason in reasons:
+        lines = [x for x in twin.process.output.splitlines() if f"rejected, {reason}" in x]
+        assert 1 <= len(lines) <= seconds + 1
