@@ -177,10 +177,10 @@ def excite(
             "or wider limits.position"
         )
     dense = np.linspace(0.0, duration, DENSE, endpoint=False)
-    pair = _within(robot, keep, duration, harmonics, centre, reach, best[2], dense)
-    assert pair is not None  # noqa: S101
-    condition = judge.condition(*_series(dense, duration, harmonics, centre, pair))
-    return Excitation(duration, harmonics, centre, pair[0], pair[1], condition)
+    final = _within(robot, keep, duration, harmonics, centre, reach, best[2], dense)
+    assert final is not None  # noqa: S101
+    condition = judge.condition(*_series(dense, duration, harmonics, centre, final))
+    return Excitation(duration, harmonics, centre, final[0], final[1], condition)
 
 
 def _range(robot: Robot, share: float) -> tuple[Array, Array]:

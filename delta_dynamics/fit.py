@@ -6,7 +6,7 @@ against positions, by some samples and alike in all joints: a drive that holds i
 period would else look like friction. How late is fitted beside, for each recording. Two windows of
 the differentiation are fitted; what they differ by counts as uncertainty beside the noise's.
 
-May import: numpy, pkm_twin's core, this package, the standard library.
+May import: numpy, scipy, pkm_twin's core, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d  # type: ignore[import-untyped]
 
 from delta_dynamics.estimation import Estimate, estimate
 from delta_dynamics.file_parameters import FileParameters, file_parameters
@@ -295,14 +296,17 @@ def _drop_outliers(
     """
     table = np.concatenate([part.table[::every] for part in parts])
     target = np.concatenate([part.target[::every] for part in parts])
-    scales = _scales(parameters, table, target)
+    rest = np.concatenate([part.rest[::every] for part in parts])
+    scales = _scales(parameters, table, target + rest)
     first = estimate(table, target, parameters.values, scales).values
     count = 0
     for part in parts:
         told = part.table @ first
         away = np.abs(part.target - told)
         bound = OUTLIER * 1.4826 * np.median(away, axis=0)
-        far = (away > bound) & (bound > 1e-6 * np.abs(part.target).max(0))
+        # Where friction turns over, an effort that is some samples late is no outlier.
+        near = maximum_filter1d(np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0)
+        far = (away > bound + LATE * near) & (bound > 1e-6 * np.abs(part.target).max(0))
         if far.mean() > 0.05:
             continue
         part.target[far] = told[far]
@@ -310,10 +314,10 @@ def _drop_outliers(
     return first, count
 
 
-def _scales(parameters: FileParameters, table: Array, target: Array) -> Array:
+def _scales(parameters: FileParameters, table: Array, effort: Array) -> Array:
     """The prior's deviations; of friction and rotors what would be all of the joints' efforts."""
     scales = parameters.scales.copy()
-    size = np.sqrt(np.mean(target**2, 0))
+    size = np.sqrt(np.mean(effort**2, 0))
     columns = np.sqrt(np.mean(table**2, 0))
     for k in np.flatnonzero(np.isnan(scales)):
         joint = int(np.argmax(columns[:, k]))
@@ -332,11 +336,11 @@ def _estimate(
 ) -> tuple[Estimate, tuple[float, ...]]:
     """Of the parameters, and how late the efforts of each recording are, s."""
     used = [made.part(slice(0, _split(made))) for made in rows]
-    table, target, counts = (
+    table, target, rest, counts = (
         np.concatenate([getattr(made, name) for made in used])
-        for name in ("table", "target", "counts")
+        for name in ("table", "target", "rest", "counts")
     )
-    scales = _scales(parameters, table, target)
+    scales = _scales(parameters, table, target + rest)
     # Late by a delay is less the delay times the change.
     late = [
         np.concatenate(
