@@ -225,8 +225,11 @@ def _rows(
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
     made = [part.filtered(first, track, how) for part, track in zip(parts, pieces, strict=True)]
-    joined = [np.concatenate([one[k] for one in made]) for k in range(6)]
-    return _Rows(*joined, outliers, pieces[0].period), how
+    time, table, target, rest, counts, change = (
+        np.concatenate([one[k] for one in made]) for k in range(6)
+    )
+    period = pieces[0].period
+    return _Rows(time, table, target, rest, counts, change, outliers, period), how
 
 
 @dataclass(frozen=True, eq=False)

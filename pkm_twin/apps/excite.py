@@ -101,7 +101,8 @@ def excite(
     time = time[time <= duration]
     motion = best.at(time)
     own = machine.controller
-    commanded = (motion[0] * own.factors + own.offsets, *(m * own.factors for m in motion[1:]))
+    place, rates, changes = (m * own.factors for m in motion)
+    commanded = (place + own.offsets, rates, changes)
     facts = {"robot": machine.name, "source": "pkm-twin excite", "condition": best.condition}
     _write_bag(out, own.names, time, commanded, facts, overwrite)
     columns = {"time": time}

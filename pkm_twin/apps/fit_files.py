@@ -49,7 +49,7 @@ def fitted_yaml(text: str, result: Fit, recordings: Sequence[str]) -> str:
     """The robot's file with what was fitted, each number's deviation and source in a comment."""
     groups: dict[Key, list[Number]] = {}
     for number in result.numbers:
-        base = tuple(k for k in number.key if not isinstance(k, int))
+        base: Key = tuple(k for k in number.key if not isinstance(k, int))
         # A section of a list is no place in a vector.
         if number.key[:1] == ("limbs",) and isinstance(number.key[1], int):
             base = (*number.key[:2], *base[1:])
