@@ -263,7 +263,7 @@ def _print(result: Any) -> None:
     e = result.estimate
     typer.echo(f"condition number {e.condition:.3g} over {e.directions} combinations")
     if e.bound:
-        typer.echo("the nearest possible masses and inertias: the data alone want impossible ones")
+        typer.echo("held by a bound: the data alone want negative friction or no possible body")
     for judged, delay in zip(result.judged, result.delays, strict=True):
         typer.echo(f"{judged.name}: efforts late by {1e3 * delay:.3g} ms")
         before, after = judged.rms(judged.before), judged.rms(judged.after)
