@@ -15,6 +15,7 @@ from delta_dynamics.isotropy import (
     tilted_pose,
 )
 from delta_dynamics.observer import MomentumObserver, platform_wrench
+from delta_dynamics.payload import PayloadEstimate, PayloadEstimator
 from delta_dynamics.reactions import Reactions, least_norm_reactions, reactions
 from delta_dynamics.regressor import (
     parameter_names,
@@ -38,6 +39,8 @@ __all__ = [
     "Extremes",
     "JointMotion",
     "MomentumObserver",
+    "PayloadEstimate",
+    "PayloadEstimator",
     "Reactions",
     "Terms",
     "base_parameters",

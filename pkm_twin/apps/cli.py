@@ -502,9 +502,9 @@ def certify(
 app.add_typer(atlases.app, name="atlas")
 app.command("calibrate")(calibrate_command)
 app.command()(guard_check)
-app.command()(excite)
-app.command()(fit)
 app.command()(view)
+app.command()(fit)
+app.command()(excite)
 app.command()(atlases.show)
 
 

@@ -76,6 +76,18 @@ def put(data: Any, path: str, value: float) -> None:
     data[last] = value
 
 
+def has_entry(data: Any, path: str) -> bool:
+    """Whether plain data has a value of that path."""
+    for key in keys_of(path):
+        if isinstance(data, Mapping):
+            data = data.get(key)
+        elif isinstance(data, list) and isinstance(key, int) and key < len(data):
+            data = data[key]
+        else:
+            return False
+    return data is not None
+
+
 def changed_graph(robot: Robot, path: str, value: float) -> Graph:
     """The graph with one number changed; nothing is compiled.
 
