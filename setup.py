@@ -99,6 +99,7 @@ setup(
         "bags": ["pin", "PyNiteFEA"],
         "certificate": ["mpmath", "mujoco", "pin", "pytest", "scipy"],
         "mjcf": ["mujoco"],
+        "audit": ["pip-audit"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },
     entry_points={
