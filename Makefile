@@ -6,13 +6,16 @@ VENV ?= .venv
 MINUTES ?= 3
 SECONDS ?= 60
 SEED ?= 1
+# Tests that run for as long as they are told.
+ENDLESS := test/bags/test_fuzz.py test/fuzz/test_nodes.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bags bench certificate fuzz faults soak audit scale pages clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale pages clean help
 
 help:
 	@echo "make demo         set up .venv, run both nodes on the recorded bags, table and picture in out/"
 	@echo "make test         lint, types and tests"
+	@echo "make long         more robots, states and points of what make test has some of"
 	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
 	@echo "make certificate  torques and compliance against other engines, into docs/certificate*.md"
@@ -47,8 +50,12 @@ types: $(VENV)/test.stamp
 	$(BIN)/mypy
 
 # Two at a time: a test that needs quiet waits for conditions, none for a clock.
+# A file is one worker's: what its tests share is made once.
 unit: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+long: $(VENV)/test.stamp
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m long $(ENDLESS:%=--ignore=%)
 
 bags: $(VENV)/bags.stamp
 	$(BIN)/python -m bags.recording
@@ -74,7 +81,7 @@ faults: $(VENV)/test.stamp
 	$(BIN)/python -m test.faults
 
 soak: $(VENV)/test.stamp
-	SOAK_MINUTES=$(MINUTES) SOAK_OUT=$(CURDIR)/out $(BIN)/python -m pytest -m long test/atlas test/nodes/test_soak.py
+	SOAK_MINUTES=$(MINUTES) SOAK_OUT=$(CURDIR)/out $(BIN)/python -m pytest -m long test/atlas/test_run.py test/nodes/test_soak.py
 	$(BIN)/python -m test.nodes.soak out
 
 audit: $(VENV)/audit.stamp

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigid-body dynamics of parallel kinematic machines."""
 
+from delta_dynamics.base_parameters import BaseParameters, base_parameters
 from delta_dynamics.isotropy import (
     Extremes,
     JointMotion,
@@ -13,7 +14,15 @@ from delta_dynamics.isotropy import (
     spread,
     tilted_pose,
 )
+from delta_dynamics.observer import MomentumObserver, platform_wrench
+from delta_dynamics.payload import PayloadEstimate, PayloadEstimator
 from delta_dynamics.reactions import Reactions, least_norm_reactions, reactions
+from delta_dynamics.regressor import (
+    parameter_names,
+    parameter_units,
+    parameter_values,
+    regressor,
+)
 from delta_dynamics.terms import Terms, dynamics_terms
 from delta_dynamics.virtual_work import (
     Energy,
@@ -25,11 +34,16 @@ from delta_dynamics.virtual_work import (
 from pkm_twin.kinematics.tracking import sphere_directions
 
 __all__ = [
+    "BaseParameters",
     "Energy",
     "Extremes",
     "JointMotion",
+    "MomentumObserver",
+    "PayloadEstimate",
+    "PayloadEstimator",
     "Reactions",
     "Terms",
+    "base_parameters",
     "dynamics_terms",
     "energy",
     "energy_matrices",
@@ -42,7 +56,12 @@ __all__ = [
     "mass_matrix",
     "max_driving_force",
     "max_driving_force_range",
+    "parameter_names",
+    "parameter_units",
+    "parameter_values",
+    "platform_wrench",
     "reactions",
+    "regressor",
     "sphere_directions",
     "spread",
     "tilted_pose",

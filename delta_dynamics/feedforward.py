@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, cast
+from operator import gt
+from typing import Any, Final, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +28,15 @@ from pkm_twin.ros.messages import (
 )
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
+from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import StreamMonitor
 
 Array = NDArray[np.float64]
 LimitPolicy = Literal["warn", "reject", "clamp"]
 OnStop = Literal["nothing", "zeros", "gravity"]
 
-STOPPING: Final = ("non-finite result", "singular", "jump")
-"""Reasons for which one sample stops the stream: it has left what the model describes."""
+STOPPING: Final = ("non-finite result", "singular", "jump", "no wrench")
+"""Reasons for which one sample stops the stream: it is none that the model describes."""
 SLICE: Final = 256
 """Points of a trajectory that are answered in one go: about a millisecond."""
 
@@ -79,9 +81,11 @@ class Settings:
         )
 
 
-@dataclass(frozen=True)
-class Torques:
-    """Efforts for one joint state; ``residual`` is measured minus predicted, None if unmeasured."""
+class Torques(NamedTuple):
+    """Efforts for one joint state; ``residual`` is measured minus predicted, None if unmeasured.
+
+    ``wrench``: the one that they bear, base axes at the platform's reference point, shape (6,).
+    """
 
     stamp: int
     motion: tuple[Array, Array, Array]
@@ -89,14 +93,19 @@ class Torques:
     effort: Array
     residual: Array | None
     saturated: bool
+    wrench: Array | None = None
 
 
 @dataclass
 class Feedforward:
-    """Answers trajectories and a stream of joint states with feedforward efforts."""
+    """Answers trajectories and a stream of joint states with feedforward efforts.
+
+    ``wrenches``: those that the stream's efforts bear; None bears none.
+    """
 
     robot: Robot
     settings: Settings = field(default_factory=Settings)
+    wrenches: WrenchWindow | None = None
 
     def __post_init__(self) -> None:
         s = self.settings
@@ -137,12 +146,18 @@ class Feedforward:
         self._rules = settings.stamp_rules
         self._continuity.warn = settings.singularity_warn
         self._continuity.stop = settings.singularity_stop
+        if self.wrenches is not None:
+            self.wrenches.change_stamps(settings.accept_zero_stamp, settings.future_tolerance)
         if (before.order, before.window) != (settings.order, settings.window):
             self._differentiator = Differentiator(settings.order, settings.window)
+            if self.wrenches is not None:
+                self.wrenches.change_fit(settings.order, settings.window)
 
     def reset(self) -> None:
         """Forget the stream, as when the clock jumps: no torque across the seam."""
         self._last_stamp = 0
+        if self.wrenches is not None:
+            self.wrenches.clear()
         self._begin_anew()
 
     def time_jumped_forward(self) -> None:
@@ -278,8 +293,13 @@ class Feedforward:
 
     def _begin_anew(self) -> None:
         self.near_singular = False
-        self._differentiator.reset()
+        self._restart_fit()
         self._continuity.reset()
+
+    def _restart_fit(self) -> None:
+        self._differentiator.reset()
+        if self.wrenches is not None:
+            self.wrenches.restart()
 
     def _take_time(self, now: int) -> None:
         """A clock that went back makes the last stamp a future one: forget it.
@@ -310,21 +330,29 @@ class Feedforward:
                 text = f"no joint state for {silence / SECOND:.3f} s by their stamps"
                 self.stream.stop("stale input", text)
             self._begin_anew()
+        wrench = None if self.wrenches is None else self.wrenches.require(sample.stamp)
         try:
             near_singular = as_message_error(self._continuity.step, sample.stamp, sample.q)
         except MessageError:
             # No derivative across a jump, nor across samples that the model has no state for.
-            self._differentiator.reset()
+            self._restart_fit()
             raise
         try:
             rates = self._differentiator.push(sample.stamp, sample.q, sample.qd)
+            measured, external = sample.effort, None
+            if self.wrenches is not None:
+                self.wrenches.push(sample, self.robot.platform(sample.q)[1], wrench)
             if rates is not None:
                 self._reader.check_derived(*rates)
                 motion = (sample.q, *rates)
-                solved = as_message_error(inverse_dynamics, self.robot, *motion)
+                if self.wrenches is not None:
+                    external, measured = self.wrenches.through()
+                solved = as_message_error(inverse_dynamics, self.robot, *motion, external)
                 effort, saturated = _gate(self.robot, self.settings.limit_policy, solved)
         except MessageError:
             self._differentiator.retract()
+            if self.wrenches is not None:
+                self.wrenches.retract()
             self._continuity.retract()
             raise
         self._last_stamp = sample.stamp
@@ -333,8 +361,8 @@ class Feedforward:
         if rates is None:
             return None
         self._last_good = sample.q
-        residual = None if sample.effort is None else sample.effort - effort
-        return Torques(sample.stamp, motion, effort, residual, saturated)
+        residual = None if measured is None else measured - effort
+        return Torques(sample.stamp, motion, effort, residual, saturated, external)
 
 
 def warm_up(robot: Robot) -> None:
@@ -371,20 +399,19 @@ def _gate(robot: Robot, policy: LimitPolicy, effort: Array) -> tuple[Array, bool
     """
     _require_finite(effort)
     limits = robot.limits.effort
-    saturated = limits is not None and _beyond(effort, limits)
-    if limits is not None and saturated:
-        if policy == "reject":
-            worst = np.unravel_index(np.argmax(np.abs(effort) / limits), effort.shape)
-            joint = int(worst[-1])
-            raise MessageError(
-                "effort limit",
-                f"effort of {robot.joint_names[joint]} is {effort[worst]:g}, "
-                f"allowed {limits[joint]:g}",
-            )
-        if policy == "clamp":
-            effort = np.clip(effort, -limits, limits)
-    _require_finite(effort)
-    return effort, saturated
+    if limits is None or not _beyond(effort, limits):
+        return effort, False
+    if policy == "reject":
+        worst = np.unravel_index(np.argmax(np.abs(effort) / limits), effort.shape)
+        joint = int(worst[-1])
+        raise MessageError(
+            "effort limit",
+            f"effort of {robot.joint_names[joint]} is {effort[worst]:g}, allowed {limits[joint]:g}",
+        )
+    if policy == "clamp":
+        effort = np.clip(effort, -limits, limits)
+        _require_finite(effort)
+    return effort, True
 
 
 def _require_finite(effort: Array) -> None:
@@ -396,8 +423,7 @@ def _require_finite(effort: Array) -> None:
 def _beyond(effort: Array, limits: Array) -> bool:
     """Whether an effort passes its limit; one sample, the stream's case, without numpy."""
     if effort.ndim == 1:
-        pairs = zip(effort.tolist(), limits.tolist(), strict=True)
-        return any(abs(value) > limit for value, limit in pairs)
+        return any(map(gt, map(abs, effort.tolist()), limits.tolist()))
     return bool((np.abs(effort) > limits).any())
 
 

@@ -27,6 +27,9 @@ from pkm_twin.machine.robot import MAX_MASS, Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
 from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.wrench import SECONDS, declare_mounts, declare_wrench
+from pkm_twin.streams.matched import WrenchWindow
+from pkm_twin.streams.wrench import WrenchReader
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 NUMBERS: Final = "std_msgs/msg/Float64MultiArray"
@@ -36,6 +39,7 @@ CHANGES = {
     "payload.inertia": ("payload", "inertia"),
     "friction.viscous": ("friction", "viscous"),
     "friction.coulomb": ("friction", "coulomb"),
+    "friction.offset": ("friction", "offset"),
     "gravity": ("gravity", ""),
     "effort_limits": ("limits", "effort"),
 }
@@ -46,6 +50,7 @@ UNITS = {
     "payload.inertia": "kg m2 about the com, 3 or 9 numbers",
     "friction.viscous": "N m s or N s/m, one a joint",
     "friction.coulomb": "N m or N, one a joint",
+    "friction.offset": "N m or N, one a joint",
     "gravity": "m/s2",
     "effort_limits": "N m or N, one a joint",
 }
@@ -75,7 +80,11 @@ class DeltaDynamics(health.TwinNode):
         # Before there is a topic to be found by: the first start compiles for many seconds.
         warm_up(robot)
         robot = _changed(robot, self._declare_changes(robot))
-        self._feedforward = Feedforward(robot, self._declare_settings())
+        settings = self._declare_settings()
+        self._base_frame = self.declare(
+            "base_frame", "base_link", "name of the fixed frame", read_only=True
+        )
+        self._feedforward = Feedforward(robot, settings, self._create_wrenches(settings))
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
         if commands and "on_stop" not in self._parameter_overrides:
             # A controller of plain commands holds the last one for ever.
@@ -191,6 +200,13 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"joint states rejected: {k}": v for k, v in core.stream.rejected.items()}
         values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
+        if core.wrenches is not None:
+            taken = core.wrenches.stream
+            values["wrenches taken"] = taken.accepted
+            values["joint states without a wrench"] = core.wrenches.without
+            values |= {f"wrenches rejected: {k}": v for k, v in taken.rejected.items()}
+            if level == health.OK and core.wrenches.last_reject:
+                level, message = health.WARN, f"last reject: {core.wrenches.last_reject}"
         return level, message, values
 
     def _create_action(self) -> Any:
@@ -216,6 +232,45 @@ class DeltaDynamics(health.TwinNode):
             lambda trajectory: self._feedforward.trajectory_steps(trajectory, self.now()),
         )
 
+    def _create_wrenches(self, settings: Settings) -> WrenchWindow | None:
+        """The measured wrench, where the parameter asks for it."""
+        wanted = self.declare(
+            "use_wrench",
+            False,
+            "torques and residual of the stream bear the measured wrench",
+            read_only=True,
+        )
+        age = self.declare(
+            "max_wrench_age", 0.1, "from a joint state to its wrench", read_only=True, **SECONDS
+        )
+        policy = self.declare(
+            "no_wrench", "ignore", "without a fresh wrench: none is taken, or the stream stops",
+            choices=("ignore", "stop"), read_only=True,
+        )  # fmt: skip
+        wrench = declare_wrench(
+            self,
+            read_only=True,
+            base_frame=self._base_frame,
+            future_tolerance=settings.future_tolerance,
+            accept_zero_stamp=settings.accept_zero_stamp,
+        )
+        mounts = declare_mounts(self)
+        if not wanted:
+            return None
+        self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench, awaited=True)
+        return WrenchWindow(
+            WrenchReader(wrench, mounts),
+            round(age * SECOND),
+            policy,
+            settings.order,
+            settings.window,
+        )
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        wrenches = self._feedforward.wrenches
+        if wrenches is not None:
+            wrenches.take(message, self.now())
+
     def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
         """A publisher for each joint's reaction, where the parameter asks for them."""
         wanted = self.declare("publish_reactions", False, "publish ~/reactions/*", read_only=True)
@@ -230,8 +285,6 @@ class DeltaDynamics(health.TwinNode):
         )
         self._reactions_period = round(SECOND / rate)
         self._reactions_due = 0
-        frame = self.declare("base_frame", "base_link", "frame of the reactions", read_only=True)
-        self._base_frame = frame
         if not wanted:
             return {}
         rest = np.zeros((2, len(robot.joint_names)))
@@ -362,7 +415,8 @@ class DeltaDynamics(health.TwinNode):
     def _on_joint_state(self, data: bytes) -> None:
         core = self._feedforward
         self._last_heard = time.monotonic_ns()
-        with self._telling_stop():
+        running = not core.stream.stopped
+        try:
             try:
                 message = self._decode(data)
             except MessageError as error:
@@ -373,10 +427,10 @@ class DeltaDynamics(health.TwinNode):
                 return
             # The process may have stood still since.
             core.check_age(torques, self.now())
-        header = message.header.stamp
-        stamp = header.sec, header.nanosec
-        if core.settings.accept_zero_stamp:
-            stamp = divmod(torques.stamp, SECOND)
+        finally:
+            if running and core.stream.stopped:
+                self._send_stop()
+        stamp = divmod(torques.stamp, SECOND)
         self._torques.publish(self._effort_message.fill(core.sent(torques.effort), stamp))
         if torques.residual is not None:
             self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))
@@ -389,7 +443,7 @@ class DeltaDynamics(health.TwinNode):
 
     def _publish_reactions(self, stamp: Any, torques: Torques) -> None:
         """Every joint's wrench that rigid bodies determine, world axes, at the joint's point."""
-        result = reactions(self._feedforward.robot, *torques.motion)
+        result = reactions(self._feedforward.robot, *torques.motion, torques.wrench)
         for k, name in enumerate(result.names):
             if not result.determinate[k].all():
                 continue

@@ -24,7 +24,7 @@ class Terms:
 
     ``gravity``, ``inertia`` (linear in qdd) and ``velocity`` (quadratic in qd) are those of the
     robot without its payload; ``payload`` is what the payload adds, its own gravity, inertia
-    and velocity parts together; ``friction`` is viscous and Coulomb; ``external`` balances
+    and velocity parts together; ``friction`` is viscous, Coulomb and offset; ``external`` balances
     the wrench on the platform.
     """
 

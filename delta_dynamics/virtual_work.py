@@ -12,12 +12,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.expressions import PARAMETERS, Objects, sign
+from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, sign
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.motion import Motion, cross
-from pkm_twin.machine.graph import BASE, FREEDOMS, Joint
+from pkm_twin.machine.graph import BASE, FREEDOMS, Joint, Rod
 from pkm_twin.machine.inertia import Layout, loaded_joints
 from pkm_twin.machine.robot import Robot
 
@@ -71,11 +71,19 @@ def torques(robot: Robot) -> Kernel:
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Generalised mass matrix on the actuated joints, payload included, shape (..., n, n)."""
+    # A simulation asks for one sample, several thousand times a second.
+    flat = robot.call_one("mass matrix", lambda: _masses_kernel(robot), robot.inertial, q)
+    if flat is not None:
+        return flat.reshape(robot.joints_count, -1)
     return _mass_matrix(robot, q, robot.inertial)
 
 
+def _masses_kernel(robot: Robot) -> Kernel:
+    return robot.massive().kernel("mass matrix", _masses)
+
+
 def _mass_matrix(robot: Robot, q: ArrayLike, p: Array) -> Array:
-    (flat,), status = robot.massive().kernel("mass matrix", _masses)(p, q)
+    (flat,), status = _masses_kernel(robot)(p, q)
     if status is not None:
         robot.refuse_joints(status, q, (q,))
     n = robot.joints_count
@@ -140,25 +148,35 @@ class Forces:
         self.moment[body] = self.moment[body] + cross(self.motion.arm(body, point), force)
 
     def inertia(self, bodies: Objects, rods: Objects) -> None:
-        """Newton's and Euler's laws, for the accelerations that the motion has (less gravity).
-
-        A thin even rod needs m (2 a + b) / 6 at its end of acceleration a and m (a + 2 b) / 6 at
-        the other: its rotation is in it.
-        """
+        """Newton's and Euler's laws, for the accelerations that the motion has (less gravity)."""
         m = self.motion
         for name, ten in zip(m.tree.links, bodies, strict=True):
-            turned = m.rotation[name]
-            first = turned @ ten[1:4]
-            matrix = _matrix(ten)
-            w, al = turned.T @ m.omega[name], turned.T @ m.alpha[name]
-            self.force[name] = self.force[name] + m.change[name] * ten[0] + m.spin(name) @ first
-            euler = turned @ (matrix @ al + cross(w, matrix @ w))
-            self.moment[name] = self.moment[name] + cross(first, m.change[name]) + euler
+            self.body(name, ten)
         for mass, rod in zip(rods, m.graph.rods.values(), strict=True):
-            a, b = m.acceleration(rod.inner, rod.ends[0]), m.acceleration(rod.outer, rod.ends[1])
-            sixth = mass * (1.0 / 6.0)
-            self.push(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
-            self.push(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
+            self.rod(rod, mass)
+
+    def body(self, name: str, ten: Objects) -> None:
+        """What the acceleration of one body needs."""
+        m = self.motion
+        turned = m.rotation[name]
+        first = turned @ ten[1:4]
+        matrix = _matrix(ten)
+        w, al = turned.T @ m.omega[name], turned.T @ m.alpha[name]
+        self.force[name] = self.force[name] + m.change[name] * ten[0] + m.spin(name) @ first
+        euler = turned @ (matrix @ al + cross(w, matrix @ w))
+        self.moment[name] = self.moment[name] + cross(first, m.change[name]) + euler
+
+    def rod(self, rod: Rod, mass: Any) -> None:
+        """What the acceleration of a thin even rod needs.
+
+        m (2 a + b) / 6 at its end of acceleration a and m (a + 2 b) / 6 at the other: its rotation
+        is in it.
+        """
+        m = self.motion
+        a, b = m.acceleration(rod.inner, rod.ends[0]), m.acceleration(rod.outer, rod.ends[1])
+        sixth = mass * (1.0 / 6.0)
+        self.push(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
+        self.push(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
 
     def momenta(self, bodies: Objects, rods: Objects) -> None:
         """The same linear part alone: momenta of the velocities that the motion has."""
@@ -179,9 +197,13 @@ class Forces:
     def passive(self, values: Objects) -> None:
         """What passive joints rub, and what their rotors resist: three numbers a joint."""
         for k, joint in enumerate(loaded_joints(self.motion.graph)):
-            viscous, coulomb, rotor = values[3 * k : 3 * k + 3]
-            rate, second = self._relative(joint, accelerated=True)
-            self._pair(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
+            self.joint(joint, values[3 * k : 3 * k + 3])
+
+    def joint(self, joint: Joint, three: Numbers) -> None:
+        """The same of one joint: viscous, Coulomb, rotor."""
+        viscous, coulomb, rotor = three
+        rate, second = self._relative(joint, accelerated=True)
+        self._pair(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
 
     def passive_momenta(self, values: Objects) -> None:
         """Momenta of the passive joints' rotors."""
@@ -256,7 +278,7 @@ def _begun(t: Traced) -> tuple[Layout, list[Objects]]:
 
 
 def _torques(t: Traced) -> Program:
-    layout, (bodies, rods, gravity, viscous, coulomb, rotors, passive) = _begun(t)
+    layout, (bodies, rods, gravity, viscous, coulomb, offset, rotors, passive) = _begun(t)
     n = t.joints
     qd, qdd, wrench = t.tape.inputs("qd", n), t.tape.inputs("qdd", n), t.tape.inputs("wrench", 6)
     t.set_rates(qd)
@@ -271,7 +293,9 @@ def _torques(t: Traced) -> Program:
     multipliers = t.lu.solve_transposed(unknown)
     efforts = driven - t.jq[t.engine.kept].T @ multipliers
     tau = [
-        efforts[k] + viscous[k] * qd[k] + coulomb[k] * sign(qd[k]) + rotors[k] * qdd[k]
+        efforts[k]
+        + (viscous[k] * qd[k] + coulomb[k] * sign(qd[k]) + offset[k])
+        + rotors[k] * qdd[k]
         for k in range(n)
     ]
     sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
@@ -297,7 +321,7 @@ def _masses(t: Traced) -> Program:
 
 
 def _energy(t: Traced) -> Program:
-    layout, (bodies, rods, gravity, _, _, rotors, passive) = _begun(t)
+    layout, (bodies, rods, gravity, *_, rotors, passive) = _begun(t)
     n = t.joints
     qd = t.tape.inputs("qd", n)
     u = t.set_rates(qd)

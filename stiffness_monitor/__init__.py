@@ -8,14 +8,17 @@ from pkm_twin.kinematics.workspace import (
     regular_workspace,
 )
 from stiffness_monitor.compliance import StrainEnergy, compliance, stiffness, strain_energy
+from stiffness_monitor.correction import Correction, setpoint_correction
 
 __all__ = [
+    "Correction",
     "RegularWorkspace",
     "StrainEnergy",
     "clearance",
     "compliance",
     "reachable",
     "regular_workspace",
+    "setpoint_correction",
     "stiffness",
     "strain_energy",
 ]

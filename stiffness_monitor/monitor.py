@@ -6,7 +6,6 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,40 +14,13 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import (
-    SECOND,
-    JointReader,
-    StampRules,
-    WrenchSample,
-    as_message_error,
-    read_wrench,
-)
-from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.ros.messages import SECOND, JointReader, WrenchSample, as_message_error
+from pkm_twin.streams.wrench import Mount, Mounts, Recent, WrenchReader, WrenchSettings, counting
 from stiffness_monitor.compliance import StrainEnergy, compliance, strain_energy
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How the node pairs and accepts messages."""
-
-    wrench_frame: str = "platform"
-    base_frame: str = "base_link"
-    accept_empty_frame: bool = False
-    max_state_age: float = 0.1
-    future_tolerance: float = 0.1
-    accept_zero_stamp: bool = False
-
-    @property
-    def platform_frame(self) -> str:
-        """The frame that turns with the platform, as far as the wrench tells it."""
-        return "platform" if self.wrench_frame == self.base_frame else self.wrench_frame
-
-    @property
-    def stamp_rules(self) -> StampRules:
-        """What stamps have to keep to."""
-        return StampRules(self.accept_zero_stamp, round(self.future_tolerance * SECOND))
+Settings = WrenchSettings
+"""How the node pairs and accepts messages."""
 
 
 @dataclass(frozen=True)
@@ -69,24 +41,28 @@ class Answer:
 
 @dataclass
 class Monitor:
-    """Pairs each wrench with the joint state nearest to it in time."""
+    """Pairs each wrench with the joint state nearest to it in time.
+
+    ``mounts``: tells where a wrench's frame stands; None is the settings' fixed mount.
+    """
 
     robot: Robot
     settings: Settings = field(default_factory=Settings)
+    mounts: Mounts | None = None
 
     def __post_init__(self) -> None:
-        self.states = StreamMonitor(trip_count=2**62, recovery_count=1)
-        self.wrenches = StreamMonitor(trip_count=2**62, recovery_count=1)
+        self.states = counting()
+        self.wrenches = counting()
         self.dropped = 0
         self.last_reject = ""
-        self._rules = self.settings.stamp_rules
+        self._recent: Recent[Array] = Recent()
         self._reader = JointReader(self.robot)
-        self._recent: deque[tuple[int, Array]] = deque(maxlen=256)
+        self.change_settings(self.settings)
 
     @property
     def latest(self) -> tuple[int, Array] | None:
         """Stamp and joint positions of the newest state, None before the first."""
-        return self._recent[-1] if self._recent else None
+        return self._recent.latest
 
     def reset(self) -> None:
         """Forget all joint states, as when the clock jumps."""
@@ -96,6 +72,7 @@ class Monitor:
         """Answer by other settings from the next message on."""
         self.settings = settings
         self._rules = settings.stamp_rules
+        self._wrenches = WrenchReader(settings, self.mounts)
 
     def refuse_joint_state(self, error: MessageError) -> None:
         """Count a joint state that is refused."""
@@ -109,24 +86,19 @@ class Monitor:
         """
         try:
             sample = self._reader.positions(message, now, self._rules)
-            if self._recent and sample.stamp < self._recent[-1][0]:
-                self.dropped += 1
-                raise MessageError(
-                    "stamp order",
-                    f"the stamp is {(self._recent[-1][0] - sample.stamp) / SECOND:.6f} s before "
-                    "the last",
-                )
+            self._recent.push(sample.stamp, sample.q)
         except MessageError as error:
+            self.dropped += error.reason == "stamp order"
             self.refuse_joint_state(error)
             raise
         self.states.accept()
-        self._recent.append((sample.stamp, sample.q))
 
     def wrench(self, message: Any, now: int) -> Answer:
         """Answer a wrench.
 
         A wrench in the base frame has fixed axes; one in any other frame has the platform's, as a
-        force-torque sensor mounted there measures it.
+        force-torque sensor mounted there measures it. From where the settings, or transforms, say
+        that it was measured it is moved to the platform's reference point.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -140,33 +112,32 @@ class Monitor:
         return answer
 
     def _wrench(self, message: Any, now: int) -> Answer:
-        s = self.settings
-        sample = read_wrench(message, now, self._rules, s.wrench_frame, s.accept_empty_frame)
+        sample, mount = self._wrenches.read(message, now)
         q = self._nearest(sample.stamp)
-        answer: Answer = as_message_error(self._answer, sample, q)
+        answer: Answer = as_message_error(self._answer, sample, mount, q)
         deflection = answer.energy.deflection
         if not (np.isfinite(answer.compliance).all() and np.isfinite(deflection).all()):
             raise MessageError("non-finite result", "the model gave a value that is not finite")
         return answer
 
-    def _answer(self, sample: WrenchSample, q: Array) -> Answer:
+    def _answer(self, sample: WrenchSample, mount: Mount, q: Array) -> Answer:
         pose = self.robot.forward(q)
         _, rotation = self.robot.platform(q)
-        turn = np.eye(3) if sample.frame == self.settings.base_frame else rotation
-        fixed = np.concatenate((turn @ sample.wrench[:3], turn @ sample.wrench[3:]))
+        fixed = self._wrenches.at_reference(sample, mount, rotation)
         energy = strain_energy(self.robot, pose, fixed)
         matrix = compliance(self.robot, pose)
         return Answer(sample.stamp, pose, fixed, matrix, energy, rotation)
 
     def _nearest(self, stamp: int) -> Array:
         """Joint positions of the state nearest in time."""
-        if not self._recent:
+        found = self._recent.nearest(stamp)
+        if found is None:
             raise MessageError("no pose", "no pose: no joint state has arrived")
-        age, q = min((abs(stamp - at), i) for i, (at, _) in enumerate(self._recent))
+        age = abs(stamp - found[0])
         if age > self.settings.max_state_age * SECOND:
             raise MessageError(
                 "no pose",
                 f"no pose: the nearest joint state is {age / SECOND:.3f} s away, allowed "
                 f"{self.settings.max_state_age:g} s",
             )
-        return self._recent[q][1]
+        return found[1]

@@ -6,11 +6,11 @@ Beside them the natural frequencies of the pose, which need joint states alone.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import sys
 from array import array
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -23,12 +23,19 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
 from pkm_twin import load
 from pkm_twin.bags.cdr import message_definition
-from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.ros import node as health
 from pkm_twin.ros.intake import JointStateDecoder
+from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench
+from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings
+
+AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
+UPPER: Final = np.triu_indices(6)
+ENTRIES: Final = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER, strict=True))
+"""Names of the compliance's entries: of the displacement, and of the force or moment."""
 
 
 class StiffnessMonitor(health.TwinNode):
@@ -39,16 +46,23 @@ class StiffnessMonitor(health.TwinNode):
         robot = load(self.declare("mechanism", "upr_rpu", "robot: name or path", read_only=True))
         for kernel in kernels(robot):
             kernel.warm_up()
-        self._monitor = Monitor(robot, self._declare_settings())
-        self._platform_frame = self.declare(
+        settings = self._declare_settings()
+        given = self.declare(
             "platform_frame",
             "",
-            "frame of ~/deflection; empty: wrench_frame, or platform where that is base_frame",
+            "frame of ~/deflection; empty: wrench_frame, or platform where that is base_frame or "
+            "the sensor stands elsewhere",
             read_only=True,
         )
+        mounts = declare_mounts(self, given or PLATFORM)
+        self._platform_frame = given or ("" if mounts is None else PLATFORM)
+        self._monitor = Monitor(robot, settings, mounts)
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self._compliance = self.create_guarded_publisher(Float64MultiArray, "~/compliance")
+        # What has no stamp, or texts for numbers, has a sibling that plots can draw.
+        self._compliance_stamped = self.create_guarded_publisher(JointState, "~/compliance_stamped")
         self._energy = self.create_guarded_publisher(DiagnosticArray, "~/strain_energy")
+        self._energy_stamped = self.create_guarded_publisher(JointState, "~/strain_energy_stamped")
         self._dominant = self.create_guarded_publisher(String, "~/dominant_element")
         self._deflection = self.create_guarded_publisher(TransformStamped, "~/deflection")
         self._known = 0
@@ -60,6 +74,9 @@ class StiffnessMonitor(health.TwinNode):
         if rate > 0.0 and has_modes(robot):
             self._frequencies = self.create_guarded_publisher(
                 Float64MultiArray, "~/natural_frequencies"
+            )
+            self._frequencies_stamped = self.create_guarded_publisher(
+                JointState, "~/natural_frequencies_stamped"
             )
             self.create_guarded_timer(1.0 / rate, self._publish_frequencies)
         self.create_guarded_subscription(
@@ -106,27 +123,20 @@ class StiffnessMonitor(health.TwinNode):
 
     def _declare_settings(self) -> Settings:
         d = Settings()
-        seconds: dict[str, Any] = {"unit": "s", "low": 0.0, "high": 3600.0}
-        frame = self.declare("wrench_frame", d.wrench_frame, "frame of the wrench", read_only=True)
-        base = self.declare("base_frame", d.base_frame, "name of the fixed frame", read_only=True)
-        for name, value in (("wrench_frame", frame), ("base_frame", base)):
-            if not value:
-                raise ParameterError(name, value, "a frame's name")
-        return Settings(
-            frame,
-            base,
-            self.declare(
-                "accept_empty_frame", d.accept_empty_frame, "an empty frame means wrench_frame"
+        return declare_wrench(
+            self,
+            base_frame=self.declare(
+                "base_frame", d.base_frame, "name of the fixed frame", read_only=True
             ),
-            self.declare(
+            max_state_age=self.declare(
                 "max_state_age", d.max_state_age, "from a wrench to the nearest joint state",
-                **seconds,
+                **SECONDS,
             ),
-            self.declare(
+            future_tolerance=self.declare(
                 "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
-                **seconds,
+                **SECONDS,
             ),
-            self.declare(
+            accept_zero_stamp=self.declare(
                 "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
             ),
         )  # fmt: skip
@@ -138,9 +148,7 @@ class StiffnessMonitor(health.TwinNode):
             for name, value in values.items():
                 if self.has_parameter(name):
                     self.check_parameter(name, value)
-            fields = {field.name for field in dataclasses.fields(Settings)}
-            settings = {name: value for name, value in values.items() if name in fields}
-            self._pending = dataclasses.replace(self._monitor.settings, **settings)
+            self._pending = changed(self._monitor.settings, values)
 
         return health.verdict(check)
 
@@ -160,11 +168,18 @@ class StiffnessMonitor(health.TwinNode):
     def _on_wrench(self, message: WrenchStamped) -> None:
         answer = self._monitor.wrench(message, self.now())
         stamp = Time(nanoseconds=answer.stamp).to_msg()
+        base = self._monitor.settings.base_frame
         self._compliance.publish(_matrix(answer.compliance))
+        entries = answer.compliance[UPPER].tolist()
+        self._compliance_stamped.publish(_named(stamp, base, ENTRIES, entries))
         energy = DiagnosticArray(status=[self._status(answer)])
         energy.header.stamp = stamp
-        energy.header.frame_id = self._monitor.settings.base_frame
+        energy.header.frame_id = base
         self._energy.publish(energy)
+        found = answer.energy
+        self._energy_stamped.publish(
+            _named(stamp, base, found.elements, found.factors.tolist(), found.energies.tolist())
+        )
         self._dominant.publish(String(data=answer.energy.dominant))
         deflection = _transform(answer)
         deflection.header.stamp = stamp
@@ -190,6 +205,9 @@ class StiffnessMonitor(health.TwinNode):
             MultiArrayDimension(label="frequency", size=len(values), stride=len(values))
         ]
         self._frequencies.publish(message)
+        stamp = Time(nanoseconds=self._known).to_msg()
+        names = [f"mode_{k + 1}" for k in range(len(values))]
+        self._frequencies_stamped.publish(_named(stamp, "", names, values.tolist()))
 
     def _status(self, answer: Answer) -> DiagnosticStatus:
         """Factors, energy, pose and frame; factors are absent where no load makes energy."""
@@ -210,6 +228,19 @@ class StiffnessMonitor(health.TwinNode):
             hardware_id=robot.name,
             values=[KeyValue(key=key, value=value) for key, value in pairs.items()],
         )
+
+
+def _named(
+    stamp: Any,
+    frame: str,
+    names: Sequence[str],
+    values: Sequence[float],
+    efforts: Sequence[float] = (),
+) -> JointState:
+    """Numbers by name, stamped: the message of names and numbers that plots know."""
+    message = JointState(name=list(names), position=array("d", values), effort=array("d", efforts))
+    message.header.stamp, message.header.frame_id = stamp, frame
+    return message
 
 
 def _matrix(values: NDArray[np.float64]) -> Float64MultiArray:

@@ -16,7 +16,7 @@ from scipy.linalg import cholesky, solve_triangular  # type: ignore[import-untyp
 from pkm_twin.errors import SingularityError
 from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 from stiffness_monitor.beams import System, assemble
-from stiffness_monitor.structure import structural_model
+from stiffness_monitor.structure import Member, structural_model
 
 Array = NDArray[np.float64]
 
@@ -69,9 +69,7 @@ def frame_energies(
     for index in np.ndindex(*batch):
         system = assemble(structural_model(robot, poses[index]), 1)
         root = stiffness_root(system, index)
-        shape = solve_triangular(
-            root, _platform_columns(root) @ loads[index], lower=True, trans=1, check_finite=False
-        )
+        shape = _loaded_shape(root, loads[index])
         every, strain, _ = system.energies(shape)
         elastic = [every.index(name) for name in system.elastic]
         names = system.elastic
@@ -79,6 +77,29 @@ def frame_energies(
         # What carries no load can round to just below zero.
         energies.append(np.maximum(strain[elastic] / 2, 0.0))
     return names, deflections, np.array(energies).reshape(*batch, len(names))
+
+
+def frame_deflections(
+    robot: Robot, pose: ArrayLike, wrench: ArrayLike, *, elements: int = 4
+) -> dict[str, tuple[Array, Array]]:
+    """Points along every member and their displacements under a wrench, by member.
+
+    :param pose: shape (m,); errors as :func:`frame_compliance`.
+    :param wrench: as in :func:`frame_energies`, shape (6,).
+    :param elements: how many parts a member is divided into.
+    :returns: points (elements + 1, 3) in the pose, m, and displacements of the same shape, m; base
+        axes.
+    """
+    poses = checked_poses(robot, pose)
+    model = structural_model(robot, poses)
+    system = assemble(model, elements)
+    shape = _loaded_shape(stiffness_root(system, ()), np.asarray(wrench, np.float64))
+    # The platform's node comes first, then those of each member.
+    moved = system.displacements(shape)[1:, :3]
+    points = system.positions[1:]
+    names = [part.name for part in model.parts if isinstance(part, Member)]
+    rows = [slice(k * (elements + 1), (k + 1) * (elements + 1)) for k in range(len(names))]
+    return {name: (points[r], moved[r]) for name, r in zip(names, rows, strict=True)}
 
 
 def checked_poses(robot: Robot, pose: ArrayLike) -> Array:
@@ -106,6 +127,16 @@ def stiffness_root(system: System, index: tuple[int, ...]) -> Array:
     if not measure > SINGULARITY_BOUND:
         raise SingularityError("the elastic frame of the pose", index, measure, SINGULARITY_BOUND)
     return root
+
+
+def _loaded_shape(root: Array, wrench: Array) -> Array:
+    """Coordinates of the frame under a wrench on the platform, shape (6,)."""
+    return np.asarray(
+        solve_triangular(
+            root, _platform_columns(root) @ wrench, lower=True, trans=1, check_finite=False
+        ),
+        np.float64,
+    )
 
 
 def _platform_columns(root: Array) -> Array:

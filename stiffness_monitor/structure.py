@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pkm_twin.kinematics.motion import reaction_directions
 from pkm_twin.machine.graph import BASE, FREEDOMS, Joint, Rod
 from pkm_twin.machine.members import Beam, Section, Structure
+from pkm_twin.machine.outline import Posture
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -132,20 +133,12 @@ def structural_model(robot: Robot, pose: Array) -> StructuralModel:
 class _Builder:
     def __init__(self, robot: Robot, structure: Structure, q: Array) -> None:
         self.robot, self.structure, self.graph = robot, structure, robot.graph
-        rotations, origins = robot.placements(q)
-        self.rotations = {BASE: np.eye(3)} | rotations
-        tree = robot.engine.tree
-        self.shifts = {BASE: np.zeros(3)} | {
-            name: origins[name] - rotations[name] @ tree.at[name] for name in rotations
-        }
+        posture = Posture(robot, q)
+        self.rotations, self.place = posture.rotations, posture.place
         self.beam_of = {part: beam for beam in structure.beams for part in beam.parts}
         self.hanging = {BASE, self.graph.platform}
         self.parts: list[Member | Carried] = []
         self.closures: list[Closure] = []
-
-    def place(self, body: str, point: Array) -> Array:
-        """A point of a body, given at home, in the pose."""
-        return np.asarray(self.rotations[body] @ point + self.shifts[body], np.float64)
 
     def build(self) -> StructuralModel:
         left = [joint for joint in self.graph.joints.values() if not joint.given]

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
+import functools
 import signal
 
 import numpy as np
 import pytest
 import yaml
+from support.command import command
 from support.robots import (  # noqa: F401
     LIMITED,
     both_ways,
@@ -23,6 +25,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 @pytest.fixture
 def rng():
     return np.random.default_rng(20240229)
+
+
+@pytest.fixture
+def twin(capsys):
+    """Run a command in this process: twin("info", "delta_cu")."""
+    return functools.partial(command, capsys)
 
 
 @pytest.fixture

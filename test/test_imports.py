@@ -22,6 +22,7 @@ MAY = {
     "pkm_twin.mechanisms": CORE,
     "pkm_twin.kinematics": CORE,
     "pkm_twin.streams": CORE | MESSAGES,
+    "pkm_twin.state": CORE | MESSAGES | {"pkm_twin.streams"},
     "delta_dynamics": CORE | MESSAGES | {"pkm_twin.streams"},
     "stiffness_monitor": CORE | MESSAGES | {"pkm_twin.streams"},
 }
@@ -30,9 +31,16 @@ NODES = {
     "delta_dynamics.node",
     "delta_dynamics.action_node",
     "delta_dynamics.gate_node",
+    "delta_dynamics.sim_node",
     "stiffness_monitor.node",
+    "pkm_twin.state.node",
 }
-APPS_WITH_ROS = {"pkm_twin.apps.demo", "pkm_twin.apps.guard_check"}
+APPS_WITH_ROS = {
+    "pkm_twin.apps.demo",
+    "pkm_twin.apps.demo_recorder",
+    "pkm_twin.apps.demo_tracking",
+    "pkm_twin.apps.guard_check",
+}
 WITH_ROS = {"rclpy", "rcl_interfaces", "lifecycle_msgs"}
 
 

@@ -19,7 +19,9 @@ import pytest
 import pkm_twin
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-EXECUTABLES = {"delta_dynamics", "stiffness_monitor", "command_gate", "pkm-twin"}
+EXECUTABLES = {
+    "delta_dynamics", "stiffness_monitor", "command_gate", "machine_sim", "pkm-twin"
+}  # fmt: skip
 COLCON = Path(sys.executable).with_name("colcon")
 needs_colcon = pytest.mark.skipif(
     not COLCON.exists(), reason="colcon is not installed beside this Python"
@@ -45,7 +47,6 @@ def run(*command, cwd, **environment):
         env={**os.environ, **environment},
         capture_output=True,
         text=True,
-        timeout=240,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -158,7 +159,6 @@ class TestColcon:
                 | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "87"},
                 capture_output=True,
                 text=True,
-                timeout=60,
             )
             assert refused.returncode == 1, refused.stderr
             assert "no_such_robot" in refused.stderr

@@ -19,10 +19,13 @@ MAY_IMPORT_ROS = {
     "delta_dynamics/action_node.py",
     "delta_dynamics/gate_node.py",
     "delta_dynamics/node.py",
+    "delta_dynamics/sim_node.py",
     "stiffness_monitor/node.py",
     "pkm_twin/ros/player.py",
     "pkm_twin/ros/node.py",
     "pkm_twin/apps/demo.py",
+    "pkm_twin/apps/demo_recorder.py",
+    "pkm_twin/apps/demo_tracking.py",
     "pkm_twin/apps/guard_check.py",
 }
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")

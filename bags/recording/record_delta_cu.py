@@ -11,6 +11,7 @@ May import: numpy, the standard library, its neighbours in this package.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -132,9 +133,11 @@ def platform_motion(move: Move, time: float) -> tuple[Array, Array, Array]:
     return position, velocity, acceleration
 
 
-def reference(engine: DeltaEngine, moves: list[Move]) -> tuple[Array, Array, Array]:
+def reference(
+    engine: DeltaEngine, moves: list[Move], duration: float = DURATION
+) -> tuple[Array, Array, Array]:
     """Return commanded arm angles, rates and accelerations, each of shape (samples, 3)."""
-    count = round(DURATION * 1e9) // PERIOD_NS
+    count = round(duration * 1e9) // PERIOD_NS
     q, qd, qdd = (np.zeros((count, 3)) for _ in range(3))
     near = engine.assemble_pose(HOME)
     filled = 0
@@ -172,11 +175,72 @@ def standstill(moves: list[Move], after: float, *, picks: bool) -> float:
     raise ValueError(f"no standstill after {after} s")
 
 
+def sensors() -> dict[str, float]:
+    """Return what the metadata say of the drives' signals."""
+    return {
+        "encoder_counts_per_revolution": ENCODER_COUNTS,
+        "velocity_noise_rad_s": VELOCITY_NOISE,
+        "velocity_step_rad_s": VELOCITY_STEP,
+        "effort_noise_N_m": EFFORT_NOISE,
+        "effort_step_N_m": EFFORT_STEP,
+    }
+
+
+def simulate(
+    capture: Capture,
+    motion: tuple[Array, Array, Array],
+    plant: Callable[[float], DeltaEngine],
+    rng: np.random.Generator,
+    *,
+    push: Callable[[float, Array, Array], Array | None] = lambda *_: None,
+    progress: Progress | None = None,
+) -> None:
+    """Run the machine along a reference under its controller and keep its joint states.
+
+    :param motion: of :func:`reference`.
+    :param plant: the machine as it is at a time, s.
+    :param push: wrench on the platform, world axes, at a time and a state of the tree.
+    """
+    begin = plant(0.0)
+    names: list[str] = list(begin.params["joints"])
+    limits = begin.params.get("limits") or {}
+    peak = np.asarray(limits.get("effort", np.inf), dtype=float)
+    configuration = begin.assemble(motion[0][0])
+    velocity = np.zeros_like(configuration)
+    torque = begin.inverse_dynamics(motion[0][0], np.zeros(3), np.zeros(3))
+    integral = torque - NOMINAL_WEIGHT * -np.cos(motion[0][0])
+    count = len(motion[0])
+    period = PERIOD_NS * 1e-9
+    for k in range(count):
+        engine = plant(k * period)
+        q = steps(configuration[engine.actuated], 2.0 * math.pi / ENCODER_COUNTS)
+        noise = rng.normal(size=(2, 3))
+        qd = steps(velocity[engine.actuated] + VELOCITY_NOISE * noise[0], VELOCITY_STEP)
+        effort = steps(torque + EFFORT_NOISE * noise[1], EFFORT_STEP)
+        time = k * PERIOD_NS
+        capture.write(
+            "/joint_states",
+            joint_state(time, names, q, qd, effort),
+            time + JOINT_STATE_LATENCY_NS,
+        )
+        error = motion[0][k] - q
+        integral = integral + INTEGRAL * error * period
+        feedforward = NOMINAL_INERTIA * motion[2][k] - NOMINAL_WEIGHT * np.cos(motion[0][k])
+        torque = feedforward + STIFFNESS * error + DAMPING * (motion[1][k] - qd) + integral
+        torque = np.clip(torque, -peak, peak)
+        for _ in range(SUBSTEPS):
+            wrench = push(k * period, configuration, velocity)
+            configuration, velocity = engine.step(
+                configuration, velocity, torque, wrench, period / SUBSTEPS
+            )
+        if progress is not None and k % 100 == 99:
+            progress((k + 1) / count)
+
+
 def record(path: Path, seed: int = 20250101, progress: Progress | None = None) -> None:
     """Simulate and write the bag."""
     parameters = machine_parameters("delta_cu")
     names: list[str] = parameters["joints"]
-    peak = np.asarray((parameters.get("limits") or {}).get("effort", np.inf), dtype=float)
     payload = {"mass": PAYLOAD_MASS, "com": PAYLOAD_COM}
     empty = DeltaEngine(parameters)
     laden = DeltaEngine({**parameters, "payload": payload})
@@ -203,11 +267,7 @@ def record(path: Path, seed: int = 20250101, progress: Progress | None = None) -
             "payload_com_m": " ".join(map(str, PAYLOAD_COM)),
             "payload_picked_s": f"{pick:.3f}",
             "payload_released_s": f"{release:.3f}",
-            "encoder_counts_per_revolution": ENCODER_COUNTS,
-            "velocity_noise_rad_s": VELOCITY_NOISE,
-            "velocity_step_rad_s": VELOCITY_STEP,
-            "effort_noise_N_m": EFFORT_NOISE,
-            "effort_step_N_m": EFFORT_STEP,
+            **sensors(),
         }
     )
     capture.add_topic("/joint_states", "sensor_msgs/msg/JointState")
@@ -216,34 +276,11 @@ def record(path: Path, seed: int = 20250101, progress: Progress | None = None) -
         start, message = trajectory(move, names, motion)
         capture.write("/delta_dynamics/joint_trajectory", message, start - TRAJECTORY_LEAD_NS)
 
-    rng = np.random.default_rng(seed)
-    configuration = empty.assemble(motion[0][0])
-    velocity = np.zeros_like(configuration)
-    torque = empty.inverse_dynamics(motion[0][0], np.zeros(3), np.zeros(3))
-    integral = torque - NOMINAL_WEIGHT * -np.cos(motion[0][0])
-    count = len(motion[0])
-    period = PERIOD_NS * 1e-9
-    for k in range(count):
-        engine = laden if pick <= k * period < release else empty
-        q = steps(configuration[engine.actuated], 2.0 * math.pi / ENCODER_COUNTS)
-        noise = rng.normal(size=(2, 3))
-        qd = steps(velocity[engine.actuated] + VELOCITY_NOISE * noise[0], VELOCITY_STEP)
-        effort = steps(torque + EFFORT_NOISE * noise[1], EFFORT_STEP)
-        time = k * PERIOD_NS
-        capture.write(
-            "/joint_states",
-            joint_state(time, names, q, qd, effort),
-            time + JOINT_STATE_LATENCY_NS,
-        )
-        error = motion[0][k] - q
-        integral = integral + INTEGRAL * error * period
-        feedforward = NOMINAL_INERTIA * motion[2][k] - NOMINAL_WEIGHT * np.cos(motion[0][k])
-        torque = feedforward + STIFFNESS * error + DAMPING * (motion[1][k] - qd) + integral
-        torque = np.clip(torque, -peak, peak)
-        for _ in range(SUBSTEPS):
-            configuration, velocity = engine.step(
-                configuration, velocity, torque, None, period / SUBSTEPS
-            )
-        if progress is not None and k % 100 == 99:
-            progress((k + 1) / count)
+    simulate(
+        capture,
+        motion,
+        lambda time: laden if pick <= time < release else empty,
+        np.random.default_rng(seed),
+        progress=progress,
+    )
     capture.save(path)

@@ -41,7 +41,7 @@ class Bounds:
     rejected: float = 0.0
     """Messages that a node would refuse, part of all."""
     singularity: float = 1e-3
-    """Least reciprocal condition number of the scaled Jacobian."""
+    """Least distance to a singularity, 0 in one, 1 at best."""
 
 
 @dataclass(frozen=True)
@@ -216,16 +216,22 @@ def residuals(r: Recording) -> tuple[Array, NDArray[np.bool_]]:
     the caller tells of is part of the model while it is held.
     """
     assert r.effort is not None  # noqa: S101
+    expected, used = predicted(r)
+    if r.load is not None:
+        used = used & ~r.load.near_change(r.time, 0.5)
+    return r.effort - expected, used
+
+
+def predicted(r: Recording) -> tuple[Array, NDArray[np.bool_]]:
+    """Efforts that the twin expects (samples, n), zero where its window is not full; and where."""
     qd, qdd, used = motion(r)
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
-    predicted = np.zeros_like(r.q)
+    efforts = np.zeros_like(r.q)
     for robot, part in by_load(r.robot, r.load, r.time, _BLOCK):
         rows = np.arange(part.start, part.stop)[used[part]]
         state = (r.q[rows], qd[rows], qdd[rows], wrench[rows])
-        predicted[rows] = inverse_dynamics(robot, *state)
-    if r.load is not None:
-        used = used & ~r.load.near_change(r.time, 0.5)
-    return r.effort - predicted, used
+        efforts[rows] = inverse_dynamics(robot, *state)
+    return efforts, used
 
 
 def motion(r: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -13,6 +13,8 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.apps.calibrate import calibrate_command
+from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.apps.options import (
     BagPath,
@@ -26,6 +28,7 @@ from pkm_twin.apps.options import (
     RobotName,
     load_of,
 )
+from pkm_twin.apps.view.command import view
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
     flush_output,
@@ -496,7 +499,10 @@ def certify(
 
 
 app.add_typer(atlases.app, name="atlas")
+app.command("calibrate")(calibrate_command)
 app.command()(guard_check)
+app.command()(view)
+app.command()(fit)
 app.command()(atlases.show)
 
 

@@ -1,43 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demonstration: every recorded bag through the real nodes over the real middleware.
 
-For each bag a node and the player run as processes of their own; this process records what the
-node publishes into one MCAP, reads that back, and ends with a table, a picture and a verdict.
+For each bag a node and the player run as processes of their own, then the twin beside a simulated
+machine; this process records what the nodes publish into one MCAP, reads that back, and ends with
+a table, a picture and a verdict.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
-import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from pkm_twin.apps import demo_tracking
+from pkm_twin.apps.demo_recorder import (
+    MATCH_SECONDS,
+    STATE,
+    TRAJECTORY,
+    Recorder,
+    drain,
+    process,
+    wait_for,
+)
 from pkm_twin.apps.demo_report import REPORTS, Finding, draw, print_findings
+from pkm_twin.apps.tracking_report import report_tracking
 from pkm_twin.bags.reader import BagWriter, inspect
 from pkm_twin.errors import BagError, PkmTwinError
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
-
-MATCH_SECONDS = 60.0
-"""How long a node may take to come up: the first start compiles the kernels."""
-
-STATE = "sensor_msgs/msg/JointState"
-TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 
 
 @dataclass(frozen=True)
@@ -92,42 +91,6 @@ STAGES = (
 )
 
 
-class Recorder:
-    """Writes the raw messages of some topics into a bag, under a prefix for each stage."""
-
-    def __init__(self, node: Node, writer: BagWriter) -> None:
-        self._node = node
-        self._writer = writer
-        self._subscriptions: list[Any] = []
-        self.counts: dict[str, int] = {}
-
-    def listen(self, prefix: str, topics: dict[str, str]) -> None:
-        """Record these topics from now on, as ``prefix`` followed by the topic."""
-        qos = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
-        for topic, kind in topics.items():
-            name = f"/{prefix}{topic}"
-            self._writer.add_topic(name, kind)
-            self.counts[name] = 0
-            self._subscriptions.append(
-                self._node.create_subscription(
-                    _message_class(kind), topic, self._keep(name), qos, raw=True
-                )
-            )
-
-    def stop(self) -> None:
-        """Forget the current topics."""
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions.clear()
-
-    def _keep(self, name: str) -> Callable[[bytes], None]:
-        def callback(data: bytes) -> None:
-            self.counts[name] += 1
-            self._writer.write(name, data, time.time_ns())
-
-        return callback
-
-
 def run_stage(
     stage: Stage, bag: Path, recorder: Recorder, executor: SingleThreadedExecutor, console: Console
 ) -> None:
@@ -148,7 +111,7 @@ def run_stage(
         ) as progress,
     ):
         bar = progress.add_task(f"{stage.bag} -> {stage.module}", total=seconds, messages=0)
-        _wait(
+        wait_for(
             executor,
             lambda: all(node.count_publishers(topic) for topic in stage.outputs),
             MATCH_SECONDS,
@@ -169,33 +132,10 @@ def run_stage(
                 )
             if player.returncode != 0:
                 raise BagError(f"the player ended with code {player.returncode}", path=bag)
-        _drain(executor, recorder)
+        drain(executor, recorder)
         answers = sum(recorder.counts.values()) - before
         progress.update(bar, completed=seconds, messages=answers)
     recorder.stop()
-
-
-@contextmanager
-def process(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
-    """A child process in a session of its own, ended with SIGINT and waited for."""
-    child = subprocess.Popen(command, start_new_session=True, env=child_environment())  # noqa: S603
-    try:
-        yield child
-    finally:
-        if child.poll() is None:
-            child.send_signal(signal.SIGINT)
-            try:
-                child.wait(timeout=5.0)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()
-
-
-def child_environment() -> dict[str, str]:
-    """The environment, changed so that a child's ROS wheels find their libraries again."""
-    environment = dict(os.environ)
-    environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
-    return environment
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -224,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(bags: Path, out: Path, console: Console) -> list[Finding]:
-    """Replay every bag through its node, and print and draw what came back."""
+    """Bags through their nodes, a machine by the twin; print and draw what came back."""
     recording = out / "demo.mcap"
     context = Context()
     rclpy.init(context=context)
@@ -235,6 +175,8 @@ def run(bags: Path, out: Path, console: Console) -> list[Finding]:
             recorder = Recorder(executor.get_nodes()[0], writer)
             for stage in STAGES:
                 run_stage(stage, bags / f"{stage.bag}.mcap", recorder, executor, console)
+            for spread in demo_tracking.SPREADS:
+                demo_tracking.run(spread, recorder, executor, console)
     finally:
         rclpy.try_shutdown(context=context)
     findings: list[Finding] = []
@@ -244,41 +186,12 @@ def run(bags: Path, out: Path, console: Console) -> list[Finding]:
             bags / f"{stage.bag}.mcap", recording, stage.bag
         )
         findings += found
+    found, series["machine_sim"] = report_tracking(recording, demo_tracking.SPREADS)
+    findings += found
     picture = draw(series, out / "demo.png")
     print_findings(console, findings)
     console.print(f"picture {picture}, recording {recording}")
     return findings
-
-
-def _message_class(kind: str) -> Any:
-    package, _, name = kind.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
-
-
-def _wait(
-    executor: SingleThreadedExecutor,
-    condition: Callable[[], bool],
-    seconds: float,
-    what: str,
-    child: subprocess.Popen[bytes],
-) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        executor.spin_once(timeout_sec=0.1)
-        if child.poll() is not None:
-            raise PkmTwinError(f"waiting for {what}: it ended with code {child.returncode}")
-        if time.monotonic() > deadline:
-            raise PkmTwinError(f"waiting for {what}: nothing after {seconds:g} s")
-
-
-def _drain(executor: SingleThreadedExecutor, recorder: Recorder) -> None:
-    """Take what is still on its way: until nothing has come for half a second."""
-    last, quiet = sum(recorder.counts.values()), time.monotonic()
-    while time.monotonic() - quiet < 0.5:
-        executor.spin_once(timeout_sec=0.05)
-        count = sum(recorder.counts.values())
-        if count != last:
-            last, quiet = count, time.monotonic()
 
 
 if __name__ == "__main__":

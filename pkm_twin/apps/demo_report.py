@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from pkm_twin.atlas import plots
 from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import stamp_of
+
+if TYPE_CHECKING:
+    from pkm_twin.apps.tracking_report import TrackingSeries
 
 Array = NDArray[np.float64]
 
@@ -254,7 +257,7 @@ REPORTS: dict[str, Report] = {
 
 def print_findings(console: Console, findings: list[Finding]) -> None:
     """The table that a person reads."""
-    table = Table(title="pkm_twin on recorded bags")
+    table = Table(title="pkm_twin on recorded bags and a simulated machine")
     for column in ("bag", "what", "value", "limit", ""):
         table.add_column(column)
     last = ""
@@ -265,14 +268,18 @@ def print_findings(console: Console, findings: list[Finding]) -> None:
     console.print(table)
 
 
-def draw(series: Mapping[str, DynamicsSeries | StiffnessSeries], path: Path) -> Path:
+def draw(
+    series: Mapping[str, DynamicsSeries | StiffnessSeries | TrackingSeries], path: Path
+) -> Path:
     """One picture of all stages: a column each."""
     figure, axes = plots.columns(len(series), 3)
     for column, data in zip(axes, series.values(), strict=True):
         if isinstance(data, DynamicsSeries):
             plots.efforts(column, data)
-        else:
+        elif isinstance(data, StiffnessSeries):
             plots.deflections(column, data)
+        else:
+            plots.tracking(column, data)
     return plots.save(figure, path)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.graph import BASE, Graph
+from pkm_twin.machine.outline import body_points, platform_face
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -23,25 +24,6 @@ PLATFORM: Final = "#D55E00"
 GROUND: Final = "#000000"
 DRIVE: Final = "#0072B2"
 """Colours that are told apart with every kind of colour vision (Okabe and Ito 2008)."""
-
-
-def body_points(graph: Graph) -> dict[str, list[Array]]:
-    """Points of each body's joints and rods at home, the base's too, shape (3,) each."""
-    points: dict[str, list[Array]] = {name: [] for name in (BASE, *graph.bodies)}
-    for joint in graph.joints.values():
-        if joint.kind == "translation":  # it has no place
-            continue
-        at = joint.at
-        for name in (joint.inner, joint.outer):
-            points[name].append(at)
-        if joint.kind == "prismatic" and joint.inner != BASE:
-            # A telescope: the tube ends where the rod that slides in it has its next joint.
-            points[joint.inner].append(at + joint.home * joint.axes[0] / 2)
-    for rod in graph.rods.values():
-        for name, end in zip((rod.inner, rod.outer), rod.ends, strict=True):
-            points[name].append(end)
-    points[graph.platform].append(graph.origin)
-    return points
 
 
 def draw(robot: Robot, ax: Any = None) -> Any:
@@ -63,7 +45,7 @@ def draw(robot: Robot, ax: Any = None) -> Any:
         if name == BASE:
             ax.scatter(*np.array(places).T, color=GROUND, s=30, marker="s", label="base")
         elif name == graph.platform:
-            _platform(ax, np.array(places))
+            _platform(ax, graph, np.array(places))
         else:
             _lines(ax, np.array([*places, *_only_com(graph, name, places)]), BODY, 3)
     for rod in graph.rods.values():
@@ -112,17 +94,14 @@ def _lines(ax: Any, places: Array, colour: str, width: float) -> None:
         ax.plot(*np.array([middle, place]).T, color=colour, linewidth=width)
 
 
-def _platform(ax: Any, places: Array) -> None:
+def _platform(ax: Any, graph: Graph, places: Array) -> None:
     """A face around the joints of the platform where they span one, and lines in any case."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
-    origin, joints = places[-1], places[:-1]
-    middle = joints.mean(0)
-    axes = np.linalg.svd(joints - middle)[2]
-    flat = (joints - middle) @ axes[:2].T
-    if len(joints) > 2 and np.ptp(flat, axis=0).min() > 1e-6 * np.ptp(flat, axis=0).max():
-        order = np.argsort(np.arctan2(flat[:, 1], flat[:, 0]))
-        face = Poly3DCollection([joints[order]], facecolor=PLATFORM, alpha=0.35, edgecolor=PLATFORM)
+    origin, joints = places[0], places[1:]
+    corners = platform_face(graph)
+    if len(corners):
+        face = Poly3DCollection([corners], facecolor=PLATFORM, alpha=0.35, edgecolor=PLATFORM)
         ax.add_collection3d(face)
     else:
         _lines(ax, joints, PLATFORM, 3)

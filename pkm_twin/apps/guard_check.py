@@ -6,8 +6,6 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
@@ -16,6 +14,7 @@ import typer
 from pkm_twin.apps.verdict import Item, Verdict, items_table
 from pkm_twin.console import print_json, table_console
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.ros.listener import listening_node
 from pkm_twin.ros.messages import stamp_of
 from pkm_twin.ros.signals import first_signal
 from pkm_twin.streams.arrivals import SECOND, Arrivals
@@ -121,7 +120,7 @@ def watch(
             raise ParameterError(name, value, "a number of seconds above 0")
     arrivals = Arrivals(deadline)
     offer = Offer(0, math.inf, math.inf)
-    with _node(sim_time) as (node, spin):
+    with listening_node("guard_check", sim_time) as (node, spin):
         name = node.resolve_topic_name(topic)
         now = node.get_clock().now
 
@@ -155,38 +154,6 @@ def watch(
             pass  # What was seen until then is the report.
         arrivals.ended(time.monotonic_ns())
     return judge(name, arrivals, offer)
-
-
-@contextmanager
-def _node(sim_time: bool) -> Iterator[tuple[Any, Any]]:
-    """A node, and a function that lets it take messages for some time, s."""
-    try:
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.parameter import Parameter
-        from rclpy.signals import SignalHandlerOptions
-    except ImportError as error:
-        raise PkmTwinError(
-            f"guard-check needs ROS 2: source its setup, or pip install pkm_twin[jazzy] ({error})"
-        ) from error
-    context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        clock = Parameter("use_sim_time", value=sim_time)
-        node = rclpy.create_node("guard_check", context=context, parameter_overrides=[clock])
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-
-        def spin(seconds: float) -> None:
-            until = time.monotonic() + seconds
-            while (left := until - time.monotonic()) > 0.0:
-                executor.spin_once(timeout_sec=left)
-
-        yield node, spin
-        executor.shutdown()
-        node.destroy_node()
-    finally:
-        context.try_shutdown()
 
 
 def _subscribe(node: Any, topic: str, take: Any) -> bool:

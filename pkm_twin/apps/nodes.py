@@ -12,11 +12,15 @@ MODULES = {
     "delta_dynamics": "delta_dynamics.node",
     "command_gate": "delta_dynamics.gate_node",
     "stiffness_monitor": "stiffness_monitor.node",
+    "machine_state": "pkm_twin.state.node",
+    "machine_sim": "delta_dynamics.sim_node",
 }
 SUMMARIES = {
     "delta_dynamics": "Trajectories and joint states in, feedforward torques out.",
     "command_gate": "Stamped torques in, plain commands of an effort controller out.",
     "stiffness_monitor": "Wrenches in, compliance and the dominant strain-energy element out.",
+    "machine_state": "Joint states in; all joints, the platform's motion and markers out.",
+    "machine_sim": "Efforts or trajectories in, a simulated machine's joint states out.",
 }
 
 
@@ -33,6 +37,16 @@ def command_gate() -> None:
 def stiffness_monitor() -> None:
     """Entry point of ``ros2 run pkm_twin stiffness_monitor``."""
     _run("stiffness_monitor")
+
+
+def machine_state() -> None:
+    """Entry point of ``ros2 run pkm_twin machine_state``."""
+    _run("machine_state")
+
+
+def machine_sim() -> None:
+    """Entry point of ``ros2 run pkm_twin machine_sim``."""
+    _run("machine_sim")
 
 
 def _run(name: str) -> None:

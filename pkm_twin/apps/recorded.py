@@ -159,13 +159,13 @@ class Recording:
         return sum(self.bag.report.topics[name].count for name in names if name is not None)
 
 
-def robot_of(bag: Bag, name: str | None) -> Robot:
-    """The robot by name, or the one that the bag's metadata names.
+def robot_of(bag: Bag, name: str | Robot | None) -> Robot:
+    """The robot, by name too, or the one that the bag's metadata names.
 
     :raises BagError: neither is given, or the bag names one that is not in ``config/``.
     """
     if name is not None:
-        return load(name)
+        return name if isinstance(name, Robot) else load(name)
     recorded = bag.report.metadata.get("pkm_twin", {}).get("robot")
     if recorded is None:
         raise BagError(
@@ -378,7 +378,7 @@ def _choice_error(bag: Bag, text: str, reason: str = "topic") -> BagError:
 
 def read_recording(
     path: str | Path,
-    robot: str | None = None,
+    robot: str | Robot | None = None,
     progress: Callable[[int], None] | None = None,
     *,
     topics: Sequence[str] = (),

@@ -3,16 +3,12 @@
 
 from __future__ import annotations
 
-import array
 import csv
 import importlib.util
-import io
-import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +16,7 @@ from numpy.typing import NDArray
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions
 from pkm_twin import load
 from pkm_twin.apps.check import motion
+from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.apps.recorded import Load, by_load, read_recording
 from pkm_twin.errors import (
@@ -30,7 +27,6 @@ from pkm_twin.errors import (
     UnknownNameError,
     UnreachableError,
 )
-from pkm_twin.files import open_regular
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -40,10 +36,6 @@ ENDINGS = (".csv", ".parquet")
 WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
-MAX_CSV_BYTES = 1024**3
-"""Largest CSV that is read: some millions of samples."""
-MAX_CSV_LINE = 1024**2
-"""Longest line of it, characters."""
 SHORTEST_STEP = 1e-9
 """Between two of its times, s: what a bag's stamps resolve."""
 
@@ -114,7 +106,7 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
     :raises ParameterError: a column is missing or misspelt, or a value is no finite number.
     """
     machine = load(robot)
-    columns = _read_columns(path)
+    columns = read_columns(path)
     known = [f"{joint}.{what}" for joint in machine.joint_names for what in INPUTS]
     for name in columns:
         joint, dot, what = name.rpartition(".")
@@ -259,47 +251,3 @@ def _write_parquet(columns: dict[str, Array], path: Path) -> None:
     from pyarrow import parquet
 
     parquet.write_table(pyarrow.table(columns), path)
-
-
-def _read_columns(path: Path) -> dict[str, Array]:
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size > MAX_CSV_BYTES:
-                raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_CSV_BYTES}")
-            # Spreadsheets put a byte order mark before the header row.
-            with io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text:
-                return _parse_columns(path, csv.reader(_lines(text, path)))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        what = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ParameterError(str(path), what, "a readable CSV file") from None
-
-
-def _lines(text: TextIO, path: Path) -> Iterator[str]:
-    """The lines of a file, none so long that a row takes all the memory."""
-    while line := text.readline(MAX_CSV_LINE):
-        if len(line) == MAX_CSV_LINE:
-            raise ParameterError(f"{path}: a line", f"{line[:40]}...", f"below {MAX_CSV_LINE} long")
-        yield line
-
-
-def _parse_columns(path: Path, rows: Iterator[list[str]]) -> dict[str, Array]:
-    header = [name.strip() for name in next(rows, [])]
-    if len(set(header)) != len(header):
-        raise ParameterError(f"{path}: header row", ", ".join(header), "different names")
-    data = array.array("d")
-    number = 1
-    for number, row in enumerate(rows, 2):
-        if len(row) != len(header):
-            raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
-        try:
-            values = [float(cell) for cell in row]
-        except ValueError as error:
-            raise ParameterError(f"{path}: line {number}", str(error), "numbers") from None
-        if not all(map(math.isfinite, values)):
-            raise ParameterError(f"{path}: line {number}", row, "finite numbers")
-        data.extend(values)
-    if not data:
-        raise ParameterError(str(path), f"{number if header else 0} lines", "a header row and rows")
-    table = np.frombuffer(data, np.float64).reshape(-1, len(header))
-    return dict(zip(header, np.ascontiguousarray(table.T), strict=True))

@@ -17,7 +17,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import qmc  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import (
@@ -35,8 +34,6 @@ Mask = NDArray[np.bool_]
 RAYS: Final = 360
 REFINEMENTS: Final = 32
 BLOCK: Final = 16
-SPARSE: Final = 4
-"""Every how many rays and rungs the distance to a singularity is looked at."""
 JOINT_STATES: Final = 2**14
 """Joint states, evenly spread between the limits, whose poses bound a workspace."""
 CLIMBERS: Final = 32
@@ -117,6 +114,9 @@ def _from_joints(robot: Robot) -> Array:
     count = len(robot.joint_names)
     if limits is None or not np.isfinite(limits).all():
         return np.empty((0, len(robot.pose_names)))
+    # Not above: every process of a sweep would load it, which takes longer than many sweeps.
+    from scipy.stats import qmc  # type: ignore[import-untyped]
+
     # Extremes are mostly where joints are at a limit or in the middle.
     corners = np.stack(np.meshgrid(*[[0.0, 0.5, 1.0]] * count, indexing="ij"), -1)
     inner = qmc.Halton(count, scramble=False).random(JOINT_STATES)
@@ -201,19 +201,14 @@ def circles(
     step = largest_distance(robot) / steps
 
     def inside(height: float, distance: Array, azimuth: Array) -> Mask:
-        return reachable(robot, grid.polar_pose(height, distance, azimuth), least_clearance)
-
-    def clear(height: float, distance: Array, azimuth: Array) -> Mask:
         poses = grid.polar_pose(height, distance, azimuth)
-        return np.asarray(singularity_at(robot, poses) >= max(least, CLEAR))
+        kept = reachable(robot, poses, least_clearance)
+        kept[kept] = singularity_at(robot, poses[kept]) >= max(least, CLEAR)
+        return kept
 
     radius = np.zeros(len(z))
     for k, height in enumerate(z.tolist()):
-        reach = _free(functools.partial(inside, height), turn, step, steps)
-        # The measure changes slowly, so fewer rays and rungs tell where it is too small.
-        rungs = math.ceil(reach / step / SPARSE)
-        test = functools.partial(clear, height)
-        radius[k] = min(reach, _free(test, turn[::SPARSE], reach / max(rungs, 1), rungs))
+        radius[k] = _free(functools.partial(inside, height), turn, step, steps)
     return Reach(z, radius)
 
 

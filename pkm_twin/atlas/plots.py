@@ -14,6 +14,7 @@ from pkm_twin.atlas.store import replace_file, writing
 
 if TYPE_CHECKING:
     from pkm_twin.apps.demo_report import DynamicsSeries, StiffnessSeries
+    from pkm_twin.apps.tracking_report import TrackingSeries
 
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
@@ -125,6 +126,38 @@ def deflections(axes: Sequence[Any], data: StiffnessSeries) -> None:
     shares.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     for ax in axes:
         ax.set_xlabel("time (s)")
+        ax.grid(alpha=0.3)
+
+
+def tracking(axes: Sequence[Any], data: TrackingSeries) -> None:
+    """Tracking errors of PD alone and with feedforward, and the first joint's efforts."""
+    least = min(data.runs)
+    together, ahead, efforts = axes
+    for i, (spread, (plain, fed)) in enumerate(data.runs.items()):
+        told = f"{100 * spread:g} %"
+        for ax, run, what in ((together, plain, "PD"), (ahead, fed, "with feedforward")):
+            size = 1e3 * np.linalg.norm(run.error, axis=1)
+            ax.plot(run.time, size, color=COLOURS[i], lw=1.2, label=f"{what}, {told}")
+        together.plot(
+            fed.time,
+            1e3 * np.linalg.norm(fed.error, axis=1),
+            *("--",),
+            color=COLOURS[i],
+            lw=1,
+            label=f"with feedforward, {told}",
+        )
+    for i, (run, what) in enumerate(zip(data.runs[least], ("PD", "with feedforward"), strict=True)):
+        for k, joint in enumerate(data.joints):
+            label = f"{joint}, {what}"
+            style = {"lw": 1.0, "ls": ("-", "--")[i], "color": COLOURS[k]}
+            efforts.plot(run.time, run.effort[:, k], label=label, **style)
+    together.set_title("machine_sim: tracking error of a path there and back, by parameter error")
+    ahead.set_title("the same with feedforward, closely")
+    efforts.set_title(f"drives' efforts at {100 * least:g} %")
+    for ax in axes:
+        ax.set_xlabel("time (s)")
+        ax.set_ylabel("effort (N m)" if ax is efforts else "error, all joints (mrad)")
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
         ax.grid(alpha=0.3)
 
 

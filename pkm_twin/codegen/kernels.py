@@ -34,6 +34,8 @@ GOOD: Final = 0.0
 REFUSED: Final = 1.0
 NOT_FINITE: Final = 2.0
 
+_WRITERS: Final = ("codegen", "machine", "kinematics", "mechanisms", "streams")
+"""Folders beside this one whose sources write programs."""
 _F8: Final = np.dtype(np.float64)
 
 
@@ -57,7 +59,7 @@ def compiled() -> bool:
 def _sources() -> str:
     """What the package's formulas hang on: a changed file compiles anew."""
     root = Path(__file__).resolve().parents[1]
-    folders = [root / name for name in ("codegen", "machine", "kinematics", "mechanisms")]
+    folders = [root / name for name in _WRITERS]
     folders += [root.parent / name for name in ("delta_dynamics", "stiffness_monitor")]
     paths = sorted(path for place in folders for path in place.glob("*.py"))
     return cache.digest(*(path.read_text(encoding="utf-8") for path in paths))
@@ -90,8 +92,9 @@ class _Space:
         self.words[2] = p.ctypes.data
 
 
-def _take_none(*inputs: Any) -> Array | None:
-    raise TypeError(f"{len(inputs)} inputs go the way of a batch")
+def _take_none(*_: Any) -> Array | None:
+    """On plain Python every sample goes the way of a batch."""
+    return None
 
 
 @remembered
@@ -238,7 +241,7 @@ class Kernel:
         return [output[0] for output in outputs], None if status is None else status[0]
 
     def first_of_one(self, p: Array) -> Callable[..., Array | None]:
-        """The first output of one sample, as fast as can be; on plain Python it takes none.
+        """The first output of one sample, as fast as can be; on plain Python always None.
 
         The function takes arrays of doubles of exactly the inputs' shapes, (size,) each, else it
         raises TypeError or ValueError; it gives None where a sample is not good at once.

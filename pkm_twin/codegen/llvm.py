@@ -35,6 +35,8 @@ from pkm_twin.codegen.program import (
 LANES: Final = 4
 SYMBOL: Final = "kernel"
 OPTIMISATION: Final = 2
+LONG: Final = 100
+"""Entries of an output from which on they are stored in a loop."""
 
 DOUBLE: Final = ir.DoubleType()
 INT64: Final = ir.IntType(64)
@@ -316,12 +318,38 @@ class _Writer:
 
     def _save(self, base: Any, values: Sequence[Any]) -> None:
         b = self.b
+        if len(values) > LONG:
+            self._save_long(base, values)
+            return
         size = ir.Constant(INT64, len(values))
         rows = [b.mul(place, size) for place in self.places]
         for j, vector in enumerate(values):
             for lane, row in enumerate(rows):
                 at = b.gep(base, [b.add(row, ir.Constant(INT64, j))])
                 b.store(b.extract_element(vector, ir.Constant(INT32, lane)), at)
+
+    def _save_long(self, base: Any, values: Sequence[Any]) -> None:
+        """The same in a loop: thousands of stores in a row take minutes to compile."""
+        b = self.b
+        size = ir.Constant(INT64, len(values))
+        with b.goto_entry_block():
+            scratch, counter = b.alloca(VECTOR, len(values)), b.alloca(INT64)
+        for j, vector in enumerate(values):
+            b.store(vector, b.gep(scratch, [ir.Constant(INT64, j)]))
+        loop, done = (self.function.append_basic_block(name) for name in ("save", "saved"))
+        b.store(ir.Constant(INT64, 0), counter)
+        rows = [b.mul(place, size) for place in self.places]
+        b.branch(loop)
+        b.position_at_end(loop)
+        j = b.load(counter)
+        vector = b.load(b.gep(scratch, [j]))
+        for lane, row in enumerate(rows):
+            at = b.gep(base, [b.add(row, j)])
+            b.store(b.extract_element(vector, ir.Constant(INT32, lane)), at)
+        after = b.add(j, ir.Constant(INT64, 1))
+        b.store(after, counter)
+        b.cbranch(b.icmp_signed("<", after, size), loop, done)
+        b.position_at_end(done)
 
     def write(self) -> str:
         b, blocks, program = self.b, self.blocks, self.program

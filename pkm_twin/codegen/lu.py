@@ -54,7 +54,7 @@ class SparseLU:
     def __init__(self, matrix: Objects, samples: Array, share: float = 0.1) -> None:
         n = self.size = len(matrix)
         rows: list[dict[int, Any]] = [
-            {c: matrix[r][c] for c in range(n) if not _is_zero(matrix[r][c])} for r in range(n)
+            {c: matrix[r][c] for c in range(n) if not is_zero(matrix[r][c])} for r in range(n)
         ]
         numbers = np.array(samples, float)
         open_rows, open_columns = set(range(n)), set(range(n))
@@ -155,7 +155,8 @@ class SparseLU:
         return _objects(y)
 
 
-def _is_zero(value: Any) -> bool:
+def is_zero(value: Any) -> bool:
+    """Whether an expression or a number is zero for all samples."""
     constant = getattr(value, "is_constant", None)
     return bool(constant(0.0)) if constant is not None else value == 0.0
 

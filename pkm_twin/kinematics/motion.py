@@ -40,7 +40,8 @@ def numbers(values: Any) -> Array:
     return np.asarray(np.array(values, dtype=float), np.float64)
 
 
-def _difference(b: Columns, a: Columns) -> Columns:
+def difference(b: Columns, a: Columns) -> Columns:
+    """Columns of b less those of a, by rate."""
     keys = dict.fromkeys([*b, *a])
     return {k: (b[k] - a[k] if k in a else b[k]) if k in b else -a[k] for k in keys}
 
@@ -50,8 +51,9 @@ class Row:
     """One scalar equation of a closure: ``value`` is zero, ``columns`` its derivatives by rates.
 
     ``bias``: its second derivative in time at zero accelerations of the unknowns. ``scale`` makes
-    it of unit one. ``part``: the joint or rod. A unit of its multiplier is a force ``force`` and a
-    moment ``moment`` on ``outer`` at ``point``, and the opposite on ``inner``.
+    it of unit one; ``angle``: it is about directions. ``part``: the joint or rod. A unit of its
+    multiplier is a force ``force`` and a moment ``moment`` on ``outer`` at ``point``, and the
+    opposite on ``inner``.
     """
 
     part: str
@@ -64,6 +66,7 @@ class Row:
     point: Any
     force: Any
     moment: Any
+    angle: bool = False
 
 
 class Motion:
@@ -206,7 +209,7 @@ class Motion:
         """Both bodies' points are at one place."""
         a, b, at = joint.inner, joint.outer, joint.at
         xa, xb = self.point(a, at), self.point(b, at)
-        columns = _difference(self.point_columns(b, xb), self.point_columns(a, xa))
+        columns = difference(self.point_columns(b, xb), self.point_columns(a, xa))
 
         def bias(i: int) -> Callable[[], Any]:
             return lambda: self.acceleration(b, at)[i] - self.acceleration(a, at)[i]
@@ -224,7 +227,7 @@ class Motion:
         a, b = joint.inner, joint.outer
         ea, ub = self.direction(a, e), self.direction(b, u)
         normal = cross(ub, ea)
-        columns = _difference(self.turn_columns(b), self.turn_columns(a))
+        columns = difference(self.turn_columns(b), self.turn_columns(a))
 
         def bias() -> Any:
             wa, wb = self.omega[a], self.omega[b]
@@ -234,7 +237,7 @@ class Motion:
 
         return Row(
             joint.name, ea @ ub - float(e @ u), {k: c @ normal for k, c in columns.items()}, bias,
-            1.0, a, b, self.point(b, joint.at), np.zeros(3), normal,
+            1.0, a, b, self.point(b, joint.at), np.zeros(3), normal, angle=True,
         )  # fmt: skip
 
     def _offset(self, joint: Joint, e: Array) -> Row:
@@ -243,7 +246,7 @@ class Motion:
         ea, xa, xb = self.direction(a, e), self.point(a, at), self.point(b, at)
         apart = xb - xa
         normal = cross(ea, apart)
-        linear = _difference(self.point_columns(b, xb), self.point_columns(a, xa))
+        linear = difference(self.point_columns(b, xb), self.point_columns(a, xa))
         columns = {k: c @ ea for k, c in linear.items()}
         for k, c in self.turn_columns(a).items():
             columns[k] = columns[k] + c @ normal if k in columns else c @ normal
@@ -267,7 +270,7 @@ class Motion:
         a, b, (start, end) = rod.inner, rod.outer, rod.ends
         xa, xb = self.point(a, start), self.point(b, end)
         apart = xb - xa
-        columns = _difference(self.point_columns(b, xb), self.point_columns(a, xa))
+        columns = difference(self.point_columns(b, xb), self.point_columns(a, xa))
         square = float((end - start) @ (end - start))
 
         def bias() -> Any:

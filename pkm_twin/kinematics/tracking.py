@@ -151,8 +151,6 @@ def _inside(robot: Robot, poses: Array, singularity: float) -> NDArray[np.bool_]
         with np.errstate(invalid="ignore"):
             good &= ((q >= limits[:, 0]) & (q <= limits[:, 1])).all(-1)
     if good.any():
-        rates, usable = robot.try_jacobian(q[good])
-        measure = np.zeros(len(rates))
-        measure[usable] = robot.singularity_of(rates[usable])
+        measure, usable = robot.try_singularity(q[good])
         good[good] = usable & (measure >= singularity)
     return good

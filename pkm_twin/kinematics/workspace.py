@@ -45,10 +45,8 @@ def singularity_at(robot: Robot, pose: ArrayLike) -> Array:
     :param pose: shape (..., m), m and rad.
     """
     q, good = try_inverse(robot, pose)
-    rates, found = robot.try_jacobian(q)
-    good &= found
     measure = np.zeros(good.shape)
-    measure[good] = robot.singularity_of(rates[good])
+    measure[good], _ = robot.try_singularity(q[good])
     return measure
 
 

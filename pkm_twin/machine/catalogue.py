@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
@@ -34,6 +35,19 @@ def robot_names() -> list[str]:
     return sorted(path.stem for path in config_folder().glob("*.yaml"))
 
 
+def robot_path(robot: str | Path) -> Path:
+    """The file of a robot's name or path.
+
+    :raises UnknownNameError: no such name; the closest one is named.
+    """
+    text = str(robot)
+    if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
+        return Path(robot)
+    if text in robot_names():
+        return config_folder() / f"{text}.yaml"
+    raise UnknownNameError("robot", text, robot_names())
+
+
 def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     """A robot by its name in ``config/``, from a parameter file, or from a URDF with its loops.
 
@@ -42,19 +56,22 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     :raises UnknownNameError: no such name; the closest one is named.
     :raises ParameterError: a file, key, type or value that is refused, by its dotted name.
     """
-    text = str(robot)
-    if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
-        path = Path(robot)
-    elif text in robot_names():
-        path = config_folder() / f"{text}.yaml"
-    else:
-        raise UnknownNameError("robot", text, robot_names())
+    path = robot_path(robot)
     if path.suffix in TREES:
         data = read_urdf(path, platform=platform)
     elif platform is not None:
         raise ParameterError("platform", platform, "none: the file names its own platform")
     else:
         data = schema.read_yaml(path)
+    return robot_of_data(data, path.stem)
+
+
+def robot_of_data(data: Mapping[str, Any], name: str) -> Robot:
+    """A robot of what a parameter file says.
+
+    :raises UnknownNameError: no such mechanism; the closest one is named.
+    :raises ParameterError: a key, type or value that is refused, by its dotted name.
+    """
     mechanism = data.get("mechanism")
     if mechanism is None:
         raise ParameterError("mechanism", None, f"one of {', '.join(sorted(CATALOGUE))}")
@@ -62,4 +79,4 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
         raise UnknownNameError("mechanism", mechanism, CATALOGUE)
     module, kind = CATALOGUE[mechanism].split(":")
     made: type[Robot] = getattr(importlib.import_module(module), kind)
-    return made.from_data(data, path.stem)
+    return made.from_data(data, name)

@@ -176,6 +176,21 @@ class Graph:
         return extent if extent > 0.0 else 1.0
 
     @property
+    def rim(self) -> float:
+        """Greatest distance of a joint on the platform from its reference point, m."""
+        points = self.joint_points(self.platform)
+        far = max((float(np.linalg.norm(p - self.origin)) for p in points), default=0.0)
+        return far if far > 1e-6 * self.size else 0.1 * self.size
+
+    def joint_points(self, body: str) -> list[Array]:
+        """Where joints and rods meet a body at home, m."""
+        points = [j.at for j in self.joints.values() if body in (j.inner, j.outer)]
+        for rod in self.rods.values():
+            bodies = (rod.inner, rod.outer)
+            points += [e for e, b in zip(rod.ends, bodies, strict=True) if b == body]
+        return points
+
+    @property
     def key(self) -> str:
         """Text of the geometry: all that compiled programs hang on, inertia and friction not."""
         joints = [

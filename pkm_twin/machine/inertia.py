@@ -19,6 +19,12 @@ from pkm_twin.machine.tree import Tree
 
 Objects = NDArray[Any]
 
+TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+"""Names of a body's ten numbers: mass, kg; first moments, kg m; inertia, kg m2."""
+PARTS: Final = (
+    "bodies", "rods", "gravity", "viscous", "coulomb", "offset", "rotors", "passive",
+)  # fmt: skip
+"""Parts of the inputs, in order."""
 GRAVITY: Final = 2
 """Part of the inputs, see :meth:`Layout.part`."""
 
@@ -29,12 +35,36 @@ def ten_numbers(mass: float, com: Array, inertia: Array) -> Array:
     :param com: centre of mass, shape (3,), m; ``inertia`` about it, shape (3, 3), kg m2.
     """
     about = inertia + mass * (com @ com * np.eye(3) - np.outer(com, com))
+    return _numbers(mass, mass * com, about)
+
+
+def transport(axes: Array, lever: Array) -> Array:
+    """Takes ten numbers about one point to those about another and in other axes, shape (10, 10).
+
+    :param axes: the new axes as columns in the old ones, shape (3, 3).
+    :param lever: from the new point to the old one, in the old axes, shape (3,), m.
+    """
+    columns = []
+    for ten in np.eye(10):
+        mass, first, about = ten[0], ten[1:4], matrix_of(ten)
+        crossed = np.outer(lever, first)
+        about = about + 2.0 * np.trace(crossed) * np.eye(3) - crossed - crossed.T
+        about = about + mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
+        columns.append(_numbers(mass, axes.T @ (first + mass * lever), axes.T @ about @ axes))
+    return np.array(columns).T
+
+
+def matrix_of(ten: Array) -> Array:
+    """The inertia matrix in ten numbers, shape (3, 3)."""
+    xx, yy, zz, xy, xz, yz = ten[4:]
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _numbers(mass: float, first: Array, about: Array) -> Array:
+    i = about
     return np.array(
-        [
-            mass, *(mass * com), about[0, 0], about[1, 1], about[2, 2], about[0, 1], about[0, 2],
-            about[1, 2],
-        ]
-    )  # fmt: skip
+        [mass, *first, i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]], dtype=np.float64
+    )
 
 
 def loaded_joints(graph: Graph) -> tuple[Joint, ...]:
@@ -52,6 +82,10 @@ class Coefficients(Protocol):
     @property
     def coulomb(self) -> Array:
         """By the rate's sign, N m or N."""
+
+    @property
+    def offset(self) -> Array:
+        """What the drive needs beside, whatever the motion, N m or N."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +106,7 @@ class Layout:
             n,
             n,
             n,
+            n,
             3 * len(loaded_joints(graph)),
         ]
         return np.cumsum([0, *sizes])
@@ -82,7 +117,7 @@ class Layout:
         return int(self.starts[-1])
 
     def part(self, k: int) -> slice:
-        """Part k: 0 bodies, 1 rods, 2 gravity, 3 viscous, 4 Coulomb, 5 rotors, 6 passive."""
+        """Part k, of :data:`PARTS`."""
         a, b = self.starts[k : k + 2]
         return slice(int(a), int(b))
 
@@ -90,9 +125,9 @@ class Layout:
     def friction(self) -> NDArray[np.intp]:
         """Indices of all friction, that of passive joints too."""
         starts = self.starts
-        passive = np.arange(starts[6], starts[7])
+        passive = np.arange(starts[7], starts[8])
         rubs = passive[np.arange(len(passive)) % 3 < 2]
-        return np.concatenate([np.arange(starts[3], starts[5]), rubs]).astype(np.intp)
+        return np.concatenate([np.arange(starts[3], starts[6]), rubs]).astype(np.intp)
 
     def body(self, name: str) -> slice:
         """The ten numbers of a body."""
@@ -101,7 +136,7 @@ class Layout:
 
     def split(self, p: Objects) -> list[Objects]:
         """The parts of an input vector; bodies with shape (bodies, 10)."""
-        parts = [p[self.part(k)] for k in range(7)]
+        parts = [p[self.part(k)] for k in range(len(PARTS))]
         parts[0] = parts[0].reshape(-1, 10)
         return parts
 
@@ -127,6 +162,7 @@ class Layout:
                 gravity,
                 friction.viscous,
                 friction.coulomb,
+                friction.offset,
                 [j.rotor_inertia for j in drives],
                 [
                     value

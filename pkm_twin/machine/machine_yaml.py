@@ -34,7 +34,8 @@ SECTIONS: Final = {
 # type: revolute, prismatic, cylindrical (axis), universal (axes: first fixed to the inner body,
 # second to the outer), spherical, fixed, translation. between: [inner body, outer body], positive
 # motion is that of the outer one. at: a point of the joint, m. home: its value at home, rad or m.
-# limits: position, velocity, effort. friction: viscous (effort per rate), coulomb (effort).
+# limits: position, velocity, effort. friction: viscous (effort per rate), coulomb,
+# offset (effort).
 # rotor_inertia: the drive's at the joint, kg m2 or kg.
 # The actuated joints' order is that of the robot's joint_names.
 """,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.rotations import about
+from pkm_twin.machine.rotations import about, from_quaternion
 from pkm_twin.machine.urdf_file import Joint, Link, Urdf
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
@@ -276,8 +276,5 @@ class _Reader:
 
 def _rotation(quaternion: Array) -> Array:
     """The rotation of a unit quaternion w, x, y, z."""
-    w, vector = quaternion[0], quaternion[1:]
-    size = float(np.linalg.norm(vector))
-    if size < 1e-15:
-        return np.eye(3)
-    return about(vector / size, 2.0 * np.arctan2(size, w))
+    w, x, y, z = quaternion.tolist()
+    return from_quaternion(x, y, z, w)

@@ -28,6 +28,7 @@ from pkm_twin.kinematics.engine import Engine, Traced, engine_of
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.passive import passive_names, passive_program
 from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import FREEDOMS, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
@@ -35,6 +36,7 @@ from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import position_box
+from pkm_twin.machine.shared import Shared, drive_units, shared_number, shared_payload
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -89,10 +91,16 @@ def check_angles(angle: float, path: str) -> None:
 
 @remembered
 def friction_of(joints: int) -> Any:
-    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign."""
-    field: dict[str, Any] = {"at_least": 0.0, "spread": True, "default": [0.0] * joints}
+    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign.
+
+    ``offset``: what the drive needs beside, whatever the motion.
+    """
+    field: dict[str, Any] = {"spread": True, "default": [0.0] * joints}
     units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
-    entries = [(n, Array, schema.vector(joints, unit=u, **field)) for n, u in units.items()]
+    entries = [
+        (n, Array, schema.vector(joints, unit=u, at_least=0.0, **field)) for n, u in units.items()
+    ]
+    entries.append(("offset", Array, schema.vector(joints, unit="{effort}", **field)))
     return _section("Friction", entries, joints)
 
 
@@ -275,7 +283,52 @@ class Robot:
         """
         raise ParameterError("members", None, "a section with the elastic members")
 
+    def shared_inertia(self) -> tuple[Shared, ...]:
+        """What the file says of masses, as linear parameters.
+
+        :raises ParameterError: the robot's file gives no masses.
+        """
+        raise NotImplementedError
+
     # What follows for all.
+
+    def shared_drives(self) -> tuple[Shared, ...]:
+        """Friction of each actuated joint and the rotors, as linear parameters of the file."""
+        graph, friction = self.graph, self.friction
+        result = []
+        for k, joint in enumerate(graph.actuated):
+            units = drive_units(graph, joint)
+            for what in ("viscous", "coulomb", "offset"):
+                value = float(getattr(friction, what)[k])
+                name, path = f"{joint}.{what}", ("friction", what, k)
+                result.append(
+                    shared_number(
+                        "friction", name, units[what], value, math.nan, path, others=[name],
+                        signed=what == "offset",
+                    )
+                )  # fmt: skip
+        first, rotors = graph.actuated[0], [f"{j}.rotor_inertia" for j in graph.actuated]
+        result.append(
+            shared_number(
+                "rotor", "rotor_inertia", drive_units(graph, first)["rotor_inertia"],
+                graph.joints[first].rotor_inertia, math.nan, ("inertia", "rotor_inertia"),
+                others=rotors,
+            )
+        )  # fmt: skip
+        return tuple(result)
+
+    def shared_parameters(self) -> tuple[Shared, ...]:
+        """All that a fit of the robot's file may change: drives, payload, bodies and rods.
+
+        :raises ParameterError: the robot's file gives no masses.
+        """
+        graph, load = self.massive().graph, self.payload
+        masses = [body.mass for body in graph.bodies.values()]
+        heavy = max(graph.bodies[graph.platform].mass, 0.1 * sum(masses))
+        payload = shared_payload(
+            self.graph, load.mass, load.com, load.inertia, heavy, 0.3 * graph.size
+        )
+        return (*self.shared_drives(), payload, *self.shared_inertia())
 
     @cached_property
     def graph(self) -> Graph:
@@ -590,17 +643,27 @@ class Robot:
     def singularity(self, q: ArrayLike) -> Array:
         """How far a joint state is from a singularity: 0 in one, 1 at best, shape (...).
 
-        The reciprocal condition number of the Jacobian, its angles multiplied by the platform's
-        radius, so that units do not count. Goes to zero at singularities of either kind: where
-        the actuators lose the platform and where they lose a direction.
+        Of any kind: the actuators are locked and the platform or another body moves (constraint
+        singularities included), or joints move and the platform does not (the edge of reach); see
+        ``kinematics.singularity``. No unit or scale counts. Errors as :meth:`forward`.
         """
-        return self.singularity_of(self.jacobian(q))
+        one = self.call_one("singularity", self.singularity_kernel, _NONE, q)
+        if one is not None:
+            return np.asarray(one[0])
+        (measure,), status = self.singularity_kernel()(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        return np.asarray(measure[..., 0], np.float64)
 
-    def singularity_of(self, jacobian: Array) -> Array:
-        """The same of Jacobians, shape (..., m, n)."""
-        scaled = self.pose_scales[:, None] * jacobian / self.joint_scales
-        values = np.linalg.svd(scaled, compute_uv=False)
-        return np.asarray(values[..., -1] / values[..., 0], np.float64)
+    def singularity_kernel(self) -> Kernel:
+        """The same as a program, q to the measure (1)."""
+        return singularity_kernel(self.engine)
+
+    def try_singularity(self, q: ArrayLike) -> tuple[Array, Mask]:
+        """The measure (...), 0 where there is no assembly; which joint states have one."""
+        (measure,), status = self.singularity_kernel()(_NONE, q)
+        good = np.ones(measure.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+        return np.where(good, measure[..., 0], 0.0), np.asarray(good)
 
     @cached_property
     def passive_joints(self) -> tuple[str, ...]:

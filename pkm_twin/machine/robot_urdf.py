@@ -27,7 +27,8 @@ def robot_urdf(robot: Robot) -> str:
 
     Its joints are ``robot.joint_names`` and ``robot.passive_joints``; with their values the link
     ``platform`` stands where ``robot.platform`` says, and the masses sum to the robot's. A URDF
-    has no place for rotors, nor for friction in the joints that it cuts: both are left out.
+    has no place for rotors and offsets, nor for friction in the joints that it cuts: they are left
+    out.
     """
     engine, load = robot.engine, robot.payload
     tree = urdf_tree(
@@ -64,8 +65,11 @@ def robot_description(robot: Robot) -> dict[str, Any]:
                 limits[key] = value
         if limits:
             joint["limits"] = limits
-        if drive.damping or drive.friction:
+        offset = float(robot.friction.offset[robot.graph.actuated.index(name)])
+        if drive.damping or drive.friction or offset:
             joint["friction"] = {"viscous": drive.damping, "coulomb": drive.friction}
+        if offset:
+            joint["friction"]["offset"] = offset
     return data
 
 

@@ -16,11 +16,18 @@ Array = NDArray[np.float64]
 
 def about(axis: Array, angle: ArrayLike) -> Array:
     """Rotations by angles (...,), rad, about a unit vector (3,), shape (..., 3, 3)."""
-    x, y, z = axis
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    across = skew(np.asarray(axis, np.float64))
     sine, rest = np.sin(angle)[..., None, None], 1.0 - np.cos(angle)[..., None, None]
-    rotation: Array = np.eye(3) + sine * skew + rest * (skew @ skew)
+    rotation: Array = np.eye(3) + sine * across + rest * (across @ across)
     return rotation
+
+
+def skew(vectors: Array) -> Array:
+    """Matrices (..., 3, 3) that take the cross product of vectors (..., 3) with what follows."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    none = np.zeros_like(x)
+    rows = ((none, -z, y), (z, none, -x), (-y, x, none))
+    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def from_rpy(angles: Array) -> Array:
@@ -39,6 +46,31 @@ def to_rpy(rotation: Array) -> Array:
         return np.array([math.atan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])
     roll = math.atan2(rotation[2, 1], rotation[2, 2])
     return np.array([roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0])])
+
+
+def from_quaternion(x: float, y: float, z: float, w: float) -> Array:
+    """The rotation of a quaternion, of unit length or not."""
+    n = x * x + y * y + z * z + w * w
+    v = np.array([x, y, z])
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation: Array = ((w * w - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) + 2.0 * w * skew) / n
+    return rotation
+
+
+def to_quaternion(rotation: Array) -> Array:
+    """Unit quaternion x, y, z, w (4,) of a rotation, w zero or more (Bar-Itzhack 2000, version 1).
+
+    The eigenvector of the greatest eigenvalue: no case is near-singular.
+    """
+    r = rotation
+    k = np.array([
+        [r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
+        [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
+        [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], r[1, 0] - r[0, 1]],
+        [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], np.trace(r)],
+    ])  # fmt: skip
+    quaternion: Array = np.linalg.eigh(k / 3.0)[1][:, -1]
+    return -quaternion if quaternion[3] < 0.0 else quaternion
 
 
 def across(axis: Array) -> Array:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A graph and the single joints of its spanning tree as what the URDF writer takes.
 
-May import: numpy, this package's graph and URDF writer, the names of passive joints.
+May import: numpy, this package's graph, outline and URDF writer, the names of passive joints.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.kinematics.passive import Axis
-from pkm_twin.machine.graph import BASE, Array, Graph
+from pkm_twin.machine.graph import BASE, Graph
+from pkm_twin.machine.outline import bars
 from pkm_twin.machine.urdf_write import (
     GROUND,
     PLATFORM,
@@ -25,8 +26,6 @@ from pkm_twin.machine.urdf_write import (
     UrdfTree,
 )
 
-BAR: Final = 0.01
-"""Radius of the bars that stand for bodies, per size of the machine."""
 PAYLOAD: Final = "payload"
 """The link of a payload, apart from the platform's."""
 KINDS: Final = {"R": "revolute", "P": "prismatic", "": "fixed"}
@@ -94,7 +93,7 @@ def urdf_tree(
         tuple(bodies),
         tuple(singles),
         tuple(closures),
-        tuple(_bars(graph, links)),
+        tuple(_capsules(graph, links)),
         graph.actuated,
         links[graph.platform],
         graph.origin,
@@ -114,26 +113,10 @@ def _body(graph: Graph, axis: Axis, link: str) -> UrdfBody:
     return UrdfBody(link, 0.0, axis.point, np.zeros((3, 3)))
 
 
-def _bars(graph: Graph, links: Mapping[str, str]) -> list[UrdfCapsule]:
-    """Rods as they are; a body as bars from one of its joints to the others."""
-    spots: dict[str, list[Array]] = {body: [] for body in graph.bodies}
-    spots[graph.platform].append(graph.origin)
-    ends = [(body, j.at) for j in graph.joints.values() for body in (j.inner, j.outer)]
-    for rod in graph.rods.values():
-        ends += zip((rod.inner, rod.outer), rod.ends, strict=True)
-    for body, point in ends:
-        if body in spots:
-            spots[body].append(point)
-    radius = BAR * graph.size
-    bars = [
-        UrdfCapsule(links[body], found[0], point, radius)
-        for body, found in spots.items()
-        for point in found[1:]
-        if float(np.linalg.norm(point - found[0])) > radius
+def _capsules(graph: Graph, links: Mapping[str, str]) -> list[UrdfCapsule]:
+    return [
+        UrdfCapsule(links[bar.part], bar.start[1], bar.end[1], bar.radius) for bar in bars(graph)
     ]
-    for rod in graph.rods.values():
-        bars.append(UrdfCapsule(links[rod.name], rod.ends[0], rod.ends[1], radius / 2.0))
-    return bars
 
 
 def _link_names(names: Sequence[str]) -> dict[str, str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Final
@@ -47,6 +47,7 @@ from pkm_twin.machine.robot import (
     mass,
 )
 from pkm_twin.machine.robot_urdf import robot_description
+from pkm_twin.machine.shared import Key, Shared, drive_units, shared_body, shared_number
 
 Array = NDArray[np.float64]
 
@@ -98,10 +99,14 @@ class BodySpec:
 
 @dataclass(frozen=True, eq=False)
 class FrictionSpec:
-    """Friction of one joint: N m s/rad or N s/m, and N m or N."""
+    """Friction of one joint: N m s/rad or N s/m, and N m or N.
+
+    ``offset``: what an actuated joint's drive needs beside, whatever the motion.
+    """
 
     viscous: float = schema.number(at_least=0.0, unit="{effort} per {joint}/s", default=0.0)
     coulomb: float = schema.number(at_least=0.0, unit="{effort}", default=0.0)
+    offset: float = schema.number(unit="{effort}", default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +188,10 @@ class JointSpec:
         steps = FREEDOMS[self.type]
         if self.actuated and steps not in ("R", "P"):
             raise ParameterError(f"{path}.actuated", self.type, "a revolute or prismatic joint")
+        if self.friction is not None and self.friction.offset and not self.actuated:
+            raise ParameterError(
+                f"{path}.friction.offset", self.friction.offset, "0 at a joint that is not actuated"
+            )
         if self.rotor_inertia and self.drive is not None:
             raise ParameterError(f"{path}.drive", "given", "either drive or rotor_inertia")
         for key in ("limits", "friction", "rotor_inertia", "drive", "home"):
@@ -222,6 +231,18 @@ class RodSpec:
     radius: float | None = length(default=None)
 
 
+@dataclass(frozen=True)
+class Source:
+    """Where an entry stands in the file, its name there, and which copy of how many it is."""
+
+    path: Key
+    name: str
+    copy: int = 0
+    copies: int = 1
+    azimuth: float = 0.0
+
+
+_RUBS: Final = ("viscous", "coulomb", "offset")
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
 """The three mappings of a graph, and the schema of their entries."""
 _KEYS: Final = (
@@ -238,6 +259,8 @@ class Machine(Robot):
 
     described: Graph
     specs: Mapping[str, Mapping[str, Any]]
+    sources: Mapping[tuple[str, str], Source]
+    """Where each entry stands in the file, by kind and name."""
     pose: tuple[str, ...]
 
     changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
@@ -251,7 +274,7 @@ class Machine(Robot):
         for key in data:
             if key not in _KEYS:
                 raise UnknownNameError(str(key), key, _KEYS)
-        specs = _written_out(data)
+        specs, sources = _written_out(data)
         graph = _graph(data, specs)
         graph.check()
         drives = graph.actuated
@@ -267,6 +290,7 @@ class Machine(Robot):
             "friction": friction_of(n)(
                 viscous=array([graph.joints[j].viscous for j in drives]),
                 coulomb=array([graph.joints[j].coulomb for j in drives]),
+                offset=array([_offset(specs["joints"][j]) for j in drives]),
             ),
             "limits": limits_of(n)(
                 position=_together([v.position for v in limits], [-math.inf, math.inf]),
@@ -286,6 +310,7 @@ class Machine(Robot):
             name=name,
             described=graph,
             specs=specs,
+            sources=sources,
             pose=coordinates,
             **sections,
         )
@@ -321,14 +346,7 @@ class Machine(Robot):
     @property
     def size(self) -> float:
         """Greatest distance of a joint on the platform from its reference point, m."""
-        g = self.graph
-        points = [j.at for j in g.joints.values() if g.platform in (j.inner, j.outer)]
-        for rod in g.rods.values():
-            points += [
-                e for e, b in zip(rod.ends, (rod.inner, rod.outer), strict=True) if b == g.platform
-            ]
-        far = max((float(np.linalg.norm(p - g.origin)) for p in points), default=0.0)
-        return far if far > 1e-6 * g.size else 0.1 * g.size
+        return self.graph.rim
 
     def make_graph(self) -> Graph:
         """The graph of the file."""
@@ -353,6 +371,83 @@ class Machine(Robot):
     def home(self) -> Array:
         """The pose at home, shape (m,)."""
         return self.engine.home_pose.copy()
+
+    def shared_drives(self) -> tuple[Shared, ...]:
+        """Friction of each joint, and the rotors, one for the copies of a limb."""
+        graph, friction = self.graph, self.friction
+        result: list[Shared] = []
+        rotors: dict[Key, list[str]] = {}
+        for name, joint in graph.joints.items():
+            if not (joint.actuated or joint.loaded):
+                continue
+            units, source = drive_units(graph, name), self.sources["joints", name]
+            tail: Key = () if source.copies == 1 else (source.copy,)
+            for what in ("viscous", "coulomb", "offset"):
+                if what == "offset" and not joint.actuated:
+                    continue
+                k = graph.actuated.index(name) if joint.actuated else 0
+                value = getattr(friction, what)[k] if joint.actuated else getattr(joint, what)
+                result.append(
+                    shared_number(
+                        "friction", f"{name}.{what}", units[what], float(value), math.nan,
+                        (*source.path, "friction", what, *tail), others=[f"{name}.{what}"],
+                        signed=what == "offset",
+                    )
+                )  # fmt: skip
+            if joint.actuated or joint.rotor_inertia:
+                rotors.setdefault(source.path, []).append(name)
+        for path, names in rotors.items():
+            first, drive = graph.joints[names[0]], self.specs["joints"][names[0]].drive
+            alone = names[0] if len(names) == 1 else self.sources["joints", names[0]].name
+            tail = ("rotor_inertia",) if drive is None else ("drive", "inertia")
+            one = shared_number(
+                "rotor", f"{alone}.rotor_inertia",
+                drive_units(graph, names[0])["rotor_inertia"], first.rotor_inertia, math.nan,
+                (*path, *tail), others=[f"{name}.rotor_inertia" for name in names],
+            )  # fmt: skip
+            if drive is not None and drive.inertia > 0.0:
+                one = dataclasses.replace(one, keys=_behind_gear(one, drive.inertia))
+            result.append(one)
+        return tuple(result)
+
+    def shared_inertia(self) -> tuple[Shared, ...]:
+        """Every body with a mass and every rod, one for all copies of a limb."""
+        groups: dict[Key, list[str]] = {}
+        for kind, entries in (("bodies", self.graph.bodies), ("rods", self.graph.rods)):
+            for name, entry in entries.items():
+                if entry.mass > 0.0:
+                    groups.setdefault(self.sources[kind, name].path, []).append(name)
+        return tuple(self._shared_group(path, names) for path, names in groups.items())
+
+    def _shared_group(self, path: Key, names: list[str]) -> Shared:
+        kind = "rods" if names[0] in self.graph.rods else "bodies"
+        first = self.sources[kind, names[0]]
+        alone = names[0] if len(names) == 1 else first.name
+        if kind == "rods":
+            mass = self.graph.rods[names[0]].mass
+            return shared_number(
+                "inertia", f"{alone}.mass", "kg", mass, mass, (*path, "mass"),
+                others=[f"{name}.mass" for name in names],
+            )  # fmt: skip
+        body = self.graph.bodies[names[0]]
+        turned = rotation_about_z(first.azimuth).T
+        own = Body(alone, body.mass, array(turned @ body.com), turned @ body.inertia @ turned.T)
+        return shared_body(
+            alone, own, path,
+            {name: rotation_about_z(self.sources[kind, name].azimuth) for name in names},
+            length=self._length_of(names[0]),
+        )  # fmt: skip
+
+    def _length_of(self, name: str) -> float:
+        """A body's extent: greatest distance of its joints and rods from its centre, m."""
+        graph, body = self.graph, self.graph.bodies[name]
+        points = [j.at for j in graph.joints.values() if name in (j.inner, j.outer)]
+        for rod in graph.rods.values():
+            points += [
+                e for e, b in zip(rod.ends, (rod.inner, rod.outer), strict=True) if b == name
+            ]
+        far = max((float(np.linalg.norm(p - body.com)) for p in points), default=0.0)
+        return far if far > 1e-3 * graph.size else 0.1 * graph.size
 
     def check_masses(self) -> None:
         """Refuse actuated joints that move no mass at all.
@@ -446,6 +541,12 @@ class Machine(Robot):
         return Structure(beams, sections, compliances)
 
 
+def _behind_gear(reflected: Shared, rotor: float) -> Callable[[Array], Mapping[Key, float]]:
+    """The rotor's own inertia for the one that is reflected to the joint."""
+    factor = rotor / float(reflected.values[0])
+    return lambda new: {key: factor * v for key, v in reflected.keys(new).items()}
+
+
 def _root(inertia: Array) -> Array:
     """A matrix whose square is a symmetric one."""
     values, vectors = np.linalg.eigh(inertia)
@@ -459,6 +560,10 @@ def _together(values: list[Any], absent: Any) -> Array | None:
     return array([absent if value is None else value for value in values])
 
 
+def _offset(joint: JointSpec) -> float:
+    return 0.0 if joint.friction is None else joint.friction.offset
+
+
 def _section(data: Mapping[str, Any], key: str, path: str) -> Mapping[str, Any]:
     value = data.get(key) or {}
     if not isinstance(value, Mapping):
@@ -469,8 +574,10 @@ def _section(data: Mapping[str, Any], key: str, path: str) -> Mapping[str, Any]:
     return value
 
 
-def _written_out(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """All entries by name, checked, the limbs' copies turned about base z."""
+def _written_out(
+    data: Mapping[str, Any],
+) -> tuple[dict[str, dict[str, Any]], dict[tuple[str, str], Source]]:
+    """All entries by name, checked, the limbs' copies turned about base z; where each stands."""
     result: dict[str, dict[str, Any]] = {
         kind: {
             name: schema.build(spec, entry, f"{kind}.{name}")
@@ -478,6 +585,7 @@ def _written_out(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         }
         for kind, spec in KINDS.items()
     }
+    sources = {(kind, n): Source((kind, n), n) for kind, all_ in result.items() for n in all_}
     limbs = data.get("limbs") or []
     sections = limbs if isinstance(limbs, list) else [limbs]
     for k, section in enumerate(sections):
@@ -491,13 +599,18 @@ def _written_out(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         for i, azimuth in enumerate(azimuths):
             check_angles(float(azimuth), f"{path}azimuths[{i}]")
         own = set(_section(section, "bodies", path))
-        checked: dict[str, dict[str, Any]] = {
+        count = len(azimuths)
+        checked: dict[str, dict[str, list[Any]]] = {
             kind: {
-                name: schema.build(spec, entry, f"{path}{kind}.{name}")
+                name: [
+                    schema.build(spec, one, f"{path}{kind}.{name}")
+                    for one in _copies(entry, count, f"{path}{kind}.{name}")
+                ]
                 for name, entry in _section(section, kind, path).items()
             }
             for kind, spec in KINDS.items()
         }
+        place: Key = ("limbs", k) if isinstance(limbs, list) else ("limbs",)
         for number, azimuth in enumerate(azimuths, 1):
             for kind, entries in checked.items():
                 for name, entry in entries.items():
@@ -506,7 +619,33 @@ def _written_out(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
                         raise ParameterError(
                             f"{path}{kind}.{name}", full, "a name that is not taken"
                         )
-                    result[kind][full] = _turned(entry, float(azimuth), own, number)
+                    copy = entry[number - 1]
+                    result[kind][full] = _turned(copy, float(azimuth), own, number)
+                    sources[kind, full] = Source(
+                        (*place, kind, name), name, number - 1, count, float(azimuth)
+                    )
+    return result, sources
+
+
+def _copies(entry: Any, count: int, path: str) -> list[Any]:
+    """A limb's entry for each azimuth: drives' numbers may be lists, one number a copy."""
+    result = [entry] * count
+    if not isinstance(entry, Mapping):
+        return result
+    for keys in (("rotor_inertia",), *(("friction", what) for what in _RUBS)):
+        value: Any = entry
+        for key in keys:
+            value = value.get(key) if isinstance(value, Mapping) else None
+        if not isinstance(value, list):
+            continue
+        if len(value) != count:
+            raise ParameterError(
+                f"{path}.{'.'.join(keys)}", value, f"one number, or {count}, one a copy"
+            )
+        for k in range(count):
+            inner = {keys[-1]: value[k]}
+            whole = inner if len(keys) == 1 else {keys[0]: {**result[k][keys[0]], **inner}}
+            result[k] = {**result[k], **whole}
     return result
 
 

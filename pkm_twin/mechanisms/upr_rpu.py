@@ -40,9 +40,11 @@ from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
+from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Section, Structure, compliances, disc, modulus
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import MIN_LENGTH, Inverse, LimbElements, Robot, length, mass
+from pkm_twin.machine.shared import Shared, shared_body, shared_number
 
 Array = NDArray[np.float64]
 
@@ -416,6 +418,30 @@ class UprRpu(Robot):
                 array(turning_inertia),
             )  # fmt: skip
         return Graph(bodies, joints, {}, PLATFORM, origin)
+
+    def shared_inertia(self) -> tuple[Shared, ...]:
+        """The bars' density and the platform.
+
+        :raises ParameterError: the robot's file gives no masses.
+        """
+        graph, inertia = self.massive().graph, self.inertia
+        assert inertia is not None  # noqa: S101
+        tubes = {
+            name: ten_numbers(body.mass, body.com, body.inertia) / inertia.density
+            for name, body in graph.bodies.items()
+            if name != PLATFORM
+        }
+        return (
+            shared_number(
+                "inertia", "bars.density", "kg/m3", inertia.density, inertia.density,
+                ("inertia", "density"), bodies=tubes,
+            ),
+            shared_body(
+                PLATFORM, graph.bodies[PLATFORM], ("inertia",), {PLATFORM: np.eye(3)},
+                words=("platform_mass", "platform_com", "platform_inertia"), origin=graph.origin,
+                length=self._radii[0],
+            ),
+        )  # fmt: skip
 
     def _tube(self, name: str, i: int, reach: float, d: Array, com: Array) -> Body:
         """A round bar of half the limb."""

@@ -12,7 +12,8 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from operator import le
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,7 @@ COLUMNS: Final = {
     "positions": "position",
     "velocities": "velocity",
     "accelerations": "acceleration",
+    "effort": "effort",
 }
 """What a trajectory's point may carry that is read here, and the name of one such value."""
 
@@ -87,8 +89,7 @@ _MODEL: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
 """What makes the model's numbers of a controller's."""
 
 
-@dataclass(frozen=True)
-class JointSample:
+class JointSample(NamedTuple):
     """One joint state in the robot's joint order; None where the message carries nothing."""
 
     stamp: int
@@ -167,6 +168,8 @@ class Trajectory:
     qd: Array | None
     qdd: Array | None
     columns: tuple[int, ...]
+    effort: Array | None = None
+    """Shape (p, n), N m or N, where the reader takes efforts and every point has them."""
 
 
 @dataclass
@@ -176,11 +179,13 @@ class JointReader:
     ``limited``: positions and velocities beyond the robot's limits are refused, else only those
     beyond all machines. ``extra_joints``: a trajectory's joints that the model lacks, such as a
     Delta's telescopic fourth axis: ``refuse`` the trajectory, or answer them with effort ``zero``.
+    ``with_effort``: a trajectory's efforts are read too, else whatever it brings is left alone.
     """
 
     robot: Robot
     limited: bool = True
     extra_joints: ExtraJoints = "refuse"
+    with_effort: bool = False
     _known: dict[tuple[str, ...], list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -283,16 +288,15 @@ class JointReader:
             self._columns("velocities", fields, index, self._velocity),
             self._columns("accelerations", fields, index, self._acceleration),
             tuple(self._names.index(n) if n in self._names else -1 for n in names),
+            self._columns("effort", fields, index, self._effort) if self.with_effort else None,
         )
 
     def check_derived(self, qd: Array, qdd: Array) -> None:
         """Differentiated rates and accelerations keep the bounds of measured ones, (..., n)."""
         if qd.ndim == 1:
             # A stream's sample, without numpy.
-            rates = zip(qd.tolist(), self.highest_velocity, strict=True)
-            if all(abs(v) <= high for v, high in rates) and all(
-                abs(a) <= MAX_ACCELERATION for a in qdd.tolist()
-            ):
+            rates, seconds = map(abs, qd.tolist()), map(abs, qdd.tolist())
+            if all(map(le, rates, self.highest_velocity)) and max(seconds) <= MAX_ACCELERATION:
                 return
         for what, values, high in (
             ("velocity", qd, self._highest_velocity),
@@ -340,7 +344,7 @@ class JointReader:
             return None
         if len(values) != count:
             raise MessageError("length", f"{what}: {len(values)} values for {count} names")
-        picked = [float(values[i]) for i in index]
+        picked = [values[i] for i in index]
         if self._map is not None:
             picked = _MODEL[what](self._map, np.array(picked)).tolist()
         for i, (value, (low, high)) in enumerate(zip(picked, bounds, strict=True)):

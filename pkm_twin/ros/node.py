@@ -42,6 +42,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import (
+    DurabilityPolicy,
     QoSCompatibility,
     QoSPolicyKind,
     QoSProfile,
@@ -125,6 +126,15 @@ class UnknownParametersError(PkmTwinError):
 def output_qos() -> QoSProfile:
     """Reliable and volatile: a torque or a compliance is for now, never for a late joiner."""
     return QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def latched_qos() -> QoSProfile:
+    """What does not change while a node runs, such as a description: late joiners get it too."""
+    return QoSProfile(
+        depth=1,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
 
 
 def input_qos(depth: int, *, best_effort: bool, expiry: float | None = None) -> QoSProfile:
@@ -267,7 +277,8 @@ class TwinNode(LifecycleNode):
 
     def now(self) -> int:
         """The ROS clock, ns."""
-        nanoseconds: int = self.get_clock().now().nanoseconds
+        # As Clock.now, without its objects: it is asked twice a sample.
+        nanoseconds: int = self.get_clock().handle.get_now().nanoseconds
         return nanoseconds
 
     def declare(
@@ -444,14 +455,15 @@ class TwinNode(LifecycleNode):
         subscription = subscribe()
 
     def create_guarded_publisher(
-        self, kind: type[M], topic: str, expiry: float | None = None
+        self, kind: type[M], topic: str, expiry: float | None = None, *, latched: bool = False
     ) -> Any:
         """A publisher with QoS overrides by parameter.
 
-        :param expiry: lifespan and deadline that the topic offers, s; None is none.
+        :param expiry: lifespan and deadline that the topic offers, s; None is none. ``latched``:
+            late joiners get the last message.
         :raises ParameterError: an override that would make it never expire.
         """
-        qos = output_qos()
+        qos = latched_qos() if latched else output_qos()
         overrides: tuple[Any, ...] = OVERRIDES
         if expiry is not None:
             qos.lifespan = qos.deadline = Duration(seconds=expiry)

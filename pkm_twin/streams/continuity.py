@@ -6,15 +6,15 @@ May import: numpy, pkm_twin's core, the standard library; never rclpy.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
+from pkm_twin.kinematics.stream import stream_kernel
 from pkm_twin.kinematics.tracking import MAX_MOVE
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import SECOND
@@ -29,43 +29,10 @@ over the time between their stamps and this slack for stamps that are off, s."""
 
 @dataclass(slots=True)
 class _State:
-    """A sample: q (n,), the pose (m,) and its rates per joint rate (m, n), angles at the rim."""
+    """A sample, and its row of :func:`stream_kernel`."""
 
     stamp: int
-    q: Array
-    pose: Array
-    rates: Array
-    clearance: float
-    """Lower bound of the singularity measure; ``greatest``: upper bound of the rates' norm."""
-    greatest: float
-
-
-class Clearance:
-    """A lower bound of a Jacobian's reciprocal condition number, cheap along a stream.
-
-    No singular value moves farther than the matrix does (Weyl), so those of one matrix bound
-    those of all near it; they are taken anew only where the bound says too little.
-    """
-
-    def __init__(self) -> None:
-        self._near: tuple[Array, float, float] | None = None
-        self.greatest = math.inf
-        """Bound of the last matrix' greatest singular value."""
-
-    def at_least(self, rates: Array, wanted: float) -> float:
-        """A bound of the measure of ``rates`` (m, n): the measure itself where it is below."""
-        if self._near is not None and self._near[0].shape == rates.shape:
-            matrix, least, greatest = self._near
-            change = (rates - matrix).ravel()
-            moved = _length(change)
-            self.greatest = greatest + moved
-            bound = (least - moved) / self.greatest if self.greatest > 0.0 else 0.0
-            if bound >= wanted:
-                return bound
-        values = np.linalg.svd(rates, compute_uv=False)
-        least, self.greatest = values.item(-1), values.item(0)
-        self._near = rates, least, self.greatest
-        return least / self.greatest if self.greatest > 0.0 else 0.0
+    numbers: Array
 
 
 class Continuity:
@@ -84,10 +51,12 @@ class Continuity:
         self.warn, self.stop = warn, stop
         self._velocity = tuple(velocity)
         self._largest = MAX_MOVE * robot.size
-        self._rows = robot.pose_scales
-        self._matrix = robot.pose_scales[:, None]
-        self._joints = robot.joint_scales
-        self._clearance = Clearance()
+        self._scales = robot.pose_scales
+        n, m = len(robot.joint_names), len(self._scales)
+        self._told = n + m + m * n
+        self._nothing = np.zeros(self._told + m + 1)
+        self._kernel = stream_kernel(robot.engine)
+        self._call = self._kernel.first_of_one(self._scales)
         self.reset()
 
     def reset(self) -> None:
@@ -106,61 +75,43 @@ class Continuity:
             The next sample is then compared with the one before.
         :raises UnreachableError: the robot has no assembly there.
         """
-        pose = self._rows * self.robot.forward(q)
-        rates = self._matrix * self.robot.jacobian(q)
-        clearance = self._clearance.at_least(rates / self._joints, self.warn)
-        state = _State(stamp, q, pose, rates, clearance, self._clearance.greatest)
-        if self._last is not None:
-            self._check_jump(self._last, state)
-        near = self._near_singularity(state)
-        self._before, self._last = self._last, state
-        return near
-
-    def _near_singularity(self, state: _State) -> bool:
-        if state.clearance >= self.warn:
-            return False
-        measure = float(self.robot.singularity(state.q))
+        last = self._last
+        before = self._nothing if last is None else last.numbers
+        result: Any = self._call(q, before)
+        if result is None:
+            (result,), status = self._kernel(self._scales, q, before)
+            if status is not None:
+                self.robot.refuse_joints(status, q)
+        state = _State(stamp, result)
+        *beyond, measure = result.tolist()[self._told :]
+        if last is not None:
+            self._check_jump(last, state, beyond)
         if not measure >= self.stop:
             raise MessageError(
                 "singular",
                 f"too close to a singularity or the edge of reach: measure {measure:.3g}, "
                 f"singularity_stop is {self.stop:g}",
             )
-        return measure < self.warn
+        self._before, self._last = last, state
+        return bool(measure < self.warn)
 
-    def _check_jump(self, last: _State, state: _State) -> None:
+    def _check_jump(self, last: _State, state: _State, beyond: list[float]) -> None:
         """No joint moves farther than its velocity limit allows, no pose than its rates tell."""
-        move = state.q - last.q
         period = (state.stamp - last.stamp) / SECOND
         factor = JUMP_FACTOR * period + JUMP_SLACK
-        moves = move.tolist()
-        for joint, (moved, velocity) in enumerate(zip(moves, self._velocity, strict=True)):
-            if not abs(moved) <= velocity * factor:
+        joints = zip(state.numbers.tolist(), last.numbers.tolist(), self._velocity, strict=False)
+        for joint, (now, before, velocity) in enumerate(joints):
+            if not abs(now - before) <= velocity * factor:
                 unit = self.robot.joint_units[joint]
                 raise MessageError(
                     "jump",
-                    f"{self.robot.joint_names[joint]} moved by {moved:g} {unit} in {period:g} s, "
-                    f"allowed {velocity * factor:g}",
+                    f"{self.robot.joint_names[joint]} moved by {now - before:g} {unit} in "
+                    f"{period:g} s, allowed {velocity * factor:g}",
                 )
-        shift = state.pose - last.pose
-        greatest = max(state.greatest, last.greatest)
-        # What is predicted is no longer than the joints' move times the greatest singular value,
-        # so most samples need no more than two lengths.
-        if _length(shift) + 0.5 * greatest * _length(move * self._joints) <= self._largest:
-            return
-        # What the mean of both rates predicts errs by the third power of the move; how much, the
-        # change of the rates tells. Half of what is predicted is for where they turn between.
-        predicted = 0.5 * (state.rates + last.rates) @ move
-        bend = np.abs(state.rates - last.rates) @ np.abs(move)
-        error = np.abs(shift - predicted)
-        far = ~(error - 0.5 * np.abs(predicted) - bend <= self._largest)
-        if far.any():
+        worst = max(beyond)
+        if not worst <= self._largest:
             raise MessageError(
                 "jump",
-                f"{self.robot.pose_names[int(far.argmax())]} of the platform jumped while the "
+                f"{self.robot.pose_names[beyond.index(worst)]} of the platform jumped while the "
                 "joints did not: another assembly mode",
             )
-
-
-def _length(vector: Array) -> float:
-    return math.sqrt(float(vector @ vector))

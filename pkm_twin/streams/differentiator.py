@@ -10,18 +10,21 @@ slope of the window, which is the acceleration half a window ago.
 A. Savitzky, M. J. E. Golay, Smoothing and differentiation of data by simplified least squares
 procedures, Analytical Chemistry 36 (1964), doi:10.1021/ac60214a047.
 
-May import: numpy, scipy, pkm_twin's core, the standard library.
+May import: numpy, pkm_twin's core, the standard library.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from functools import cache
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 
+from pkm_twin.codegen.expressions import Objects, Tape, sqrt
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.messages import SECOND
 
@@ -29,6 +32,9 @@ Array = NDArray[np.float64]
 
 LEAST_PIVOT: Final = 1e-4
 """Least diagonal entry of the normal equations' Cholesky factor; even stamps stay above 1e-2."""
+BLOCK: Final = 32
+"""Samples that one call of a program sums up: those of the default window, and some."""
+_NONE: Final = np.zeros(0)
 
 
 @dataclass
@@ -45,14 +51,15 @@ class Differentiator:
     _carries_velocity: bool | None = None
 
     def __post_init__(self) -> None:
-        # One place more than the window has, so that the newest sample can be taken back; every
+        # One place more than whole blocks have, so that the newest sample can be taken back; every
         # sample stands twice, so that each window is one piece, oldest first.
-        self._places = self.window + 1
+        self._held = -(-self.window // BLOCK) * BLOCK
+        self._places = self._held + 1
         # Since the first sample, ns: whole numbers, exact for a hundred days.
         self._stamps = np.zeros(2 * self._places)
         self._begin = 0
-        self._values = np.zeros((2 * self._places, 0))
-        self._fits = {carries: _Fit(self.order + (not carries), self.window) for carries in (0, 1)}
+        self._values = np.zeros(0)
+        self._fit: _Fit | None = None
         self._count = 0
 
     @property
@@ -80,29 +87,28 @@ class Differentiator:
         """
         carries = qd is not None
         values = q if qd is None else qd
-        if carries is not self._carries_velocity or len(values) != self._values.shape[1]:
+        n = len(values)
+        if self._fit is None or carries is not self._carries_velocity or n != self._fit.joints:
             self.reset()
             self._carries_velocity = carries
-            self._values = np.zeros((2 * self._places, len(values)))
+            self._values = np.zeros(2 * self._places * n)
+            self._fit = _Fit(self.order + (not carries), self.window, n)
         if self._count == 0:
             self._begin = stamp
         slot = self._count % self._places
         twin = slot + self._places
         self._stamps[slot] = self._stamps[twin] = stamp - self._begin
-        self._values[slot] = self._values[twin] = values
+        self._values[slot * n : slot * n + n] = self._values[twin * n : twin * n + n] = values
         self._count += 1
         if self._count < self.window:
             return None
-        # The window ends at the newest sample's second place, or at its first.
-        end = (slot if slot + 1 >= self.window else twin) + 1
-        window = slice(end - self.window, end)
-        rows = self._values[window]
-        at = self.window // 2 if self.middle else self.window - 1
-        coefficients, weights, seconds = self._fits[carries].solve(self._stamps[window], rows, at)
-        first = weights[0] @ coefficients / seconds
+        # The blocks end at the newest sample's second place, or at its first.
+        end = (slot if slot + 1 >= self._held else twin) + 1
+        at = end - 1 - (self.window - 1 - self.window // 2 if self.middle else 0)
+        first, second = self._fit.derivatives(self._stamps, self._values, end, at)
         if qd is None:
-            return first, weights[1] @ coefficients / (seconds * seconds)
-        return (rows[at].copy() if self.middle else qd), first
+            return first, second
+        return (self._values[at * n : at * n + n].copy() if self.middle else qd), first
 
 
 class _Fit:
@@ -112,42 +118,111 @@ class _Fit:
     V V' c = V y of a degree up to 5 stay far from rounding.
     """
 
-    def __init__(self, degree: int, window: int) -> None:
-        self._powers = np.ones((degree + 1, window))
-        self._transposed = self._powers.T
-        self._times = self._powers[1]
-        self._steps = [tuple(self._powers[i : i + 2]) for i in range(1, degree)]
-        self._newest = _derivatives(degree, 1.0)
+    def __init__(self, degree: int, window: int, joints: int) -> None:
+        self.joints, self._window = joints, window
+        self._kernel = _kernel(degree, joints, solved=True)
+        self._call = self._kernel.first_of_one(_NONE)
+        self._sums = _kernel(degree, joints, solved=False)
+        size = degree + 1
+        self._nothing = np.zeros(2 * degree + 1 + size * joints)
+        self._blocks = -(-window // BLOCK)
+        self._all = np.ones(BLOCK)
+        # Of the oldest block, those of the window alone.
+        self._oldest = np.zeros(BLOCK)
+        self._oldest[self._blocks * BLOCK - window :] = 1.0
 
-    def solve(self, stamps: Array, values: Array, at: int) -> tuple[Array, Array, float]:
-        """The polynomials' coefficients (degree + 1, n) in t, and how to derive them at a sample.
+    def derivatives(self, stamps: Array, values: Array, end: int, at: int) -> tuple[Array, Array]:
+        """First and second derivative by time at the sample ``at``, shape (n,) each.
 
-        :returns: coefficients, weights (2, degree + 1) of the first and the second derivative by
-            t, and the time that t counts in, s.
+        :param stamps: ns, and ``values``, n each: the window is what stands before ``end``.
+        :raises MessageError: the stamps are too uneven.
         """
-        powers, times = self._powers, self._times
-        newest = stamps.item(-1)
-        half = 0.5 * (newest - stamps.item(0))
-        np.subtract(stamps, newest - half, out=times)
-        np.divide(times, half, out=times)
-        for last, power in self._steps:
-            np.multiply(last, times, out=power)
-        factor, coefficients, fault = dposv(powers @ self._transposed, powers @ values)
-        if fault or not min(factor.item(i, i) for i in range(len(powers))) > LEAST_PIVOT:
+        n = self.joints
+        oldest, newest = stamps.item(end - self._window), stamps.item(end - 1)
+        half = 0.5 * (newest - oldest)
+        place = np.array((oldest + half, half, stamps.item(at)))
+        sums, weights = self._nothing, self._oldest
+        for block in range(self._blocks - 1, 0, -1):
+            last = end - block * BLOCK
+            part = slice(last - BLOCK, last), slice((last - BLOCK) * n, last * n)
+            (sums,), _ = self._sums(_NONE, sums, stamps[part[0]], values[part[1]], weights, place)
+            weights = self._all
+        first = end - BLOCK
+        inputs = sums, stamps[first:end], values[first * n : end * n], weights, place
+        result: Any = self._call(*inputs)
+        if result is None:
+            (result,), _ = self._kernel(_NONE, *inputs)
+        if not min(result[2 * n :].tolist()) > LEAST_PIVOT:
             raise MessageError(
                 "uneven stamps", "the stamps of the window are too uneven to differentiate"
             )
-        last_sample = at == len(times) - 1
-        weights = self._newest if last_sample else _derivatives(len(powers) - 1, times.item(at))
-        return coefficients, weights, half / SECOND
+        return result[:n], result[n : 2 * n]
 
 
-def _derivatives(degree: int, t: float) -> Array:
-    """First and second derivative of the powers of t, shape (2, degree + 1)."""
-    k = np.arange(degree + 1)
-    return np.array(
-        [
-            k * t ** np.maximum(k - 1, 0),
-            k * (k - 1) * t ** np.maximum(k - 2, 0),
-        ]
+@cache
+def _kernel(degree: int, joints: int, *, solved: bool) -> Kernel:
+    """Sums over a block of samples, added to those before: of powers of t, and of them and values.
+
+    In: the sums before; stamps, values and weights (0 or 1) of the block; the middle of the window
+    and half of it, and where to look, ns. Out: the sums; or, ``solved``, the first and the second
+    derivative by s there, and the pivots of V V'.
+    """
+    name = f"polynomial fit {degree} {joints} {solved}"
+    return Kernel(lambda: _program(degree, joints, solved), name)
+
+
+def _program(degree: int, joints: int, solved: bool) -> Program:
+    tape, size = Tape(), degree + 1
+    sizes = {
+        "before": 2 * degree + 1 + size * joints, "stamps": BLOCK, "values": BLOCK * joints,
+        "weights": BLOCK, "place": 3,
+    }  # fmt: skip
+    before, stamps, values, weights, (middle, half, look) = (
+        tape.inputs(name, count) for name, count in sizes.items()
     )
+    inverse = 1.0 / half
+    powers = list(before[: 2 * degree + 1])
+    mixed = before[2 * degree + 1 :].reshape(size, joints)
+    for k in range(BLOCK):
+        t, power = (stamps[k] - middle) * inverse, weights[k]
+        for i in range(2 * degree + 1):
+            powers[i] = powers[i] + power
+            if i < size:
+                mixed[i] = mixed[i] + power * values[k * joints : (k + 1) * joints]
+            power = power * t
+    results = [*powers, *mixed.ravel()]
+    if solved:
+        t = (look - middle) * inverse
+        results = _solution(powers, mixed, t, float(SECOND) * inverse)
+    return Program(sizes, 0, {"result": [tape.lift(value) for value in results]})
+
+
+def _solution(powers: list[Any], mixed: Objects, t: Any, rate: Any) -> list[Any]:
+    """First and second derivative at t, n each, ``rate`` the change of t in a second; the pivots.
+
+    :param powers: sums of t^k; ``mixed``: of t^k y, shape (degree + 1, n).
+    """
+    size, joints = mixed.shape
+    factor = np.zeros((size, size), dtype=object)
+    for j in range(size):
+        for i in range(j, size):
+            rest = powers[i + j] - factor[i, :j] @ factor[j, :j]
+            factor[i, j] = sqrt(rest) if i == j else rest / factor[j, j]
+    here: list[Any] = [1.0]
+    for _ in range(size):
+        here.append(here[-1] * t)
+    results: list[Any] = []
+    for slopes, scale in (
+        ([0, *range(1, size)], rate),
+        ([k * (k - 1) for k in range(size)], rate * rate),
+    ):
+        first = 1 if scale is rate else 2
+        # V V' w = d, by both triangles; then w' V y.
+        w = np.zeros(size, dtype=object)
+        for k in range(size):
+            d = float(slopes[k]) * here[k - first] if slopes[k] else 0.0
+            w[k] = (d - factor[k, :k] @ w[:k]) / factor[k, k]
+        for k in reversed(range(size)):
+            w[k] = (w[k] - factor[k + 1 :, k] @ w[k + 1 :]) / factor[k, k]
+        results += [scale * (w @ mixed[:, j]) for j in range(joints)]
+    return [*results, *(factor[k, k] for k in range(size))]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import os
 import shutil
@@ -24,7 +25,6 @@ FLAGS = (
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--window-size=600,520",
     "--remote-debugging-port=0",
 )
 PATIENCE = 120.0
@@ -40,15 +40,23 @@ def find_browser() -> str | None:
 class Browser:
     """One browser with one page; a context manager that leaves nothing behind."""
 
-    def __init__(self, program: str) -> None:
-        self._program = program
+    def __init__(self, program: str, size: tuple[int, int] = (600, 520)) -> None:
+        self._program, self._size = program, size
         self._count = 0
+        self.events: list[dict[str, Any]] = []
+        """What the protocol told unasked, once a domain is enabled."""
 
     def __enter__(self) -> Browser:
         self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         self._loop = asyncio.new_event_loop()
         self._process = subprocess.Popen(
-            [self._program, *FLAGS, f"--user-data-dir={self._folder.name}", "about:blank"],
+            [
+                self._program,
+                *FLAGS,
+                "--window-size={},{}".format(*self._size),
+                f"--user-data-dir={self._folder.name}",
+                "about:blank",
+            ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -100,6 +108,7 @@ class Browser:
                 if answer.get("id") == number:
                     assert "error" not in answer, answer
                     return answer["result"]
+                self.events.append(answer)
 
         return self._loop.run_until_complete(exchange())
 
@@ -121,11 +130,45 @@ class Browser:
             assert time.monotonic() < end, f"never true: {script}"
             time.sleep(0.05)
 
+    def slow_down(self, seconds: float) -> None:
+        """From the next page on, let so much time pass between frames.
+
+        Without a graphics card a scene that is drawn all the time leaves time for nothing else.
+        """
+        script = (
+            "window.requestAnimationFrame = call => setTimeout("
+            f"() => call(performance.now()), {1e3 * seconds:g});"
+            "window.cancelAnimationFrame = clearTimeout;"
+        )
+        self.call("Page.enable")
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+
     def open(self, path: Path) -> None:
         """Go to a file of this machine."""
-        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.visit(path.resolve().as_uri())
+
+    def visit(self, address: str) -> None:
+        """Go to an address."""
+        self.call("Page.navigate", url=address)
         self.until("document.readyState === 'complete'")
+
+    def picture(self) -> bytes:
+        """The page as it is seen, PNG."""
+        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
     def move(self, x: float, y: float) -> None:
         """Put the mouse to a place, in pixels of the window."""
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+
+    def click(self, element: str) -> None:
+        """Press and release the mouse on the middle of an element, given by a script."""
+        box = f"(() => {{ const b = ({element}).getBoundingClientRect();"
+        x, y = self.run(f"{box} return [b.x + b.width / 2, b.y + b.height / 2]; }})()")
+        self.move(x, y)
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def press(self, key: str) -> None:
+        """Press and release a key, by its name (ArrowRight)."""
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key)

@@ -25,22 +25,35 @@ def environment():
     return {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
 
 
-def call(*words, folder, code=0):
-    result = subprocess.run(
-        [*COMMAND, *map(str, words)],
+@pytest.fixture
+def call(twin, tmp_path, monkeypatch):
+    """Run a command in the test's folder, in this process: call("show", "a.nc", code=1)."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+
+    def run(*words, code=0):
+        result = twin(*words)
+        assert result.code == code, result.err
+        return result
+
+    return run
+
+
+def show_process(name, folder, stdout=subprocess.PIPE):
+    """Draw a file in a process of its own."""
+    return subprocess.run(
+        [*COMMAND, "show", name],
         cwd=folder,
         env=environment(),
-        capture_output=True,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
         text=True,
-        timeout=120,
     )
-    assert result.returncode == code, result.stderr
-    return result
 
 
-def test_atlas_to_pictures_and_show(tmp_path):
+def test_atlas_to_pictures_and_show(call, tmp_path):
     pytest.importorskip("plotly")
-    out = call(*SWEEP, "--out", "a.nc", "--workers", "1", folder=tmp_path).stdout
+    out = call(*SWEEP, "--out", "a.nc", "--workers", "1").out
     assert "paper, table 2" in out
     for name in ("plane", "factors", "slices", "global"):
         picture = tmp_path / f"a_{name}.png"
@@ -52,15 +65,15 @@ def test_atlas_to_pictures_and_show(tmp_path):
         assert data.attrs["pkm_twin_version"]
         assert data.energy.dims == ("z", "tilt", "azimuth")
         assert data.energy.attrs["units"] == "J"
-    call("show", "a.nc", "--out", "b", "--html", folder=tmp_path)
+    call("show", "a.nc", "--out", "b", "--html")
     assert (tmp_path / "b_plane.png").exists()
     assert "Plotly" in (tmp_path / "b.html").read_text()
 
 
-def test_interrupted_and_resumed(tmp_path):
+def test_interrupted_and_resumed(call, tmp_path):
     """Ctrl-C leaves finished parts; the same command goes on, with the same file."""
     words = ["atlas", "upr_rpu", "strain-energy", "--points", "300000", "--no-picture"]
-    call(*words, "--out", "whole.nc", folder=tmp_path)
+    call(*words, "--out", "whole.nc", "--workers", "1")
     process = subprocess.Popen(
         [*COMMAND, *words, "--out", "cut.nc"],
         cwd=tmp_path,
@@ -70,19 +83,18 @@ def test_interrupted_and_resumed(tmp_path):
         start_new_session=True,
     )
     parts = tmp_path / "cut.nc.parts"
-    end = time.monotonic() + 60
-    while time.monotonic() < end and len(list(parts.glob("*.npz"))) < 2:
+    while process.poll() is None and len(list(parts.glob("*.npz"))) < 2:
         time.sleep(0.005)
     # As a terminal does it: to the workers too, and an impatient person more than once.
     for _ in range(3):
         os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate()
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     assert "goes on from there" in errors
     assert parts.exists()
     assert not (tmp_path / "cut.nc").exists()
-    call(*words, "--out", "cut.nc", folder=tmp_path)
+    call(*words, "--out", "cut.nc", "--workers", "1")
     assert not parts.exists()
     assert same(tmp_path / "whole.nc", tmp_path / "cut.nc")
 
@@ -105,16 +117,16 @@ def test_interrupted_and_resumed(tmp_path):
         (["show", "none.nc"], 1, "none.nc"),
     ],
 )
-def test_refusals_are_one_line(words, code, text, tmp_path):
-    result = call(*words, folder=tmp_path, code=code)
-    assert text in result.stderr
-    assert "Traceback" not in result.stderr
+def test_refusals_are_one_line(words, code, text, call, tmp_path):
+    result = call(*words, code=code)
+    assert text in result.err
+    assert "Traceback" not in result.err
     assert list(tmp_path.iterdir()) == []
     if code == 1:
-        assert result.stderr.count("\n") == 1
+        assert result.err.count("\n") == 1
 
 
-def test_each_kind_says_its_own_options(tmp_path):
+def test_each_kind_says_its_own_options(call):
     shared = {"--points", "--out", "--workers", "--scheduler", "--html", "--overwrite"}
     own = {
         "workspace": {"--least-singularity", "--least-clearance"},
@@ -123,49 +135,35 @@ def test_each_kind_says_its_own_options(tmp_path):
         "modes": set(),
     }
     for kind, options in own.items():
-        text = call("atlas", "delta", kind, "--help", folder=tmp_path).stdout
+        text = call("atlas", "delta", kind, "--help").out
         for option in set().union(shared, *own.values()):
             assert (option in text) == (option in shared | options)
 
 
-def test_damaged_atlases_are_one_line(tmp_path):
-    call(*SWEEP, "--out", "a.nc", "--no-picture", folder=tmp_path)
+def test_damaged_atlases_are_one_line(call, tmp_path):
+    call(*SWEEP, "--out", "a.nc", "--no-picture", "--workers", "1")
     whole = (tmp_path / "a.nc").read_bytes()
     rng = np.random.default_rng(5)
-    for k in range(6):
+    for k in (0, 1, 4):
         damaged = bytearray(whole[: len(whole) // 3] if k == 0 else whole)
         for _ in range(40 * k):
             # Where the file says what it holds, not in its numbers.
             damaged[rng.integers(0, 60_000)] ^= 255
         (tmp_path / "b.nc").write_bytes(damaged)
-        result = subprocess.run(
-            [*COMMAND, "show", "b.nc"],
-            cwd=tmp_path,
-            env=environment(),
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
+        # HDF5 may end the process.
+        result = show_process("b.nc", tmp_path)
         assert result.returncode == 1, result
         assert result.stderr.startswith("pkm-twin: b.nc: ")
         assert result.stderr.count("\n") == 1
 
 
-def test_output_that_cannot_be_written_is_one_line(tmp_path):
-    call(*SWEEP, "--out", "a.nc", "--no-picture", folder=tmp_path)
+def test_output_that_cannot_be_written_is_one_line(call, tmp_path):
+    call(*SWEEP, "--out", "a.nc", "--no-picture", "--workers", "1")
     with open("/dev/full", "w") as full:
-        result = subprocess.run(
-            [*COMMAND, "show", "a.nc"],
-            cwd=tmp_path,
-            env=environment(),
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            timeout=120,
-        )
+        result = show_process("a.nc", tmp_path, stdout=full)
     assert result.returncode == 1
     assert result.stderr.count("\n") == 1
     (tmp_path / "a_plane.png").mkdir()
-    result = call("show", "a.nc", folder=tmp_path, code=1)
-    assert "a_plane.png" in result.stderr
-    assert result.stderr.count("\n") == 1
+    result = call("show", "a.nc", code=1)
+    assert "a_plane.png" in result.err
+    assert result.err.count("\n") == 1

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.robots import partly_long
 
 from pkm_twin import load, robot_names
 from pkm_twin.atlas import kinds, workspace
@@ -43,7 +44,13 @@ def test_the_default_atlas_holds_all_that_is_reachable(name, rng):
     assert ((box[:, 0] <= poses) & (poses <= box[:, 1])).all()
 
 
-@pytest.mark.parametrize("name", [n for n in robot_names() if len(load(n).pose_names) in (2, 3)])
+# A box of two and of three coordinates, and one about an axis.
+VOLUMES = partly_long(
+    [n for n in robot_names() if len(load(n).pose_names) in (2, 3)], "five_bar", "delta_cu"
+)
+
+
+@pytest.mark.parametrize("name", VOLUMES)
 def test_the_volume_is_that_of_random_poses(name, rng, monkeypatch, tmp_path):
     """By Monte Carlo in the search box, which the atlas's own box has no part in."""
     monkeypatch.setattr(workspace, "LAYERS", 3)
@@ -74,7 +81,10 @@ def test_a_cylinder_of_poses_holds_all_that_is_reachable(name, rng):
     assert on_axis == pytest.approx(np.array([[0.1 * (n == grid.height) for n in grid.names]] * 2))
 
 
-@pytest.mark.parametrize("name", [n for n in robot_names() if load(n).grid().kind == "box"])
+@pytest.mark.parametrize(
+    "name",
+    partly_long([n for n in robot_names() if load(n).grid().kind == "box"], "five_bar", "stewart"),
+)
 def test_an_atlas_without_an_axis(name, tmp_path):
     """Sections through the home pose: a whole grid of two or three coordinates, pairs of more."""
     from matplotlib import pyplot

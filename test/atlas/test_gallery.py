@@ -3,24 +3,15 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from delta_dynamics import energy_transfer_range, max_driving_force_range, tilted_pose
 from pkm_twin import load
+from test.support.pages import numbers
 
-PAGE = " ".join((Path(__file__).parents[2] / "docs" / "gallery.md").read_text().split())
+PAGE = "docs/gallery.md"
 AZIMUTHS = np.radians(np.arange(0, 360, 30))
-
-
-def numbers(pattern):
-    """The numbers of a sentence of the page."""
-    match = re.search(pattern, PAGE)
-    assert match, pattern
-    return [float(text) for text in match.groups()]
 
 
 def poses(robot, degrees):
@@ -31,8 +22,9 @@ def poses(robot, degrees):
 def test_the_range_of_eta_repeats_and_that_of_force_does_not():
     robot = load("prru")
     tilt, first, other = numbers(
+        PAGE,
         r"at a tilt of (\S+) degrees its greatest value is (\S+) N at azimuth 0 and (\S+) N at 120 "
-        "and 240 degrees"
+        "and 240 degrees",
     )
     third = len(AZIMUTHS) // 3
     eta = energy_transfer_range(robot, poses(robot, tilt))
@@ -46,7 +38,7 @@ def test_the_range_of_eta_repeats_and_that_of_force_does_not():
 
 def test_the_spread_of_eta_falls_before_it_grows():
     robot = load("prru")
-    least, most, tilt = numbers(r"falls by (\S+) to (\S+) % up to a tilt of (\S+) degrees")
+    least, most, tilt = numbers(PAGE, r"falls by (\S+) to (\S+) % up to a tilt of (\S+) degrees")
     upright, there, beyond = (
         energy_transfer_range(robot, poses(robot, degrees)).spread for degrees in (0, tilt, 45)
     )

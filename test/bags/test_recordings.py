@@ -25,10 +25,14 @@ from stiffness_monitor.monitor import Monitor
 FOLDER = Path(__file__).resolve().parents[2] / "bags"
 EPOCH = 1_700_000_000_000_000_000
 SECOND = 10**9
-STATES, WRENCH = "/joint_states", "/wrench"
+STATES, WRENCH, TRUE_WRENCH = "/joint_states", "/wrench", "/ground_truth/wrench"
 TRAJECTORY = "/delta_dynamics/joint_trajectory"
 # Topics with their types, rates in Hz or counts, and log times less stamps in ms, as in the README.
 EXPECTED = {
+    "delta_cu_collision": {
+        STATES: ("sensor_msgs/msg/JointState", 4000, 0.2),
+        TRUE_WRENCH: ("geometry_msgs/msg/WrenchStamped", 2000, 0.4),
+    },
     "delta_cu_pick_and_place": {
         STATES: ("sensor_msgs/msg/JointState", 20000, 0.2),
         TRAJECTORY: ("trajectory_msgs/msg/JointTrajectory", 31, -50.0),
@@ -46,6 +50,8 @@ EXPECTED = {
     },
 }
 NAMES = sorted(EXPECTED)
+DURATIONS = {"delta_cu_collision": 4.0}
+"""Lengths that are not the usual one, s."""
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +110,7 @@ class TestFile:
             elif m.topic == TRAJECTORY:
                 assert tuple(m.message.joint_names) == robot.joint_names
         duration = float(facts_of(bags[name])["duration_s"])
-        assert duration == 20.0
+        assert duration == DURATIONS.get(name, 20.0)
         for topic, times in stamps.items():
             if topic != TRAJECTORY:
                 steps = np.diff(times)

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from test.certificate.compare import Figures, compare
 from test.certificate.links import POSES, Links, compare_links, paper_rows
 from test.certificate.machines import ROBOTS
-from test.certificate.report import document
+from test.certificate.report import conclude, document
 from test.certificate.swing import Swing, run, starts
 from test.validation.calculix import CCX
 
@@ -81,12 +81,7 @@ def main() -> int:
     text, failures = document(
         figures, runs, ordered, paper_rows(), "python -m test.certificate", options.seed
     )
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(text)
-    console.print(f"{options.output} written")
-    for line in failures:
-        console.print(line, style="red")
-    return 1 if failures else 0
+    return conclude(options.output, text, failures, console)
 
 
 if __name__ == "__main__":

@@ -85,13 +85,19 @@ def _positions(name: str, robot: Robot, rng: np.random.Generator, states: int) -
                     continue
             else:
                 q = rng.uniform(-0.6, 1.0, 3)
-            if robot.singularity(q) > LEAST_MEASURE:
+            if _regularity(robot, q) > LEAST_MEASURE:
                 found.append(q)
         except (UnreachableError, SingularityError):
             continue
         if len(found) == states:
             return np.array(found)
     return None
+
+
+def _regularity(robot: Robot, q: np.ndarray) -> float:
+    """Reciprocal condition of the Jacobian, lengths at the platform's rim."""
+    values = np.linalg.svd(robot.pose_scales[:, None] * robot.jacobian(q), compute_uv=False)
+    return float(values[-1] / values[0])
 
 
 def _solid(rng: np.random.Generator, mass: float, size: float) -> list[list[float]]:

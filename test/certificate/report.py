@@ -7,8 +7,10 @@ import datetime
 import platform
 import textwrap
 from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 
 from test.certificate.compare import BALANCE_BOUNDS, BOUNDS, PLACE_BOUND, ROUTES, Figures
 from test.certificate.lagrange import DIGITS
@@ -337,6 +339,16 @@ are the paper's finite elements over the twin, less 1.
 def _filled(text: str) -> str:
     """One paragraph, in lines as long as the page's."""
     return textwrap.fill(" ".join(text.split()), 100)
+
+
+def conclude(path: Path, text: str, failures: list[str], console: Console) -> int:
+    """Write a certificate, say what exceeds its bounds: the exit code."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    console.print(f"{path} written")
+    for line in failures:
+        console.print(line, style="red")
+    return 1 if failures else 0
 
 
 def _percent(value: float) -> str:

@@ -1,50 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run `pkm-twin` in this process or in one of its own, and cut or spoil recorded bags."""
+"""Run `pkm-twin` in a process of its own, and cut or spoil recorded bags."""
 
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import yaml
+from support.command import Result
 
-from pkm_twin.apps import cli
 from pkm_twin.bags.reader import BagWriter, open_bag
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DELTA = REPOSITORY / "bags/delta_cu_pick_and_place.mcap"
 MILLING = REPOSITORY / "bags/prru_milling.mcap"
 STIFFNESS = REPOSITORY / "bags/upr_rpu_milling.mcap"
-
-
-@dataclass(frozen=True)
-class Result:
-    code: int
-    out: str
-    err: str
-
-    def one_line_error(self):
-        """The error, which has to be one line without a traceback."""
-        lines = self.err.strip().splitlines()
-        assert len(lines) == 1, self.err
-        assert lines[0].startswith("pkm-twin: ")
-        return lines[0]
-
-
-@pytest.fixture
-def twin(capsys):
-    """Run a command in this process: twin("info", "delta_cu")."""
-
-    def run(*arguments):
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return Result(end.value.code or 0, captured.out, captured.err)
-
-    return run
 
 
 @pytest.fixture(scope="session")
@@ -56,21 +26,12 @@ def process():
             [sys.executable, "-m", "pkm_twin.apps.cli", *map(str, arguments)],
             capture_output=True,
             text=True,
-            timeout=120,
             cwd=folder,
             env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
         )
         return Result(done.returncode, done.stdout, done.stderr)
 
     return run
-
-
-def massless(path):
-    """A 2UPR-RPU whose file has no masses."""
-    data = yaml.safe_load((REPOSITORY / "config/upr_rpu.yaml").read_text())
-    del data["inertia"]
-    path.write_text(yaml.safe_dump(data))
-    return path
 
 
 def rewrite(source, target, change=None, begin=0.0, seconds=2.0, metadata=None, topics=None):

@@ -10,6 +10,7 @@ import sys
 from functools import cache
 
 import pytest
+from support.command import Result
 from typer.main import get_command
 
 from pkm_twin.apps.cli import app
@@ -18,6 +19,7 @@ from test.commands.conftest import DELTA, REPOSITORY, rewrite
 NOT_RUN = {
     r"pkm-twin .*\b(my_delta|converted)\..*": "of a file that the page writes: test/docs runs them",
     r"pkm-twin guard-check.*": "needs ROS and a running node: test/nodes has one",
+    r"pkm-twin view .*": "serves until a signal: test/view runs it in a browser",
     r"pkm-twin play .*": "needs ROS: test_player runs it over the real middleware",
     r"pkm-twin atlas .* --scheduler .*": "needs a Dask cluster: test/atlas/test_run.py has one",
     r"pkm-twin atlas \w+ [\w-]+( --wrench \w+)?( --html)?( --out \S+)?( --html)?": "minutes: the "
@@ -107,26 +109,28 @@ def folder(tmp_path_factory):
     return path
 
 
-@pytest.mark.timeout(900)
-def test_it_runs_as_it_stands(folder):
-    """In the order of the page, in one folder: a later line may use what an earlier one wrote."""
+def by_shell(line):
+    """A line that redirects or pipes, in processes of their own."""
     program = f"{shlex.quote(sys.executable)} -m pkm_twin.apps.cli"
+    shell = f'pkm-twin() {{ {program} "$@"; }}\n{line}'
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, env=environment)
+    return Result(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.mark.timeout(900)
+def test_it_runs_as_it_stands(folder, twin, monkeypatch):
+    """In the order of the page, in one folder: a later line may use what an earlier one wrote."""
+    monkeypatch.chdir(folder)
     done = set()
     for (page, line), block in commands().items():
         if not block or line in done or reason(line):
             continue
         done.add(line)
-        shell = f'pkm-twin() {{ {program} "$@"; }}\n{line}'
-        result = subprocess.run(
-            ["bash", "-c", shell],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-            check=False,
-        )
-        assert result.returncode == ENDS.get(line, 0), f"{page}: {line}\n{result.stderr}"
-        assert "Traceback" not in result.stderr
+        words = shlex.split(line)[1:]
+        result = by_shell(line) if set(words) & set(SHELL) else twin(*words)
+        assert result.code == ENDS.get(line, 0), f"{page}: {line}\n{result.err}"
+        assert "Traceback" not in result.err
     assert len(done) >= 8
 
 

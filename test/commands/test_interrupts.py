@@ -56,7 +56,7 @@ def test_only_the_first_signal_counts(number):
         process.send_signal(signal.SIGINT)
         process.send_signal(signal.SIGTERM)
         time.sleep(0.001)
-    out, err = process.communicate(timeout=20)
+    out, err = process.communicate()
     assert (process.returncode, out, err) == (0, "cleaned up\n", "")
 
 
@@ -74,7 +74,7 @@ with interrupts.first_signal(lambda: SystemExit(7)):
     time.sleep(0.3)
     signal.raise_signal(signal.SIGINT)
 """
-    done = subprocess.run([sys.executable, "-c", script], env=environment(), timeout=20)
+    done = subprocess.run([sys.executable, "-c", script], env=environment())
     assert done.returncode == 7
 
 
@@ -98,6 +98,6 @@ def test_an_interrupted_command_has_its_own_exit_code(tmp_path):
     ):
         time.sleep(0.005)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate()
     assert (process.returncode, out) == (130, "")
     assert "Traceback" not in err

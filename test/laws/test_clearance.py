@@ -272,11 +272,11 @@ def test_limbs_of_the_shipped_robots_never_meet(name, at_least):
 def test_the_regular_workspace_is_that_without_interference(monkeypatch):
     robot = load("upr_rpu")
     z = np.arange(-0.90, -0.34, 0.05)
-    found = regular_workspace(robot, z, directions=90)
+    found = regular_workspace(robot, z, directions=24)
     monkeypatch.setattr(type(robot), "beams", ())
     blind = replace(robot)
     assert not has_clearance(blind)
-    without = regular_workspace(blind, z, directions=90)
+    without = regular_workspace(blind, z, directions=24)
     assert (found.z == without.z).all()
     assert (found.radius == without.radius).all()
 
@@ -285,17 +285,15 @@ def test_the_regular_workspace_ends_where_limbs_meet(variant):
     """Bars so thick that they meet first: its circles are smaller, and limbs touch on them."""
     z = np.arange(-0.90, -0.34, 0.05)
     robot, _ = variant("upr_rpu", members={"diameter": 0.36})
-    wide = regular_workspace(load("upr_rpu"), z, least_radius=0.0)
-    narrow = regular_workspace(robot, z, least_radius=0.0)
+    wide = regular_workspace(load("upr_rpu"), z, least_radius=0.0, directions=72)
+    narrow = regular_workspace(robot, z, least_radius=0.0, directions=72)
     assert (narrow.z == wide.z).all()
     assert (narrow.radius <= wide.radius).all()
     touched = narrow.radius < wide.radius - 1e-6
     assert touched.sum() >= 3
-    turn = np.arange(360) * (2 * np.pi / 360)
+    turn = np.arange(72) * (2 * np.pi / 72)
     for height, radius in zip(narrow.z[touched], narrow.radius[touched], strict=True):
-        poses = np.column_stack(
-            (np.full(360, height), radius * np.cos(turn), radius * np.sin(turn))
-        )
+        poses = np.column_stack((np.full(72, height), radius * np.cos(turn), radius * np.sin(turn)))
         assert clearance(robot, poses).min() == pytest.approx(0.0, abs=1e-7)
 
 

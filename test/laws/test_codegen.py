@@ -159,7 +159,7 @@ def start(folder):
 
 
 def finished(process):
-    out, error = process.communicate(timeout=250)
+    out, error = process.communicate()
     assert process.returncode == 0, error
     return out, error.splitlines()
 

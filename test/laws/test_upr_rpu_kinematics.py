@@ -76,7 +76,7 @@ def test_constraints_of_the_limbs_hold():
 @pytest.mark.parametrize("size", SIZES)
 def test_forward_of_inverse_is_the_pose(size):
     robot = machine(*size)
-    poses = branch_poses(robot, 20_000, 3)
+    poses = branch_poses(robot, 4000, 3)
     back = robot.forward(robot.inverse(poses))
     # The margin of 0.05 from the singularities costs up to 1 / 0.05 in digits.
     assert np.abs(back - poses).max() < 5e-13
@@ -84,7 +84,7 @@ def test_forward_of_inverse_is_the_pose(size):
 
 def test_forward_of_inverse_in_the_working_range():
     rng = np.random.default_rng(4)
-    poses = rng.uniform((-1.0, -0.5, -0.5), (-0.3, 0.5, 0.5), (100_000, 3))
+    poses = rng.uniform((-1.0, -0.5, -0.5), (-0.3, 0.5, 0.5), (20_000, 3))
     assert np.abs(ROBOT.forward(ROBOT.inverse(poses)) - poses).max() < 1e-14
 
 
@@ -104,7 +104,7 @@ def test_inverse_of_forward_is_the_joint_state():
 
 def test_forward_follows_the_home_pose():
     """Along paths that stay in the branch's middle, small steps in q are small steps in pose."""
-    ends = branch_poses(ROBOT, 200, 6, margin=0.2)
+    ends = branch_poses(ROBOT, 80, 6, margin=0.2)
     home = np.array([-0.6, 0.0, 0.0])
     path = home + np.linspace(0, 1, 200)[:, None, None] * (ends - home)
     a, b = ROBOT.geometry.platform_radius, ROBOT.geometry.base_radius
@@ -113,14 +113,14 @@ def test_forward_follows_the_home_pose():
         path[..., 0] + a * np.sin(path[..., 1]) < -0.01
     )
     whole = clear.all(axis=0)
-    assert whole.sum() > 100
+    assert whole.sum() > 40
     assert ROBOT.forward(ROBOT.inverse(path[:, whole])) == pytest.approx(path[:, whole], abs=1e-11)
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_jacobians_against_differences(size):
     robot = machine(*size)
-    poses = branch_poses(robot, 40, 7, margin=0.15)
+    poses = branch_poses(robot, 10, 7, margin=0.15)
     scale = sum(size)
     h = 1e-5 * scale
     for pose in poses:

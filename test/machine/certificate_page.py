@@ -22,6 +22,7 @@ from pkm_twin import load, robot_names
 from pkm_twin.apps.certify import BOUNDS, certificate_of
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.catalogue import config_folder
+from test.certificate.report import conclude
 from test.machine.random_machines import NAMES, plain, variant
 
 WHAT = tuple(name for name in BOUNDS if name not in ("round_trip", "batch"))
@@ -146,12 +147,7 @@ def main():
     for title, kind in (("Shipped robots", "robot"), ("Random machines", "machine")):
         rows = table([results[task] for task in sorted(results) if task[0] == kind])
         text += f"\n## {title}\n\n" + "\n".join(rows) + "\n"
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(text)
-    console.print(f"{options.output} written")
-    for line in failures:
-        console.print(line, style="red")
-    return 1 if failures else 0
+    return conclude(options.output, text, failures, console)
 
 
 if __name__ == "__main__":

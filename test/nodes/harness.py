@@ -23,7 +23,7 @@ except ImportError:  # The tests of the pure cores run without ROS.
     rclpy = None
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-DEADLINE = 60.0
+DEADLINE = 240.0
 """How long a condition is waited for, s: no verdict but for what will never be so."""
 SECOND = 10**9
 
@@ -147,18 +147,13 @@ def end_with_parent():
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
-class NodeProcess:
-    """``python -m MODULE --ros-args -p ...`` in a session of its own, output kept.
+class Process:
+    """A command in a session of its own, output kept."""
 
-    ``arguments`` are further ROS arguments; ``code`` is run instead of the module.
-    """
-
-    def __init__(self, domain, module, *parameters, arguments=(), code=None):
+    def __init__(self, domain, command):
         self._output = tempfile.TemporaryFile("w+")  # noqa: SIM115
-        flags = [flag for parameter in parameters for flag in ("-p", parameter)]
-        run = ["-m", module] if code is None else ["-c", code]
         self.process = subprocess.Popen(
-            [sys.executable, *run, "--ros-args", *flags, *arguments],
+            command,
             stdout=self._output,
             stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
@@ -176,7 +171,7 @@ class NodeProcess:
     def alive(self):
         return self.process.poll() is None
 
-    def wait(self, timeout=60.0):
+    def wait(self, timeout=DEADLINE):
         """The exit code of a process that ends by itself."""
         return self.process.wait(timeout)
 
@@ -195,6 +190,19 @@ class NodeProcess:
             self.process.kill()
             self.process.wait()
         self._output.close()
+
+
+class NodeProcess(Process):
+    """``python -m MODULE --ros-args -p ...``
+
+    ``arguments`` are further ROS arguments; ``code`` is run instead of the module, or ``script``,
+    a path and its own arguments.
+    """
+
+    def __init__(self, domain, module, *parameters, arguments=(), code=None, script=None):
+        flags = [flag for parameter in parameters for flag in ("-p", parameter)]
+        run = script or (["-m", module] if code is None else ["-c", code])
+        super().__init__(domain, [sys.executable, *run, "--ros-args", *flags, *arguments])
 
 
 class Peer:

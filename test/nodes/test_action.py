@@ -17,8 +17,6 @@ from delta_dynamics import inverse_dynamics
 from test.nodes.harness import SECOND
 from test.nodes.twin import MAKE, MODULE, ROBOT, trajectory
 
-PATIENCE = 90.0
-
 
 class Controller:
     """A controller's action: it keeps the goals that come and ends them as it is told."""
@@ -59,7 +57,7 @@ class Client:
     def send(self, message):
         self.feedback = []
         peer = self.peer
-        peer.until(self.client.server_is_ready, PATIENCE)
+        peer.until(self.client.server_is_ready)
         goal = FollowJointTrajectory.Goal(trajectory=message)
         sent = self.client.send_goal_async(goal, feedback_callback=self.feedback.append)
         peer.until(sent.done)
@@ -67,7 +65,7 @@ class Client:
         self.result = self.handle.get_result_async()
 
     def ended(self):
-        self.peer.until(self.result.done, PATIENCE)
+        self.peer.until(self.result.done)
         answer = self.result.result()
         return answer.status, answer.result
 

@@ -20,7 +20,6 @@ def run(node, *arguments, before=""):
         env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
 

@@ -48,14 +48,14 @@ import numpy as np
 import delta_dynamics.node as node
 from delta_dynamics import feedforward
 solve = feedforward.inverse_dynamics
-def late(robot, q, qd, qdd):
+def late(robot, q, *rest):
     if q.ndim > 1:
         return np.full(q.shape, np.inf)
     if q[0] == 0.125:
         time.sleep(0.02)
     if q[0] == 0.1125:
         os.kill(os.getpid(), signal.SIGSTOP)
-    return solve(robot, q, qd, qdd)
+    return solve(robot, q, *rest)
 feedforward.inverse_dynamics = late
 node.main()
 """
@@ -139,7 +139,7 @@ def running(twin):
         assert twin.process.alive(), twin.process.output
         at_pace(twin, 12)
 
-    twin.peer.until(lambda: any(not is_zeros(m) for m in torques), 90.0, send)
+    twin.peer.until(lambda: any(not is_zeros(m) for m in torques), repeat=send)
     return twin
 
 
@@ -168,9 +168,9 @@ def count_settled(twin):
 
 
 def count_at_rest(quick):
-    """The count once the stream has stopped: then the queue is empty."""
+    """The count once the stream has stopped, and nothing more waits."""
     quick.peer.until(lambda: is_zeros(quick.received("joint_torques")[-1]))
-    return count_of(quick.diagnostics())
+    return count_of(count_settled(quick))
 
 
 @pytest.fixture
@@ -241,7 +241,7 @@ class TestLoad:
         node = twin.peer.node
         heard = node.count_subscribers("/late/joint_torques")
         listener = launch(None, code=LISTENER)
-        twin.peer.until(lambda: node.count_subscribers("/late/joint_torques") > heard, 60.0)
+        twin.peer.until(lambda: node.count_subscribers("/late/joint_torques") > heard)
         listener.process.send_signal(signal.SIGSTOP)
         try:
             # Ten times as many as the queue of the one that stands still holds.
@@ -291,23 +291,35 @@ class TestLoad:
                 if array.status[0].name == "/late"
             )
 
-        late.peer.until(told, repeat=lambda: at_pace(late, 20, 5e-3, position=(0.125, 0.2, 0.3)))
+        # One right after the other: their period is short however slow this machine is.
+        late.peer.until(told, repeat=lambda: late.stream(4, position=(0.125, 0.2, 0.3)))
 
     def test_a_trajectory_that_overflows_the_model_stops_the_stream(self, fleet):
-        late = running(fleet["late"])
-        late.since([at_pace(late, 9)[0]])
-        torques = late.received("joint_torques")
-        torques.clear()
-        rows = [tuple(Q)] * 3
-        late.peer.send(
-            "/late/joint_trajectory",
-            MAKE.trajectory(NAMES, [0, STEP, SECOND], rows, stamp=late.stamp()),
-        )
-        late.peer.until(lambda: any(map(is_zeros, torques)))
-        array = late.diagnostics(lambda a: a.status[0].level == b"\x02")
-        assert array.status[0].message.startswith("stopped: non-finite result")
-        assert sum(map(is_zeros, torques)) == 1
-        assert late.received("joint_trajectory_ff") == []
+        late = fleet["late"]
+        # Silence shall not stop the stream first, nor good samples that wait end the stop.
+        assert late.set(stale_after=60.0).successful
+        try:
+            running(late)
+            assert late.set(recovery_count=1000).successful
+            before = counts_of(late.diagnostics(), "stopped")
+            torques = late.received("joint_torques")
+            torques.clear()
+            rows = [tuple(Q)] * 3
+            at_pace(late, 50, position=(0.125, 0.2, 0.3))
+            late.peer.send(
+                "/late/joint_trajectory",
+                MAKE.trajectory(NAMES, [0, STEP, SECOND], rows, stamp=late.begin()),
+            )
+            late.peer.until(lambda: any(map(is_zeros, torques)))
+            array = count_settled(late)
+            assert array.status[0].level == b"\x02"
+            assert array.status[0].message.startswith("stopped: non-finite result")
+            assert counts_of(array, "stopped") == before | {"non-finite result": 1}
+            # Nothing after it, however many samples waited.
+            assert [is_zeros(m) for m in torques].index(True) == len(torques) - 1
+            assert late.received("joint_trajectory_ff") == []
+        finally:
+            assert late.set(recovery_count=2, stale_after=5.0).successful
 
 
 class TestClocks:
@@ -343,7 +355,7 @@ class TestClocks:
     def test_no_torque_is_made_across_a_jump_of_the_clock(self, fleet):
         timed = fleet["timed"]
         timed.peer.talk(Clock, "/clock")
-        timed.peer.until(timed.peer.matched, 90.0)
+        timed.peer.until(timed.peer.matched)
         self.tick(timed, self.start)
         assert self.stream(timed, self.start, 20) == list(range(WINDOW - 1, 20))
         # Back, as when a bag begins anew: the window is filled anew. By as little as stamps may be
@@ -412,12 +424,12 @@ class TestNeighbours:
         try:
             twin.peer.until(
                 lambda: answers,
-                repeat=lambda: twin.peer.send(topic, trajectory(stamp=twin.stamp())),
+                repeat=lambda: twin.peer.send(topic, trajectory(stamp=twin.begin())),
             )
             twin.peer.node.destroy_publisher(twin.peer._publishers[topic])
             twin.peer._publishers[topic] = before
             # The reliable one as before.
-            assert twin.ask(trajectory(stamp=twin.stamp()))
+            assert twin.ask(trajectory(stamp=twin.begin()))
         finally:
             twin.peer._publishers[topic] = before
 
@@ -448,7 +460,7 @@ class TestNeighbours:
         namesake = launch(MODULE, arguments=remap)
         try:
             line = "2 nodes have this name"
-            quick.peer.until(lambda: line in text_of(quick.diagnostics()), 90.0)
+            quick.peer.until(lambda: line in text_of(quick.diagnostics()))
         finally:
             namesake.close()
         self.told(quick, lambda text: line not in text)
@@ -486,7 +498,7 @@ class TestNeighbours:
         torques = quick.received("joint_torques")
         sender = launch(None, code=SENDER)
         torques.clear()
-        quick.peer.until(lambda: sum(not is_zeros(m) for m in torques) > 20, 60.0)
+        quick.peer.until(lambda: sum(not is_zeros(m) for m in torques) > 20)
         sender.process.kill()
         sender.wait()
         quick.peer.until(lambda: is_zeros(torques[-1]))

@@ -14,7 +14,6 @@ from delta_dynamics import feedforward, inverse_dynamics
 from delta_dynamics.feedforward import SLICE, Feedforward, Settings
 from pkm_twin import load
 from pkm_twin.errors import MessageError, ParameterError, SingularityError
-from pkm_twin.streams.continuity import Clearance
 from test.nodes.harness import SECOND, Maker, Plain
 
 NOW = 1_000 * SECOND
@@ -370,25 +369,6 @@ class TestSingularities:
             assert twin.trajectory(message, NOW).shape == (6, 3)
             assert twin.near_singularities == 6
 
-    @given(
-        shape=st.tuples(st.integers(1, 6), st.integers(1, 6)),
-        seed=st.integers(0, 2**32 - 1),
-        step=st.sampled_from([0.0, 1e-4, 1e-2, 0.3, 3.0]),
-        wanted=st.floats(0.0, 0.5),
-    )
-    def test_the_bound_along_a_stream_is_below_the_measure(self, shape, seed, step, wanted):
-        rng = np.random.default_rng(seed)
-        clearance = Clearance()
-        matrix = rng.normal(size=shape)
-        for _ in range(20):
-            matrix = matrix + step * rng.normal(size=shape)
-            values = np.linalg.svd(matrix, compute_uv=False)
-            measure = values[-1] / values[0]
-            bound = clearance.at_least(matrix, wanted)
-            assert bound <= measure * (1 + 1e-12)
-            assert bound >= min(wanted, measure) * (1 - 1e-12)
-            assert clearance.greatest >= values[0] * (1 - 1e-12)
-
     @pytest.mark.parametrize("name", ["delta", "delta_cu", "prru"])
     def test_the_defaults_leave_the_workspace_alone(self, name):
         robot = load(name)
@@ -432,16 +412,13 @@ class TestJumps:
         assert (results[-1].motion[2] == 0.0).all()
 
     @pytest.mark.parametrize(("shift", "jumps"), [(0.02, True), (0.01, False)])
-    def test_a_jump_to_another_assembly_mode_stops_the_stream(
-        self, make, monkeypatch, shift, jumps
-    ):
+    def test_a_jump_to_another_assembly_mode_stops_the_stream(self, make, shift, jumps):
         """The platform is elsewhere by more than a quarter of its radius, the joints are not."""
         twin = core()
         results = [twin.joint_state(*held(make, i, [0.1, 0.2, 0.3])) for i in range(WINDOW)]
         assert results[-1] is not None
-        forward = type(ROBOT).forward
-        there = np.array([shift, 0.0, 0.0])
-        monkeypatch.setattr(type(ROBOT), "forward", lambda self, q: forward(self, q) + there)
+        # The row of the last sample: after the joints comes the pose.
+        twin._continuity._last.numbers[len(NAMES)] -= shift
         message = held(make, WINDOW, [0.1, 0.2, 0.3])
         if not jumps:
             assert twin.joint_state(*message) is not None
@@ -791,7 +768,7 @@ class TestAnything:
     """Whatever comes: a MessageError, or finite efforts; never another exception, never NaN."""
 
     relaxed = settings(
-        max_examples=500, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+        max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
     )
 
     @relaxed

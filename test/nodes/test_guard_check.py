@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from test.nodes.harness import REPOSITORY
+from test.nodes.harness import DEADLINE, REPOSITORY
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -58,8 +58,7 @@ def stream_until_end(twin, process):
     """Joint states until the command has ended: its exit code and its JSON."""
     twin.peer.until(
         lambda: process.poll() is not None,
-        90.0,
-        lambda: twin.send_state(state(twin.stamp())),
+        repeat=lambda: twin.send_state(state(twin.stamp())),
     )
     out, err = process.communicate()
     return process.returncode, json.loads(out) if out else {}, err
@@ -83,7 +82,7 @@ def test_a_deadline_that_the_node_does_not_promise_is_bad(twin, check):
     topic = "/judged/joint_torques"
     count = twin.peer.node.count_subscribers
     before = count(topic)
-    twin.peer.until(lambda: count(topic) > before, 60.0)
+    twin.peer.until(lambda: count(topic) > before)
     for _ in range(50):
         twin.settle()
     process.send_signal(signal.SIGINT)
@@ -97,7 +96,7 @@ def test_a_deadline_that_the_node_does_not_promise_is_bad(twin, check):
 
 def test_where_nothing_comes_it_says_so(peer, check):
     process = check("nobody/joint_torques", "--wait", 0.5)
-    assert process.wait(60) == 1
+    assert process.wait(DEADLINE) == 1
     out, err = process.communicate()
     assert "0" in out
     assert err == ""
@@ -106,7 +105,7 @@ def test_where_nothing_comes_it_says_so(peer, check):
 def test_plain_commands_cannot_be_judged(peer, check):
     peer.talk(Float64MultiArray, "/plain/commands")
     process = check("plain/commands", "--wait", 60)
-    assert process.wait(90) == 1
+    assert process.wait(DEADLINE) == 1
     _, err = process.communicate()
     (line,) = err.strip().splitlines()
     assert "std_msgs/msg/Float64MultiArray" in line
@@ -118,7 +117,7 @@ def test_plain_commands_cannot_be_judged(peer, check):
 )
 def test_a_bound_that_is_no_time_is_refused(check, option, value):
     process = check(option, value)
-    assert process.wait(60) == 1
+    assert process.wait(DEADLINE) == 1
     assert process.communicate()[1].startswith(f"pkm-twin: {option[2:]}: ")
 
 
@@ -133,5 +132,5 @@ def test_it_matches_a_publisher_of_either_reliability(peer, check):
         message.header.stamp = peer.node.get_clock().now().to_msg()
         publisher.publish(message)
 
-    peer.until(lambda: process.poll() is not None, 90.0, repeat)
+    peer.until(lambda: process.poll() is not None, repeat=repeat)
     assert json.loads(process.communicate()[0])["messages"] > 0

@@ -58,7 +58,7 @@ def trajectories(draw):
     return message
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(joint_states(), min_size=1, max_size=4))
 def test_joint_states_come_as_the_middleware_gives_them(messages):
     decode = JointStateDecoder(JOINT_STATE)
@@ -72,7 +72,7 @@ def test_joint_states_come_as_the_middleware_gives_them(messages):
         assert view.header.stamp.nanosec == message.header.stamp.nanosec
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(message=joint_states(), data=st.data())
 def test_damaged_joint_states_are_refused_or_read(message, data):
     raw = bytearray(serialize_message(message))
@@ -90,7 +90,7 @@ def test_damaged_joint_states_are_refused_or_read(message, data):
             assert all(isinstance(x, float) for x in view.position)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(trajectories())
 def test_trajectories_come_as_the_middleware_gives_them(message):
     raw = RawTrajectory.of(bytes(serialize_message(message)))
@@ -105,7 +105,7 @@ def test_trajectories_come_as_the_middleware_gives_them(message):
             assert given.tolist() == rows
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(message=trajectories(), seed=st.integers(0, 2**31))
 def test_efforts_are_put_in_and_nothing_else_is_changed(message, seed):
     points = len(message.points)
@@ -119,7 +119,7 @@ def test_efforts_are_put_in_and_nothing_else_is_changed(message, seed):
     assert answer == message
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(message=trajectories(), data=st.data())
 def test_damaged_trajectories_are_refused_or_read(message, data):
     raw = bytearray(serialize_message(message))

@@ -10,8 +10,6 @@ import contextlib
 import os
 import re
 import signal
-import subprocess
-import tempfile
 from importlib.util import find_spec
 
 import numpy as np
@@ -19,7 +17,7 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics
-from test.nodes.harness import REPOSITORY, end_with_parent
+from test.nodes.harness import REPOSITORY, Process
 
 LAUNCH = REPOSITORY / "launch"
 FILES = ("twin", "cell", "control")
@@ -28,8 +26,6 @@ NODES = {
     "stiffness_monitor": "stiffness_monitor/node.py",
     "command_gate": "delta_dynamics/gate_node.py",
 }
-PATIENCE = 90.0
-"""How long a loaded machine may take to start several nodes, s."""
 
 
 def literal(name, variable):
@@ -121,26 +117,11 @@ def mock_hardware(names, positions):
     )
 
 
-class Launched:
-    """``ros2 launch FILE ARGUMENTS`` in a session of its own."""
+class Launched(Process):
+    """``ros2 launch FILE ARGUMENTS``."""
 
     def __init__(self, domain, name, arguments):
-        self._output = tempfile.TemporaryFile("w+")  # noqa: SIM115
-        self.process = subprocess.Popen(
-            ["ros2", "launch", str(LAUNCH / f"{name}.launch.py"), *arguments],
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            cwd=tempfile.gettempdir(),
-            env=domain.environment(),
-            start_new_session=True,
-            preexec_fn=end_with_parent,
-        )
-
-    @property
-    def output(self):
-        self._output.seek(0)
-        return self._output.read()
+        super().__init__(domain, ["ros2", "launch", str(LAUNCH / f"{name}.launch.py"), *arguments])
 
     def started(self, node):
         """Process ids of a node, in the order of its starts."""
@@ -148,15 +129,10 @@ class Launched:
         return [int(number) for number in re.findall(pattern, self.output)]
 
     def close(self):
-        """As Ctrl-C in a terminal; what is left after that is killed."""
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGINT)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(30.0)
+        """As Ctrl-C in a terminal; what the launch leaves behind is killed."""
+        super().close()
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
-        self._output.close()
 
 
 @pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
@@ -189,10 +165,10 @@ class TestRunning:
         """Wait until exactly these nodes are there."""
 
         def so():
-            assert process.process.poll() is None, process.output
+            assert process.alive(), process.output
             return self.nodes(peer) == sorted(names)
 
-        peer.until(so, PATIENCE)
+        peer.until(so)
 
     def parameter(self, peer, node, name):
         from rcl_interfaces.srv import GetParameters
@@ -213,7 +189,7 @@ class TestRunning:
         process = launched("twin", "namespace:=left", "command_gate:=true", "robot:=prru")
         names = [f"/left/{node}" for node in NODES]
         self.until_nodes(peer, process, *names)
-        peer.until(lambda: "/left/wrench" in self.subscribed(peer), PATIENCE)
+        peer.until(lambda: "/left/wrench" in self.subscribed(peer))
         assert {topic for topic in self.subscribed(peer) if not topic.startswith("/left/")} == set()
         assert "/left/joint_states" in self.subscribed(peer)
         for name in names:
@@ -251,7 +227,7 @@ class TestRunning:
         self.until_nodes(peer, process, "/delta_dynamics", "/command_gate")
         (gate,) = process.started("command_gate")
         os.kill(gate, signal.SIGKILL)
-        peer.until(lambda: len(process.started("command_gate")) == 2, PATIENCE)
+        peer.until(lambda: len(process.started("command_gate")) == 2)
         (dynamics,) = process.started("delta_dynamics")
         os.kill(dynamics, signal.SIGKILL)
         peer.until(lambda: f"process has died [pid {dynamics}, exit code -9" in process.output)
@@ -262,12 +238,12 @@ class TestRunning:
         process = launched("twin", "stiffness_monitor:=false")
         self.until_nodes(peer, process, "/delta_dynamics")
         os.kill(process.started("delta_dynamics")[0], signal.SIGKILL)
-        peer.until(lambda: len(process.started("delta_dynamics")) == 2, PATIENCE)
+        peer.until(lambda: len(process.started("delta_dynamics")) == 2)
 
     def test_the_log_level_is_passed_on(self, launched, peer):
         process = launched("twin", "stiffness_monitor:=false", "log_level:=error")
         self.until_nodes(peer, process, "/delta_dynamics")
-        peer.until(lambda: "/joint_states" in self.subscribed(peer), PATIENCE)
+        peer.until(lambda: "/joint_states" in self.subscribed(peer))
         assert "robot delta_cu" not in process.output
 
     def test_a_cell_keeps_its_machines_apart(self, launched, peer):
@@ -275,7 +251,7 @@ class TestRunning:
         names = [f"/{space}/{node}" for space in "ab" for node in list(NODES)[:2]]
         self.until_nodes(peer, process, *names)
         both = {f"/{space}/joint_states" for space in "ab"}
-        peer.until(lambda: both <= self.subscribed(peer), PATIENCE)
+        peer.until(lambda: both <= self.subscribed(peer))
         assert "/joint_states" not in self.subscribed(peer)
         assert self.parameter(peer, "/a/delta_dynamics", "mechanism") == "delta_cu"
         assert self.parameter(peer, "/b/delta_dynamics", "mechanism") == "prru"
@@ -311,11 +287,11 @@ class TestRunning:
         )
 
         def ready():
-            assert process.process.poll() is None, process.output
+            assert process.alive(), process.output
             return client.server_is_ready() and peer.received(state)
 
         try:
-            peer.until(ready, PATIENCE)
+            peer.until(ready)
             peer.received(state).clear()
             sent = trajectory(count=5)
             # The controller takes none that does not end at rest.
@@ -325,7 +301,7 @@ class TestRunning:
                 goal = client.send_goal_async(FollowJointTrajectory.Goal(trajectory=sent))
                 peer.until(goal.done)
                 result = goal.result().get_result_async()
-                peer.until(result.done, PATIENCE)
+                peer.until(result.done)
                 return result.result()
 
             last = answer()
@@ -362,13 +338,13 @@ class TestRunning:
     )
     def test_a_bad_argument_is_refused_by_name(self, launched, name, argument, said):
         process = launched(name, argument)
-        assert process.process.wait(PATIENCE) == 1
+        assert process.wait() == 1
         assert said in process.output
 
     def test_ctrl_c_ends_all_of_it_cleanly(self, launched, peer):
         process = launched("twin", "command_gate:=true")
         self.until_nodes(peer, process, *(f"/{node}" for node in NODES))
         process.process.send_signal(signal.SIGINT)
-        process.process.wait(PATIENCE)
+        process.wait()
         assert process.output.count("process has finished cleanly") == 3
         assert "Traceback" not in process.output

@@ -242,7 +242,7 @@ class TestLongTrajectories:
             0.3 * np.cos(waves) * [3.0, -4.0, 5.0],
             -0.3 * np.sin(waves) * [9.0, 16.0, 25.0],
         ]
-        stamp = twin.stamp()
+        stamp = twin.begin()
         message = MAKE.trajectory(NAMES, [i * STEP for i in range(self.points)], *rows, stamp=stamp)
         answered(twin)
         answers = twin.received("joint_trajectory_ff")
@@ -250,7 +250,7 @@ class TestLongTrajectories:
         answers.clear()
         torques.clear()
         twin.peer.send(f"/{twin.name}/joint_trajectory", message)
-        twin.peer.until(lambda: answers, 120.0, lambda: twin.stream(1))
+        twin.peer.until(lambda: answers, repeat=lambda: twin.stream(1))
         # Of the states that were sent meanwhile.
         assert len(torques) > 3
         picked = slice(None, None, 997)
@@ -263,7 +263,7 @@ class TestLongTrajectories:
         before = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0)
         count = 40
         for _ in range(count):
-            message = trajectory(count=2000, stamp=twin.stamp())
+            message = trajectory(count=2000, stamp=twin.begin())
             for point, time in zip(message.points, range(2000), strict=True):
                 point.time_from_start.sec, point.time_from_start.nanosec = divmod(
                     time * STEP * 100, SECOND
@@ -275,7 +275,7 @@ class TestLongTrajectories:
             busy = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0) - before
             return len(answers) + busy >= count
 
-        twin.peer.until(all_told, 120.0)
+        twin.peer.until(all_told)
         answers.clear()
 
 

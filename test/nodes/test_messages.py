@@ -381,7 +381,7 @@ class TestAnything:
         st.lists(st.one_of(st.sampled_from(NAMES), st.text(max_size=8)), max_size=5),
     )
 
-    @settings(max_examples=400, deadline=None)
+    @settings(max_examples=150, deadline=None)
     @given(
         names=names,
         arrays=st.tuples(*[st.lists(anything, max_size=4)] * 3),
@@ -400,7 +400,7 @@ class TestAnything:
         for values in (sample.q, sample.qd, sample.effort):
             assert values is None or (values.shape == (3,) and np.isfinite(values).all())
 
-    @settings(max_examples=200, deadline=None)
+    @settings(max_examples=100, deadline=None)
     @given(
         order=st.permutations(range(3)),
         rows=st.lists(
@@ -416,7 +416,7 @@ class TestAnything:
         assert t.q.tolist() == [list(row) for row in rows]
         assert [ROBOT.joint_names[i] for i in t.columns] == names
 
-    @settings(max_examples=200, deadline=None)
+    @settings(max_examples=100, deadline=None)
     @given(values=st.tuples(*[anything] * 6), frame=st.sampled_from(["platform", "", "x"]))
     def test_wrenches(self, values, frame):
         try:

@@ -228,7 +228,7 @@ NUMBERS = st.one_of(st.floats(-1e3, 1e3), st.floats(), st.sampled_from([*DAMAGED
 LENGTHS = st.one_of(st.floats(0.3, 1.0), st.floats(0.3, 1.0), NUMBERS)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(q=st.tuples(LENGTHS, LENGTHS, LENGTHS), wrench=st.tuples(*[NUMBERS] * 6))
 def test_anything_is_rejected_or_answered_with_finite_numbers(q, wrench):
     make = Maker(Plain())

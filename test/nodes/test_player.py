@@ -108,6 +108,7 @@ def player() -> Iterator[Callable[..., subprocess.Popen[str]]]:
     started: list[subprocess.Popen[str]] = []
 
     def start(path: Path, **options: object) -> subprocess.Popen[str]:
+        options = {"wait_for_subscribers": DEADLINE, **options}
         command = [sys.executable, "-c", PROGRAM, str(path), repr(options)]
         process = subprocess.Popen(
             command,
@@ -134,7 +135,7 @@ def test_order_count_and_timing(
         String, "note", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
     )
     topics = ["/joint_states", "/note"]
-    process = player(bag, rate=rate, wait_for_subscribers=10.0, topics=topics)
+    process = player(bag, rate=rate, topics=topics)
     listener.spin(lambda: process.poll() is not None)
     out, err = process.communicate()
     assert process.returncode == 0, err
@@ -155,9 +156,7 @@ def test_recorded_durability_is_offered(
     """A subscriber that asks for latched messages matches, which a volatile offer would not."""
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     listener.listen(String, "elsewhere", latched)
-    process = player(
-        bag, remap={"/latched": "/elsewhere"}, topics=["/latched"], wait_for_subscribers=10.0
-    )
+    process = player(bag, remap={"/latched": "/elsewhere"}, topics=["/latched"])
     listener.spin(lambda: len(listener.of("elsewhere")) == 1)
     assert process.wait(DEADLINE) == 0
 
@@ -166,7 +165,7 @@ def test_clock(bag: Path, listener: Listener, player: Callable[..., Any]) -> Non
     """/clock runs at its rate in bag time and is there before the first message."""
     listener.listen(Clock, "clock")
     listener.listen(JointState, "joint_states")
-    process = player(bag, clock=50.0, rate=2.0, wait_for_subscribers=10.0, topics=["/joint_states"])
+    process = player(bag, clock=50.0, rate=2.0, topics=["/joint_states"])
     listener.spin(lambda: process.poll() is not None)
     assert process.returncode == 0, process.communicate()[1]
     times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.of("clock")]
@@ -179,9 +178,7 @@ def test_clock(bag: Path, listener: Listener, player: Callable[..., Any]) -> Non
 def test_loop_ends_by_sigint(bag: Path, listener: Listener, player: Callable[..., Any]) -> None:
     listener.listen(JointState, "joint_states")
     listener.listen(Clock, "clock")
-    process = player(
-        bag, loop=True, rate=4.0, clock=100.0, wait_for_subscribers=10.0, topics=["/joint_states"]
-    )
+    process = player(bag, loop=True, rate=4.0, clock=100.0, topics=["/joint_states"])
     listener.spin(lambda: len(listener.of("joint_states")) > 2 * COUNT + 10)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=DEADLINE)
@@ -203,7 +200,7 @@ def test_signal_during_a_long_pause(
         writer.write("/note", String(data="first"), FIRST)
         writer.write("/note", String(data="an hour later"), FIRST + 3600 * 10**9)
     listener.listen(String, "note")
-    process = player(path, wait_for_subscribers=10.0)
+    process = player(path)
     listener.spin(lambda: len(listener.heard) == 1)
     # An impatient person, or a terminal and a launcher both: handlers interrupt each other.
     for _ in range(5):

@@ -79,7 +79,7 @@ class Monitor:
             self.send_state()
             self.send_wrench()
 
-        self.peer.until(lambda: all(self.received(t) for t in OUTPUTS), 90.0, repeat)
+        self.peer.until(lambda: all(self.received(t) for t in OUTPUTS), repeat=repeat)
         return self
 
     def answer(self, *arguments, **options):
@@ -261,7 +261,7 @@ class TestRejects:
         remap = ("-r", "__node:=young", "-r", "joint_states:=/young/states")
         process = launch(MODULE, arguments=(*remap, "-r", "wrench:=/young/wrench"))
         young = Monitor(peer, process, "young")
-        peer.until(peer.matched, 90.0)
+        peer.until(peer.matched)
 
         def rejected(count):
             return lambda a: counts_of(a, "wrenches rejected").get("no pose", 0) >= count

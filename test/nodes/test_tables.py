@@ -27,7 +27,9 @@ def rows(node):
             yield cells[1:-1]
 
 
-@pytest.fixture(scope="module", params=["delta_dynamics", "command_gate", "stiffness_monitor"])
+@pytest.fixture(
+    scope="module", params=["delta_dynamics", "command_gate", "stiffness_monitor", "machine_sim"]
+)
 def node(request, peer, launch):
     """The node's name, with all topics that parameters can ask for, once it is found."""
     name = request.param
@@ -40,6 +42,7 @@ def node(request, peer, launch):
         "command_gate": ("on_stop:=gravity",),
         # The robot in whose file the masses are.
         "stiffness_monitor": ("mechanism:=delta_cu",),
+        "machine_sim": (),
     }
     process = launch(MODULES[name], *options[name])
 
@@ -47,8 +50,8 @@ def node(request, peer, launch):
         assert process.alive(), process.output
         return (name, "/") in peer.node.get_node_names_and_namespaces()
 
-    peer.until(found, 90.0)
-    peer.until(lambda: "joints" in process.output, 90.0)
+    peer.until(found)
+    peer.until(lambda: "joints" in process.output)
     return name
 
 

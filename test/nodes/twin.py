@@ -47,6 +47,10 @@ class Twin:
         self._last = max(self.peer.now(), self._last + step)
         return self._last
 
+    def begin(self):
+        """A stamp for a trajectory: so late that none is over before it is looked at, ns."""
+        return self.stamp() + 60 * SECOND
+
     def ask(self, message):
         """Send a trajectory and wait for its answer: all answers up to it."""
         received = self.received("joint_trajectory_ff")
@@ -64,11 +68,11 @@ class Twin:
 
         def repeat():
             assert self.process.alive(), self.process.output
-            self.peer.send(f"/{self.name}/joint_trajectory", trajectory(stamp=self.stamp()))
+            self.peer.send(f"/{self.name}/joint_trajectory", trajectory(stamp=self.begin()))
             self.send_state(state(stamp=self.stamp(), effort=(0.0, 0.0, 0.0)))
 
         topics = ("joint_trajectory_ff", "joint_torques", "torque_residual", "commands")
-        self.peer.until(lambda: all(self.received(t) for t in topics), 90.0, repeat)
+        self.peer.until(lambda: all(self.received(t) for t in topics), repeat=repeat)
         self.settle()
         return self
 
@@ -77,7 +81,7 @@ class Twin:
 
         A stream that has stopped in a long pause runs again.
         """
-        self.ask(trajectory(stamp=self.stamp()))
+        self.ask(trajectory(stamp=self.begin()))
         sent = set()
 
         def repeat():
@@ -86,7 +90,7 @@ class Twin:
 
         received = self.received("joint_torques")
         self.peer.until(lambda: any(stamp_of(m) in sent for m in received), repeat=repeat)
-        self.ask(trajectory(stamp=self.stamp()))
+        self.ask(trajectory(stamp=self.begin()))
         for topic in ("joint_torques", "torque_residual", "commands"):
             self.received(topic).clear()
 
@@ -117,7 +121,7 @@ class Twin:
         """What the node answers for holding still at q."""
         rows = [tuple(q)]
         zero = [(0.0, 0.0, 0.0)]
-        (answer,) = self.ask(MAKE.trajectory(NAMES, [SECOND], rows, zero, zero, self.stamp()))
+        (answer,) = self.ask(MAKE.trajectory(NAMES, [SECOND], rows, zero, zero, self.begin()))
         return np.array(answer.points[0].effort)
 
     def diagnostics(self, condition=lambda array: True):

@@ -10,6 +10,8 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,10 +27,16 @@ Array = NDArray[np.float64]
 
 LIMITED = 0.7
 """Part of the joint range that random states are drawn from."""
-CLEAR = 0.2
+CLEAR = 0.1
 """Least singularity measure of random states: nearer to one, no tolerance is the law's own."""
 FREE = {"viscous": 0.0, "coulomb": 0.0}
 """Friction section without friction."""
+
+
+def partly_long(names: Iterable[Any], *kept: Any) -> list[Any]:
+    """Parameters of a kind: those that are kept are run by default, the others by `make long`."""
+    marks = pytest.mark.long
+    return [name if name in kept else pytest.param(name, marks=marks) for name in names]
 
 
 def has(robot: Robot, ask: str) -> bool:
@@ -41,7 +49,6 @@ def has(robot: Robot, ask: str) -> bool:
 
 
 MASSIVE = [name for name in robot_names() if has(load(name), "massive")]
-MASSLESS = [name for name in robot_names() if name not in MASSIVE]
 ELASTIC = [name for name in robot_names() if has(load(name), "structure")]
 
 every_robot = pytest.mark.parametrize("name", robot_names())
@@ -53,6 +60,14 @@ def parameters_of(name: str) -> dict[str, Any]:
     """The plain parameter mapping of a shipped robot."""
     data: dict[str, Any] = yaml.safe_load((config_folder() / f"{name}.yaml").read_text())
     return data
+
+
+def massless(path: Path) -> Path:
+    """A 2UPR-RPU whose file has no masses, written there."""
+    data = parameters_of("upr_rpu")
+    del data["inertia"]
+    path.write_text(yaml.safe_dump(data))
+    return path
 
 
 def loaded(name: str) -> Robot:
@@ -91,9 +106,8 @@ def random_joints(
     kept = np.empty((0, len(middle)))
     for _ in range(100):
         drawn = rng.uniform(middle - half, middle + half, (max(count, 1), len(middle)))
-        rates, good = robot.try_jacobian(drawn)
-        good[good] = robot.singularity_of(rates[good]) > clear
-        kept = np.concatenate([kept, drawn[good]])
+        measure, good = robot.try_singularity(drawn)
+        kept = np.concatenate([kept, drawn[good & (measure > clear)]])
         if len(kept) >= count:
             return kept[:count]
     raise AssertionError(f"{robot.name}: of 100 draws {len(kept)} joint states can be assembled")

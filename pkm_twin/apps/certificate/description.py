@@ -67,6 +67,7 @@ class Joint:
     """Limits of the value, rad or m."""
     viscous: float
     coulomb: float
+    offset: float
     rotor_inertia: float
 
 
@@ -266,6 +267,7 @@ def _joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
         (float(low), float(high)),
         float(friction.get("viscous", 0.0)),
         float(friction.get("coulomb", 0.0)),
+        float(friction.get("offset", 0.0)),
         float(entry.get("rotor_inertia", 0.0)),
     )
 

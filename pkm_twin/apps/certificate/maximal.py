@@ -400,5 +400,5 @@ class Maximal(Moving):
 
 def drag(joint: Joint, rates: Array) -> Array:
     """Friction's share of the effort at these rates, one a rate, N m or N."""
-    result: Array = joint.viscous * rates + joint.coulomb * np.sign(rates)
+    result: Array = joint.viscous * rates + joint.coulomb * np.sign(rates) + joint.offset
     return result

@@ -281,10 +281,10 @@ class MujocoTree(Moving):
         if wrench is not None:
             force -= self._twist_columns().T @ np.asarray(wrench, dtype=float)
         for joint in self.machine.joints:
-            if joint.viscous or joint.coulomb or joint.rotor_inertia:
+            if joint.viscous or joint.coulomb or joint.offset or joint.rotor_inertia:
                 row = self.rates(joint)
                 own = row.columns @ data.qvel
-                drag = joint.viscous * own + joint.coulomb * np.sign(own)
+                drag = joint.viscous * own + joint.coulomb * np.sign(own) + joint.offset
                 if joint.rotor_inertia:
                     drag = drag + joint.rotor_inertia * (row.columns @ change + row.bias)
                 force += row.columns.T @ drag

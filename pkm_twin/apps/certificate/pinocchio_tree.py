@@ -389,7 +389,7 @@ class PinocchioTree:
         for drag in drags:
             effort = effort + drag
         for k, joint in enumerate(self.machine.actuated):
-            own = joint.viscous * qd[k] + joint.coulomb * np.sign(qd[k])
+            own = joint.viscous * qd[k] + joint.coulomb * np.sign(qd[k]) + joint.offset
             effort[self._driven[k]] += own + joint.rotor_inertia * qdd[k]
         result: Array = tangent.T @ effort
         return result

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weighted linear least squares with a prior, robust, physically consistent, and how sure it is.
+
+Directions that the data tell less of than the prior keep the prior's values; the others are the
+data's alone, without shrinking. Where the result is no possible machine, the nearest that is one,
+by the same measure, takes its place.
+
+May import: numpy, scipy, cvxpy where semidefinite constraints bind, pkm_twin's errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import PkmTwinError
+
+Array = NDArray[np.float64]
+Cones = Sequence[tuple[slice, Array]]
+
+HUBER: Final = 1.5
+"""Robust deviations up to which a residual counts with its square."""
+TURNS: Final = 15
+TOLD: Final = 3.0
+"""A direction is the data's where they tell it by this much better than the prior."""
+MODEL: Final = 1e-5
+"""Part of the efforts that no model is better than: a direction that shows less is not seen."""
+WIDEN: Final = 1.1
+"""On all deviations: the residual's autocorrelation is itself an estimate."""
+PSD: Final = 1e-9
+"""Least eigenvalue of a cone, over the sizes in it, that counts as not negative."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Parameters of a fit, shape (k,), and what is known of them.
+
+    ``covariance``: shape (k, k), of data and prior together. ``prior``: deviations before, (k,).
+    ``noise``: deviation of the efforts' residual by joint, (n,). ``directions``: how many
+    combinations the data told. ``condition``: of the weighted regressor over those, columns
+    scaled by the prior. ``weights``: of the samples, shape (samples, n). ``bound``: whether a
+    physical bound holds the values.
+    """
+
+    values: Array
+    covariance: Array
+    prior: Array
+    noise: Array
+    directions: int
+    condition: float
+    weights: Array
+    bound: bool
+
+
+def estimate(
+    table: Array,
+    target: Array,
+    start: Array,
+    scales: Array,
+    cones: Cones = (),
+    judged: Array | None = None,
+) -> Estimate:
+    """Fit target = table parameters.
+
+    :param table: regressor, shape (samples, n, k), samples in the order of time.
+    :param target: efforts, shape (samples, n).
+    :param start: the prior's values, shape (k,).
+    :param scales: its deviations, shape (k,), above zero.
+    :param cones: matrices that have to stay positive semidefinite.
+    :param judged: 1 or 0 for what counts, shape (samples, n).
+    """
+    samples, n, k = table.shape
+    counts = np.ones((samples, n)) if judged is None else judged
+    used = np.asarray(counts, bool)
+    change = target - table @ start
+    scaled = table * scales
+    size = np.sqrt(_mean(target**2, counts))
+    floor = 1e-9 * max(float(size.max()), 1e-300)
+    noise = np.maximum(np.sqrt(_mean(change**2, counts)), floor)
+    weights = counts.copy()
+    told: Any = None
+    z = np.zeros(k)
+    for _ in range(TURNS):
+        root = np.sqrt(weights) / noise
+        rows = (scaled * root[..., None]).reshape(-1, k)
+        gram, side = rows.T @ rows, rows.T @ (change * root).ravel()
+        least = MODEL**2 * samples * float(np.sum((size / noise) ** 2))
+        told = _directions(gram, side, max(TOLD**2, least))
+        before, z = z, told[0]
+        residual = change - scaled @ z
+        new = np.array([_robust(residual[used[:, j], j], floor) for j in range(n)])
+        settled = np.abs(scaled @ (z - before) / noise).max(initial=0.0) < 1e-3
+        noise = new
+        weights = counts * np.minimum(1.0, HUBER / np.maximum(np.abs(residual) / noise, 1e-12))
+        if settled:
+            break
+    z, values, vectors, kept = told
+    noise = np.sqrt(np.sum(weights * residual**2, 0) / np.maximum(np.sum(weights, 0) - k / n, 1.0))
+    noise = np.maximum(noise, floor)
+    spread = _covariance(scaled, residual * weights, counts, noise, values, vectors, kept)
+    fitted = start + scales * z
+    bound = not possible(fitted, cones)
+    if bound:
+        fitted = _nearest(z, values, vectors, kept, start, scales, cones)
+    condition = float(np.sqrt(values[kept].max() / values[kept].min())) if kept.any() else np.inf
+    return Estimate(
+        fitted, scales[:, None] * spread * scales, scales, noise, int(kept.sum()), condition,
+        weights, bound,
+    )  # fmt: skip
+
+
+def _mean(values: Array, counts: Array) -> Array:
+    """Over the samples that count, shape (n,)."""
+    return np.asarray(np.sum(values * counts, 0) / np.maximum(np.sum(counts, 0), 1.0), np.float64)
+
+
+def _robust(residual: Array, floor: float) -> float:
+    """Deviation by the median absolute one."""
+    if not len(residual):
+        return floor
+    middle = float(np.median(np.abs(residual - np.median(residual))))
+    return max(1.4826 * middle, floor)
+
+
+def _directions(gram: Array, side: Array, least: float) -> tuple[Array, Array, Array, Any]:
+    """Solution in the directions whose information is above ``least``; eigenvalues, vectors."""
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > max(least, 1e-13 * float(values.max(initial=0.0)))
+    inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+    return vectors @ (inverse * (vectors.T @ side)), values, vectors, kept
+
+
+def _covariance(
+    scaled: Array, residual: Array, counts: Array, noise: Array, values: Array, vectors: Array,
+    kept: Any,
+) -> Array:  # fmt: skip
+    """Of the scaled parameters: of the data by the residual's own autocorrelation, and the prior's.
+
+    Filtered samples are not independent: the residual's covariance over time, also of two joints,
+    stands between the two halves of the sandwich.
+    """
+    samples, n, k = scaled.shape
+    modes = (scaled.reshape(-1, k) @ vectors[:, kept]).reshape(samples, n, -1)
+    modes = modes * (counts / noise**2)[..., None]
+    pairs = np.maximum(counts.T @ counts, 1.0)
+    lags = min(samples // 4, max(14, round(2.0 * samples ** (1 / 3))))
+    meat = np.zeros((modes.shape[-1],) * 2)
+    for lag in range(lags + 1):
+        # Flat over the filter's own correlation, then falling (Politis, Romano, 1995).
+        taper = min(1.0, 2.0 * (1.0 - lag / (lags + 1.0)))
+        ahead, behind = residual[lag:], residual[: samples - lag]
+        cross = taper * (behind.T @ ahead) / pairs
+        part = np.einsum(
+            "sia,ij,sjb->ab", modes[: samples - lag], cross, modes[lag:], optimize=True
+        )
+        meat += part if lag == 0 else part + part.T
+    meat *= WIDEN**2 * samples * n / max(samples * n - int(np.sum(kept)), 1)
+    inverse = 1.0 / values[kept]
+    inner = inverse[:, None] * ((meat + meat.T) / 2) * inverse
+    # Never surer than independent samples would be.
+    plain = np.diag(inverse)
+    low, turned = np.linalg.eigh(inner * np.sqrt(np.outer(1 / inverse, 1 / inverse)))
+    root = turned * np.sqrt(np.maximum(low, 1.0))
+    root = np.sqrt(plain) @ root
+    data = vectors[:, kept] @ (root @ root.T) @ vectors[:, kept].T
+    rest = vectors[:, ~kept]
+    return np.asarray(data + rest @ rest.T, np.float64)
+
+
+def possible(values: Array, cones: Cones) -> bool:
+    """Whether every cone's matrix is positive semidefinite, but for rounding."""
+    for where, cone in cones:
+        block = _equilibrated(cone @ values[where])
+        if np.linalg.eigvalsh(block)[0] < -PSD:
+            return False
+    return True
+
+
+def _equilibrated(block: Array) -> Array:
+    """A matrix scaled to a diagonal of ones, where that is above zero."""
+    diagonal = np.abs(np.diag(block))
+    most = float(diagonal.max(initial=0.0))
+    if most == 0.0:
+        return block
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-9 * most))
+    return scale[:, None] * block * scale
+
+
+def _nearest(
+    z: Array, values: Array, vectors: Array, kept: Any, start: Array, scales: Array, cones: Cones
+) -> Array:
+    """The possible parameters nearest to a solution, as the data and the prior measure it."""
+    information = np.where(kept, values, 1.0)
+    if all(len(cone) == 1 and np.count_nonzero(cone) == 1 for _, cone in cones):
+        root = np.sqrt(information)[:, None] * vectors.T
+        return _bounded(root, root @ z, start, scales, cones)
+    try:
+        import cvxpy
+    except ImportError:
+        raise PkmTwinError(
+            "the data want a mass or an inertia that no body has, and the nearest possible one "
+            "needs cvxpy: pip install 'pkm_twin[fit]'"
+        ) from None
+    # In deviations from the solution: each counts alike, however much the data know of it.
+    moved = scales[:, None] * vectors / np.sqrt(information)
+    unknown = cvxpy.Variable(len(z))
+    physical = start + scales * z + moved @ unknown
+    limits = []
+    for where, cone in cones:
+        basis = _reached(cone, scales[where])
+        if basis.shape[1] == 1:
+            row = np.einsum("ia,ijk,jb->k", basis, cone, basis)
+            limits.append(row @ physical[where] >= 0.0)
+            continue
+        block = sum(
+            (basis.T @ cone[..., k] @ basis) * physical[where.start + k]
+            for k in range(cone.shape[-1])
+        )
+        limits.append((block + block.T) / 2 >> 0)
+    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(unknown)), limits)
+    problem.solve(solver=cvxpy.CLARABEL)
+    if unknown.value is None:
+        raise PkmTwinError(f"no possible masses and inertias near the data: {problem.status}")
+    result = start + scales * z + moved @ np.asarray(unknown.value, np.float64)
+    result[np.abs(result) < 1e-9 * scales] = 0.0
+    return _inside(result, start, cones)
+
+
+def _reached(cone: Array, scales: Array) -> Array:
+    """Scaled basis of what the cone's matrices reach, shape (d, r)."""
+    reach = np.concatenate([np.abs(cone[..., k] * scales[k]) for k in range(cone.shape[-1])], 1)
+    used = reach.max(1) > 0.0
+    basis = np.diag(1.0 / np.sqrt(np.where(used, reach.max(1), 1.0)))[:, used]
+    return np.asarray(basis, np.float64)
+
+
+def _bounded(root: Array, aim: Array, start: Array, scales: Array, cones: Cones) -> Array:
+    from scipy.optimize import lsq_linear  # type: ignore[import-untyped]
+
+    low = np.full(len(start), -np.inf)
+    for where, cone in cones:
+        k = int(np.flatnonzero(cone[0, 0])[0])
+        low[where.start + k] = -start[where.start + k] / scales[where.start + k]
+    found = lsq_linear(root, aim, (np.minimum(low, -1e-15), np.inf), method="bvls")
+    return np.maximum(start + scales * found.x, np.where(np.isfinite(low), 0.0, -np.inf))
+
+
+def _inside(values: Array, start: Array, cones: Cones) -> Array:
+    """A solver's result moved inwards by what it is beyond the edge, towards the file's values."""
+    for share in (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3):
+        moved = values + share * (start - values)
+        if possible(moved, cones):
+            return moved
+    return values

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wrench of the surroundings from joint states and efforts, without accelerations.
+
+May import: numpy, pkm_twin's core, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+RANK: Final = 1e-9
+"""Singular values below this share of the greatest are directions that the joints do not feel."""
+
+
+class MomentumObserver:
+    """External efforts at the joints by their generalised momentum, a first-order estimate.
+
+    With the mass matrix M, the momentum M qd, what the motion needs without acceleration b (the
+    inverse dynamics at qdd = 0) and the measured efforts tau, external efforts e obey
+
+        M qdd + b = tau + e,    and the estimate r obeys    r' = bandwidth (e - r)
+
+    Over a sample, M qdd becomes the mean of M times the change of qd, which is exactly the change
+    of the momentum less what the change of M itself brings: no acceleration and no derivative of M
+    is needed, and the error is of second order in the period. The step is implicit, so it is
+    stable at every period (the observer of De Luca and Mattone, 2003, in its sampled form).
+    """
+
+    def __init__(self, robot: Robot, bandwidth: float = 60.0) -> None:
+        """Begin without a past.
+
+        :param bandwidth: of the estimate, 1/s: its time constant is the inverse.
+        :raises ValueError: a bandwidth that is not positive and finite.
+        """
+        if not 0.0 < bandwidth < np.inf:
+            raise ValueError(f"bandwidth is {bandwidth:g} 1/s, allowed above 0")
+        self.robot = robot
+        self.bandwidth = bandwidth
+        self._last: tuple[float, Array, Array, Array] | None = None
+        self._estimate = np.zeros(robot.joints_count)
+        self._still = np.zeros(robot.joints_count)
+
+    def reset(self) -> None:
+        """Forget the stream, as after a gap."""
+        self._last = None
+        self._estimate = np.zeros_like(self._still)
+
+    def push(self, time: float, q: Array, qd: Array, effort: Array) -> Array | None:
+        """Take a sample; the external efforts (n,), N m or N, None for the first sample.
+
+        :param time: of the sample, s, later than the last one's.
+        :param q: joint positions (n,), rad or m, with their rates ``qd`` and measured ``effort``.
+        :raises UnreachableError: a joint state without an assembly.
+        :raises SingularityError: the Jacobian of the closure has no inverse.
+        """
+        mass = mass_matrix(self.robot, q)
+        driving = effort - inverse_dynamics(self.robot, q, qd, self._still)
+        last, self._last = self._last, (time, qd, mass, driving)
+        if last is None:
+            return None
+        before, qd_before, mass_before, driving_before = last
+        step = time - before
+        change = 0.5 * (mass + mass_before) @ (qd - qd_before)
+        change -= 0.5 * step * (driving + driving_before)
+        gain = self.bandwidth
+        self._estimate = (self._estimate + gain * change) / (1.0 + gain * step)
+        return self._estimate
+
+
+def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
+    """The platform's wrench that external joint efforts stand for, base axes, shape (..., 6).
+
+    A machine with fewer than six actuated joints feels only as many of the wrench's directions; of
+    the wrenches that explain the efforts this is the least one, moments taken at the platform's
+    size as lever. Nothing tells a wrench at the platform from a push against a limb.
+
+    :param q: joint positions, shape (..., n), rad or m.
+    :param external: efforts that the surroundings apply in terms of the joints, shape (..., n):
+        J' wrench with the platform's Jacobian J.
+    """
+    lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
+    jacobian = robot.platform_jacobian(q) * lever[:, None]
+    inverse = np.linalg.pinv(np.swapaxes(jacobian, -1, -2), rcond=RANK)
+    least = (inverse @ np.asarray(external, np.float64)[..., None])[..., 0]
+    return np.asarray(least * lever, np.float64)

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the platform carries, from the efforts that the model does not explain, sample by sample.
+
+May import: numpy, pkm_twin's core, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.regressor import PAYLOAD, parameter_names, regressor
+from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+FOUND: Final = ("mass", "mx", "my", "mz")
+"""What is estimated: mass and first moments about the platform's reference point."""
+CORRELATION: Final = 0.02
+"""Time over which what is left is one and the same error, s: samples closer together share it."""
+MEMORY: Final = 20.0
+"""Time after which what was learnt weighs 1/e, s."""
+STEADY: Final = 0.4
+"""Time after a beginning in which no jump is looked for, s."""
+AVERAGED: Final = 1.0
+"""Time over which the noise is averaged, s."""
+CLIPPED: Final = 4.0
+"""A square counts as noise up to so many times the average: a jump is none."""
+JUMP: Final = 0.06
+"""Time over which what is left is averaged to see a jump of it, s."""
+THRESHOLD: Final = 6.0
+"""Deviations of that average that are a jump."""
+SHARE: Final = 0.01
+"""Least deviation of an effort, as a share of the robot's greatest effort at rest."""
+
+
+@dataclass(frozen=True)
+class PayloadEstimate:
+    """Mass, kg, and centre of mass (3,), m from the platform's reference point, platform axes.
+
+    With standard deviations; a centre that the motion does not tell has an infinite one and is that
+    of the robot's own payload.
+    """
+
+    mass: float
+    com: Array
+    mass_deviation: float
+    com_deviation: Array
+    resets: int
+
+
+class PayloadEstimator:
+    """Recursive least squares on measured less computed efforts, without inertia of the payload.
+
+    Efforts are linear in mass and first moments (:mod:`delta_dynamics.regressor`). Information of a
+    sample counts by the time that it stands for, at most the correlation time of the errors, and
+    fades slowly. Where what is left jumps, the load has changed: all is forgotten but the noise.
+    """
+
+    def __init__(self, robot: Robot, *, mass_range: float = 5.0, reach: float = 0.2) -> None:
+        """Begin with the robot's own payload.
+
+        :param mass_range: deviation that a load's mass has before anything is known, kg.
+        :param reach: the same of its centre, m.
+        """
+        self.robot = robot
+        names = parameter_names(robot)
+        self._columns = [names.index(f"{PAYLOAD}.{what}") for what in FOUND]
+        load = robot.payload
+        self._own = np.array([load.mass, *(load.mass * load.com)])
+        self._prior = np.array([mass_range, *(3 * [mass_range * reach])])
+        still = np.zeros(robot.joints_count)
+        rest = inverse_dynamics(robot, robot.inverse(robot.home()), still, still)
+        # A machine that hangs in balance has no effort at rest.
+        self._least = SHARE * max(float(np.abs(rest).max()), 1e-3 * self._scale())
+        self.resets = 0
+        self._noise = np.full(robot.joints_count, 4.0 * self._least**2)
+        self._learning = 0.0
+        self.reset()
+        self.resets = 0
+
+    def _scale(self) -> float:
+        limits = self.robot.limits.effort
+        return 1.0 if limits is None else float(np.abs(limits).max())
+
+    def reset(self) -> None:
+        """Forget the load, not the noise."""
+        self.resets += 1
+        self._information = np.diag(self._prior**-2.0)
+        self._weighted = self._information @ self._own
+        self._average = np.zeros(self.robot.joints_count)
+        self._since = 0.0
+        self._last: float | None = None
+
+    def push(
+        self, time: float, q: Array, qd: Array, qdd: Array, effort: Array,
+        wrench: Array | None = None,
+    ) -> PayloadEstimate | None:  # fmt: skip
+        """Take a sample; None for the first one after a reset.
+
+        :param time: of the sample, s, later than the last one's.
+        :param q: joint positions (n,), with rates, accelerations and measured efforts (n,).
+        :param wrench: on the platform at its reference point, base axes, (6,), where it is known.
+        """
+        last, self._last = self._last, time
+        if last is None:
+            return None
+        step = time - last
+        columns = regressor(self.robot, q, qd, qdd)[:, self._columns]
+        computed = inverse_dynamics(self.robot, q, qd, qdd, wrench)
+        target = effort - computed + columns @ self._own
+        left = target - columns @ self._solution()
+        if self._jumped(left, step):
+            self.reset()
+            self._last = time
+            return self.estimate()
+        fade = math.exp(-step / MEMORY)
+        share = min(1.0, step / CORRELATION)
+        rows = columns / self._noise[:, None]
+        prior = np.diag(self._prior**-2.0)
+        # What fades away gives place to what is known of any load.
+        self._information = fade * self._information + (1 - fade) * prior + share * rows.T @ columns
+        self._weighted = (
+            fade * self._weighted + (1 - fade) * prior @ self._own + share * rows.T @ target
+        )
+        self._learn_noise(target - columns @ self._solution(), step)
+        return self.estimate()
+
+    def _learn_noise(self, after: Array, step: float) -> None:
+        self._learning += step
+        square = after**2
+        if self._learning > STEADY:
+            square = np.minimum(square, CLIPPED * self._noise)
+        part = min(1.0, step / min(self._learning, AVERAGED))
+        self._noise = np.maximum(self._noise + part * (square - self._noise), self._least**2)
+
+    def _solution(self) -> Array:
+        return np.asarray(np.linalg.solve(self._information, self._weighted), np.float64)
+
+    def _jumped(self, left: Array, step: float) -> bool:
+        """Whether the average of what is left has gone from zero, once there was time to learn."""
+        self._since += step
+        self._average = self._average + min(1.0, step / JUMP) * (left - self._average)
+        if self._since < STEADY:
+            return False
+        # The average of errors that last for their correlation time.
+        spread = np.sqrt(self._noise * CORRELATION / (CORRELATION + JUMP))
+        return bool((np.abs(self._average) > THRESHOLD * spread).any())
+
+    def estimate(self) -> PayloadEstimate:
+        """What is known now."""
+        values = self._solution()
+        covariance = np.linalg.inv(self._information)
+        mass = float(values[0])
+        deviation = math.sqrt(covariance[0, 0])
+        told = np.diag(covariance)[1:] < (0.5 * self._prior[1:]) ** 2
+        safe = mass if abs(mass) > 3.0 * deviation else math.nan
+        com = values[1:] / safe
+        # First-order: of a quotient of two correlated numbers.
+        gradient = np.hstack([-com[:, None] / safe, np.eye(3) / safe])
+        spread = np.sqrt(np.einsum("ki,ij,kj->k", gradient, covariance, gradient))
+        known = told & np.isfinite(com)
+        own = self.robot.payload.com
+        return PayloadEstimate(
+            mass, np.where(known, com, own), deviation, np.where(known, spread, np.inf), self.resets
+        )

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The efforts as a linear function of the inertial and friction parameters, exactly.
+
+tau = Y(q, qd, qdd) pi: a column of Y is the efforts that a unit of one parameter needs, by the
+principle of virtual work: its force on the body that has it, times how that body moves with each
+actuated joint.
+
+May import: numpy, pkm_twin's core, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from delta_dynamics.virtual_work import Forces
+from pkm_twin.codegen.expressions import PARAMETERS
+from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics.engine import Traced
+from pkm_twin.machine.graph import Joint, Rod
+from pkm_twin.machine.inertia import TEN, loaded_joints, ten_numbers, transport
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.shared import TEN_UNITS, drive_units
+
+Array = NDArray[np.float64]
+
+DRIVE: Final = ("viscous", "coulomb", "offset", "rotor_inertia")
+"""An actuated joint's parameters; a passive one that is loaded has no offset."""
+PAYLOAD: Final = "payload"
+WRENCH: Final = "wrench"
+"""Name of the last column: the share of the given wrench, whose value is 1."""
+
+
+def parameter_names(robot: Robot) -> tuple[str, ...]:
+    """Names of the columns of :func:`regressor`, shape (p,): ``OWNER.WHAT``, and ``wrench``.
+
+    Of every body and the payload ``mass``, first moments ``mx my mz`` and inertia ``ixx iyy izz
+    ixy ixz iyz``, in base axes at home; a body's about its frame's origin at home
+    (``robot.engine.tree.at``), the payload's about the platform's reference point. Of a rod its
+    ``mass``. Of an actuated joint ``viscous``, ``coulomb``, ``offset`` and ``rotor_inertia``; of a
+    passive joint to which the file gives friction or a rotor those but ``offset``.
+    """
+    return tuple(name for name, _ in _columns(robot))
+
+
+def parameter_units(robot: Robot) -> tuple[str, ...]:
+    """Units of the parameters, shape (p,)."""
+    return tuple(unit for _, unit in _columns(robot))
+
+
+def parameter_values(robot: Robot) -> Array:
+    """The robot's own values of the parameters, pi, shape (p,)."""
+    graph, tree = robot.graph, robot.massive().tree
+    values: list[Any] = []
+    for link in tree.links.values():
+        body = graph.bodies[link.body]
+        values += [*ten_numbers(body.mass, body.com - link.at, body.inertia)]
+    values += [rod.mass for rod in graph.rods.values()]
+    load, friction = robot.payload, robot.friction
+    values += [*ten_numbers(load.mass, load.com, load.inertia)]
+    for k, name in enumerate(graph.actuated):
+        rub = [friction.viscous[k], friction.coulomb[k], friction.offset[k]]
+        values += [*rub, graph.joints[name].rotor_inertia]
+    for joint in loaded_joints(graph):
+        values += [joint.viscous, joint.coulomb, joint.rotor_inertia]
+    return np.array([*values, 1.0])
+
+
+def regressor(
+    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
+) -> Array:
+    """Efforts of a motion by a unit of each parameter: Y pi = inverse_dynamics, exactly.
+
+    Only the geometry, gravity and which passive joints are loaded are taken from the robot; pi is
+    :func:`parameter_values`, or others. The last column is what the wrench needs (zero without
+    one), its parameter's value 1.
+
+    :param q: joint positions, shape (..., n), rad or m.
+    :param qd: joint rates, shape (..., n).
+    :param qdd: joint accelerations, shape (..., n).
+    :param wrench: as in ``inverse_dynamics``, shape (..., 6); None is none.
+    :returns: Y, shape (..., n, p), N m or N per unit of the parameter.
+    :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
+    :raises SingularityError: a singularity on the way from home.
+    :raises ValueError: a wrong last axis, or a value that is not finite.
+    """
+    load = np.zeros(6) if wrench is None else wrench
+    (bodies, others), status = robot.massive().kernel("regressor", _regressor)(
+        np.ascontiguousarray(robot.gravity), q, qd, qdd, load
+    )
+    if status is not None:
+        robot.refuse_joints(status, q, (q, qd, qdd, load))
+    n, batch, graph = robot.joints_count, bodies.shape[:-1], robot.graph
+    links = robot.engine.tree.links
+    ten = _body_columns(bodies.reshape(*batch, len(links), 3 + 2 * n, 3), n)
+    other = others.reshape(*batch, n, -1)
+    rods = len(graph.rods)
+    platform = ten[..., list(links).index(graph.platform), :, :]
+    lever = graph.origin - links[graph.platform].at
+    rates, changes = (np.broadcast_to(np.asarray(v, np.float64), (*batch, n)) for v in (qd, qdd))
+    parts = [
+        np.moveaxis(ten, -3, -2).reshape(*batch, n, -1),
+        other[..., :rods],
+        platform @ transport(np.eye(3), lever),
+        _drive_columns(rates, changes),
+        other[..., rods:],
+    ]
+    return np.concatenate(parts, -1)
+
+
+def _body_columns(motion: Array, n: int) -> Array:
+    """Newton's and Euler's laws by a body's ten numbers, times its motion with each joint.
+
+    :param motion: rows a (less gravity), omega, alpha of the body, then velocities v of its origin
+        and angular velocities w per joint rate, in its own axes, shape (..., 3 + 2 n, 3).
+    :returns: shape (..., n, 10): of mass v a; of first moments h, whose force is alpha x h +
+        omega x (omega x h) and whose moment is h x a; of inertia J w (J alpha + omega x J omega).
+    """
+    a, omega, alpha = (motion[..., k, None, :] for k in range(3))
+    v, w = motion[..., 3 : 3 + n, :], motion[..., 3 + n :, :]
+    mass = np.sum(v * a, -1, keepdims=True)
+    first = (
+        np.cross(v, alpha)
+        + np.sum(v * omega, -1, keepdims=True) * omega
+        - np.sum(omega * omega, -1, keepdims=True) * v
+        + np.cross(a, w)
+    )
+    # w (omega x J omega) is (w x omega) J omega.
+    turning = np.cross(w, omega)
+    diagonal = w * alpha + turning * omega
+    pairs = [
+        w[..., i] * alpha[..., j] + w[..., j] * alpha[..., i]
+        + turning[..., i] * omega[..., j] + turning[..., j] * omega[..., i]
+        for i, j in ((0, 1), (0, 2), (1, 2))
+    ]  # fmt: skip
+    return np.concatenate([mass, first, diagonal, np.stack(pairs, -1)], -1)
+
+
+def _drive_columns(rates: Array, changes: Array) -> Array:
+    """Friction and rotors of the actuated joints, shape (..., n, 4 n)."""
+    *batch, n = rates.shape
+    columns = np.zeros((*batch, n, n, len(DRIVE)))
+    for k in range(n):
+        rate, change = rates[..., k], changes[..., k]
+        columns[..., k, k, :] = np.stack([rate, np.sign(rate), np.ones_like(rate), change], -1)
+    return columns.reshape(*batch, n, -1)
+
+
+def _columns(robot: Robot) -> list[tuple[str, str]]:
+    """Names and units of the parameters."""
+    graph, tree = robot.graph, robot.massive().tree
+
+    def ten(owner: str) -> list[tuple[str, str]]:
+        return [(f"{owner}.{what}", unit) for what, unit in zip(TEN, TEN_UNITS, strict=True)]
+
+    def joint(name: str, whats: Sequence[str]) -> list[tuple[str, str]]:
+        units = drive_units(graph, name)
+        return [(f"{name}.{what}", units[what]) for what in whats]
+
+    result = [column for body in tree.links for column in ten(body)]
+    result += [(f"{name}.mass", "kg") for name in graph.rods]
+    result += ten(PAYLOAD)
+    result += [column for name in graph.actuated for column in joint(name, DRIVE)]
+    passive = tuple(what for what in DRIVE if what != "offset")
+    result += [column for j in loaded_joints(graph) for column in joint(j.name, passive)]
+    return [*result, (WRENCH, "1")]
+
+
+def _regressor(t: Traced) -> Program:
+    """The bodies' motion in their own axes at home; and columns of rods, passive joints, wrench."""
+    t.solve()
+    graph, motion, n = t.engine.graph, t.motion, t.joints
+    gravity = t.tape.inputs(PARAMETERS, 3)
+    qd, qdd, wrench = t.tape.inputs("qd", n), t.tape.inputs("qdd", n), t.tape.inputs("wrench", 6)
+    twists = []
+    for j, column in enumerate(t.rate_columns()):
+        motion.set_rates(column, np.eye(n)[j])
+        twists.append((motion.speed, motion.omega))
+    t.set_rates(qd)
+    t.set_accelerations(qdd, gravity)
+    bodies: list[Any] = []
+    for body in t.tree.links:
+        own = motion.turned(body).T
+        rows = [motion.change[body], motion.omega[body], motion.alpha[body]]
+        rows += [speed[body] for speed, _ in twists] + [omega[body] for _, omega in twists]
+        bodies += [entry for row in rows for entry in own @ row]
+
+    def powers(write: Callable[[Forces], None], *names: str) -> list[Any]:
+        forces = Forces(motion)
+        write(forces)
+        return [
+            sum(speed[b] @ forces.force[b] + omega[b] @ forces.moment[b] for b in names)
+            for speed, omega in twists
+        ]
+
+    def pull(forces: Forces) -> None:
+        forces.push(graph.platform, graph.origin, -wrench[:3])
+        forces.moment[graph.platform] = forces.moment[graph.platform] - wrench[3:]
+
+    columns = [powers(partial(_rod, rod), rod.inner, rod.outer) for rod in graph.rods.values()]
+    for joint in loaded_joints(graph):
+        columns += [
+            powers(partial(_joint, joint, three), joint.inner, joint.outer) for three in np.eye(3)
+        ]
+    columns.append(powers(pull, graph.platform))
+    others = [column[j] for j in range(n) for column in columns]
+    sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
+    return Program(sizes, 3, {"bodies": t.lift(bodies), "others": t.lift(others)}, t.equations())
+
+
+def _rod(rod: Rod, forces: Forces) -> None:
+    forces.rod(rod, 1.0)
+
+
+def _joint(joint: Joint, three: Array, forces: Forces) -> None:
+    forces.joint(joint, three)
+
+
+__all__ = [
+    "DRIVE",
+    "PAYLOAD",
+    "TEN",
+    "WRENCH",
+    "parameter_names",
+    "parameter_units",
+    "parameter_values",
+    "regressor",
+]

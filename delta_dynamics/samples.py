@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording for identification: rates without delay, regressor and efforts filtered alike.
+
+Rates and accelerations are a Savitzky-Golay fit read off in the middle of its window: no phase
+is lost. The window is the one whose acceleration has the least expected error: what the positions'
+noise makes of it, and what a polynomial of two degrees more says beside. Then the columns of the
+regressor and the efforts go through one zero-phase low-pass filter (Butterworth, forwards and
+backwards): both sides of tau = Y pi stay equal, what the noise has beyond the motion goes
+(Gautier, Khalil, Exciting trajectories ..., 1992; Janot et al., doi:10.1109/TCST.2013.2253321).
+
+May import: numpy, scipy, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from math import comb
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal  # type: ignore[import-untyped]
+from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
+
+Array = NDArray[np.float64]
+
+DEGREE: Final = 4
+"""Of the local polynomial."""
+WINDOWS: Final = (7, 9, 11, 15, 19, 25, 33, 43, 57, 75, 99, 131)
+"""Samples that may be fitted."""
+DIFFERENCE: Final = 6
+"""Order of the difference that shows the noise of the positions."""
+GAP: Final = 5.0
+"""Median periods without a sample that divide a recording."""
+UNEVEN: Final = 0.02
+"""Part of a period by which stamps may be off before they are interpolated."""
+BAND: Final = 10.0
+"""Cut-off of the low-pass filter, by the motion's mean frequency."""
+LEAST: Final = 200
+"""Samples that a recording needs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Evenly sampled motion of one piece of a recording: ``time`` (k,), q, qd, qdd, effort (k, n).
+
+    ``wrench``: (k, 6). ``held``: where the payload that is looked for is on the platform, (k,),
+    0 or 1.
+    """
+
+    time: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    effort: Array
+    wrench: Array
+    held: Array
+    period: float
+
+
+@dataclass(frozen=True)
+class Filtering:
+    """What was done to the signals: window in samples, cut-off in Hz (None: none), rate kept."""
+
+    window: int
+    position_noise: tuple[float, ...]
+    cutoff: float | None
+    keep_every: int
+
+
+def position_noise(pieces: list[Array]) -> Array:
+    """Standard deviation of the positions' noise, shape (n,), by their sixth differences.
+
+    :param pieces: evenly sampled positions, shape (samples, n) each.
+    """
+    jumps = np.concatenate([np.diff(q, DIFFERENCE, axis=0) for q in pieces])
+    moving = np.abs(jumps).max(1) > 0.0
+    jumps = jumps[moving] if moving.any() else jumps
+    size = np.sqrt(comb(2 * DIFFERENCE, DIFFERENCE))
+    return np.asarray(1.4826 * np.median(np.abs(jumps), axis=0) / size, np.float64)
+
+
+def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
+    """The window whose accelerations have the least expected error, all joints together."""
+    best, least = WINDOWS[0], np.inf
+    for window in WINDOWS:
+        if window > min(len(q) for q in pieces) // 4:
+            break
+        change = _derivative(window, DEGREE, 2, period)
+        error, size = np.zeros(noise.shape), np.zeros(noise.shape)
+        for q in pieces:
+            rough = signal.savgol_filter(q, window, DEGREE, 2, period, axis=0)
+            size += np.mean(rough**2, 0)
+            if window > DEGREE + 3:
+                fine = signal.savgol_filter(q, window, DEGREE + 2, 2, period, axis=0)
+                inner = slice(window, -window)
+                extra = _derivative(window, DEGREE + 2, 2, period) - change
+                made = noise**2 * (extra @ extra)
+                error += np.maximum(np.mean((fine - rough)[inner] ** 2, 0) - made, 0.0)
+        error += len(pieces) * noise**2 * (change @ change)
+        total = float(np.sum(error / np.maximum(size, 1e-300)))
+        if total < least:
+            best, least = window, total
+    return best
+
+
+def _derivative(window: int, degree: int, order: int, period: float) -> Array:
+    return np.asarray(signal.savgol_coeffs(window, degree, order, period), np.float64)
+
+
+def even_pieces(time: Array, columns: list[Array]) -> list[tuple[Array, list[Array]]]:
+    """Pieces without gaps, on even stamps, interpolated by cubic splines where they are not."""
+    period = float(np.median(np.diff(time)))
+    edges = [0, *(np.flatnonzero(np.diff(time) > GAP * period) + 1).tolist(), len(time)]
+    pieces = []
+    for begin, end in pairwise(edges):
+        if end - begin < LEAST // 2:
+            continue
+        t = time[begin:end]
+        own = [c[begin:end] for c in columns]
+        if np.abs(np.diff(t) - period).max() > UNEVEN * period:
+            even = np.arange(t[0], t[-1], period)
+            own = [np.asarray(CubicSpline(t, c)(even), np.float64) for c in own]
+            t = even
+        pieces.append((t, own))
+    return pieces
+
+
+def tracks(
+    time: Array, q: Array, effort: Array, wrench: Array, held: Array, window: int | None = None
+) -> tuple[list[Track], Filtering]:
+    """A recording as evenly sampled motion, the ends of each piece left out.
+
+    :param window: of the polynomial, samples; None chooses it.
+    """
+    period = float(np.median(np.diff(time)))
+    pieces = even_pieces(time, [q, effort, wrench, held])
+    if not pieces:
+        return [], Filtering(0, (), None, 1)
+    positions = [own[0] for _, own in pieces]
+    noise = position_noise(positions)
+    width = window or choose_window(positions, period, noise)
+    result = []
+    for t, (place, force, load, carried) in pieces:
+        rates = [
+            np.asarray(signal.savgol_filter(place, width, DEGREE, k, period, axis=0))
+            for k in range(3)
+        ]
+        cut = slice(width // 2, len(t) - width // 2)
+        result.append(
+            Track(t[cut], *(r[cut] for r in rates), force[cut], load[cut], carried[cut], period)
+        )
+    speed = np.sqrt(np.mean(np.concatenate([p.qd for p in result]) ** 2, 0))
+    change = np.sqrt(np.mean(np.concatenate([p.qdd for p in result]) ** 2, 0))
+    moving = speed > 0.0
+    mean = float(np.max(change[moving] / speed[moving], initial=0.0)) / (2 * np.pi)
+    cutoff = BAND * mean
+    # Without a motion, or faster than the samples, nothing is filtered.
+    filtered = 0.0 < cutoff < 0.2 / period
+    keep = max(1, int(0.2 / (cutoff * period))) if filtered else 1
+    return result, Filtering(width, tuple(noise.tolist()), cutoff if filtered else None, keep)
+
+
+def low_pass(values: Array, period: float, how: Filtering) -> Array:
+    """Signals along the first axis, filtered without phase, thinned out, ends left out."""
+    if how.cutoff is None:
+        return values
+    sections = signal.butter(4, 2.0 * how.cutoff * period, output="sos")
+    smooth = signal.sosfiltfilt(sections, values, axis=0)
+    # What the filter makes up at the ends dies out in a period of its cut-off.
+    edge = min(int(1.0 / (how.cutoff * period)), len(values) // 4)
+    return np.asarray(smooth[edge : len(values) - edge : how.keep_every], np.float64)
+
+
+def by_blocks(rows: int, block: int, evaluate: Callable[[slice], Array]) -> Array:
+    """Rows that are evaluated some at a time, so that memory stays flat."""
+    starts = range(0, rows, block)
+    return np.concatenate([evaluate(slice(a, min(a + block, rows))) for a in starts])

@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node ``machine_sim``: efforts or trajectories in, a simulated machine's joint states out."""
+
+from __future__ import annotations
+
+import sys
+import time
+from array import array
+from typing import Any, Final
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import WrenchStamped
+from numpy.typing import NDArray
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
+
+from delta_dynamics.feedforward import warm_up
+from delta_dynamics.gate import effort_limits
+from delta_dynamics.simulation import (
+    MachineSettings,
+    Measured,
+    PayloadEvent,
+    Simulation,
+    WrenchSignal,
+    tuned,
+)
+from pkm_twin import load
+from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.variation import KINDS, MAX_SPREAD, Variation, varied
+from pkm_twin.ros import node as health
+from pkm_twin.ros.intake import RawTrajectory
+from pkm_twin.ros.messages import SECOND
+
+Array = NDArray[np.float64]
+
+BEGIN: Final = SECOND
+"""Simulated time at the start, ns: a stamp of zero would be none."""
+TICK: Final = 1e-3
+BUDGET: Final = 5e-3
+"""How long one tick of the clock may simulate, s: messages are taken between."""
+BEHIND: Final = 0.1
+"""How far the machine may be behind the clock that it keeps, s; beyond, it stands still."""
+CLOCK_PERIOD: Final = 5_000_000
+"""Of /clock, ns of simulated time."""
+ALONE: Final = 1.0
+"""In lockstep: how long an answer is waited for, s of the wall."""
+LOOK: Final = 0.05
+
+
+class MachineSim(health.TwinNode):
+    """A robot's drives and sensors, its motion simulated."""
+
+    def __init__(self) -> None:
+        super().__init__("machine_sim")
+        robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
+        robot.massive()
+        self._variation = self._declare_spread(robot)
+        self._declare_clock()
+        settings = self._declare_settings(self._variation.robot)
+        begin = BEGIN if self._simulated else self.now()
+        self._simulation = Simulation(self._variation.robot, settings, begin)
+        self._skipped = 0
+        # Compiled before there is a topic to be found by.
+        warm_up(self._variation.robot)
+        self._simulation.plant.advance(
+            np.zeros_like(settings.start), np.zeros(6), settings.period / settings.substeps
+        )
+        self._simulation.restart()
+        self._frame = self.declare("wrench_frame", "platform", "frame id of wrench", read_only=True)
+        self._base = self.declare(
+            "base_frame", "base_link", "frame of ~/applied_wrench", read_only=True
+        )
+        self._create_topics()
+        self._due = time.monotonic()
+        self._heard = self._due
+        if self._lockstep:
+            self.create_guarded_timer(LOOK, self._go_alone)
+        else:
+            self.create_guarded_timer(TICK, self._catch_up)
+        self.start()
+        self._publish_drawn()
+
+    def summary(self) -> str:
+        """One line that says what the node runs."""
+        robot, drawn = self._simulation.robot, self._variation.drawn
+        spread = f", {len(drawn)} parameters drawn" if drawn else ""
+        return (
+            f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)}"
+            f"{spread}, clock {self._clock_kind}"
+        )
+
+    def activated(self) -> None:
+        """The machine goes on; on the wall's clock, from now."""
+        self._due = self._heard = time.monotonic()
+        if not self._simulated:
+            self._simulation.skip(max(0, self.now() - self._simulation.now))
+        self._publish()
+
+    def reset_stop(self) -> str:
+        """Back to the start, braked."""
+        text = self._simulation.failure
+        self._simulation.restart()
+        return text or "the machine stands at its start"
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Level, message and values of the node's diagnostic status."""
+        sim = self._simulation
+        level, message = health.OK, "braked: no command yet" if sim.braked else "moving freely"
+        if sim.failure:
+            level, message = health.ERROR, f"the machine has failed: {sim.failure}"
+        values: dict[str, object] = {
+            "robot": sim.robot.name,
+            "time (s)": f"{sim.time:.3f}",
+            "effort commands taken": sim.stream.accepted,
+            "trajectories taken": sim.trajectories.accepted,
+            "effort limit passed": sim.saturations,
+            "payload mass": sim.plant.robot.payload.mass,
+            "times behind the clock": self._skipped,
+        }
+        values |= {f"effort commands rejected: {k}": v for k, v in sim.stream.rejected.items()}
+        values |= {f"trajectories rejected: {k}": v for k, v in sim.trajectories.rejected.items()}
+        return level, message, values
+
+    def _declare_spread(self, robot: Robot) -> Variation:
+        fixed: dict[str, Any] = {"read_only": True}
+        size = self.declare(
+            "spread", 0.0, "how far the machine's parameters are from its file's, relative",
+            low=0.0, high=MAX_SPREAD, **fixed,
+        )  # fmt: skip
+        kinds = self.declare("spread_kinds", list(KINDS), f"of {', '.join(KINDS)}", **fixed)
+        seed = self.declare("seed", 1, "of the draws", low=0, high=2**31 - 1, **fixed)
+        distribution = self.declare(
+            "distribution", "normal", "spread is the standard deviation, or the bound",
+            choices=("normal", "uniform"), **fixed,
+        )  # fmt: skip
+        return varied(robot, dict.fromkeys(kinds, size), seed, distribution)
+
+    def _declare_clock(self) -> None:
+        self._clock_kind = self.declare(
+            "clock", "wall", "wall; or the source of /clock: simulated, by real_time_factor, or "
+            "lockstep, a period with each effort command",
+            choices=("wall", "simulated", "lockstep"), read_only=True,
+        )  # fmt: skip
+        self._factor = self.declare(
+            "real_time_factor", 1.0, "of the simulated clock; 0: as fast as can be",
+            low=0.0, high=1000.0, read_only=True,
+        )  # fmt: skip
+        self._simulated = self._clock_kind != "wall"
+        self._lockstep = self._clock_kind == "lockstep"
+        if self.get_parameter("use_sim_time").value:
+            raise ParameterError("use_sim_time", True, "false: the machine has a clock of its own")
+        if not self._simulated:
+            self._factor = 1.0
+
+    def _declare_settings(self, robot: Robot) -> MachineSettings:
+        fixed: dict[str, Any] = {"read_only": True}
+        seconds: dict[str, Any] = {"unit": "s", "high": 10.0, "read_only": True}
+        bandwidth = self.declare(
+            "bandwidth", 10.0, "of the position control, critically damped", unit="Hz",
+            low=0.01, high=1000.0, **fixed,
+        )  # fmt: skip
+        stiffness, damping = tuned(robot, bandwidth)
+        home = robot.inverse(robot.home())
+        period = self.declare("period", 1e-3, "of the sensors", low=1e-4, **seconds)
+        return MachineSettings(
+            start=self._row("start", home, "joint positions at the start, rad or m"),
+            effort_limits=self._row(
+                "effort_limits", effort_limits(robot), "what the drives give at most, N m or N", 0.0
+            ),
+            stiffness=self._row(
+                "stiffness", stiffness, "of the position control, by default bandwidth's", 0.0
+            ),
+            damping=self._row("damping", damping, "as stiffness, per rate", 0.0),
+            period=period,
+            substeps=self.declare(
+                "substeps", 1, "of the integration in a period", low=1, high=100, **fixed
+            ),
+            resolution=self._row(
+                "encoder_resolution", np.zeros(len(home)), "rad or m; 0 is exact", 0.0
+            ),
+            delay=self.declare("command_delay", 0.0, "of every effort", low=0.0, **seconds),
+            deadline=self.declare(
+                "deadline", 0.1, "longest silence of effort commands", low=1e-3, **seconds
+            ),
+            on_silence=self.declare(
+                "on_silence", "zeros", "what the drives do then",
+                choices=("zeros", "hold"), **fixed,
+            ),
+            payloads=self._declare_payloads(robot),
+            wrench=WrenchSignal(
+                self._row("wrench.constant", np.zeros(6), "N and N m, base axes"),
+                self._row("wrench.amplitude", np.zeros(6), "of a sine beside it"),
+                self.declare(
+                    "wrench.frequency", 1.0, "of the sine", unit="Hz", low=0.0, high=1e4, **fixed
+                ),
+            ),
+        )  # fmt: skip
+
+    def _declare_payloads(self, robot: Robot) -> tuple[PayloadEvent, ...]:
+        """Events as three lists; by default the robot's own payload from the start."""
+        own = robot.payload
+        times, masses, coms = (
+            self.declare(name, default, text, read_only=True)
+            for name, default, text in (
+                ("payload.times", [0.0], "s after the start"),
+                ("payload.masses", [own.mass], "kg, one a time"),
+                ("payload.coms", own.com.tolist(), "m, from the platform's origin, three a time"),
+            )
+        )
+        if len(masses) != len(times) or len(coms) != 3 * len(times):
+            raise ParameterError(
+                "payload.masses", list(masses), f"{len(times)} numbers, and payload.coms three each"
+            )
+        events = tuple(
+            PayloadEvent(float(t), float(m), tuple(map(float, coms[3 * i : 3 * i + 3])))
+            for i, (t, m) in enumerate(zip(times, masses, strict=True))
+        )
+        for event in events:
+            if not 0.0 <= event.time < np.inf:
+                raise ParameterError("payload.times", event.time, "0 or more, finite")
+            robot.changed(payload={"mass": event.mass, "com": list(event.com)})
+        return events
+
+    def _row(self, name: str, default: Array, text: str, low: float | None = None) -> Array:
+        """A parameter of one number a joint (or component); one stands for all."""
+        given = self.declare(name, default.tolist(), text, read_only=True)
+        values = np.asarray(given, np.float64)
+        if len(values) not in (1, len(default)):
+            raise ParameterError(name, list(given), f"{len(default)} numbers, or one for all")
+        if np.isnan(values).any() or (low is not None and (values < low).any()):
+            raise ParameterError(
+                name, list(given), "numbers" if low is None else f"{low:g} or more"
+            )
+        return np.broadcast_to(values, default.shape).copy()
+
+    def _create_topics(self) -> None:
+        self._states = self.create_guarded_publisher(JointState, "joint_states")
+        self._wrenches = self.create_guarded_publisher(WrenchStamped, "wrench")
+        kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._drawn = self.create_publisher(DiagnosticArray, "~/drawn", kept)
+        self._clock_topic = self.create_publisher(Clock, "/clock", 10) if self._simulated else None
+        self._clock_due = 0
+        self.create_guarded_subscription(Float64MultiArray, "~/commands", self._on_commands)
+        self.create_guarded_subscription(
+            JointTrajectory, "~/joint_trajectory", self._on_trajectory, raw=True, best_effort=False
+        )
+        self.create_guarded_subscription(
+            WrenchStamped, "~/applied_wrench", lambda m: self._simulation.push(m, self._base)
+        )
+
+    def _on_commands(self, message: Float64MultiArray) -> None:
+        self._simulation.commands(message)
+        self._heard = time.monotonic()
+        if self._lockstep:
+            self._advance()
+
+    def _on_trajectory(self, data: bytes) -> None:
+        self._simulation.trajectory(RawTrajectory.of(data).fields)
+
+    def _catch_up(self) -> None:
+        """As many periods as are due, by the steady clock."""
+        if not self.active:
+            return
+        period = self._simulation.settings.period
+        begun = time.monotonic()
+        if self._factor == 0.0:
+            self._due = begun - BUDGET
+        step = period / self._factor if self._factor else 0.0
+        while self._due + step <= (now := time.monotonic()):
+            if now - begun > BUDGET:
+                break
+            self._due += step
+            self._advance()
+        behind = time.monotonic() - self._due
+        if self._factor and behind > BEHIND:
+            self._skipped += 1
+            self._due += behind
+            if not self._simulated:
+                self._simulation.skip(round(behind * SECOND))
+
+    def _go_alone(self) -> None:
+        """Time goes on where nobody commands: before the first command, and without an answer."""
+        if not self.active:
+            return
+        if self._simulation.braked or time.monotonic() - self._heard > ALONE:
+            self._advance()
+
+    def _advance(self) -> None:
+        try:
+            self._simulation.advance()
+        except MessageError as error:
+            self.log_throttled(error.reason, f"the machine has failed: {error.reason}: {error}")
+        self._publish()
+
+    def _publish(self) -> None:
+        measured = self._simulation.measured()
+        stamp = Time(nanoseconds=measured.stamp).to_msg()
+        if self._clock_topic is not None and measured.stamp >= self._clock_due:
+            self._clock_due = measured.stamp + CLOCK_PERIOD
+            self._clock_topic.publish(Clock(clock=stamp))
+        self._wrenches.publish(self._wrench(measured, stamp))
+        robot = self._simulation.robot.controller
+        state = JointState(name=list(robot.names))
+        state.header.stamp = stamp
+        state.position = _numbers(robot.offsets + robot.factors * measured.q)
+        state.velocity = _numbers(robot.factors * measured.qd)
+        state.effort = _numbers(robot.controller_efforts(measured.effort))
+        # Last: who answers it has all else.
+        self._states.publish(state)
+
+    def _wrench(self, measured: Measured, stamp: Any) -> WrenchStamped:
+        message = WrenchStamped()
+        message.header.stamp, message.header.frame_id = stamp, self._frame
+        force, torque = message.wrench.force, message.wrench.torque
+        values = measured.wrench.tolist()
+        force.x, force.y, force.z, torque.x, torque.y, torque.z = values
+        return message
+
+    def _publish_drawn(self) -> None:
+        """What was drawn: into the log, and kept on a topic for who comes late."""
+        drawn = self._variation.drawn
+        values = [KeyValue(key=name, value=f"{value!r}") for name, value in drawn.items()]
+        status = DiagnosticStatus(name=self.get_fully_qualified_name(), values=values)
+        status.message = f"{len(drawn)} parameters drawn"
+        status.hardware_id = self._simulation.robot.name
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._drawn.publish(message)
+        for name, value in drawn.items():
+            self.get_logger().info(f"drawn: {name} {value:.6g}")
+
+
+def _numbers(values: Array) -> array[float]:
+    return array("d", values.tobytes())
+
+
+def main() -> None:
+    """Entry point of ``ros2 run pkm_twin machine_sim``."""
+    sys.exit(health.run(MachineSim))
+
+
+if __name__ == "__main__":
+    main()

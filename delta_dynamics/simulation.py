@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated machine: drives and sensors around a plant, as a controller meets them.
+
+Times are integers in nanoseconds by the machine's own clock, which :meth:`Simulation.advance`
+alone moves. Pure: messages are read by their attributes.
+
+May import: numpy, pkm_twin's core, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.plant import Plant
+from delta_dynamics.virtual_work import mass_matrix
+from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import (
+    MAX_EFFORT,
+    MAX_RATE,
+    SECOND,
+    JointReader,
+    StampRules,
+    as_message_error,
+    read_wrench,
+)
+from pkm_twin.streams.continuity import Continuity
+from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.path import JointPath
+
+Array = NDArray[np.float64]
+OnSilence = Literal["zeros", "hold"]
+
+SINGULAR: Final = 1e-3
+"""Singularity measure below which a machine has left what rigid bodies describe."""
+
+
+@dataclass(frozen=True)
+class PayloadEvent:
+    """From ``time`` (s after the start) on the platform carries this."""
+
+    time: float
+    mass: float
+    com: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class WrenchSignal:
+    """What the surroundings apply to the platform: constant + amplitude sin(2 pi frequency t).
+
+    Shape (6,) each, N and N m, base axes, at the platform's reference point.
+    """
+
+    constant: Array = field(default_factory=lambda: np.zeros(6))
+    amplitude: Array = field(default_factory=lambda: np.zeros(6))
+    frequency: float = 0.0
+
+    def at(self, time: float) -> Array:
+        """At a time after the start, s."""
+        turn = 2.0 * np.pi * self.frequency * time
+        return np.asarray(self.constant + self.amplitude * np.sin(turn), np.float64)
+
+
+@dataclass(frozen=True)
+class MachineSettings:
+    """Drives and sensors of a machine; arrays have shape (n,)."""
+
+    start: Array
+    """Joint positions at the start, rad or m."""
+    effort_limits: Array
+    """What the drives give at most, N m or N."""
+    stiffness: Array
+    damping: Array
+    """Of the position control that goes trajectories, N m/rad and N m s/rad (N/m and N s/m)."""
+    period: float = 1e-3
+    """Of sensors and position control, s."""
+    substeps: int = 1
+    """Steps of the integration in a period."""
+    resolution: Array = field(default_factory=lambda: np.zeros(1))
+    """Encoder step, rad or m; 0 is none."""
+    delay: float = 0.0
+    """From a command to the drive's effort, s."""
+    deadline: float = 0.1
+    """Longest silence of effort commands, s."""
+    on_silence: OnSilence = "zeros"
+    payloads: tuple[PayloadEvent, ...] = ()
+    wrench: WrenchSignal = field(default_factory=WrenchSignal)
+
+
+def tuned(robot: Robot, bandwidth: float) -> tuple[Array, Array]:
+    """Stiffness and damping of a position control, by the masses at the home pose, (n,) each.
+
+    :param bandwidth: undamped natural frequency of each joint for itself, Hz; damped critically.
+    """
+    inertia = np.diag(mass_matrix(robot, robot.inverse(robot.home())))
+    turn = 2.0 * np.pi * bandwidth
+    return inertia * turn**2, 2.0 * inertia * turn
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the sensors tell, shape (n,) each: rad or m, their rates, N m or N."""
+
+    stamp: int
+    q: Array
+    qd: Array
+    effort: Array
+    wrench: Array
+    """At the platform's reference point, platform axes, without the payload's own, shape (6,)."""
+
+
+class Simulation:
+    """One machine with brakes, which the first command opens.
+
+    Effort commands and trajectories take turns: what came last is obeyed.
+
+    :param start: the machine's clock at its start, ns.
+    """
+
+    def __init__(self, robot: Robot, settings: MachineSettings, start: int) -> None:
+        bounds = robot.limits.position
+        if bounds is not None:
+            places = zip(robot.joint_names, settings.start, bounds, strict=True)
+            for name, q, (low, high) in places:
+                if not low <= q <= high:
+                    raise ParameterError(f"start, {name}", float(q), f"{low:g} to {high:g}")
+        self.robot, self.settings = robot, settings
+        self.stream = StreamMonitor(trip_count=2**62, recovery_count=1)
+        """Effort commands, and what has stopped the machine."""
+        self.trajectories = StreamMonitor(trip_count=2**62, recovery_count=1)
+        self.saturations = 0
+        self.now = start
+        self._reader = JointReader(robot, with_effort=True)
+        self._begin()
+
+    def _begin(self) -> None:
+        s = self.settings
+        self.braked, self.failure = True, ""
+        self.plant = Plant(self.robot, s.start)
+        self._continuity = Continuity(
+            self.robot, SINGULAR, SINGULAR, [MAX_RATE] * self.robot.joints_count
+        )
+        self._begun = self.now
+        self._payloads = deque(sorted(s.payloads, key=lambda event: event.time))
+        self._coming: deque[tuple[int, Array]] = deque()
+        self._effort = np.zeros(self.robot.joints_count)
+        self._commanded: int | None = None
+        self._path: tuple[int, JointPath] | None = None
+        self._pushed = np.zeros(6)
+        self._seen = self._encoder()
+        self._seen_rate = np.zeros_like(self._seen)
+
+    def restart(self) -> None:
+        """Stand at the start again, braked; the clock goes on."""
+        self.stream.resume()
+        self._begin()
+
+    @property
+    def time(self) -> float:
+        """Since the machine's start, s."""
+        return (self.now - self._begun) / SECOND
+
+    def skip(self, nanoseconds: int) -> None:
+        """The clock goes on and the machine does not: whoever runs it stood still."""
+        self.now += nanoseconds
+        self._begun += nanoseconds
+
+    def commands(self, message: Any) -> None:
+        """Efforts as std_msgs/Float64MultiArray, the controller's, in the robot's order.
+
+        :raises MessageError: refused whole, and counted; what was commanded before stays.
+        """
+        try:
+            effort = self._efforts(message.data)
+        except MessageError as error:
+            self.stream.reject(error.reason, str(error))
+            raise
+        self.stream.accept()
+        self._path = None
+        self._commanded = self.now
+        self.braked = False
+        self._send(effort)
+
+    def trajectory(self, message: Any) -> None:
+        """Go a trajectory_msgs/JointTrajectory by position control, its effort as feedforward.
+
+        A zero stamp starts it now. Before its first point the way leads there from here.
+
+        :param message: the message or its TrajectoryFields.
+        :raises MessageError: refused whole, and counted; what was commanded before stays.
+        """
+        try:
+            t = self._reader.trajectory(message, self.now)
+        except MessageError as error:
+            self.trajectories.reject(error.reason, str(error))
+            raise
+        self.trajectories.accept()
+        self._path = (t.stamp or self.now, JointPath(t).from_here(self._seen))
+
+    def push(self, message: Any, frame: str) -> None:
+        """A geometry_msgs/WrenchStamped in the base frame, which stays until the next.
+
+        :raises MessageError: refused.
+        """
+        rules = StampRules(accept_zero=True, future_tolerance=SECOND)
+        self._pushed = read_wrench(message, self.now, rules, frame, False).wrench
+
+    def measured(self) -> Measured:
+        """What the sensors tell now."""
+        force = self._wrench()
+        rotation = self.robot.platform(self.plant.q)[1]
+        turned = np.concatenate([force[:3] @ rotation, force[3:] @ rotation])
+        return Measured(self.now, self._seen, self._seen_rate, self._effort, turned)
+
+    def advance(self) -> None:
+        """Go on by a period. A machine that has failed stands where it was.
+
+        :raises MessageError: it fails now: a singularity, the edge of reach, or no finite result.
+        """
+        s = self.settings
+        control = self._control()
+        if control is not None:
+            self._send(control)
+        while self._coming and self._coming[0][0] <= self.now:
+            self._apply(self._coming.popleft()[1])
+        if self._commanded is not None and self._silent() and s.on_silence == "zeros":
+            self._apply(np.zeros_like(self._effort))
+        self._load()
+        if not self.failure and not self.braked:
+            try:
+                as_message_error(self._move)
+            except MessageError as error:
+                self.plant.rest()
+                self.failure = f"{error.reason}: {error}"
+                self.stream.stop(error.reason, str(error))
+                self._tick()
+                raise
+        self._tick()
+
+    def _move(self) -> None:
+        s, wrench = self.settings, self._wrench()
+        q = self.plant.q
+        for _ in range(s.substeps):
+            self.plant.advance(self._effort, wrench, s.period / s.substeps)
+        if not np.isfinite(self.plant.qd).all():
+            raise MessageError("non-finite result", "the motion is not finite")
+        try:
+            self._continuity.step(self.now, self.plant.q)
+        except PkmTwinError:
+            self.plant.q = q
+            raise
+
+    def _tick(self) -> None:
+        """The period's end: the clock, and what the encoders see."""
+        s = self.settings
+        self.now += round(s.period * SECOND)
+        before, self._seen = self._seen, self._encoder()
+        stepped = np.broadcast_to(s.resolution, before.shape) > 0.0
+        self._seen_rate = np.where(stepped, (self._seen - before) / s.period, self.plant.qd)
+
+    def _encoder(self) -> Array:
+        q, step = self.plant.q, np.broadcast_to(self.settings.resolution, self.plant.q.shape)
+        steps = np.where(step > 0.0, step, 1.0)
+        return np.where(step > 0.0, np.round(q / steps) * steps, q)
+
+    def _control(self) -> Array | None:
+        """The position control's effort, shape (n,); None where no trajectory is gone."""
+        if self._path is None or self.now < self._path[0]:
+            return None
+        start, path = self._path
+        self.braked, self._commanded = False, None
+        wanted = path.at((self.now - start) / SECOND)
+        s = self.settings
+        errors = wanted.q - self._seen, wanted.qd - self._seen_rate
+        return np.asarray(s.stiffness * errors[0] + s.damping * errors[1] + wanted.effort)
+
+    def _send(self, effort: Array) -> None:
+        self._coming.append((self.now + round(self.settings.delay * SECOND), effort))
+
+    def _apply(self, effort: Array) -> None:
+        limits = self.settings.effort_limits
+        self.saturations += bool((np.abs(effort) > limits).any())
+        self._effort = np.clip(effort, -limits, limits)
+
+    def _silent(self) -> bool:
+        assert self._commanded is not None  # noqa: S101
+        return self.now - self._commanded > self.settings.deadline * SECOND
+
+    def _load(self) -> None:
+        """Take what payload is due."""
+        while self._payloads and self._payloads[0].time <= self.time:
+            event = self._payloads.popleft()
+            load = {"mass": event.mass, "com": list(event.com)}
+            self.plant.change_robot(self.robot.changed(payload=load))
+
+    def _wrench(self) -> Array:
+        return self.settings.wrench.at(self.time) + self._pushed
+
+    def _efforts(self, values: Sequence[float]) -> Array:
+        names = self.robot.joint_names
+        if len(values) != len(names):
+            raise MessageError("length", f"{len(values)} efforts for {len(names)} joints")
+        effort = self.robot.controller.efforts(np.array(values, np.float64))
+        for name, value in zip(names, effort.tolist(), strict=True):
+            if not np.isfinite(value):
+                raise MessageError("not finite", f"effort of {name} is {value}")
+            if abs(value) > MAX_EFFORT:
+                raise MessageError(
+                    "bounds", f"effort of {name} is {value:g}, allowed up to {MAX_EFFORT:g}"
+                )
+        return effort

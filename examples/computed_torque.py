@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A guarded computed-torque controller: joint states in, efforts out, zeros when in doubt.
+
+It holds the robot where its first joint state finds it, then goes a smooth path there and back:
+tau = inverse_dynamics(q, qd, qdd_wanted + 2 w (qd_wanted - qd) + w^2 (q_wanted - q)).
+
+    ros2 run pkm_twin machine_sim --ros-args -p mechanism:=delta_cu -p clock:=lockstep
+    python3 computed_torque.py --robot delta_cu --ros-args -p use_sim_time:=true
+"""
+
+import argparse
+import sys
+import time
+
+import numpy as np
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import load
+
+SECOND = 1e9
+
+
+class Controller(Node):
+    """Commands a robot's efforts; the first thing that is wrong stops it for good."""
+
+    def __init__(self, options):
+        super().__init__("computed_torque")
+        self.robot = load(options.robot)
+        self.options = options
+        self.errors, self.stopped, self.done = [], "", False
+        self._first = self._last = None
+        low, high = self.robot.limits.position.T
+        self._reach = options.reach * (high - low)
+        # Compiled before the first joint state is due.
+        rest = np.zeros(self.robot.joints_count)
+        inverse_dynamics(self.robot, self.robot.inverse(self.robot.home()), rest, rest)
+        self._publisher = self.create_publisher(Float64MultiArray, options.commands, 1)
+        self.create_subscription(JointState, "joint_states", self._on_state, 10)
+        # By the steady clock: a clock that stands still stops nothing else.
+        self._heard = time.monotonic()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._watch = self.create_timer(0.05, self._on_silence, clock=steady)
+
+    def _on_silence(self):
+        silent = time.monotonic() - self._heard
+        if self._first is not None and silent > self.options.deadline:
+            self.stop(f"no joint state for {silent:.3f} s")
+
+    def _on_state(self, message):
+        self._heard = time.monotonic()
+        if self.stopped or self.done:
+            return
+        stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+        if stamp == self._last:
+            return
+        trouble = self._trouble(message, stamp)
+        if trouble:
+            self.stop(trouble)
+            return
+        index = [message.name.index(name) for name in self.robot.joint_names]
+        q, qd = np.array(message.position)[index], np.array(message.velocity)[index]
+        if self._first is None:
+            self._first, self._start = stamp, q
+        self._last = stamp
+        wanted = self.wanted((stamp - self._first) / SECOND)
+        if wanted is None:
+            self.done = True
+            return
+        w = 2.0 * np.pi * self.options.bandwidth
+        error, error_rate = wanted[0] - q, wanted[1] - qd
+        self.errors.append(error)
+        qdd = wanted[2] + 2.0 * w * error_rate + w**2 * error
+        try:
+            self.send(inverse_dynamics(self.robot, q, qd, qdd))
+        except ValueError as refusal:
+            self.stop(str(refusal))
+
+    def _trouble(self, message, stamp):
+        """What is wrong with a joint state, or nothing."""
+        missing = set(self.robot.joint_names) - set(message.name)
+        if missing:
+            return f"no joint {', '.join(sorted(missing))}"
+        if not len(message.name) == len(message.position) == len(message.velocity):
+            return "positions and velocities are not as many as names"
+        if not np.isfinite([*message.position, *message.velocity]).all():
+            return "a position or velocity is not finite"
+        age = (self.get_clock().now().nanoseconds - stamp) / SECOND
+        if age > self.options.age:
+            return f"the joint state is {age:.3f} s old"
+        if self._last is None:
+            return ""
+        gap = (stamp - self._last) / SECOND
+        if not 0.0 < gap <= self.options.gap:
+            return f"{gap:.4f} s between two joint states, allowed {self.options.gap:g}"
+        return ""
+
+    def wanted(self, t):
+        """Position, rate and acceleration of the path there and back; None behind its end."""
+        x = t / self.options.seconds
+        if x > 1.0:
+            return None
+        # 64 (x - x^2)^3: rest at both ends, 1 in the middle.
+        blend = 64.0 * np.array([-1.0, 3.0, -3.0, 1.0, 0.0, 0.0, 0.0])
+        scale = self.options.seconds
+        p, v, a = (np.polyval(np.polyder(blend, k), x) / scale**k for k in range(3))
+        return self._start + p * self._reach, v * self._reach, a * self._reach
+
+    def send(self, effort):
+        """Command efforts; none that is not finite, none beyond the limits, leaves."""
+        limits = self.robot.limits.effort
+        if not np.isfinite(effort).all() or (limits is not None and (abs(effort) > limits).any()):
+            self.stop(f"effort {effort.round(3).tolist()} is beyond the limits")
+            return
+        self._publisher.publish(Float64MultiArray(data=effort.tolist()))
+
+    def stop(self, why):
+        """Zeros, and nothing after them."""
+        if not self.stopped:
+            self.stopped = why
+            self.get_logger().error(f"stopped: {why}")
+            self.end()
+
+    def end(self):
+        """Zeros, and the controller has them before this process ends."""
+        zeros = [0.0] * self.robot.joints_count
+        self._publisher.publish(Float64MultiArray(data=zeros))
+        self._publisher.wait_for_all_acked(Duration(seconds=0.5))
+
+
+def main():
+    """0 where the path was gone to its end, 1 where a guard stopped it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robot", default="delta_cu")
+    parser.add_argument("--commands", default="machine_sim/commands")
+    parser.add_argument("--seconds", type=float, default=1.0, help="duration of the path")
+    parser.add_argument("--reach", type=float, default=0.1, help="part of the joints' range")
+    parser.add_argument("--bandwidth", type=float, default=8.0, help="Hz")
+    parser.add_argument("--deadline", type=float, default=0.1, help="longest silence, s")
+    parser.add_argument("--age", type=float, default=0.05, help="greatest age of a state, s")
+    parser.add_argument("--gap", type=float, default=0.01, help="between two stamps, s")
+    options = parser.parse_args(rclpy.utilities.remove_ros_args()[1:])
+    # Ctrl-C must leave the topics open for the zeros.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    controller = Controller(options)
+    try:
+        while not (controller.stopped or controller.done):
+            rclpy.spin_once(controller, timeout_sec=0.1)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        controller.stop("interrupted")
+    if controller.done:
+        controller.end()
+        worst = abs(np.array(controller.errors)).max()
+        print(f"{len(controller.errors)} samples, greatest tracking error {worst:.3e}")
+    controller.destroy_node()
+    rclpy.try_shutdown()
+    return 0 if controller.done else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A trajectory client: has a trajectory filled with effort by the twin, forwards it, watches it.
+
+    ros2 run pkm_twin machine_sim --ros-args -p mechanism:=delta_cu
+    ros2 run pkm_twin delta_dynamics --ros-args -p mechanism:=delta_cu
+    python3 trajectory_client.py --robot delta_cu
+
+A controller that is to take the twin's answer directly needs no client in between: remap
+delta_dynamics' ~/joint_trajectory_ff to its topic.
+"""
+
+import argparse
+import sys
+import time
+
+import numpy as np
+import rclpy
+from rclpy.duration import Duration
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from pkm_twin import load
+
+
+def blend(points=101, seconds=1.0):
+    """Times and a smooth way from 0 to 1 with two derivatives, at rest at both ends."""
+    x = np.linspace(0.0, 1.0, points)
+    way = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
+    return x * seconds, [np.polyval(np.polyder(way, k), x) / seconds**k for k in range(3)]
+
+
+def trajectory(names, times, q, qd, qdd):
+    """A message with a zero stamp: it starts on receipt."""
+    rows = zip(times, q.tolist(), qd.tolist(), qdd.tolist(), strict=True)
+    points = [
+        JointTrajectoryPoint(
+            positions=p, velocities=v, accelerations=a, time_from_start=Duration(seconds=t).to_msg()
+        )
+        for t, p, v, a in rows
+    ]
+    return JointTrajectory(joint_names=list(names), points=points)
+
+
+class Client(Node):
+    """Sends a trajectory to the twin and what comes back to the controller."""
+
+    def __init__(self, controller="machine_sim/joint_trajectory", twin="delta_dynamics"):
+        super().__init__("trajectory_client")
+        self.answers, self.states = [], []
+        self._to_twin = self.create_publisher(JointTrajectory, f"{twin}/joint_trajectory", 1)
+        self._to_controller = self.create_publisher(JointTrajectory, controller, 1)
+        topic = f"{twin}/joint_trajectory_ff"
+        self.create_subscription(JointTrajectory, topic, self.answers.append, 1)
+        self.create_subscription(JointState, "joint_states", self.states.append, 1000)
+
+    def go(self, message, patience=60.0):
+        """Joint states until the trajectory's end, and the efforts of its points.
+
+        :raises TimeoutError: something that is awaited does not come.
+        """
+        ends = (self._to_twin, self._to_controller)
+        self.until(lambda: all(p.get_subscription_count() for p in ends), patience, "both nodes")
+        self.until(lambda: self.states, patience, "joint_states")
+        self._to_twin.publish(message)
+        self.until(lambda: self.answers, patience, "the efforts")
+        filled = self.answers[-1]
+        efforts = np.array([point.effort for point in filled.points])
+        if efforts.shape != (len(message.points), len(message.joint_names)):
+            raise RuntimeError(f"the answer has efforts of shape {efforts.shape}")
+        if not np.isfinite(efforts).all():
+            raise RuntimeError("an effort is not finite")
+        self.states.clear()
+        self._to_controller.publish(filled)
+        goal = np.array(filled.points[-1].positions)
+        self.until(lambda: self.at_rest(goal, filled.joint_names), patience, "the end")
+        return list(self.states), efforts
+
+    def at_rest(self, goal, names):
+        """Whether the newest joint state stands at the goal, but for a percent of the way."""
+        if not self.states:
+            return False
+        q, first = (positions(self.states[i], names) for i in (-1, 0))
+        return abs(q - goal).max() < 0.01 * max(abs(goal - first).max(), 1e-6) and (
+            len(self.states) > 20
+            and abs(q - positions(self.states[-20], names)).max() < 1e-4 * abs(goal - first).max()
+        )
+
+    def until(self, condition, patience, what):
+        """Spin until it is so."""
+        end = time.monotonic() + patience
+        while not condition():
+            rclpy.spin_once(self, timeout_sec=0.1)
+            if time.monotonic() > end:
+                raise TimeoutError(f"{what}: nothing within {patience:g} s")
+
+
+def positions(state, names):
+    """Joint positions of a state in the order of the names."""
+    return np.array([state.position[state.name.index(name)] for name in names])
+
+
+def main():
+    """Go a part of every joint's range, from where the machine stands at the start."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robot", default="delta_cu")
+    parser.add_argument("--controller", default="machine_sim/joint_trajectory")
+    parser.add_argument("--seconds", type=float, default=1.0)
+    parser.add_argument("--reach", type=float, default=0.1, help="part of the joints' range")
+    options = parser.parse_args(rclpy.utilities.remove_ros_args()[1:])
+    robot = load(options.robot)
+    rclpy.init()
+    client = Client(options.controller)
+    try:
+        client.until(lambda: client.states, 60.0, "joint_states")
+        start = positions(client.states[-1], robot.joint_names)
+        low, high = robot.limits.position.T
+        times, ways = blend(seconds=options.seconds)
+        rows = [np.outer(way, options.reach * (high - low)) for way in ways]
+        message = trajectory(robot.joint_names, times, start + rows[0], *rows[1:])
+        states, efforts = client.go(message)
+    except (TimeoutError, RuntimeError) as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
+    finally:
+        client.destroy_node()
+        rclpy.try_shutdown()
+    miss = abs(positions(states[-1], robot.joint_names) - start - rows[0][-1]).max()
+    peak = ", ".join(f"{value:.3g}" for value in abs(efforts).max(0))
+    print(f"{len(efforts)} points, peak efforts {peak}, {miss:.2e} from the goal at the end")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

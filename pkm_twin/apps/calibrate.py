@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin calibrate``: the geometry of one's own machine from measured platform poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.table import Table
+from rich.text import Text
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
+
+from pkm_twin.apps.calibration import (
+    FRAME,
+    HELD_OUT,
+    STEPS,
+    TARGET,
+    Calibration,
+    Errors,
+    Parameter,
+    Poses,
+    calibrate,
+    geometric,
+)
+from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.options import Json, RobotName
+from pkm_twin.console import print_json, progress, refuse_existing, table_console
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine.edited import Fitted, edited_yaml, write_edited
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+ANGLES = ("roll", "pitch", "yaw")
+QUATERNION = ("qx", "qy", "qz", "qw")
+
+
+def read_poses(path: Path, robot: Robot) -> Poses:
+    """Measured poses of a CSV.
+
+    Columns, in any order: ``JOINT.position`` of every joint, in the controller's names and numbers;
+    ``x y z``, m; and, where measured, ``roll pitch yaw``, rad, or ``qx qy qz qw``, of the platform
+    relative to home.
+
+    :raises ParameterError: a column is missing, or a value is no finite number.
+    """
+    columns = read_columns(path)
+    joints = [f"{name}.position" for name in robot.controller.names]
+    known = [*joints, "x", "y", "z", *ANGLES, *QUATERNION]
+    for name in columns:
+        if name.endswith(".position") and name not in known:
+            raise UnknownNameError(f"{path}: column", name, known)
+
+    def stack(names: Sequence[str]) -> Array:
+        missing = [name for name in names if name not in columns]
+        if missing:
+            raise ParameterError(str(path), ", ".join(columns), f"a column {missing[0]!r}")
+        return np.stack([columns[name] for name in names], -1)
+
+    def stack_some(names: Sequence[str]) -> Array | None:
+        return stack(names) if any(name in columns for name in names) else None
+
+    q, position = stack(joints), stack("xyz")
+    angles, quaternion = stack_some(ANGLES), stack_some(QUATERNION)
+    rotation = None
+    if quaternion is not None:
+        if not (np.linalg.norm(quaternion, axis=1) > 1e-6).all():
+            raise ParameterError(f"{path}: qx qy qz qw", 0.0, "quaternions of length one")
+        rotation = Rotation.from_quat(quaternion).as_matrix()
+    elif angles is not None:
+        rotation = Rotation.from_euler("xyz", angles).as_matrix()
+    return Poses(q, position, rotation)
+
+
+def calibrate_command(
+    robot: RobotName,
+    poses: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV: JOINT.position columns, x y z (m), perhaps roll pitch yaw (rad) or "
+            "qx qy qz qw",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="the calibrated robot, a YAML")] = Path(
+        "calibrated.yaml"
+    ),
+    only: Annotated[
+        list[str], typer.Option(help="fit only numbers whose path begins so; may be repeated")
+    ] = [],  # noqa: B006  typer copies it
+    offsets: Annotated[
+        bool, typer.Option("--offsets/--no-offsets", help="fit the joints' sensor offsets")
+    ] = True,
+    frame: Annotated[
+        bool, typer.Option("--frame", help="fit where the instrument stands: its six numbers")
+    ] = False,
+    target: Annotated[
+        bool,
+        typer.Option("--target", help="fit where the target is on the platform: three numbers"),
+    ] = False,
+    prior: Annotated[
+        float,
+        typer.Option(
+            min=1e-6, max=1.0, help="how well lengths are known before, m (standard deviation)"
+        ),
+    ] = 0.01,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
+    as_json: Json = False,
+) -> None:
+    """Fit a robot's geometry and joint offsets to poses that an instrument measured.
+
+    Weighted least squares on the machine's own closures, by their exact derivatives; what the poses
+    do not tell stays as the file has it, and is named. Every fourth pose is held out: the error
+    there, before and after, says what the calibration is worth.
+    """
+    from pkm_twin import load
+
+    refuse_existing(out, overwrite)
+    machine = load(robot)
+    measured = read_poses(poses, machine)
+    q = machine.controller.positions(measured.joints)
+    paths = geometric(machine, q, only)
+    with progress("steps", 2 * STEPS) as update:
+        done = 0
+
+        def step(count: int) -> None:
+            nonlocal done
+            done += count
+            update(done)
+
+        result = calibrate(
+            machine, measured, paths, offsets=offsets, frame=frame, target=target, prior=prior,
+            progress=step,
+        )  # fmt: skip
+    source = f"calibrated with {poses.name}"
+    values = {
+        p.name: Fitted(p.value, p.deviation, p.unit, source)
+        for p in result.parameters
+        if p.name not in (*FRAME, *TARGET)
+    }
+    head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
+    write_edited(out, head, edited_yaml(machine, robot, values))
+    if as_json:
+        print_json({"robot": machine.name, "out": str(out), **as_data(result)})
+        return
+    _print(result)
+    typer.echo(f"{out}: {len(values)} numbers")
+
+
+def as_data(result: Calibration) -> dict[str, Any]:
+    """Plain numbers for a script, SI units."""
+    pairs = {"fitted": result.fitted, "held_out": result.held_out}
+    return {
+        "parameters": {
+            p.name: {
+                "unit": p.unit,
+                "before": p.before,
+                "value": p.value,
+                "standard_deviation": p.deviation,
+                "observed": p.observed,
+            }
+            for p in result.parameters
+        },
+        "not_observed": list(result.unobserved),
+        "condition": result.condition,
+        "noise_m": result.noise,
+        "noise_rad": result.noise_angle,
+        "steps": result.steps,
+        **{
+            name: {"before": _errors(before), "after": _errors(after)}
+            for name, (before, after) in pairs.items()
+        },
+    }
+
+
+def _errors(errors: Errors) -> dict[str, float]:
+    names = {"rms": "rms_m", "worst": "worst_m", "rms_angle": "rms_rad", "worst_angle": "worst_rad"}
+    return {names[key]: value for key, value in asdict(errors).items() if value is not None}
+
+
+def _print(result: Calibration) -> None:
+    table = Table(title=Text("calibrated numbers"))
+    for column in ("number", "before", "after", "deviation", "unit", "observed"):
+        table.add_column(column)
+    for p in result.parameters:
+        table.add_row(Text(p.name), *_row(p))
+    table_console().print(table)
+    errors = Table(title=Text("distance of measured and computed poses"))
+    for column in ("poses", "rms before", "rms after", "worst before", "worst after"):
+        errors.add_column(column)
+    for name, (before, after) in (
+        ("fitted", result.fitted),
+        (f"held out, every {HELD_OUT}th", result.held_out),
+    ):
+        lengths = (before.rms, after.rms, before.worst, after.worst)
+        errors.add_row(Text(f"{name}, mm"), *(f"{1e3 * value:.4f}" for value in lengths))
+        angles = (before.rms_angle, after.rms_angle, before.worst_angle, after.worst_angle)
+        told = [value for value in angles if value is not None]
+        if told:
+            errors.add_row(Text(f"{name}, mrad"), *(f"{1e3 * value:.4f}" for value in told))
+    table_console().print(errors)
+    noise = f"{1e3 * result.noise:.4f} mm"
+    if result.noise_angle is not None:
+        noise += f", {1e3 * result.noise_angle:.4f} mrad"
+    typer.echo(f"noise that is left, an axis: {noise}; condition number {result.condition:.3g}")
+    for combination in result.unobserved:
+        text = " ".join(f"{weight:+.2f} {name}" for name, weight in combination.items())
+        typer.echo(f"not told by the poses, stays as the file has it: {text}")
+
+
+def _row(p: Parameter) -> tuple[str, ...]:
+    numbers = (f"{value:.6g}" for value in (p.before, p.value))
+    return (*numbers, f"{p.deviation:.2g}", p.unit, "yes" if p.observed else "no")

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of numbers: CSV files with a header row."""
+
+from __future__ import annotations
+
+import array
+import csv
+import io
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.files import open_regular
+
+Array = NDArray[np.float64]
+MAX_CSV_BYTES = 1024**3
+"""Largest CSV that is read: some millions of samples."""
+MAX_CSV_LINE = 1024**2
+"""Longest line of it, characters."""
+
+
+def read_columns(path: Path) -> dict[str, Array]:
+    """Columns of a CSV with a header row, by name, shape (rows,) each.
+
+    :raises ParameterError: not readable, too large, or a value is no finite number.
+    """
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > MAX_CSV_BYTES:
+                raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_CSV_BYTES}")
+            # Spreadsheets put a byte order mark before the header row.
+            with io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text:
+                return _parse_columns(path, csv.reader(_lines(text, path)))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        what = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ParameterError(str(path), what, "a readable CSV file") from None
+
+
+def _lines(text: TextIO, path: Path) -> Iterator[str]:
+    """The lines of a file, none so long that a row takes all the memory."""
+    while line := text.readline(MAX_CSV_LINE):
+        if len(line) == MAX_CSV_LINE:
+            raise ParameterError(f"{path}: a line", f"{line[:40]}...", f"below {MAX_CSV_LINE} long")
+        yield line
+
+
+def _parse_columns(path: Path, rows: Iterator[list[str]]) -> dict[str, Array]:
+    header = [name.strip() for name in next(rows, [])]
+    if len(set(header)) != len(header):
+        raise ParameterError(f"{path}: header row", ", ".join(header), "different names")
+    data = array.array("d")
+    number = 1
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
+        try:
+            values = [float(cell) for cell in row]
+        except ValueError as error:
+            raise ParameterError(f"{path}: line {number}", str(error), "numbers") from None
+        if not all(map(math.isfinite, values)):
+            raise ParameterError(f"{path}: line {number}", row, "finite numbers")
+        data.extend(values)
+    if not data:
+        raise ParameterError(str(path), f"{number if header else 0} lines", "a header row and rows")
+    table = np.frombuffer(data, np.float64).reshape(-1, len(header))
+    return dict(zip(header, np.ascontiguousarray(table.T), strict=True))

@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin fit``: a robot's file from recordings of its motion and efforts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.table import Table
+
+from pkm_twin.apps.options import BagTopics, Json, LoadTimes, Payload, load_of
+from pkm_twin.console import print_json, progress, refuse_existing, table_console
+from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
+
+Array = NDArray[np.float64]
+
+RobotFile = Annotated[
+    str, typer.Argument(help="a robot's name (see `pkm-twin robots`) or a file: the numbers before")
+]
+NEAR: Final = 0.5
+"""Around a pick or release the payload is neither held nor gone, s."""
+
+
+def fit(
+    robot: RobotFile,
+    recordings: Annotated[
+        list[Path], typer.Argument(help="bags, or CSV files with a header row", show_default=False)
+    ],
+    what: Annotated[
+        str, typer.Option(help="of friction, rotor, payload, inertia, commas between")
+    ] = "friction,rotor,payload,inertia",
+    out: Annotated[
+        Path, typer.Option(help="YAML to write; the report goes beside it as HTML")
+    ] = Path("fitted.yaml"),
+    report: Annotated[bool, typer.Option(help="write the report with pictures")] = True,
+    per_copy: Annotated[
+        bool,
+        typer.Option("--per-copy", help="the copies of a limb each by itself, written out"),
+    ] = False,
+    topic: BagTopics = [],  # noqa: B006  typer copies it
+    payload: Payload = None,
+    load_times: LoadTimes = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="replace the YAML and the report")
+    ] = False,
+    json_output: Json = False,
+) -> None:
+    """Fit friction, rotors, payload and masses of a robot to recorded efforts.
+
+    Positions and efforts are enough: rates are differentiated without delay, and regressor and
+    efforts filtered alike. CSV columns: time (s); JOINT.position and JOINT.effort for every
+    actuated joint; optionally the wrench fx fy fz mx my mz. The last third of each recording is
+    held out and judged.
+
+    The YAML is the robot's file with new numbers, each with its standard deviation in a comment.
+    What the motion does not show keeps the file's value and is named. --payload and --load-times
+    tell of a payload that is known, or, with `payload` among what is fitted, when it is held.
+    """
+    from pkm_twin.apps.fit_files import fitted_yaml, robot_text
+
+    kinds = _kinds(what)
+    page = out.with_suffix(".html")
+    if out.suffix not in (".yaml", ".yml"):
+        raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
+    for target in (out, page) if report else (out,):
+        refuse_existing(target, overwrite)
+    text, machine = robot_text(robot, per_copy=per_copy)
+    carried = load_of(payload, load_times)
+    with progress("fit", 2 * len(recordings)) as update:
+        result = fit_recordings(machine, recordings, kinds, topic, carried, update)
+    names = [path.name for path in recordings]
+    try:
+        out.write_text(fitted_yaml(text, result, names), encoding="utf-8")
+        if report:
+            from pkm_twin.apps.fit_report import fit_page
+
+            page.write_text(fit_page(result, names), encoding="utf-8")
+    except OSError as error:
+        raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
+    if json_output:
+        print_json(as_json(result) | {"out": str(out), "report": str(page) if report else None})
+        return
+    _print(result)
+    typer.echo(f"{out}" + (f", {page}" if report else ""))
+
+
+def fit_recordings(
+    machine: Any,
+    recordings: Sequence[Path],
+    kinds: Sequence[Any],
+    topics: Sequence[str] = (),
+    carried: Any = None,
+    update: Callable[[int], None] | None = None,
+) -> Any:
+    """The fit of recordings, read as ``pkm-twin fit`` reads them.
+
+    :returns: a :class:`delta_dynamics.fit.Fit`.
+    :raises PkmTwinError: a recording without efforts, too short, or that shows nothing.
+    """
+    from delta_dynamics.fit import fit as fit_robot
+    from pkm_twin.bags.storage import is_bag
+
+    pairs = [
+        _of_bag(path, machine, topics, carried)
+        if is_bag(path)
+        else (_of_csv(path, machine), carried)
+        for path in recordings
+    ]
+    base = machine
+    if "payload" in kinds:
+        loads = [load for _, load in pairs if load is not None]
+        # Two payloads are not one section of a file.
+        if len({(load.mass, load.com) for load in loads}) > 1:
+            masses = ", ".join(f"{load.mass:g}" for load in loads)
+            raise PkmTwinError(f"recordings with payloads of {masses} kg: fit one at a time")
+        base = loads[0].on(machine) if loads else machine
+    made = []
+    for recorded, load in pairs:
+        held = None if load is None else load.held(recorded.time).astype(np.float64)
+        known = None if load is None or "payload" in kinds else load.on(machine)
+        if load is not None:
+            recorded = _away_from_changes(recorded, load)
+            held = load.held(recorded.time).astype(np.float64)
+        made.append(dataclasses.replace(recorded, held=held, carried=known))
+    return fit_robot(base, made, kinds, progress=update)
+
+
+def _away_from_changes(recorded: Any, load: Any) -> Any:
+    """Without the samples around a pick or release: a gap, which divides the recording."""
+    keep = ~load.near_change(recorded.time, NEAR)
+    cut = {k: getattr(recorded, k) for k in ("time", "q", "effort", "wrench")}
+    return dataclasses.replace(
+        recorded, **{k: None if v is None else v[keep] for k, v in cut.items()}
+    )
+
+
+def _kinds(what: str) -> tuple[Any, ...]:
+    from pkm_twin.machine.shared import KINDS
+
+    words = tuple(word.strip() for word in what.split(","))
+    for word in words:
+        if word not in KINDS:
+            raise UnknownNameError("what", word, KINDS)
+    return tuple(kind for kind in KINDS if kind in words)
+
+
+def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tuple[Any, Any]:
+    from delta_dynamics.fit import Recorded
+    from pkm_twin.apps.recorded import read_recording
+
+    r = read_recording(path, robot=machine, topics=topics, carried=carried, limited=False)
+    if r.effort is None:
+        raise BagError(
+            f"no efforts on {r.topics.joint_states}: a fit needs what the drives gave",
+            path=path, reason="no efforts",
+        )  # fmt: skip
+    return Recorded(path.name, r.time, r.q, r.effort, r.wrench), r.load
+
+
+def _of_csv(path: Path, machine: Any) -> Any:
+    from delta_dynamics.fit import Recorded
+    from pkm_twin.apps.columns import read_columns
+    from pkm_twin.apps.torques import WRENCH_AXES
+
+    columns = read_columns(path)
+    for what in ("position", "effort"):
+        missing = [j for j in machine.joint_names if f"{j}.{what}" not in columns]
+        if missing and what == "effort" and len(missing) == len(machine.joint_names):
+            raise ParameterError(
+                str(path), "no efforts", f"columns {missing[0]}.effort ...: what the drives gave"
+            )
+        if missing:
+            raise ParameterError(str(path), ", ".join(columns), f"a column {missing[0]}.{what}")
+    if "time" not in columns:
+        raise ParameterError(str(path), ", ".join(columns), "a column time")
+    time = columns["time"] - columns["time"][0]
+    if not (np.diff(time) > 0).all():
+        raise ParameterError(f"{path}: time", "not rising", "strictly rising times")
+    q, effort = (
+        np.stack([columns[f"{joint}.{what}"] for joint in machine.joint_names], -1)
+        for what in ("position", "effort")
+    )
+    wrench = None
+    if any(axis in columns for axis in WRENCH_AXES):
+        wrench = np.stack([columns.get(a, np.zeros(len(time))) for a in WRENCH_AXES], -1)
+    return Recorded(path.name, time, q, effort, wrench)
+
+
+def as_json(result: Any) -> dict[str, Any]:
+    """Plain data, units beside the numbers."""
+    e = result.estimate
+    units = result.robot.effort_units
+    return {
+        "robot": result.robot.name,
+        "condition": e.condition if np.isfinite(e.condition) else None,
+        "combinations_determined": e.directions,
+        "held_by_a_physical_bound": e.bound,
+        "samples_fitted": result.samples,
+        "outliers_replaced": result.outliers,
+        "efforts_late_s": list(result.delays),
+        "parameters": [
+            {
+                "key": number.name, "unit": number.unit, "before": number.before,
+                "value": number.after, "standard_deviation": number.deviation,
+                "status": number.status,
+            }
+            for number in result.numbers
+        ],
+        "not_excited": [number.name for number in result.of("not excited")],
+        "effort_noise": dict(zip(result.robot.joint_names, e.noise.tolist(), strict=True)),
+        "effort_units": dict(zip(result.robot.joint_names, units, strict=True)),
+        "held_out": [
+            {
+                "recording": judged.name,
+                "from_s": float(judged.time[0]), "to_s": float(judged.time[-1]),
+                "residual_rms_before": judged.rms(judged.before).tolist(),
+                "residual_rms_after": judged.rms(judged.after).tolist(),
+                "peak_effort": np.abs(judged.measured).max(0).tolist(),
+            }
+            for judged in result.judged
+        ],
+        "filtering": [
+            {
+                "window_samples": how.window, "cutoff_Hz": how.cutoff,
+                "kept_every": how.keep_every, "position_noise": list(how.position_noise),
+            }
+            for how in result.filtering
+        ],
+    }  # fmt: skip
+
+
+def _print(result: Any) -> None:
+    table = Table(box=None)
+    for name, side in (("", "left"), ("before", "right"), ("now", "right"), ("+-", "right")):
+        table.add_column(name, justify=side)  # type: ignore[arg-type]
+    table.add_column("unit")
+    table.add_column("")
+    for n in result.numbers:
+        if n.status == "not excited":
+            continue
+        note = "only together with others" if n.status == "combination" else ""
+        table.add_row(
+            n.name, f"{n.before:.6g}", f"{n.after:.6g}", f"{n.deviation:.2g}", n.unit, note
+        )
+    console = table_console()
+    console.print(table)
+    idle = result.of("not excited")
+    if idle:
+        typer.echo(
+            "the motion tells nothing of, and the file's value stays: "
+            + ", ".join(n.name for n in idle)
+        )
+    e = result.estimate
+    typer.echo(f"condition number {e.condition:.3g} over {e.directions} combinations")
+    if e.bound:
+        typer.echo("the nearest possible masses and inertias: the data alone want impossible ones")
+    for judged, delay in zip(result.judged, result.delays, strict=True):
+        typer.echo(f"{judged.name}: efforts late by {1e3 * delay:.3g} ms")
+        before, after = judged.rms(judged.before), judged.rms(judged.after)
+        for k, joint in enumerate(result.robot.joint_names):
+            typer.echo(
+                f"{judged.name}, held out, {joint}: residual {before[k]:.4g} before, "
+                f"{after[k]:.4g} {result.robot.effort_units[k]} now"
+            )

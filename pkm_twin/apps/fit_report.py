@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a fit: one HTML page with its pictures in it."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from delta_dynamics.fit import Fit, Number
+from pkm_twin.atlas.plots import COLOURS, columns
+
+_HEAD: Final = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<title>{title}</title>
+<style>
+body {{ font: 15px/1.5 sans-serif; margin: 2em auto; max-width: 70em; padding: 0 1em; }}
+table {{ border-collapse: collapse; margin: 1em 0; }}
+td, th {{ border-bottom: 1px solid #ccc; padding: 0.2em 0.8em; text-align: right; }}
+td:first-child, th:first-child, td.word {{ text-align: left; }}
+img {{ max-width: 100%; }}
+</style>
+</head>
+<body>
+<h1>{title}</h1>
+"""
+MOST_SAMPLES: Final = 4000
+"""Drawn of each recording."""
+WORDS: Final = {"fitted": "", "combination": "only together with others", "not excited": ""}
+
+
+def fit_page(result: Fit, recordings: Sequence[str]) -> str:
+    """The whole page."""
+    title = f"{html.escape(result.robot.name)}: fitted from {html.escape(', '.join(recordings))}"
+    e = result.estimate
+    parts = [_HEAD.format(title=title), "<h2>What was fitted</h2>", _numbers(result)]
+    parts.append(
+        f"<p>{e.directions} combinations of numbers are told by {result.samples} filtered samples; "
+        f"condition number {e.condition:.3g}. +- is one standard deviation, of the noise, of the "
+        "differentiation and of what the file said before.</p>"
+    )
+    if e.bound:
+        parts.append(
+            "<p>The data alone want masses or inertias that no body has; these are the nearest "
+            "possible ones.</p>"
+        )
+    idle = result.of("not excited")
+    if idle:
+        names = ", ".join(html.escape(n.name) for n in idle)
+        parts.append(f"<p>The motion tells nothing of, and the file's value stays: {names}.</p>")
+    parts += ["<h2>Numbers, before and now</h2>", _picture(_changes(result))]
+    parts += ["<h2>Held out: the last third of each recording</h2>", _residuals(result)]
+    parts += [_picture(_efforts(result, k)) for k in range(len(result.judged))]
+    parts += ["<h2>What was done to the signals</h2>", _signals(result, recordings)]
+    return "\n".join([*parts, "</body>", "</html>", ""])
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _numbers(result: Fit) -> str:
+    return _table(
+        ("number", "before", "now", "+-", "unit", ""),
+        [
+            (n.name, f"{n.before:.6g}", f"{n.after:.6g}", f"{n.deviation:.2g}", n.unit,
+             WORDS[n.status])
+            for n in _shown(result)
+        ],
+    )  # fmt: skip
+
+
+def _shown(result: Fit) -> list[Number]:
+    return [n for n in result.numbers if n.status != "not excited"]
+
+
+def _residuals(result: Fit) -> str:
+    rows = []
+    for judged in result.judged:
+        before, after = judged.rms(judged.before), judged.rms(judged.after)
+        peak = np.abs(judged.measured).max(0)
+        for k, joint in enumerate(result.robot.joint_names):
+            unit = result.robot.effort_units[k]
+            rows.append(
+                (judged.name, joint, f"{before[k]:.4g}", f"{after[k]:.4g}", f"{peak[k]:.4g}", unit)
+            )
+    return _table(("recording", "joint", "rms before", "rms now", "peak effort", "unit"), rows)
+
+
+def _signals(result: Fit, recordings: Sequence[str]) -> str:
+    rows = [
+        (
+            name, f"{how.window}", "none" if how.cutoff is None else f"{how.cutoff:.3g}",
+            f"{how.keep_every}", f"{1e3 * delay:.3g}",
+        )
+        for name, how, delay in zip(recordings, result.filtering, result.delays, strict=True)
+    ]  # fmt: skip
+    header = (
+        "recording", "window of the differentiation (samples)", "low-pass (Hz)",
+        "every so many samples kept", "efforts late (ms)",
+    )  # fmt: skip
+    return _table(header, rows) + f"<p>{result.outliers} efforts were outliers.</p>"
+
+
+def _changes(result: Fit) -> Any:
+    """By how many deviations each number moved, and how sure it is."""
+    shown = _shown(result)
+    figure, ((ax,),) = columns(1, 1)
+    figure.set_size_inches(9, 1 + 0.25 * len(shown))
+    places = np.arange(len(shown))[::-1]
+    for place, n in zip(places, shown, strict=True):
+        size = max(abs(n.before), abs(n.after), 3 * n.deviation, 1e-300)
+        colour = COLOURS[0] if n.status == "fitted" else COLOURS[4]
+        ax.errorbar(n.after / size, place, xerr=3 * n.deviation / size, fmt="o", color=colour)
+        ax.plot(n.before / size, place, "x", color="0.4")
+    ax.set_yticks(places, [n.name for n in shown], fontsize=8)
+    ax.set_xlim(-2, 2)
+    ax.set_xlabel("over the greater of both; cross before, dot now with three deviations")
+    ax.grid(alpha=0.3)
+    return figure
+
+
+def _efforts(result: Fit, number: int) -> Any:
+    judged = result.judged[number]
+    step = max(1, len(judged.time) // MOST_SAMPLES)
+    joints = result.robot.joint_names
+    figure, ((*axes,),) = columns(1, len(joints))
+    for k, (ax, joint) in enumerate(zip(axes, joints, strict=True)):
+        time = judged.time[::step]
+        for values, colour, label in (
+            (judged.before, COLOURS[1], "before"), (judged.after, COLOURS[0], "now"),
+        ):  # fmt: skip
+            ax.plot(time, (judged.measured - values)[::step, k], color=colour, lw=0.8, label=label)
+        ax.set_title(f"{judged.name}, {joint}: measured less predicted, held out")
+        ax.set_xlabel("time (s)")
+        ax.set_ylabel(f"effort ({result.robot.effort_units[k]})")
+        ax.legend(loc="upper right", fontsize=8)
+        ax.grid(alpha=0.3)
+    return figure
+
+
+def _picture(figure: Any) -> str:
+    from matplotlib import pyplot
+
+    data = io.BytesIO()
+    figure.savefig(data, dpi=90, format="png")
+    pyplot.close(figure)
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'

@@ -1,0 +1,6 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin view``: a robot in a browser. Pure parts, and the page that viser serves.
+
+``model`` (sliders in, numbers out), ``scene`` (numbers to shapes), ``timeline`` (a bag), ``live``
+(messages) and ``texts`` know nothing of viser; ``door`` (who may enter) and ``page`` do.
+"""

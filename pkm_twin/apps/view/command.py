@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin view``: the options, and what is opened, in which order."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+from pkm_twin.apps.options import BagTopics, LoadTimes, Payload, Platform, RobotName, load_of
+from pkm_twin.console import progress
+
+
+def view(
+    robot: RobotName,
+    platform: Platform = None,
+    bag: Annotated[
+        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        typer.Option(help="show this recording on a time line", show_default=False),
+    ] = None,
+    topic: BagTopics = [],  # noqa: B006  typer copies it
+    payload: Payload = None,
+    load_times: LoadTimes = None,
+    live: Annotated[bool, typer.Option("--live", help="follow running nodes; needs ROS")] = False,
+    namespace: Annotated[
+        str, typer.Option(help="with --live: the robot's namespace", show_default=False)
+    ] = "",
+    host: Annotated[
+        str, typer.Option(help="address to listen on; any but the loopback needs --token")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="port to listen on; 0 is any free one")] = 8080,
+    token: Annotated[
+        str,
+        typer.Option(
+            envvar="PKM_TWIN_TOKEN",
+            help="what visitors must know, at least 16 characters; better by the environment "
+            "variable than on the command line, which others see",
+            show_default=False,
+        ),
+    ] = "",
+) -> None:
+    """Show a robot in the browser, to be moved and loaded by sliders.
+
+    Joints and pose inside their limits, distance to singularities, clearance of limbs, deflection
+    and strain energy under a wrench; with --bag a recording's time line with the twin's torques,
+    with --live what running nodes say. Nothing is fetched from any other host.
+
+    Serves until Ctrl-C, on this machine alone unless --host and --token say otherwise.
+    """
+    from pkm_twin.apps.view.door import Door, listen
+    from pkm_twin.atlas.extras import require
+
+    carried = load_of(payload, load_times)
+    if bag is None and (topic or carried is not None):
+        raise typer.BadParameter("--topic, --payload and --load-times are of a recording: --bag")
+    if bag is not None and live:
+        raise typer.BadParameter("--bag and --live: one of them")
+    if namespace and not live:
+        raise typer.BadParameter("--namespace is of running nodes: --live")
+    require("viser", "view")
+    door = Door(host, token)
+    from pkm_twin import load
+    from pkm_twin.apps.view.live import Live
+    from pkm_twin.apps.view.model import Model
+    from pkm_twin.apps.view.page import Page, serving
+    from pkm_twin.apps.view.panels import BagPanel, LivePanel
+
+    with ExitStack() as stack:
+        door_socket = stack.enter_context(listen(host, port))
+        machine = load(robot, platform=platform)
+        timeline = None if bag is None else _timeline(bag, robot, topic, carried)
+        model = Model(machine)
+        server = stack.enter_context(serving(door, door_socket))
+        page = Page(server, model)
+        if timeline is not None:
+            BagPanel(page, timeline)
+        if live:
+            heard = Live(machine)
+            stack.enter_context(listening(heard, namespace))
+            LivePanel(page, heard)
+        name, number = door_socket.getsockname()[:2]
+        shown = f"[{name}]" if ":" in name else name
+        asked = "?token=TOKEN" if token else ""
+        typer.echo(f"{machine.name}: http://{shown}:{number}/{asked}  (Ctrl-C ends)")
+        page.run()
+
+
+def _timeline(bag: Path, robot: str, topic: list[str], carried: Any) -> Any:
+    from pkm_twin.apps.recorded import read_recording
+    from pkm_twin.apps.view.timeline import Timeline
+
+    with progress("reading", None) as update:
+        recording = read_recording(bag, robot, update, topics=topic, carried=carried)
+    return Timeline.of(recording)
+
+
+@contextmanager
+def listening(live: Any, namespace: str) -> Iterator[None]:
+    """Messages of the nodes in a namespace reach ``live`` while the block lasts."""
+    from pkm_twin.apps.view.live import TOPICS
+    from pkm_twin.ros.listener import listening_node, subscribe_best_effort
+
+    ended = threading.Event()
+    with listening_node("view", namespace=namespace) as (node, spin):
+        for name, (kind, topic) in TOPICS.items():
+            subscribe_best_effort(node, kind, topic, lambda m, name=name: live.take(name, m))  # type: ignore[misc]
+
+        def work() -> None:
+            while not ended.is_set():
+                spin(0.1)
+
+        thread = threading.Thread(target=work, name="view listens")
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What running nodes say, message by message: the latest of each, and traces of the torques.
+
+Messages are read by their attributes alone. May import: numpy, scipy, the core, ``ros.messages``.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
+
+from pkm_twin.errors import MessageError, one_line
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import SECOND, JointReader, StampRules, stamp_of
+
+Array = NDArray[np.float64]
+
+SPAN: Final = 20.0
+"""How much of the past is drawn, s."""
+RATE: Final = 50.0
+"""Points a second of a trace; more are left out."""
+TOPICS: Final = {
+    "state": ("sensor_msgs/msg/JointState", "joint_states"),
+    "torque": ("sensor_msgs/msg/JointState", "delta_dynamics/joint_torques"),
+    "residual": ("sensor_msgs/msg/JointState", "delta_dynamics/torque_residual"),
+    "energy": ("diagnostic_msgs/msg/DiagnosticArray", "stiffness_monitor/strain_energy"),
+    "deflection": ("geometry_msgs/msg/TransformStamped", "stiffness_monitor/deflection"),
+}
+"""What is listened to, by its name here: type, and topic in the robot's namespace."""
+TRACES: Final = ("torque", "residual")
+_ANY: Final = StampRules(accept_zero=True, future_tolerance=2**62)
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """The latest of everything; ``None`` or empty where nothing came.
+
+    ``q`` (n,); ``traces``: by name, times (k,) s before the latest, and values (k, n), N m or N;
+    ``shares``: of the strain energy by element; ``deflection``: in platform axes, (6,), m and rad.
+    ``counts``: messages taken by name; ``refused``: how many were not, with the last reason.
+    """
+
+    q: Array | None
+    traces: dict[str, tuple[Array, Array]]
+    dominant: str
+    shares: dict[str, float]
+    deflection: Array | None
+    counts: dict[str, int]
+    refused: int
+    reason: str
+
+
+class Live:
+    """Takes messages from one thread and tells of them to others."""
+
+    def __init__(self, robot: Robot) -> None:
+        # Beyond a limit is to be seen, too.
+        self._reader = JointReader(robot, limited=False)
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._refused, self._reason = 0, ""
+        self._forget()
+        self._take: dict[str, Callable[[Any], None]] = {
+            "state": self._state,
+            "torque": lambda message: self._effort("torque", message),
+            "residual": lambda message: self._effort("residual", message),
+            "energy": self._energy,
+            "deflection": self._transform,
+        }
+
+    def _forget(self) -> None:
+        self._q: Array | None = None
+        self._traces: dict[str, deque[tuple[int, Array]]] = {name: deque() for name in TRACES}
+        self._dominant, self._shares = "", dict[str, float]()
+        self._deflection: Array | None = None
+
+    def take(self, name: str, message: Any) -> None:
+        """A message of a topic by its name in TOPICS; one that makes no sense is counted."""
+        with self._lock:
+            try:
+                self._take[name](message)
+                self._counts[name] += 1
+            except MessageError as error:
+                self._refused += 1
+                self._reason = one_line(f"{TOPICS[name][1]}: {error}")
+
+    def _state(self, message: Any) -> None:
+        self._q = self._reader.positions(message, 0, _ANY).q
+
+    def _effort(self, name: str, message: Any) -> None:
+        sample = self._reader.efforts(message, 0, _ANY)
+        trace = self._traces[name]
+        if trace and sample.stamp < trace[-1][0]:
+            trace.clear()  # the clock jumped back: a bag begins anew
+        if trace and sample.stamp - trace[-1][0] < SECOND / RATE:
+            return
+        trace.append((sample.stamp, sample.effort))
+        while sample.stamp - trace[0][0] > SPAN * SECOND:
+            trace.popleft()
+
+    def _energy(self, message: Any) -> None:
+        status = next(iter(message.status), None)
+        if status is None:
+            raise MessageError("empty", "no status")
+        stamp_of(message.header)
+        values = {pair.key: _number(pair.value) for pair in status.values}
+        total = values.pop("total_energy", None)
+        if total is None:
+            raise MessageError("empty", "no total_energy")
+        # The factors come first; what follows the energy is the pose.
+        keys = [pair.key for pair in status.values]
+        factors = keys[: keys.index("total_energy")]
+        shares = {key: values[key] for key in factors}
+        if any(share is None for share in shares.values()):
+            raise MessageError("not finite", "a factor is no number")
+        self._shares = {key: float(share) for key, share in shares.items() if share is not None}
+        self._dominant = str(status.message)
+
+    def _transform(self, message: Any) -> None:
+        move, turn = message.transform.translation, message.transform.rotation
+        numbers = np.array([move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w])
+        if not np.isfinite(numbers).all() or not np.any(numbers[3:]):
+            raise MessageError("not finite", "the transform is none")
+        vector = Rotation.from_quat(numbers[3:]).as_rotvec()
+        self._deflection = np.concatenate([numbers[:3], vector])
+
+    def heard(self) -> Heard:
+        """All of it, as it is now."""
+        with self._lock:
+            newest = max((t[-1][0] for t in self._traces.values() if t), default=0)
+            traces = {
+                name: (
+                    np.array([(stamp - newest) / SECOND for stamp, _ in trace]),
+                    np.array([values for _, values in trace]),
+                )
+                for name, trace in self._traces.items()
+                if trace
+            }
+            return Heard(
+                self._q,
+                traces,
+                self._dominant,
+                dict(self._shares),
+                self._deflection,
+                dict(self._counts),
+                self._refused,
+                self._reason,
+            )
+
+
+def _number(text: Any) -> float | None:
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        return None
+    return value if math.isfinite(value) else None

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot under sliders: a state in, numbers out; what cannot be is refused in words.
+
+May import: numpy, the core, dynamics and elasticity, the limits of the command line.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.feedforward import Settings
+from pkm_twin.apps.limits import beyond_limits
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line
+from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
+from pkm_twin.kinematics.workspace import has_joint_angles
+from pkm_twin.machine.robot import Robot
+from stiffness_monitor import StrainEnergy, strain_energy
+
+Array = NDArray[np.float64]
+Grade = Literal["good", "warn", "bad"]
+
+AXES: Final = ("fx", "fy", "fz", "mx", "my", "mz")
+NEAR: Final = 0.005
+"""Clearance below which limbs are shown as near each other, m."""
+SAMPLES: Final = 1000
+"""Joint states of which the ranges of the pose sliders are made."""
+SAME: Final = 1e-6
+"""By how much a pose may miss itself, there and back, per 1 and its size; m and rad."""
+VISIBLE: Final = 0.15
+"""Size that the greatest deflection may be enlarged to, per size of the machine."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """What a slider spans, in steps that are round numbers."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    step: float
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What is shown: q (n,), pose (m,), wrench (6,) on the platform in base axes, N and N m.
+
+    ``refusal``: why the last thing that was asked for is not shown; empty where it is.
+    """
+
+    q: Array
+    pose: Array
+    wrench: Array = field(default_factory=lambda: np.zeros(6))
+    refusal: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """What is known of a state. ``None`` is not known, ``why`` says why, by name.
+
+    ``singularity``: 1 best, 0 singular; ``clearance``: of limbs, m; ``effort``: to hold the weight
+    and the wrench at rest, shape (n,), N m or N; ``energy``: of the wrench.
+    """
+
+    position: Array
+    rotation: Array
+    singularity: float
+    singularity_grade: Grade
+    clearance: float | None
+    clearance_grade: Grade
+    effort: Array | None
+    beyond_effort: tuple[str, ...]
+    energy: StrainEnergy | None
+    why: dict[str, str]
+
+
+class Model:
+    """A robot's sliders and what they lead to."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self._settings = Settings()
+        self._angles = has_joint_angles(robot)
+        self._why: dict[str, str] = {}
+        home = robot.home()
+        self.start = State(robot.inverse(home), home)
+        self._learn_what_is_known()
+
+    def _learn_what_is_known(self) -> None:
+        robot, state = self.robot, self.start
+        if not has_clearance(robot):
+            self._why["clearance"] = "the robot's file tells no diameters of members"
+        rest = np.zeros(robot.joints_count)
+        for name, call in (
+            ("effort", lambda: inverse_dynamics(robot, state.q, rest, rest)),
+            ("energy", lambda: strain_energy(robot, state.pose, np.zeros(6))),
+        ):
+            try:
+                call()
+            except ParameterError as error:
+                self._why[name] = f"the robot's file would need {error.bound}"
+
+    @cached_property
+    def joint_ranges(self) -> tuple[Range, ...]:
+        """Of q: the limits; where there are none, a turn, or the machine's size, about home."""
+        robot, graph = self.robot, self.robot.graph
+        free = {"rad": 3.15, "m": _round(graph.size) / 2}
+        rows = []
+        for k, (name, unit) in enumerate(zip(robot.joint_names, robot.joint_units, strict=True)):
+            middle = round(float(graph.home[k]), 1)
+            low, high = middle - free[unit], middle + free[unit]
+            if robot.limits.position is not None:
+                limits = robot.limits.position[k]
+                low, high = (
+                    float(limit) if math.isfinite(limit) else other
+                    for limit, other in zip(limits, (low, high), strict=True)
+                )
+            rows.append(Range(name, unit, float(low), float(high), _step(high - low)))
+        return tuple(rows)
+
+    @cached_property
+    def pose_ranges(self) -> tuple[Range, ...]:
+        """Of the pose: what joint states all over their ranges reach, rounded outwards."""
+        robot = self.robot
+        low, high = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in _ENDS)
+        random = np.random.default_rng(0).random((SAMPLES, robot.joints_count))
+        corners = np.array(list(itertools.product((0.0, 1.0), repeat=robot.joints_count)))
+        poses, good = robot.try_forward(low + (high - low) * np.concatenate([corners, random]))
+        kept = [pose for pose in poses[good] if not self._angle_beyond(pose)]
+        found = np.array([*kept, self.start.pose])
+        rows = []
+        for k, (name, unit) in enumerate(zip(robot.pose_names, robot.pose_units, strict=True)):
+            least, most = float(found[:, k].min()), float(found[:, k].max())
+            step = _step(most - least)
+            ends = math.floor(least / step) * step, math.ceil(most / step) * step
+            rows.append(Range(name, unit, *(round(end, 12) for end in ends), step))
+        return tuple(rows)
+
+    @cached_property
+    def wrench_ranges(self) -> tuple[Range, ...]:
+        """Forces and moments that the drives hold at the start, rounded up; else 100 N."""
+        robot, force = self.robot, 100.0
+        if robot.limits.effort is not None and np.isfinite(robot.limits.effort).any():
+            speeds = np.linalg.norm(robot.platform_jacobian(self.start.q)[:3], axis=0)
+            held = robot.limits.effort / np.maximum(speeds, 1e-9)
+            force = float(np.median(held[np.isfinite(held)]))
+        force, moment = _round(force), _round(force * robot.size)
+        tops = [("N", force)] * 3 + [("N m", moment)] * 3
+        return tuple(
+            Range(name, unit, -top, top, _step(2 * top))
+            for name, (unit, top) in zip(AXES, tops, strict=True)
+        )
+
+    @cached_property
+    def enlargement(self) -> Range:
+        """By how much deflections are drawn enlarged: the greatest is plain to see."""
+        if "energy" in self._why:
+            return Range("deflection enlarged", "times", 0.0, 1.0, 0.01)
+        full = np.diag([r.high for r in self.wrench_ranges])[:3]
+        poses = np.broadcast_to(self.start.pose, (3, len(self.start.pose)))
+        moved = np.asarray(strain_energy(self.robot, poses, full).deflection)
+        scale = np.repeat([1.0, self.robot.size], 3)
+        largest = float(np.abs(moved * scale).max())
+        top = _round(VISIBLE * self.robot.graph.size / largest)
+        return Range("deflection enlarged", "times", 0.0, top, _step(top))
+
+    def to_joints(self, state: State, q: ArrayLike) -> State:
+        """The state at joint positions, shape (n,), or the old one with the reason why not."""
+        asked = np.asarray(q, np.float64)
+        return self._moved(state, asked, None)
+
+    def to_pose(self, state: State, pose: ArrayLike) -> State:
+        """The state at a pose, shape (m,), or the old one with the reason why not."""
+        asked = np.asarray(pose, np.float64)
+        try:
+            q = self.robot.inverse(asked)
+        except ValueError as error:
+            return _refused(state, str(error))
+        return self._moved(state, q, asked)
+
+    def _moved(self, state: State, q: Array, asked: Array | None) -> State:
+        _, found = beyond_limits(self.robot, q)
+        if found:
+            more = f" ({len(found) - 1} more)" if len(found) > 1 else ""
+            return _refused(state, f"{found[0]}{more}")
+        try:
+            pose = self.robot.forward(q)
+        except ValueError as error:
+            return _refused(state, str(error))
+        if asked is not None:
+            if (np.abs(pose - asked) > SAME * (1.0 + np.abs(asked))).any():
+                return _refused(state, "pose is reached in another assembly than the home pose's")
+            pose = asked
+        angle = self._angle_beyond(pose)
+        return _refused(state, angle) if angle else replace(state, q=q, pose=pose, refusal="")
+
+    def _angle_beyond(self, pose: Array) -> str:
+        """What passive joint is beyond its bound at a pose, in words; empty where none is."""
+        bound = getattr(self.robot.limits, "joint_angle", None)
+        if bound is None or not self._angles:
+            return ""
+        angles = self.robot.limit_angles(pose)
+        most = 0.0 if angles is None else float(angles.max())
+        if most <= bound:
+            return ""
+        return f"a passive joint stands at {most:.6g} rad, limit {float(bound):g}"
+
+    def loaded(self, state: State, wrench: ArrayLike) -> State:
+        """The state under another wrench, shape (6,), N and N m."""
+        return replace(state, wrench=np.array(wrench, np.float64), refusal="")
+
+    def numbers(self, state: State) -> Numbers:
+        """All that is known of a state; what fails at this place is said in ``why``."""
+        robot, why = self.robot, dict(self._why)
+        measure = float(robot.singularity(state.q))
+        stop, warn = self._settings.singularity_stop, self._settings.singularity_warn
+        gap = None if "clearance" in why else float(joint_clearance(robot, state.q))
+        effort, energy = None, None
+        rest = np.zeros(robot.joints_count)
+        try:
+            if "effort" not in why:
+                effort = inverse_dynamics(robot, state.q, rest, rest, state.wrench)
+        except (PkmTwinError, ValueError) as error:
+            why["effort"] = one_line(str(error))
+        try:
+            if "energy" not in why:
+                energy = strain_energy(robot, state.pose, state.wrench)
+        except (PkmTwinError, ValueError) as error:
+            why["energy"] = one_line(str(error))
+        position, rotation = robot.platform(state.q)
+        return Numbers(
+            position, rotation, measure, _grade(measure, stop, warn),
+            gap, "good" if gap is None else _grade(gap, 0.0, NEAR),
+            effort, self._overloaded(effort), energy, why,
+        )  # fmt: skip
+
+    def _overloaded(self, effort: Array | None) -> tuple[str, ...]:
+        limits = self.robot.limits.effort
+        if effort is None or limits is None:
+            return ()
+        names = zip(self.robot.joint_names, np.abs(effort) > limits, strict=True)
+        return tuple(name for name, beyond in names if beyond)
+
+
+_ENDS: Final = ("low", "high")
+
+
+def _refused(state: State, reason: str) -> State:
+    return replace(state, refusal=one_line(reason))
+
+
+def _grade(value: float, bad: float, warn: float) -> Grade:
+    return "bad" if value <= bad else "warn" if value < warn else "good"
+
+
+def _step(span: float) -> float:
+    """A power of ten, 400 to 4000 of it in the span."""
+    return float(10.0 ** math.floor(math.log10(max(span, 1e-9) / 400)))
+
+
+def _round(value: float) -> float:
+    """The next of 1, 2, 5, 10, 20 ... from a value on."""
+    decade = 10.0 ** math.floor(math.log10(max(value, 1e-9)))
+    return float(next(k * decade for k in (1.0, 2.0, 5.0, 10.0) if k * decade >= 0.999 * value))

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of ``pkm-twin view``: viser's sliders and numbers around the pure model.
+
+Callbacks only note what was asked for; one loop does it, the latest of each kind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import socket
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.apps.view import texts
+from pkm_twin.apps.view.door import Door, behind
+from pkm_twin.apps.view.model import Model, Range, State
+from pkm_twin.apps.view.scene import DRIVE, Scene
+from pkm_twin.apps.view.stage import Stage
+
+Array = NDArray[np.float64]
+
+PERIOD: Final = 0.05
+"""How often what moves by itself is drawn, s."""
+
+
+@contextmanager
+def serving(door: Door, listening: socket.socket) -> Iterator[Any]:
+    """A viser server on the socket, behind the door, and nothing that it prints."""
+    import viser
+
+    class Server(viser.ViserServer):
+        """Without the tunnel to a host outside that any visitor could ask for."""
+
+        def request_share_url(self, verbose: bool = True) -> None:
+            """Share nothing."""
+
+    # A visitor that is sent away, or breaks off, is no error of this program's.
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)
+    with contextlib.redirect_stdout(io.StringIO()), behind(door, listening):
+        server = Server(host=door.host, port=listening.getsockname()[1], verbose=False)
+    try:
+        yield server
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+class Moving(Protocol):
+    """What moves the machine beside the sliders."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether it moves now."""
+
+    def step(self) -> None:
+        """Draw what moved since the last step."""
+
+
+class Page:
+    """One robot on a server; all who look at it see and move the same."""
+
+    def __init__(self, server: Any, model: Model) -> None:
+        self.server, self.model, self.state = server, model, model.start
+        lowest = min((r.low for r in model.pose_ranges if r.name == "z"), default=0.0)
+        self.stage = Stage(server, Scene(model.robot), model.start.q, lowest)
+        self.moving: list[Moving] = []
+        self._asked: dict[str, Callable[[], None]] = {}
+        self._wake = threading.Event()
+        self._tops = np.array([r.high for r in model.wrench_ranges])
+        server.gui.configure_theme(
+            control_layout="fixed",
+            control_width="large",
+            show_logo=False,
+            show_share_button=False,
+            brand_color=DRIVE,
+        )
+        server.gui.set_panel_label(f"pkm-twin view {model.robot.name}")
+        self._build_panel()
+        self._show()
+
+    def ask(self, react: Any, what: str, call: Callable[[], None]) -> None:
+        """Let the loop make the call when a visitor does what ``react`` is of.
+
+        :param react: ``on_update`` or ``on_click`` of a handle; of many calls with one name,
+            ``what``, the last one is made.
+        """
+
+        def noted(event: Any) -> None:
+            if event.client is not None:  # else the page itself moved it
+                self._asked[what] = call
+                self._wake.set()
+
+        react(noted)
+
+    def run(self) -> None:
+        """Serve until a signal ends the process."""
+        while True:
+            self._wake.wait(PERIOD if any(item.busy for item in self.moving) else 1.0)
+            self._wake.clear()
+            self.step()
+
+    def step(self) -> None:
+        """Do what was asked for, and draw what moved by itself."""
+        while self._asked:
+            _, call = self._asked.popitem()
+            call()
+        for item in self.moving:
+            if item.busy:
+                item.step()
+
+    def become(self, state: State) -> None:
+        """Show another state; one with a refusal leaves the sliders where they were put."""
+        self.state = state
+        self._show()
+
+    def _build_panel(self) -> None:
+        gui, model = self.server.gui, self.model
+        self._status = gui.add_html("")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Move"):
+            with gui.add_folder("Joints"):
+                self._joints = self._sliders(model.joint_ranges, "joint", self._move_joint)
+            with gui.add_folder("Pose of the platform"):
+                self._pose = self._sliders(model.pose_ranges, "pose", self._move_pose)
+            self.ask(gui.add_button("Home").on_click, "home", self._go_home)
+            named = gui.add_checkbox("names of drives", True)
+            self.ask(named.on_update, "names", lambda: self.stage.name_drives(named.value))
+        with tabs.add_tab("Load"):
+            with gui.add_folder("Wrench on the platform, base axes"):
+                self._wrench = self._sliders(model.wrench_ranges, "wrench", self._load)
+                self.ask(gui.add_button("No wrench").on_click, "unload", self._unload)
+            r = model.enlargement
+            self._enlarge = gui.add_slider(
+                "deflection drawn, times", r.low, r.high, r.step, r.high / 2
+            )
+            self.ask(self._enlarge.on_update, "enlarge", self._show)
+            self._loads = gui.add_html("")
+
+    def _sliders(
+        self, ranges: Sequence[Range], kind: str, move: Callable[[int], None]
+    ) -> list[Any]:
+        handles = []
+        for k, r in enumerate(ranges):
+            amid = min(max(0.0, r.low), r.high)
+            handle = self.server.gui.add_slider(f"{r.name}, {r.unit}", r.low, r.high, r.step, amid)
+            self.ask(handle.on_update, f"{kind} {k}", partial(move, k))
+            handles.append(handle)
+        return handles
+
+    def _move_joint(self, k: int) -> None:
+        q = self.state.q.copy()
+        q[k] = self._joints[k].value
+        self.become(self.model.to_joints(self.state, q))
+
+    def _move_pose(self, k: int) -> None:
+        pose = self.state.pose.copy()
+        pose[k] = self._pose[k].value
+        self.become(self.model.to_pose(self.state, pose))
+
+    def _load(self, _: int) -> None:
+        wrench = [handle.value for handle in self._wrench]
+        self.become(self.model.loaded(self.state, wrench))
+
+    def _unload(self) -> None:
+        self.become(self.model.loaded(self.state, np.zeros(6)))
+
+    def _go_home(self) -> None:
+        self.become(self.model.to_joints(self.state, self.model.start.q))
+
+    def _show(self) -> None:
+        state, numbers = self.state, self.model.numbers(self.state)
+        energy = numbers.energy
+        with self.server.atomic():
+            if not state.refusal:
+                _put(self._joints, state.q)
+                _put(self._pose, state.pose)
+                _put(self._wrench, state.wrench)
+            self._status.content = texts.status(self.model, state, numbers)
+            self._loads.content = texts.load(numbers)
+            if energy is None or energy.dominant == "none":
+                self.stage.draw(state.q, np.zeros(6), {}, "")
+            else:
+                factors = np.asarray(energy.factors).tolist()
+                shares = dict(zip(energy.elements, factors, strict=True))
+                self.draw_deflected(np.asarray(energy.deflection), shares, str(energy.dominant))
+            self.stage.draw_wrench(numbers.position, state.wrench / self._tops)
+
+    def draw_deflected(self, deflection: Array, shares: dict[str, float], dominant: str) -> None:
+        """The state with a deflection (6,), m and rad, base axes, enlarged as the slider says."""
+        self.stage.draw(self.state.q, deflection * self._enlarge.value, shares, dominant)
+
+
+def _put(handles: Sequence[Any], values: Array) -> None:
+    """Move sliders to values: to an end where a value is beyond."""
+    for handle, value in zip(handles, values.tolist(), strict=True):
+        # What is zero but for rounding has no sign.
+        handle.value = round(min(max(value, handle.min), handle.max), 12) + 0.0

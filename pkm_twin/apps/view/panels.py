@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What moves the machine of a page by itself: a bag's time line, and running nodes."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.apps.view import texts
+from pkm_twin.apps.view.live import SPAN, TOPICS, TRACES, Live
+from pkm_twin.apps.view.page import Page
+from pkm_twin.apps.view.timeline import Timeline
+
+Array = NDArray[np.float64]
+
+COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""Of the joints' curves (Okabe and Ito 2008)."""
+SPEEDS: Final = ("0.25", "0.5", "1", "2", "4")
+WIDTH: Final = 400
+"""Of the panel, pixels."""
+MARKED: Final = 0.25
+"""How often the curves' mark of the present moves while a bag plays, s."""
+_NO_POINTS: Final = {"show": False}
+
+
+class BagPanel:
+    """A slider of time, a play button, numbers at that time and curves of all of it."""
+
+    def __init__(self, page: Page, timeline: Timeline) -> None:
+        self._page, self._timeline = page, timeline
+        self._since: tuple[float, float] | None = None
+        self._marked = -np.inf
+        gui = page.server.gui
+        panel = gui.add_panel()
+        with panel.add_tab("Bag"):
+            self._time = gui.add_slider("time, s", 0.0, max(timeline.end, 0.01), 0.001, 0.0)
+            self._play = gui.add_button("Play")
+            self._speed = gui.add_dropdown("speed, times", SPEEDS, initial_value="1")
+            self._instant = gui.add_html("")
+            at, twin, residual = timeline.curves()
+            named = (("torque of the twin", twin), ("residual: measured less twin", residual))
+            self._charts = [
+                (_chart(page, title, at, values, mark=True), at, values)
+                for title, values in named
+                if values is not None and len(at) > 1
+            ]
+        page.ask(self._time.on_update, "time", self._go)
+        page.ask(self._play.on_click, "play", self._play_or_pause)
+        page.ask(self._speed.on_update, "speed", self._restart)
+        panel.dock_left()
+        panel.set_width(WIDTH)
+        page.moving.append(self)
+        self._go()
+
+    @property
+    def busy(self) -> bool:
+        """Whether it plays."""
+        return self._since is not None
+
+    def show(self, at: float) -> None:
+        """Go to a time, s."""
+        self._time.value = min(max(at, 0.0), self._timeline.end)
+        self._go()
+
+    def _go(self) -> None:
+        self._restart()
+        page, at = self._page, self._timeline.at(self._time.value)
+        state = page.state
+        if at.wrench is not None:
+            state = page.model.loaded(state, at.wrench)
+        state = page.model.to_joints(state, at.q)
+        self._instant.content = texts.instant(page.model.robot, self._timeline, at)
+        page.become(state)
+        if not self.busy or time.monotonic() - self._marked > MARKED:
+            self._marked = time.monotonic()
+            for chart, times, values in self._charts:
+                chart.data = (*chart.data[:-1], _mark(times, values, at.time))
+
+    def _play_or_pause(self) -> None:
+        if self.busy:
+            self._since = None
+        else:
+            if self._time.value >= self._timeline.end:
+                self._time.value = 0.0
+            self._since = time.monotonic(), self._time.value
+        self._play.label = "Pause" if self.busy else "Play"
+
+    def _restart(self) -> None:
+        """Play on from the slider's time, at the chosen speed."""
+        if self.busy:
+            self._since = time.monotonic(), self._time.value
+
+    def step(self) -> None:
+        """Go on to the time that it is by now."""
+        if self._since is None:
+            return
+        began, start = self._since
+        now = start + (time.monotonic() - began) * float(self._speed.value)
+        self._time.value = min(now, self._timeline.end)
+        if now >= self._timeline.end:
+            self._since = None
+            self._play.label = "Play"
+        self._go()
+
+
+class LivePanel:
+    """What running nodes say: the machine follows their joint states, with traces of torques."""
+
+    busy = True
+
+    def __init__(self, page: Page, live: Live) -> None:
+        self._page, self._live = page, live
+        gui = page.server.gui
+        panel = gui.add_panel()
+        with panel.add_tab("Live"):
+            self._heard = gui.add_html("")
+            nothing = np.zeros((2, page.model.robot.joints_count))
+            self._charts = {
+                name: _chart(page, f"{name}, the last {SPAN:g} s", np.array([-SPAN, 0.0]), nothing)
+                for name in TRACES
+            }
+        panel.dock_left()
+        panel.set_width(WIDTH)
+        page.moving.append(self)
+
+    def step(self) -> None:
+        """Show what was heard last."""
+        page, heard = self._page, self._live.heard()
+        waiting = ", ".join(TOPICS[name][1] for name in TOPICS if not heard.counts.get(name))
+        self._heard.content = texts.heard(page.model.robot, heard, waiting)
+        for name, (times, values) in heard.traces.items():
+            if len(times) > 1:
+                self._charts[name].data = (times, *map(np.ascontiguousarray, values.T))
+        if heard.q is None:
+            return
+        page.become(page.model.to_joints(page.state, heard.q))
+        # A wrench on the sliders is looked at instead of the measured one.
+        if heard.shares and heard.deflection is not None and not page.state.wrench.any():
+            rotation = page.model.robot.platform(page.state.q)[1]
+            moved = np.concatenate([rotation @ part for part in np.split(heard.deflection, 2)])
+            page.draw_deflected(moved, heard.shares, heard.dominant)
+
+
+def _chart(page: Page, title: str, times: Array, values: Array, *, mark: bool = False) -> Any:
+    """Curves of all joints, values (k, n), and where asked for a mark of the present."""
+    from viser import uplot
+
+    robot = page.model.robot
+    series = [uplot.Series(label="t, s")]
+    series += [
+        uplot.Series(label=name, stroke=COLOURS[k % len(COLOURS)], width=1.5, points=_NO_POINTS)
+        for k, name in enumerate(robot.joint_names)
+    ]
+    curves = list(map(np.ascontiguousarray, values.T))
+    if mark:
+        series.append(uplot.Series(label="now", stroke="#555555", width=1, points=_NO_POINTS))
+        curves.append(_mark(times, values, 0.0))
+    return page.server.gui.add_uplot(
+        (times, *curves),
+        tuple(series),
+        title=f"{title}, {robot.effort_unit}",
+        scales={"x": uplot.Scale(time=False)},
+        height=185,
+    )
+
+
+def _mark(times: Array, values: Array, now: float) -> Array:
+    """A curve along the bottom with a spike at the time shown: charts draw no upright lines."""
+    result = np.full(len(times), float(values.min()))
+    result[int(np.argmin(np.abs(times - now)))] = float(values.max())
+    return result

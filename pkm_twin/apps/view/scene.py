@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A state as shapes: cylinders, balls and plates with their places and colours, in numbers.
+
+May import: numpy, scipy, the core; what it draws is ``pkm_twin.machine.outline``'s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
+
+from pkm_twin.apps import drawing
+from pkm_twin.machine.graph import BASE, Joint
+from pkm_twin.machine.members import Place
+from pkm_twin.machine.outline import (
+    BAR,
+    Bar,
+    Posture,
+    base_face,
+    platform_face,
+    robot_bars,
+    telescope,
+)
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+
+def rgb(code: str) -> Colour:
+    """Numbers of a colour's code, ``#7F7F7F``."""
+    red, green, blue = bytes.fromhex(code[1:])
+    return red, green, blue
+
+
+BODY: Final = (128, 136, 146)
+ROD: Final = rgb(drawing.ROD)
+PLATFORM: Final = rgb(drawing.PLATFORM)
+DRIVE: Final = rgb(drawing.DRIVE)
+GROUND: Final = (70, 74, 80)
+JOINT: Final = (98, 104, 112)
+SCALE: Final = np.array([[198, 206, 214], [240, 228, 66], [213, 94, 0]], np.float64)
+"""From no share of the energy to the greatest one: grey, yellow, vermilion (Okabe and Ito 2008)."""
+
+
+def share_colours(shares: Mapping[str, float]) -> dict[str, Colour]:
+    """A colour for each element by its share of the strain energy, the greatest at the scale's end.
+
+    Empty where there is no energy.
+    """
+    most = max(shares.values(), default=0.0)
+    if not most > 0.0:
+        return {}
+    result = {}
+    for name, share in shares.items():
+        at = np.clip(share / most, 0.0, 1.0) * (len(SCALE) - 1)
+        red, green, blue = (
+            round(float(np.interp(at, range(len(SCALE)), channel))) for channel in SCALE.T
+        )
+        result[name] = (red, green, blue)
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """What stands where: cylinders along their z at unit size, balls, and the platform.
+
+    ``*_at``: (k, 3) m; ``cylinder_turns``: (k, 4) quaternions, w first; ``*_sizes``: (k, 3)
+    scales in own axes; ``*_colours``: (k, 3) of 0 to 255. ``platform_at``, ``platform_turn``: of
+    the plate, deflected; ``places``: (name, (3,)) of elements, for a label.
+    """
+
+    cylinder_at: Array
+    cylinder_turns: Array
+    cylinder_sizes: Array
+    cylinder_colours: NDArray[np.uint8]
+    ball_at: Array
+    ball_sizes: Array
+    ball_colours: NDArray[np.uint8]
+    platform_at: Array
+    platform_turn: Array
+    places: dict[str, Array]
+
+
+class Scene:
+    """The shapes of a robot in any state: how many they are never changes."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot, graph = robot, robot.graph
+        self.size = graph.size
+        self.bars = robot_bars(robot)
+        self.base = base_face(graph)
+        self.platform = platform_face(graph) - graph.origin
+        self._thin = BAR * graph.size
+        self._elements = {bar.element for bar in self.bars if bar.element}
+        self._joints = [j for j in graph.joints.values() if j.kind not in ("translation", "fixed")]
+        self._drives = [j for j in self._joints if j.actuated]
+        self._balls = self._ball_places()
+        self._held = [[self._on_platform(end) for end in (b.start, b.end)] for b in self.bars]
+
+    def _ball_places(self) -> list[tuple[str, Place]]:
+        """Where balls stand: joints that turn, and the ends of rods, by the joint's label."""
+        graph = self.robot.graph
+        found = [
+            (j.label or j.name, (j.outer, j.at)) for j in self._joints if j.kind != "prismatic"
+        ]
+        for rod in graph.rods.values():
+            shifts = (0.0,) if rod.pair is None else (-rod.width / 2, rod.width / 2)
+            for shift in shifts:
+                aside = np.zeros(3) if rod.pair is None else shift * rod.pair
+                ends = zip(rod.joint_names, (rod.inner, rod.outer), rod.ends, strict=True)
+                found += [(name, (body, end + aside)) for name, body, end in ends]
+        return found
+
+    def _on_platform(self, place: Place) -> bool:
+        """Whether a point moves with the platform: one of it, or of a joint with it."""
+        graph, (body, point) = self.robot.graph, place
+        if body == graph.platform:
+            return True
+        near = 1e-6 * self.size
+        return any(
+            {j.inner, j.outer} == {body, graph.platform}
+            and float(np.linalg.norm(j.at - point)) < near
+            for j in self._joints
+        )
+
+    def _radius(self, place: Place) -> float:
+        """Of the thickest bar that ends at a point, else of a body's bar, m."""
+        near = 1e-6 * self.size
+        at_end = [
+            bar.radius
+            for bar in self.bars
+            for _, point in (bar.start, bar.end)
+            if float(np.linalg.norm(point - place[1])) < near and bar.part != BASE
+        ]
+        return max(at_end, default=self._thin)
+
+    def shapes(
+        self, q: Array, deflection: Array | None = None, shares: Mapping[str, float] | None = None
+    ) -> Shapes:
+        """Shapes at joint positions, shape (n,).
+
+        :param deflection: of the platform as it is to be drawn, already enlarged: (6,), m and rad,
+            base axes.
+        :param shares: of the strain energy by element, which colour members and joints.
+        """
+        posture, graph = Posture(self.robot, q), self.robot.graph
+        colours = share_colours(shares or {})
+        origin = posture.place(graph.platform, graph.origin)
+        moved = np.zeros(6) if deflection is None else np.array(deflection)
+        turn = Rotation.from_rotvec(moved[3:])
+
+        def place(spot: Place, held: bool) -> Array:
+            point = posture.place(*spot)
+            if not held or deflection is None:
+                return point
+            return np.asarray(origin + moved[:3] + turn.apply(point - origin), np.float64)
+
+        ends = np.array(
+            [
+                [place(spot, on) for spot, on in zip((bar.start, bar.end), held, strict=True)]
+                for bar, held in zip(self.bars, self._held, strict=True)
+            ]
+        ).reshape(-1, 2, 3)
+        radii = np.array([bar.radius for bar in self.bars])
+        motors = [self._motor(joint, posture) for joint in self._drives]
+        ends = np.concatenate([ends, np.array([m[0] for m in motors]).reshape(-1, 2, 3)])
+        radii = np.concatenate([radii, [m[1] for m in motors]])
+        bar_colours = [self._colour(bar, colours) for bar in self.bars]
+        at, turns, sizes = _cylinders(ends, radii)
+        balls = [place(spot, self._on_platform(spot)) for _, spot in self._balls]
+        ball_radii = np.array([1.25 * self._radius(spot) for _, spot in self._balls])
+        # Round ends, so that bars of one body meet without gaps.
+        tips = ends[: len(self.bars)].reshape(-1, 3)
+        tip_radii = np.repeat(radii[: len(self.bars)], 2)
+        ball_colours = [colours.get(name, JOINT) for name, _ in self._balls]
+        whole = Rotation.from_matrix(posture.rotations[graph.platform])
+        places = {
+            bar.element: ends[k].mean(0) for k, bar in enumerate(self.bars) if bar.element
+        } | {name: ball for (name, _), ball in zip(self._balls, balls, strict=True)}
+        return Shapes(
+            at,
+            turns,
+            sizes,
+            np.array([*bar_colours, *([DRIVE] * len(motors))], np.uint8),
+            np.concatenate([np.array(balls).reshape(-1, 3), tips]),
+            np.repeat(np.concatenate([ball_radii, tip_radii])[:, None], 3, axis=1),
+            np.array([*ball_colours, *np.repeat(bar_colours, 2, axis=0)], np.uint8),
+            origin + moved[:3],
+            _quaternions(turn * whole),
+            places,
+        )
+
+    def _colour(self, bar: Bar, colours: Mapping[str, Colour]) -> Colour:
+        if bar.element in colours:
+            return colours[bar.element]
+        graph = self.robot.graph
+        if bar.part == BASE:
+            return GROUND
+        if bar.part == graph.platform:
+            return PLATFORM
+        return ROD if bar.part in graph.rods else BODY
+
+    def _motor(self, joint: Joint, posture: Posture) -> tuple[Array, float]:
+        """Both ends and the radius of the cylinder that stands for a drive, along its axis."""
+        axis = posture.rotations[joint.inner] @ joint.axes[0]
+        radius = self._radius((joint.outer, joint.at))
+        if telescope(joint):
+            parts = {joint.inner, joint.outer}
+            radius = max((bar.radius for bar in self.bars if bar.part in parts), default=radius)
+            middle = posture.place(joint.inner, joint.at + joint.home * joint.axes[0] / 2)
+            half, radius = 1.5 * radius, 1.5 * radius
+        elif joint.kind == "prismatic":
+            middle = posture.place(joint.outer, joint.at)
+            half, radius = 3.0 * self._thin, 2.5 * self._thin
+        else:
+            middle = posture.place(joint.inner, joint.at)
+            half, radius = 2.0 * radius, 1.6 * radius
+        return np.array([middle - half * axis, middle + half * axis]), radius
+
+    def drive_places(self, q: Array) -> dict[str, Array]:
+        """Where the drives stand, (3,) m, by joint name: for their labels."""
+        posture = Posture(self.robot, q)
+        return {j.name: self._motor(j, posture)[0].mean(0) for j in self._drives}
+
+    def box(self) -> tuple[Array, Array]:
+        """Least and greatest coordinates of the machine at home, (3,) m."""
+        points = np.array([spot[1] for bar in self.bars for spot in (bar.start, bar.end)])
+        return points.min(0), points.max(0)
+
+
+def _cylinders(ends: Array, radii: Array) -> tuple[Array, Array, Array]:
+    """Middles, quaternions and sizes of cylinders between two points each, shape (k, 2, 3)."""
+    along = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    z = along / np.maximum(length, 1e-12)[:, None]
+    z[length < 1e-12] = (0.0, 0.0, 1.0)
+    # Any direction across will do: a cylinder is round.
+    least = np.eye(3)[np.argmin(np.abs(z), axis=1)]
+    x = np.cross(least, z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    turns = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=-1))
+    return ends.mean(1), _quaternions(turns), np.column_stack([radii, radii, length])
+
+
+def _quaternions(turns: Rotation) -> Array:
+    """Quaternions with w first, shape (..., 4)."""
+    return np.asarray(np.roll(turns.as_quat(), 1, axis=-1), np.float64)
+
+
+def round_mesh(sides: int = 24, rings: int = 12) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Vertices and triangles of a cylinder (radius and length 1, along z) and of a ball."""
+    angle = np.arange(sides) * 2 * np.pi / sides
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    k, n = np.arange(sides), np.roll(np.arange(sides), -1)
+    low, high = np.full((sides, 1), -0.5), np.full((sides, 1), 0.5)
+    # The lids have corners of their own, so that edges are sharp.
+    rims = [np.hstack([ring, z]) for z in (low, high, low, high)]
+    tips = np.array([[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]])
+    wall = [np.column_stack([k, n, sides + n]), np.column_stack([k, sides + n, sides + k])]
+    lids = [
+        np.column_stack([2 * sides + n, 2 * sides + k, np.full(sides, 4 * sides)]),
+        np.column_stack([3 * sides + k, 3 * sides + n, np.full(sides, 4 * sides + 1)]),
+    ]
+    cylinder = np.concatenate([*rims, tips]), np.concatenate(wall + lids)
+    tilt = np.linspace(0, np.pi, rings + 1)
+    ball = np.array([[np.sin(t) * c, np.sin(t) * s, np.cos(t)] for t in tilt for c, s in ring])
+    faces = []
+    for row in range(rings):
+        a, b = row * sides, (row + 1) * sides
+        faces += [np.column_stack([a + k, b + k, b + n]), np.column_stack([a + k, b + n, a + n])]
+    return cylinder, (ball, np.concatenate(faces))
+
+
+def plate(corners: Array, thickness: float) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices and triangles of a plate of convex outline, both sides and the rim."""
+    count = len(corners)
+    normal = np.linalg.svd(corners - corners.mean(0))[2][2]
+    aside = normal * thickness / 2
+    top, low = corners + aside, corners - aside
+    vertices = np.concatenate([top, low, [top.mean(0), low.mean(0)]])
+    k, n = np.arange(count), np.roll(np.arange(count), -1)
+    faces = np.concatenate(
+        [
+            np.column_stack([k, n, np.full(count, 2 * count)]),
+            np.column_stack([count + n, count + k, np.full(count, 2 * count + 1)]),
+            np.column_stack([k, count + k, count + n]),
+            np.column_stack([k, count + n, n]),
+        ]
+    )
+    # Seen from both sides: the order of the corners may go either way round.
+    return vertices, np.concatenate([faces, faces[:, ::-1]])

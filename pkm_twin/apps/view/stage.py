@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The 3-D half of the page: a scene's shapes as viser draws them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.apps.view.scene import GROUND, PLATFORM, Scene, plate, round_mesh
+
+Array = NDArray[np.float64]
+
+FORCE: Final = (0, 158, 115)
+MOMENT: Final = (204, 121, 167)
+ARROW: Final = 0.4
+"""Length of the greatest wrench's arrow, per size of the machine."""
+LOOK: Final = np.array([0.62, -0.95, 0.42])
+"""From where the machine is looked at, in its greatest extents from its middle."""
+
+
+class Stage:
+    """A machine on a server; all who look at it see the same."""
+
+    def __init__(self, server: Any, scene: Scene, q: Array, lowest: float) -> None:
+        """:param lowest: where the platform may go at least, z in m: the ground is below."""
+        self._server, self._scene = server, scene
+        self._ground(lowest)
+        self._plates()
+        self._machine(q)
+        size, draw = scene.size, server.scene
+        self._names = {
+            name: draw.add_label(f"/names/{k}", name, anchor="bottom-center", position=place)
+            for k, (name, place) in enumerate(scene.drive_places(q).items())
+        }
+        self._element = draw.add_label("/element", "", anchor="bottom-center", visible=False)
+        self._arrows = draw.add_arrows(
+            "/wrench", np.zeros((2, 2, 3)), _linear(np.array([FORCE, MOMENT])),
+            shaft_radius=0.008 * size, head_radius=0.02 * size, head_length=0.05 * size,
+            visible=False,
+        )  # fmt: skip
+
+    def _ground(self, lowest: float) -> None:
+        draw, size = self._server.scene, self._scene.size
+        draw.set_up_direction("+z")
+        # Lights of its own: a lit face has just the colour that it was given.
+        draw.configure_default_lights(False)
+        draw.configure_environment_map(None)
+        draw.add_light_ambient("/lights/all", intensity=1.5)
+        for name, place in (("key", LOOK + np.array([-0.4, 0.0, 0.6])), ("back", -LOOK)):
+            bright = 1.7 if name == "key" else 0.4
+            draw.add_light_directional(
+                f"/lights/{name}", intensity=bright, position=tuple(place.tolist()),
+                cast_shadow=name == "key",
+            )  # fmt: skip
+        low, high = self._scene.box()
+        middle, reach = (low + high) / 2, float((high - low).max())
+        cell = 10.0 ** np.floor(np.log10(reach))
+        draw.add_grid(
+            "/grid", width=6 * reach, height=6 * reach, cell_size=cell / 2, section_size=cell,
+            cell_color=(222, 225, 229), section_color=(186, 192, 200), fade_distance=7 * reach,
+            position=(0.0, 0.0, float(min(low[2], 0.0, lowest)) - 0.06 * size),
+            plane_color=(248, 249, 250), plane_opacity=1.0,
+        )  # fmt: skip
+        camera = self._server.initial_camera
+        camera.position = tuple((middle + 1.25 * reach * LOOK).tolist())
+        camera.look_at = tuple(middle.tolist())
+        camera.up = (0.0, 0.0, 1.0)
+        draw.add_frame("/base", **_axes(0.12 * size, size))
+
+    def _plates(self) -> None:
+        draw, scene, size = self._server.scene, self._scene, self._scene.size
+        if len(scene.base):
+            draw.add_mesh_simple(
+                "/base_plate", *plate(scene.base, 0.012 * size), color=GROUND, opacity=0.6
+            )
+        self._platform = draw.add_frame("/platform", **_axes(0.1 * size, size))
+        self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
+        if len(scene.platform):
+            moving = plate(scene.platform, 0.016 * size)
+            draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM)
+            still = plate(scene.platform, 0.01 * size)
+            draw.add_mesh_simple("/at_rest/plate", *still, color=(110, 110, 110), opacity=0.35)
+
+    def _machine(self, q: Array) -> None:
+        draw, shapes = self._server.scene, self._scene.shapes(q)
+        (cylinder, cylinder_faces), (ball, ball_faces) = round_mesh()
+        self._cylinders = draw.add_batched_meshes_simple(
+            "/machine/bars", cylinder, cylinder_faces, shapes.cylinder_turns, shapes.cylinder_at,
+            batched_scales=shapes.cylinder_sizes, batched_colors=_linear(shapes.cylinder_colours),
+            lod="off",
+        )  # fmt: skip
+        turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(shapes.ball_at), 1))
+        self._balls = draw.add_batched_meshes_simple(
+            "/machine/balls", ball, ball_faces, turns, shapes.ball_at,
+            batched_scales=shapes.ball_sizes, batched_colors=_linear(shapes.ball_colours),
+            lod="off",
+        )  # fmt: skip
+
+    def draw(self, q: Array, deflection: Array, shares: Mapping[str, float], dominant: str) -> None:
+        """The machine at q (n,), its platform moved by an enlarged deflection (6,), m and rad.
+
+        Where it moves, the platform at rest is a shadow beside it. Elements have the colour of
+        their share, ``dominant`` has a label.
+        """
+        moved = bool(deflection.any())
+        shapes = self._scene.shapes(q, deflection if moved else None, shares)
+        bars, balls = self._cylinders, self._balls
+        bars.batched_positions, bars.batched_wxyzs = shapes.cylinder_at, shapes.cylinder_turns
+        bars.batched_scales = shapes.cylinder_sizes
+        bars.batched_colors = _linear(shapes.cylinder_colours)
+        balls.batched_positions = shapes.ball_at
+        balls.batched_scales = shapes.ball_sizes
+        balls.batched_colors = _linear(shapes.ball_colours)
+        self._platform.position, self._platform.wxyz = shapes.platform_at, shapes.platform_turn
+        for name, place in self._scene.drive_places(q).items():
+            self._names[name].position = place
+        self._rest.visible = moved
+        if moved:
+            rest = self._scene.shapes(q)
+            self._rest.position, self._rest.wxyz = rest.platform_at, rest.platform_turn
+        self._element.visible = dominant in shapes.places
+        if dominant in shapes.places:
+            self._element.text = f"{dominant}: {100 * shares[dominant]:.0f} % of the strain energy"
+            self._element.position = shapes.places[dominant]
+
+    def draw_wrench(self, at: Array, part: Array) -> None:
+        """Arrows of a wrench at the reference point: the force ends there, the moment begins.
+
+        :param part: of the greatest wrench, (6,), base axes.
+        """
+        self._arrows.visible = bool(part.any())
+        force, moment = ARROW * self._scene.size * part.reshape(2, 3)
+        self._arrows.points = np.array([[at - force, at], [at, at + moment]])
+
+    def name_drives(self, shown: bool) -> None:
+        """Whether the drives have their names beside them."""
+        for label in self._names.values():
+            label.visible = shown
+
+
+def _axes(length: float, size: float) -> dict[str, float]:
+    return {
+        "axes_length": length,
+        "axes_radius": 0.004 * size,
+        "origin_radius": 0.008 * size,
+    }
+
+
+def _linear(colours: NDArray[Any]) -> NDArray[np.uint8]:
+    """Colours of a screen as amounts of light: viser takes those of batches so."""
+    part = np.asarray(colours) / 255.0
+    light = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+    return np.round(255 * light).astype(np.uint8)

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page's numbers as HTML: every number has an id, a unit and, where it is judged, a colour.
+
+May import: numpy, the standard library, the model's own types.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.apps.view.live import Heard
+from pkm_twin.apps.view.model import Grade, Model, Numbers, State
+from pkm_twin.apps.view.scene import share_colours
+from pkm_twin.apps.view.timeline import Instant, Timeline
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+GRADES: Final[Mapping[Grade, str]] = {"good": "#009E73", "warn": "#B87800", "bad": "#D55E00"}
+"""Colours of Okabe and Ito; the middle one darker, so that text in it is read on white."""
+SHOWN: Final = 8
+"""Elements that are listed; the rest is summed."""
+_MISSING: Final = "&ndash;"
+_STYLE: Final = "font-size:0.82em;line-height:1.5;padding:0.15em 0.9em 0.4em"
+
+
+def number(value: float) -> str:
+    """Four digits, as the page shows a number; what is zero but for rounding is 0."""
+    return f"{value:.4g}" if abs(value) > 1e-12 else "0"
+
+
+def status(model: Model, state: State, numbers: Numbers) -> str:
+    """Singularity measure, clearance, joints with their efforts at rest, and a refusal in words."""
+    gap = None if numbers.clearance is None else 1e3 * numbers.clearance
+    rows = [
+        _judged("singularity", "singularity measure", numbers.singularity, "",
+                numbers.singularity_grade, "1 best, 0 singular"),
+        _judged("clearance", "clearance of limbs", gap, "mm", numbers.clearance_grade,
+                numbers.why.get("clearance", "")),
+    ]  # fmt: skip
+    said = (
+        f'<div id="refusal" style="color:#fff;background:{GRADES["bad"]};border-radius:4px;'
+        f'padding:0.2em 0.6em;margin:0.3em 0">{escape(state.refusal)}</div>'
+        if state.refusal
+        else '<div id="refusal"></div>'
+    )
+    return f'<div style="{_STYLE}">{_table(rows)}{said}{_joints(model, state, numbers)}</div>'
+
+
+def _joints(model: Model, state: State, numbers: Numbers) -> str:
+    robot = model.robot
+    effort: Sequence[float | None] = [None] * len(state.q)
+    if numbers.effort is not None:
+        effort = numbers.effort.tolist()
+    rows = [_head("joint", "position", "effort at rest")]
+    units = zip(robot.joint_names, robot.joint_units, robot.effort_units, strict=True)
+    for k, (name, unit, effort_unit) in enumerate(units):
+        colour = GRADES["bad"] if name in numbers.beyond_effort else "inherit"
+        rows.append(
+            _row(
+                escape(name),
+                _value(f"q_{k}", float(state.q[k]), unit),
+                _value(f"effort_{k}", effort[k], effort_unit, colour),
+            )
+        )
+    why = numbers.why.get("effort", "")
+    return _table(rows) + (f"<div>efforts: {escape(why)}</div>" if why else "")
+
+
+def load(numbers: Numbers) -> str:
+    """Deflection of the platform and the elements by their share of the strain energy."""
+    energy = numbers.energy
+    if energy is None:
+        why = numbers.why.get("energy", "")
+        return f'<div style="{_STYLE}">no elasticity: {escape(why)}</div>'
+    rows = [_head("deflection", "along", "about")]
+    moved = 1e6 * np.asarray(energy.deflection)
+    for k, axis in enumerate("xyz"):
+        rows.append(
+            _row(
+                axis,
+                _value(f"deflection_{k}", float(moved[k]), "um"),
+                _value(f"deflection_{k + 3}", float(moved[k + 3]), "urad"),
+            )
+        )
+    tie = " (tie)" if energy.tie else ""
+    shares = dict(zip(energy.elements, np.asarray(energy.factors).tolist(), strict=True))
+    return (
+        f'<div style="{_STYLE}">{_table(rows)}'
+        f"{_table([_row('strain energy', _value('energy', float(energy.total), 'J'))])}"
+        f'<div>dominant element <b id="dominant">{escape(str(energy.dominant))}</b>{tie}</div>'
+        f"{bars(shares)}</div>"
+    )
+
+
+def bars(shares: Mapping[str, float]) -> str:
+    """Elements by their share, the greatest first, in the colours of the scene."""
+    colours = share_colours(shares)
+    order = sorted(colours, key=lambda name: -shares[name])
+    rows = []
+    for k, name in enumerate(order[:SHOWN]):
+        part = 100 * shares[name]
+        width = 100 * shares[name] / shares[order[0]]
+        bar = (
+            f'<div style="height:0.75em;width:{width:.1f}%;border-radius:2px;'
+            f'background:rgb{colours[name]}"></div>'
+        )
+        cells = (
+            f'<td style="white-space:nowrap">{escape(name)}</td>'
+            f'<td style="width:55%;padding:0 0.5em">{bar}</td>'
+            f'<td style="text-align:right"><span id="share_{k}">{part:.1f}</span>&nbsp;%</td>'
+        )
+        rows.append(f"<tr>{cells}</tr>")
+    rest = 100 * sum(shares[name] for name in order[SHOWN:])
+    more = f"<div>{len(order) - SHOWN} others: {rest:.1f} %</div>" if order[SHOWN:] else ""
+    return _table(rows) + more
+
+
+def instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
+    """The bag at one time: measured effort, the twin's, and the residual of every joint."""
+    rows = [_head("joint", "measured", "twin", "residual")]
+    columns = (("measured", at.measured), ("twin", at.twin), ("residual", at.residual))
+    for k, name in enumerate(robot.joint_names):
+        unit = robot.effort_units[k]
+        cells = [
+            _value(f"bag_{what}_{k}", None if v is None else float(v[k]), unit)
+            for what, v in columns
+        ]
+        rows.append(_row(escape(name), *cells))
+    why = f"<div>no torques: {escape(timeline.why)}</div>" if timeline.why else ""
+    time = _row("time", _value("bag_time", at.time, "s"))
+    return f'<div style="{_STYLE}">{_table([time])}{_table(rows)}{why}</div>'
+
+
+def heard(robot: Robot, live: Heard, waiting: str) -> str:
+    """What running nodes say: the latest torque and residual, the dominant element, refusals."""
+    rows = [_head("joint", "torque", "residual")]
+    for k, name in enumerate(robot.joint_names):
+        cells = []
+        for what in ("torque", "residual"):
+            trace = live.traces.get(what)
+            value = None if trace is None else float(trace[1][-1, k])
+            cells.append(_value(f"live_{what}_{k}", value, robot.effort_units[k]))
+        rows.append(_row(escape(name), *cells))
+    text = ""
+    if waiting:
+        text += f'<div id="waiting">waiting for {escape(waiting)}</div>'
+    if live.refused:
+        text += (
+            f'<div style="color:{GRADES["bad"]}">{live.refused} messages refused, the last: '
+            f"{escape(live.reason)}</div>"
+        )
+    if live.dominant:
+        text += f'<div>dominant element <b id="live_dominant">{escape(live.dominant)}</b></div>'
+    return f'<div style="{_STYLE}">{_table(rows)}{text}{bars(live.shares)}</div>'
+
+
+def _judged(key: str, what: str, value: float | None, unit: str, grade: Grade, hint: str) -> str:
+    # Text and colour both say it: not everybody sees the colour.
+    words = {"good": "", "warn": " low", "bad": " too low"}[grade]
+    cell = _value(key, value, unit, GRADES[grade], bold=True)
+    if value is None:
+        words = " not known"
+    note = f'<span style="color:{GRADES[grade]}">{words}</span>' if words else ""
+    return _row(f'<span title="{escape(hint)}">{what}</span>', cell + note)
+
+
+def _value(
+    key: str, value: float | None, unit: str, colour: str = "inherit", bold: bool = False
+) -> str:
+    if value is None:
+        return f'<span id="{key}">{_MISSING}</span>'
+    weight = ";font-weight:700" if bold else ""
+    shown = f'<span id="{key}" style="color:{colour}{weight}">{number(value)}</span>'
+    return f"{shown}&nbsp;{escape(unit)}" if unit else shown
+
+
+def _row(first: str, *cells: str) -> str:
+    rest = "".join(f'<td style="text-align:right">{cell}</td>' for cell in cells)
+    return f'<tr><td style="padding-right:0.5em">{first}</td>{rest}</tr>'
+
+
+def _head(first: str, *cells: str) -> str:
+    style = "font-weight:500;opacity:0.65"
+    rest = "".join(f'<th style="text-align:right;{style}">{cell}</th>' for cell in cells)
+    return f'<tr><th style="text-align:left;{style}">{first}</th>{rest}</tr>'
+
+
+def _table(rows: Iterable[str]) -> str:
+    return (
+        '<table style="width:100%;border-collapse:collapse;font-variant-numeric:tabular-nums">'
+        f"{''.join(rows)}</table>"
+    )

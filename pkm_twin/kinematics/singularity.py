@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far a machine is from a singularity of any kind: 0 in one, 1 at best.
+
+The lesser of two numbers. Bodies move by (v, L omega): v of the middle of a body's joints, L how
+far the farthest of them is from it, the platform's rim at least; of the platform by its reference
+point and rim. Closures err in lengths, angles times the rim. Hence no unit counts, and no scale.
+
+**Held**: the actuated joints are locked, and a closure errs by one. A = d(closures)/d(rates), k
+rates and r closures of which some may be redundant, B = d(bodies)/d(rates), all bodies':
+
+    held = (k / 2 sqrt(r)) / |B A+|,   |.|^2 the sum of squares,   |B A+|^2 = tr((A'A)^-1 B'B)
+
+An error of one needs motion of at least a half on each side of it, hence the bound of 1. It is zero
+where anything moves although the actuators are locked: where they lose the platform, and in every
+constraint singularity, of platform, limbs or bodies between. Here closures are all that holds in
+truth: of a parallelogram also the couple that a pair of rods passes.
+
+**Moved**: the platform's twist per joint rate T, shape (6, n), of all bodies' motion D:
+
+    moved = sqrt(n) / |D T+|,          |D T+|^2 = tr((T'T)^-1 D'D)
+
+The platform is one of the bodies, hence the bound of 1. It is zero where joints move and the
+platform does not: at the edge of reach.
+
+May import: numpy, pkm_twin's machine and codegen, this package.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+
+from pkm_twin.codegen.cholesky import trace_over
+from pkm_twin.codegen.expressions import Objects, minimum, sqrt
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics.engine import Engine, Traced
+from pkm_twin.kinematics.motion import Columns, Motion, Row, cross, difference
+from pkm_twin.machine.graph import BASE, Array, Graph, Rod
+from pkm_twin.machine.tree import Tree
+
+
+def singularity_kernel(engine: Engine) -> Kernel:
+    """The compiled program, q to the measure (1)."""
+    return engine.kernel("singularity", _singularity)
+
+
+class Placed(Motion):
+    """A tree of its own, with the places that another motion of the same bodies has found.
+
+    It has the freedoms of all that holds in truth: joints that stand for other parts are left out.
+    """
+
+    def __init__(self, motion: Motion) -> None:
+        graph = motion.graph
+        true = {name: joint for name, joint in graph.joints.items() if not joint.given}
+        self.graph: Graph = replace(graph, joints=true)
+        self.tree = Tree(self.graph)
+        self._found = motion
+        self.origin: dict[str, Any] = {BASE: np.zeros(3)}
+        self.axis: dict[int, Any] = {}
+        for link in self.tree.links.values():
+            self.origin[link.body] = motion.point(link.body, self.tree.at[link.body])
+            for step in link.steps:
+                if step.kind in "RP":
+                    # A universal joint's second axis is fixed in the body beyond it.
+                    last = self.graph.joints[str(link.joint)].kind == "universal"
+                    body = link.body if last and step is link.steps[-1] else link.parent
+                    self.axis[id(step)] = motion.direction(body, step.axis)
+
+    def point(self, body: str, point: Array) -> Any:
+        """Where a point of a body is."""
+        return self._found.point(body, point)
+
+    def direction(self, body: str, vector: Array) -> Any:
+        """Where a vector of a body points."""
+        return self._found.direction(body, vector)
+
+    def closures(self) -> list[Row]:
+        """The equations of all cut joints and rods, and the couples of pairs of rods."""
+        pairs = [self._couple(rod) for rod in self.graph.rods.values() if rod.pair is not None]
+        return [*super().closures(), *pairs]
+
+    def _couple(self, rod: Rod) -> Row:
+        """Both rods of a pair keep their lengths: no turn about their plane's normal, t x w."""
+        a, b, (start, end) = rod.inner, rod.outer, rod.ends
+        xa, xb = self.point(a, start), self.point(b, end)
+        length = float(np.linalg.norm(end - start))
+        normal = cross(self.direction(b, np.asarray(rod.pair)), (xb - xa) * (1.0 / length))
+        columns = difference(self.turn_columns(b), self.turn_columns(a))
+
+        def bias() -> Any:
+            raise NotImplementedError("a couple is looked at where it holds")
+
+        return Row(
+            rod.name, 0.0, {k: c @ normal for k, c in columns.items()}, bias, 1.0, a, b, xb,
+            np.zeros(3), normal, angle=True,
+        )  # fmt: skip
+
+
+def _singularity(t: Traced) -> Program:
+    t.solve()
+    outputs = {"measure": [t.tape.lift(singularity_measure(t))]}
+    return Program({"q": t.joints}, 0, outputs, t.equations())
+
+
+def singularity_measure(t: Traced) -> Any:
+    """The measure of a solved motion, to write other programs with; rates are overwritten."""
+    return minimum(_held(t), _moved(t))
+
+
+def _held(t: Traced) -> Any:
+    placed = Placed(t.motion)
+    unknown = placed.tree.unknown_rates
+    if not unknown:
+        return 1.0
+    rows = placed.closures()
+    rim, size = placed.graph.rim, placed.tree.size
+    errors = [
+        {k: v * (rim if row.angle else row.scale * size) for k, v in row.columns.items()}
+        for row in rows
+    ]
+    bodies = []
+    for name in placed.graph.bodies:
+        middle, reach = _frame(placed.graph, name)
+        linear = placed.point_columns(name, placed.point(name, middle))
+        turning = placed.turn_columns(name)
+        bodies += [{k: v[i] for k, v in linear.items()} for i in range(3)]
+        bodies += [{k: reach * v[i] for k, v in turning.items()} for i in range(3)]
+    response = trace_over(_gram(bodies, unknown), _gram(errors, unknown))
+    return minimum(1.0, 0.5 * unknown / np.sqrt(len(rows)) / sqrt(response))
+
+
+def _moved(t: Traced) -> Any:
+    n, graph = t.joints, t.engine.graph
+    platform: list[Columns] = []
+    bodies: list[Columns] = []
+    table: dict[str, list[Objects]] = {name: [] for name in graph.bodies}
+    for j, u in enumerate(t.rate_columns()):
+        t.motion.set_rates(u, np.eye(n)[j])
+        for name in graph.bodies:
+            middle, reach = _frame(graph, name)
+            velocity = t.motion.velocity(name, middle)
+            table[name].append(np.array([*velocity, *(reach * t.motion.omega[name])], object))
+    for name, columns in table.items():
+        rows = [{("u", j): columns[j][i] for j in range(n)} for i in range(6)]
+        bodies += rows
+        if name == graph.platform:
+            platform = rows
+    response = trace_over(_gram(bodies, n), _gram(platform, n))
+    return np.sqrt(n) / sqrt(response)
+
+
+def _frame(graph: Graph, body: str) -> tuple[Array, float]:
+    """The point of a body at home whose velocity counts, and the length of its turning, m."""
+    if body == graph.platform:
+        return graph.origin, graph.rim
+    points = np.array(graph.joint_points(body))
+    middle = points.mean(0)
+    return middle, max(graph.rim, float(np.linalg.norm(points - middle, axis=-1).max()))
+
+
+def _gram(rows: list[Columns], size: int) -> Objects:
+    """Sum over rows of the products of their entries of unknown rates, shape (size, size)."""
+    table = np.zeros((size, size), dtype=object)
+    for row in rows:
+        entries = [(k, value) for (kind, k), value in row.items() if kind == "u"]
+        for (i, a), (j, b) in combinations_with_replacement(entries, 2):
+            table[i, j] = table[i, j] + a * b
+            if i != j:
+                table[j, i] = table[i, j]
+    return table

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot's file with some numbers changed in place: its comments and its layout stay.
+
+May import: yaml, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.catalogue import TREES, robot_path
+from pkm_twin.machine.entries import given, has_entry, keys_of
+from pkm_twin.machine.machine_yaml import describe_machine_yaml
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.yaml_edit import edit_yaml
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A new number of a file, its standard deviation in the same unit, and where it is from."""
+
+    value: float
+    deviation: float
+    unit: str
+    source: str
+
+    @property
+    def comment(self) -> str:
+        """What stands above the number."""
+        unit = f" {self.unit}" if self.unit else ""
+        return f"+- {self.deviation:.2g}{unit} (standard deviation), {self.source}"
+
+
+def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted]) -> str:
+    """The text of a robot's file with other numbers, each with its comment.
+
+    Where the file writes a number once for several limbs, or is no YAML, the text is a new one with
+    every body, joint and rod written out.
+
+    :param source: the name or path that the robot was loaded by.
+    :param values: by dotted path, of :func:`pkm_twin.machine.entries.entries`; of ``joint_map``
+        also such as the file does not have yet.
+    :raises ParameterError: a path that no such file can have.
+    """
+    path = robot_path(source)
+    text = "" if path.suffix in TREES else path.read_text(encoding="utf-8")
+    data: Any = yaml.safe_load(text)
+    plain = [name for name in values if not name.startswith("joint_map.")]
+    if not all(has_entry(data, name) for name in plain):
+        sections = given(robot.parameter_sections())
+        told = {k: v for k, v in sections.items() if v or not isinstance(v, Mapping)}
+        text = describe_machine_yaml({"mechanism": robot.mechanism, **told})
+    keys = {name: tuple(keys_of(name)) for name in values}
+    return edit_yaml(
+        text,
+        {keys[name]: fit.value for name, fit in values.items()},
+        {keys[name]: f"{name}: {fit.comment}" for name, fit in values.items()},
+    )
+
+
+def write_edited(path: Path, head: Sequence[str], text: str) -> None:
+    """Write a file with lines of comment at its head, whole or not at all.
+
+    :raises ParameterError: not writable.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text("".join(f"# {line}\n" for line in head) + text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise ParameterError(str(path), error.strerror, "a file that can be written") from None

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a machine looks like: bars and faces between points of its bodies, all given at home.
+
+The one source of every picture: drawings, URDF visuals, the page of ``pkm-twin view``.
+
+May import: numpy, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pkm_twin.machine.graph import BASE, Graph, Joint
+from pkm_twin.machine.members import Place
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+BAR: Final = 0.01
+"""Radius of the bars that stand for bodies, per size of the machine; of rods the half."""
+_FLAT: Final = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Bar:
+    """A straight round bar: ``part`` is the body or rod that it is of, ``radius`` in m.
+
+    ``element``: its name among the elements of strain energy; empty where it is none of them.
+    """
+
+    part: str
+    start: Place
+    end: Place
+    radius: float
+    element: str = ""
+
+
+class Posture:
+    """Where points of bodies stand in one joint state, shape (n,); errors as ``forward``."""
+
+    def __init__(self, robot: Robot, q: ArrayLike) -> None:
+        rotations, origins = robot.placements(q)
+        at = robot.engine.tree.at
+        self.rotations = {BASE: np.eye(3)} | rotations
+        self._shifts = {BASE: np.zeros(3)} | {
+            name: origins[name] - rotations[name] @ at[name] for name in rotations
+        }
+
+    def place(self, body: str, point: Array) -> Array:
+        """A point of a body, given at home, (3,) m: where it is now."""
+        return np.asarray(self.rotations[body] @ point + self._shifts[body], np.float64)
+
+
+def telescope(joint: Joint) -> bool:
+    """Whether a joint slides a ram in a tube that itself moves: their lengths are not known."""
+    return joint.kind == "prismatic" and joint.inner != BASE and joint.home != 0.0
+
+
+def body_points(graph: Graph) -> dict[str, list[Array]]:
+    """Points of each body's joints and rods at home, the base's too, shape (3,) each.
+
+    The platform's first one is its reference point.
+    """
+    points: dict[str, list[Array]] = {name: [] for name in (BASE, *graph.bodies)}
+    points[graph.platform].append(graph.origin)
+    for joint in graph.joints.values():
+        if joint.kind == "translation":  # it has no place
+            continue
+        inner = outer = joint.at
+        if telescope(joint):
+            # A tube of half the length at home; the ram begins amid it and stays in it.
+            inner = joint.at + joint.home * joint.axes[0] / 2
+            outer = joint.at + joint.home * joint.axes[0] / 4
+            points[joint.inner].append(joint.at)
+        points[joint.inner].append(inner)
+        points[joint.outer].append(outer)
+    for rod in graph.rods.values():
+        for name, end in zip((rod.inner, rod.outer), rod.ends, strict=True):
+            points[name].append(end)
+    return points
+
+
+def bars(graph: Graph) -> tuple[Bar, ...]:
+    """Rods, both of a pair; a body as bars from one of its points to the others."""
+    radius = BAR * graph.size
+    result = []
+    for body, found in body_points(graph).items():
+        if body == BASE:
+            continue
+        # A body with one joint reaches from there to its centre of mass: else nothing is seen.
+        if not _apart(found, radius) and graph.bodies[body].mass > 0.0:
+            found = [*found[:1], graph.bodies[body].com]
+        result += [
+            Bar(body, (body, found[0]), (body, point), radius) for point in _others(found, radius)
+        ]
+    for rod in graph.rods.values():
+        for shift in (0.0,) if rod.pair is None else (-rod.width / 2, rod.width / 2):
+            ends = rod.ends if rod.pair is None else rod.ends + shift * rod.pair
+            result.append(Bar(rod.name, (rod.inner, ends[0]), (rod.outer, ends[1]), radius / 2))
+    return tuple(result)
+
+
+def robot_bars(robot: Robot) -> tuple[Bar, ...]:
+    """The same with what the robot's file knows: members with their diameters, rails' lengths."""
+    known = {part for beam in robot.beams for part in (*beam.parts, *beam.carries)}
+    members = [
+        Bar(beam.parts[0], beam.inner, beam.outer, beam.radius, beam.element)
+        for beam in robot.beams
+    ]
+    rest = [bar for bar in bars(robot.graph) if bar.part not in known]
+    return (*members, *rest, *_rails(robot))
+
+
+def face(points: Sequence[Array]) -> Array:
+    """Corners of a plate through points, in their order around it, shape (k, 3).
+
+    Empty where fewer than three are given or they stand on one line.
+    """
+    corners = np.array(points).reshape(-1, 3)
+    if len(corners) < 3:
+        return np.zeros((0, 3))
+    middle = corners.mean(0)
+    spans, axes = np.linalg.svd(corners - middle)[1:]
+    if not spans[1] > _FLAT * spans[0]:
+        return np.zeros((0, 3))
+    flat = (corners - middle) @ axes[:2].T
+    return np.asarray(corners[np.argsort(np.arctan2(flat[:, 1], flat[:, 0]))], np.float64)
+
+
+def base_face(graph: Graph) -> Array:
+    """Corners of the plate that the base's joints stand on; slides stand on rails instead."""
+    found = [p for j in graph.joints.values() if j.kind in _STANDING for p in _on(j, BASE)]
+    return face(found)
+
+
+def platform_face(graph: Graph) -> Array:
+    """Corners of the platform: its joints and rods' ends."""
+    return face(body_points(graph)[graph.platform][1:])
+
+
+_STANDING: Final = ("revolute", "universal", "spherical", "cylindrical", "fixed")
+
+
+def _on(joint: Joint, body: str) -> tuple[Array, ...]:
+    return (joint.at,) if body in (joint.inner, joint.outer) else ()
+
+
+def _others(points: Sequence[Array], radius: float) -> list[Array]:
+    return [p for p in points[1:] if float(np.linalg.norm(p - points[0])) > radius]
+
+
+def _apart(points: Sequence[Array], radius: float) -> bool:
+    return bool(points) and bool(_others(points, radius))
+
+
+def _rails(robot: Robot) -> Iterable[Bar]:
+    """What slides on the base run on, from limit to limit."""
+    graph, limits = robot.graph, robot.limits.position
+    if limits is None:
+        return
+    for k, name in enumerate(graph.actuated):
+        joint = graph.joints[name]
+        if joint.kind == "prismatic" and joint.inner == BASE and np.isfinite(limits[k]).all():
+            low, high = (joint.at + (q - joint.home) * joint.axes[0] for q in limits[k])
+            yield Bar(BASE, (BASE, low), (BASE, high), BAR * graph.size / 2)

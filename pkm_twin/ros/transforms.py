@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Transforms of other nodes, where tf2 is installed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rclpy.time import Time
+
+from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.machine import rotations
+from pkm_twin.streams.wrench import Mount
+
+if TYPE_CHECKING:
+    from pkm_twin.ros.node import TwinNode
+
+
+class TransformMounts:
+    """Where a frame stands on the platform, from ``/tf`` and ``/tf_static``.
+
+    :raises ParameterError: tf2_ros is not installed.
+    """
+
+    def __init__(self, node: TwinNode, platform_frame: str) -> None:
+        try:
+            tf2 = __import__("tf2_ros")
+        except ImportError as error:
+            raise ParameterError("use_tf", True, f"false without tf2_ros ({error})") from error
+        self._platform = platform_frame
+        self._failure = tf2.TransformException
+        self._buffer: Any = tf2.Buffer()
+        self._listener = tf2.TransformListener(self._buffer, node)
+
+    def __call__(self, frame: str, stamp: int) -> Mount:
+        """The frame on the platform at a stamp, ns.
+
+        :raises MessageError: no transform between the two is known for that time.
+        """
+        try:
+            found = self._buffer.lookup_transform(self._platform, frame, Time(nanoseconds=stamp))
+        except self._failure as error:
+            text = f"no transform from {frame!r} to {self._platform!r}: {error}"
+            raise MessageError("transform", text) from error
+        move, turn = found.transform.translation, found.transform.rotation
+        position = np.array([move.x, move.y, move.z])
+        return Mount(position, rotations.from_quaternion(turn.x, turn.y, turn.z, turn.w))

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node ``machine_state``: joint states in; all joints, the platform's motion, markers out."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
+from rclpy.duration import Duration
+from rclpy.parameter import Parameter
+from rclpy.time import Time
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
+
+from pkm_twin import load
+from pkm_twin.bags.cdr import message_definition
+from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.machine import rotations
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.robot_urdf import robot_urdf
+from pkm_twin.ros import node as health
+from pkm_twin.ros.intake import JointStateDecoder
+from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench, triple
+from pkm_twin.state import outputs
+from pkm_twin.state.scene import Load, Scales, Scene
+from pkm_twin.state.state import MachineState, State
+from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
+from stiffness_monitor.compliance import compliance, kernels, strain_energy
+from stiffness_monitor.statics import frame_deflections
+
+LIFETIME = 1.0
+"""How long what a load does is drawn after the last marker, s."""
+
+
+class MachineStateNode(health.TwinNode):
+    """What others need to see the machine: rviz2, Foxglove, robot_state_publisher, plots."""
+
+    def __init__(self) -> None:
+        super().__init__("machine_state")
+        robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
+        settings = self._declare_settings()
+        self._frames = {
+            "platform": self._declare_frame("platform_frame", PLATFORM, "on the reference point"),
+            "tool": self._declare_frame("tool_frame", "tool0", "of the tool"),
+        }
+        self._tool = Mount.of(
+            triple(self, "tool.xyz", "the tool from the platform's reference point", "m"),
+            triple(self, "tool.rpy", "roll, pitch and yaw of the tool in the platform", "rad"),
+        )
+        mounts = declare_mounts(self, self._frames["platform"])
+        self._core = MachineState(robot, settings, mounts)
+        self._scene = Scene(robot, self._declare_scales())
+        self._elastic = _is_elastic(robot)
+        _warm_up(robot)
+        self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
+        self._joints = self.create_guarded_publisher(JointState, "~/joint_states")
+        self._pose = self.create_guarded_publisher(PoseStamped, "~/pose")
+        self._twist = self.create_guarded_publisher(TwistStamped, "~/twist")
+        self._description = self.create_guarded_publisher(String, "robot_description", latched=True)
+        self._urdf = robot_urdf(robot)
+        self._transforms = self._create_transforms()
+        self._transforms_due = 0
+        self._drawn = 0
+        """Stamp of the state that was drawn last."""
+        self._create_markers()
+        self.create_guarded_subscription(
+            JointState, "joint_states", self._on_joint_state, raw=True, awaited=True
+        )
+        self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
+        self._pending: WrenchSettings | None = None
+        self.add_on_set_parameters_callback(self._on_set)
+        self.add_post_set_parameters_callback(self._after_set)
+        self.start()
+
+    def summary(self) -> str:
+        """One line that says what the node runs."""
+        robot = self._core.robot
+        members = "elastic" if self._elastic else "rigid"
+        transforms = "" if self._transforms else "; no transforms"
+        return (
+            f"robot {robot.name} ({robot.mechanism}), joints {', '.join(robot.joint_names)} and "
+            f"{len(robot.passive_joints)} passive, {members} members{transforms}"
+        )
+
+    def time_jumped_backward(self) -> None:
+        """No state across the seam."""
+        self._core.reset()
+        self._transforms_due = self._drawn = 0
+
+    def activated(self) -> None:
+        """What does not change is told once; nothing from before is."""
+        self.time_jumped_backward()
+        self._description.publish(String(data=self._urdf))
+        if self._transforms is not None:
+            self._transforms.send_tool(self.now())
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Level, message and values of the node's diagnostic status."""
+        core = self._core
+        level, message = health.OK, "running"
+        if core.last_reject:
+            level, message = health.WARN, f"last reject: {core.last_reject}"
+        values: dict[str, object] = {
+            "robot": core.robot.name,
+            "joint states answered": core.states.accepted,
+            "wrenches taken": core.wrenches.accepted,
+            "older stamps dropped": core.dropped,
+            "velocities": "" if core.latest is None else str(core.latest.twist is not None).lower(),
+        }
+        values |= {f"joint states rejected: {k}": v for k, v in core.states.rejected.items()}
+        values |= {f"wrenches rejected: {k}": v for k, v in core.wrenches.rejected.items()}
+        return level, message, values
+
+    def _declare_frame(self, name: str, default: str, text: str) -> str:
+        frame: str = self.declare(name, default, f"frame {text}", read_only=True)
+        if not frame:
+            raise ParameterError(name, frame, "a frame's name")
+        return frame
+
+    def _declare_settings(self) -> WrenchSettings:
+        d = WrenchSettings()
+        return declare_wrench(
+            self,
+            base_frame=self._declare_frame("base_frame", d.base_frame, "that is fixed"),
+            max_state_age=self.declare(
+                "max_state_age", d.max_state_age, "from a joint state to the nearest wrench",
+                **SECONDS,
+            ),
+            future_tolerance=self.declare(
+                "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
+                **SECONDS,
+            ),
+            accept_zero_stamp=self.declare(
+                "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
+            ),
+        )  # fmt: skip
+
+    def _declare_scales(self) -> Scales:
+        d = Scales()
+        large: dict[str, Any] = {"low": 0.0, "high": 1e9, "read_only": True}
+        return Scales(
+            self.declare(
+                "deflection_scale", d.deflection, "how many times deflections are enlarged", **large
+            ),
+            self.declare("force_scale", d.force, "length of a force", unit="m/N", **large),
+            self.declare("moment_scale", d.moment, "length of a moment", unit="m/(N m)", **large),
+            self.declare(
+                "ellipsoid_force", d.ellipsoid_force,
+                "force whose deflections the compliance ellipsoid shows", unit="N", **large,
+            ),
+        )  # fmt: skip
+
+    def _create_transforms(self) -> outputs.Transforms | None:
+        """Publishers of ``/tf`` and ``/tf_static``, where they are asked for and tf2 is there."""
+        wanted = self.declare(
+            "publish_tf",
+            "all",
+            "base to platform and platform to tool, the tool alone (robot_state_publisher has the "
+            "platform), or none",
+            choices=("all", "tool", "none"),
+            read_only=True,
+        )
+        rate = self.declare(
+            "tf_rate", 100.0, "of base to platform at most", unit="Hz", low=0.1, high=1e4,
+            read_only=True,
+        )  # fmt: skip
+        self._transforms_period = round(SECOND / rate)
+        if wanted == "none":
+            return None
+        try:
+            return outputs.Transforms(
+                self, self._core.settings.base_frame, self._frames, self._tool, wanted == "all"
+            )
+        except ImportError as error:
+            self.get_logger().warning(f"no transforms are published without tf2_msgs ({error})")
+            return None
+
+    def _create_markers(self) -> None:
+        rate = self.declare(
+            "markers_rate", 20.0, "of ~/markers at most, 0: none", unit="Hz", low=0.0, high=1000.0,
+            read_only=True,
+        )  # fmt: skip
+        if rate > 0.0:
+            self._markers = self.create_guarded_publisher(MarkerArray, "~/markers")
+            self.create_guarded_timer(1.0 / rate, self._publish_markers)
+
+    def _on_set(self, changes: list[Parameter]) -> Any:
+        values = health.values_of(changes)
+
+        def check() -> None:
+            for name, value in values.items():
+                if self.has_parameter(name):
+                    self.check_parameter(name, value)
+            self._pending = changed(self._core.settings, values)
+
+        return health.verdict(check)
+
+    def _after_set(self, changes: list[Parameter]) -> None:
+        if self._pending is not None:
+            self._core.change_settings(self._pending)
+            self._pending = None
+
+    def _on_joint_state(self, data: bytes) -> None:
+        try:
+            message = self._decode(data)
+        except MessageError as error:
+            self._core.refuse_joint_state(error)
+            raise
+        state = self._core.joint_state(message, self.now())
+        stamp = Time(nanoseconds=state.stamp).to_msg()
+        base = self._core.settings.base_frame
+        quaternion = rotations.to_quaternion(state.rotation)
+        self._joints.publish(outputs.joint_state(stamp, self._core.joint_names, state.joints))
+        self._pose.publish(outputs.pose(stamp, base, state.position, quaternion))
+        if state.twist is not None:
+            self._twist.publish(outputs.twist(stamp, base, state.twist))
+        if self._transforms is None or not self._transforms.platform:
+            return
+        if abs(state.stamp - self._transforms_due) >= self._transforms_period:
+            self._transforms_due = state.stamp
+            self._transforms.send_platform(stamp, state.position, quaternion)
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        self._core.wrench(message, self.now())
+
+    def _publish_markers(self) -> None:
+        """Of the latest state: shapes are for the eye, and elasticity takes its milliseconds."""
+        state = self._core.latest
+        if not self.active or state is None or state.stamp == self._drawn:
+            return
+        self._drawn = state.stamp
+        shapes = self._scene.shapes(state, self._load(state))
+        base = self._core.settings.base_frame
+        stamp = Time(nanoseconds=state.stamp).to_msg()
+        lifetime = Duration(seconds=LIFETIME).to_msg()
+        self._markers.publish(outputs.markers(stamp, base, shapes, lifetime))
+
+    def _load(self, state: State) -> Load | None:
+        """What the wrench does to the machine, None where it is not known."""
+        wrench = self._core.load(state) if self._elastic else None
+        if wrench is None:
+            return None
+        robot = self._core.robot
+        try:
+            pose = robot.forward(state.q)
+            energy = strain_energy(robot, pose, wrench)
+            return Load(
+                wrench,
+                compliance(robot, pose),
+                energy.deflection,
+                dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
+                str(energy.dominant),
+                frame_deflections(robot, pose, wrench),
+            )
+        except (PkmTwinError, ValueError) as error:
+            self.log_throttled("load", f"~/markers: without the load: {error}")
+            return None
+
+
+def _is_elastic(robot: Robot) -> bool:
+    try:
+        for kernel in kernels(robot):
+            kernel.warm_up()
+    except ParameterError:
+        return False
+    return True
+
+
+def _warm_up(robot: Robot) -> None:
+    """Compile, or load, what a sample needs before there is a topic to be found by."""
+    q = robot.inverse(robot.home())
+    robot.platform(q)
+    robot.passive(q)
+    robot.platform_jacobian(q)
+    robot.placements(q)
+
+
+def main() -> None:
+    """Run the node until a signal ends it."""
+    sys.exit(health.run(MachineStateNode))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shapes of a machine and of what a load does to it, for whoever draws. Pure.
+
+Shapes are in base axes, m. What elasticity tells comes as numbers, from whoever computes them.
+May import: numpy, pkm_twin's core, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.machine import rotations
+from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.members import Place
+from pkm_twin.machine.outline import robot_bars
+from pkm_twin.machine.robot import Robot
+from pkm_twin.state.state import State
+
+Array = NDArray[np.float64]
+Kind = Literal["cylinder", "sphere", "arrow", "line", "text"]
+Colour = tuple[float, float, float, float]
+
+PLAIN: Final[Colour] = (0.55, 0.57, 0.60, 1.0)
+DEFLECTED: Final[Colour] = (0.84, 0.37, 0.0, 0.9)
+ELLIPSOID: Final[Colour] = (0.0, 0.45, 0.70, 0.25)
+FORCE: Final[Colour] = (0.80, 0.47, 0.65, 1.0)
+MOMENT: Final[Colour] = (0.94, 0.89, 0.26, 1.0)
+TEXT: Final[Colour] = (1.0, 1.0, 1.0, 1.0)
+COLD: Final = (0.0, 0.45, 0.70)
+WARM: Final = (0.94, 0.89, 0.26)
+HOT: Final = (0.84, 0.37, 0.0)
+"""Colours that are told apart with every kind of colour vision (Okabe and Ito 2008)."""
+LINE: Final = 0.004
+ARROW: Final = 0.012
+JOINT: Final = 0.02
+LETTER: Final = 0.06
+"""Widths and heights, per size of the machine."""
+
+
+@dataclass(frozen=True, eq=False)
+class Load:
+    """What a wrench does to the machine; base axes at the platform's reference point.
+
+    ``wrench`` (6,), N and N m; ``compliance`` (6, 6); ``deflection`` (6,), m and rad. ``factors``:
+    part of the strain energy by element. ``members``: by name points (k, 3) along a member, m, and
+    their displacements (k, 3), m.
+    """
+
+    wrench: Array
+    compliance: Array
+    deflection: Array
+    factors: Mapping[str, float]
+    dominant: str
+    members: Mapping[str, tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Scales:
+    """How what is small is drawn: ``deflection`` times as large, arrows in m per N and per N m.
+
+    ``ellipsoid_force``: the force whose deflections, in all directions, the ellipsoid shows, N.
+    """
+
+    deflection: float = 1000.0
+    force: float = 1e-3
+    moment: float = 1e-2
+    ellipsoid_force: float = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One thing to draw, as a visualization_msgs/Marker has it.
+
+    ``group`` and ``number`` tell it apart. ``position`` (3,), ``quaternion`` x y z w. ``size``: of
+    a cylinder (along z) or sphere its diameters and length, of an arrow the diameters of shaft and
+    head and the head's length, of a line its width, of a text its height last. ``points``: of a
+    line or an arrow, (k, 3). ``lasting``: drawn until it is drawn anew.
+    """
+
+    kind: Kind
+    group: str
+    number: int
+    colour: Colour
+    size: tuple[float, float, float]
+    position: Array = field(default_factory=lambda: np.zeros(3))
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    text: str = ""
+    lasting: bool = False
+
+
+def heat(share: float) -> Colour:
+    """Colour of a part from 0 to 1 of the greatest: blue, yellow, vermilion."""
+    part = min(1.0, max(0.0, share))
+    low, high, at = (COLD, WARM, 2.0 * part) if part < 0.5 else (WARM, HOT, 2.0 * part - 1.0)
+    r, g, b = (a + at * (z - a) for a, z in zip(low, high, strict=True))
+    return r, g, b, 1.0
+
+
+class Scene:
+    """Shapes of one robot."""
+
+    def __init__(self, robot: Robot, scales: Scales | None = None) -> None:
+        self.robot, self.scales = robot, scales or Scales()
+        self.bars = robot_bars(robot)
+        self._size = robot.graph.size
+        bodies = {bar.element for bar in self.bars}
+        self.joints = {
+            name: place for name, place in _joint_places(robot).items() if name not in bodies
+        }
+
+    def shapes(self, state: State, load: Load | None = None) -> list[Shape]:
+        """The machine, and beside it what the load does to it."""
+        places = self.placed(state.q)
+        shares = _shares(load)
+        shapes = self._bars(places, shares)
+        if load is None:
+            return shapes
+        shapes += self._joints(state.q, shares)
+        shapes += self._deflected(places, state, load)
+        shapes.append(self._ellipsoid(state, load))
+        shapes += self._arrows(state, load)
+        if load.dominant != "none":
+            shapes.append(self._text(state, load.dominant))
+        return shapes
+
+    def placed(self, q: Array) -> Array:
+        """Ends of all bars at joint positions (n,), shape (bars, 2, 3), m."""
+        ends = [end for bar in self.bars for end in (bar.start, bar.end)]
+        return self._points(q, ends).reshape(len(self.bars), 2, 3)
+
+    def _points(self, q: Array, places: Sequence[Place]) -> Array:
+        turned, origins = self.robot.placements(q)
+        at = self.robot.engine.tree.at
+        return np.array([
+            point if body == BASE else turned[body] @ (point - at[body]) + origins[body]
+            for body, point in places
+        ]).reshape(-1, 3)  # fmt: skip
+
+    def _bars(self, places: Array, shares: Mapping[str, float]) -> list[Shape]:
+        shapes = []
+        for k, (bar, (start, end)) in enumerate(zip(self.bars, places, strict=True)):
+            share = shares.get(bar.element)
+            colour = PLAIN if share is None else heat(share)
+            span = end - start
+            length = float(np.linalg.norm(span))
+            width = 2.0 * bar.radius
+            shapes.append(
+                Shape(
+                    "cylinder", "bars", k, colour, (width, width, length), (start + end) / 2.0,
+                    _along_z(span), text=bar.part, lasting=True,
+                )
+            )  # fmt: skip
+        return shapes
+
+    def _joints(self, q: Array, shares: Mapping[str, float]) -> list[Shape]:
+        """Elastic joints as balls."""
+        names = [name for name in self.joints if name in shares]
+        width = JOINT * self._size
+        points = self._points(q, [self.joints[name] for name in names])
+        return [
+            Shape("sphere", "joints", k, heat(shares[name]), (1.5 * width,) * 3, point, text=name)
+            for k, (name, point) in enumerate(zip(names, points, strict=True))
+        ]
+
+    def _deflected(self, places: Array, state: State, load: Load) -> list[Shape]:
+        """Members bent as the load bends them, and the platform moved, enlarged alike."""
+        scale, width = self.scales.deflection, (LINE * self._size, 0.0, 0.0)
+        lines = [(name, x + scale * u) for name, (x, u) in load.members.items()]
+        shift, turn = load.deflection[:3], load.deflection[3:]
+        for bar, ends in zip(self.bars, places, strict=True):
+            if bar.part == self.robot.graph.platform:
+                moved = shift + np.cross(turn, ends - state.position)
+                lines.append((bar.part, ends + scale * moved))
+        return [
+            Shape("line", "deflected", k, DEFLECTED, width, points=points, text=name)
+            for k, (name, points) in enumerate(lines)
+        ]
+
+    def _ellipsoid(self, state: State, load: Load) -> Shape:
+        """Deflections under a force of one size in all directions: semi-axes are those of C."""
+        values, axes = np.linalg.eigh(load.compliance[:3, :3])
+        if np.linalg.det(axes) < 0.0:
+            axes = -axes
+        reach = 2.0 * values * self.scales.ellipsoid_force * self.scales.deflection
+        x, y, z = reach.tolist()
+        turned = _quaternion(axes)
+        return Shape("sphere", "compliance", 0, ELLIPSOID, (x, y, z), state.position, turned)
+
+    def _arrows(self, state: State, load: Load) -> list[Shape]:
+        """Force and moment, from the reference point."""
+        shaft = ARROW * self._size
+        size = (shaft, 2.0 * shaft, 3.0 * shaft)
+        parts = (
+            (load.wrench[:3], self.scales.force, FORCE),
+            (load.wrench[3:], self.scales.moment, MOMENT),
+        )
+        return [
+            Shape(
+                "arrow", "wrench", k, colour, size,
+                points=np.array([state.position, state.position + scale * vector]),
+            )
+            for k, (vector, scale, colour) in enumerate(parts)
+            if vector.any()
+        ]  # fmt: skip
+
+    def _text(self, state: State, name: str) -> Shape:
+        height = LETTER * self._size
+        at = state.position + np.array([0.0, 0.0, 2.0 * height])
+        return Shape("text", "dominant", 0, TEXT, (0.0, 0.0, height), at, text=name)
+
+
+def _shares(load: Load | None) -> dict[str, float]:
+    """Each element's energy as part of the greatest one's; nothing without energy."""
+    factors = {} if load is None else load.factors
+    greatest = max(factors.values(), default=0.0)
+    return {name: value / greatest for name, value in factors.items()} if greatest > 0.0 else {}
+
+
+def _joint_places(robot: Robot) -> dict[str, Place]:
+    """Where each joint stands, by its name among the elements."""
+    places: dict[str, Place] = {}
+    for joint in robot.graph.joints.values():
+        if joint.kind != "translation":
+            places.setdefault(joint.label or joint.name, (joint.outer, joint.at))
+    for rod in robot.graph.rods.values():
+        for name, body, end in zip(rod.joint_names, (rod.inner, rod.outer), rod.ends, strict=True):
+            places.setdefault(name, (body, end))
+    return places
+
+
+def _along_z(span: Array) -> tuple[float, float, float, float]:
+    """A turn that takes z along a vector."""
+    length = float(np.linalg.norm(span))
+    if not length > 0.0:
+        return 0.0, 0.0, 0.0, 1.0
+    z = span / length
+    x = rotations.across(z)
+    return _quaternion(np.column_stack((x, np.cross(z, x), z)))
+
+
+def _quaternion(rotation: Array) -> tuple[float, float, float, float]:
+    x, y, z, w = rotations.to_quaternion(rotation).tolist()
+    return x, y, z, w

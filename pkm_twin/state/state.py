@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The core of ``machine_state``: joint states in, the whole machine's state out. Pure.
+
+May import: numpy, pkm_twin's core, messages, streams; never rclpy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import MessageError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import SECOND, JointReader, JointSample, WrenchSample, as_message_error
+from pkm_twin.streams.wrench import Mount, Mounts, Recent, WrenchReader, WrenchSettings, counting
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The machine at one stamp, ns; base axes.
+
+    ``q``: shape (n,). ``joints``: all joints of the exported URDF, actuated ones first, rad or m.
+    ``position`` (3,), ``rotation`` (3, 3): of the platform's reference point. ``twist``: velocity
+    of that point and angular velocity, shape (6,), m/s and rad/s; None without joint velocities.
+    """
+
+    stamp: int
+    q: Array
+    joints: Array
+    position: Array
+    rotation: Array
+    twist: Array | None
+
+
+@dataclass
+class MachineState:
+    """Answers joint states with the machine's state, and keeps wrenches to pair with it."""
+
+    robot: Robot
+    settings: WrenchSettings = field(default_factory=WrenchSettings)
+    mounts: Mounts | None = None
+
+    def __post_init__(self) -> None:
+        self.states = counting()
+        self.wrenches = counting()
+        self.dropped = 0
+        self.last_reject = ""
+        self.joint_names = (*self.robot.joint_names, *self.robot.passive_joints)
+        self.latest: State | None = None
+        self._reader = JointReader(self.robot)
+        self._recent: Recent[tuple[WrenchSample, Mount]] = Recent()
+        self.change_settings(self.settings)
+
+    def change_settings(self, settings: WrenchSettings) -> None:
+        """Answer by other settings from the next message on."""
+        self.settings = settings
+        self._rules = settings.stamp_rules
+        self._wrench_reader = WrenchReader(settings, self.mounts)
+
+    def reset(self) -> None:
+        """Forget the past, as when the clock jumps."""
+        self.latest = None
+        self._recent.clear()
+
+    def refuse_joint_state(self, error: MessageError) -> None:
+        """Count a joint state that is refused."""
+        self.states.reject(error.reason, str(error))
+        self.last_reject = str(error)
+
+    def joint_state(self, message: Any, now: int) -> State:
+        """The machine's state at a sensor_msgs/JointState.
+
+        :raises MessageError: the message is rejected, and counted.
+        """
+        try:
+            sample = self._reader.joint_state(message, now, self._rules)
+            if self.latest is not None and sample.stamp < self.latest.stamp:
+                self.dropped += 1
+                late = (self.latest.stamp - sample.stamp) / SECOND
+                raise MessageError("stamp order", f"the stamp is {late:.6f} s before the last")
+            state: State = as_message_error(self._state, sample)
+        except MessageError as error:
+            self.refuse_joint_state(error)
+            raise
+        self.states.accept()
+        self.latest = state
+        return state
+
+    def wrench(self, message: Any, now: int) -> None:
+        """Keep a geometry_msgs/WrenchStamped.
+
+        :raises MessageError: the message is rejected, and counted.
+        """
+        try:
+            sample, mount = self._wrench_reader.read(message, now)
+            self._recent.push(sample.stamp, (sample, mount))
+        except MessageError as error:
+            self.wrenches.reject(error.reason, str(error))
+            self.last_reject = str(error)
+            raise
+        self.wrenches.accept()
+
+    def load(self, state: State) -> Array | None:
+        """The wrench nearest to a state, base axes at the reference point, shape (6,).
+
+        None where none is within ``max_state_age``.
+        """
+        found = self._recent.nearest(state.stamp)
+        if found is None or abs(state.stamp - found[0]) > self.settings.max_state_age * SECOND:
+            return None
+        sample, mount = found[1]
+        return self._wrench_reader.at_reference(sample, mount, state.rotation)
+
+    def _state(self, sample: JointSample) -> State:
+        robot, q = self.robot, sample.q
+        position, rotation = robot.platform(q)
+        joints = np.concatenate((q, robot.passive(q)))
+        twist = None if sample.qd is None else robot.platform_jacobian(q) @ sample.qd
+        for values in (position, joints, *([] if twist is None else [twist])):
+            if not np.isfinite(values).all():
+                raise MessageError("non-finite result", "the model gave a value that is not finite")
+        return State(sample.stamp, q, joints, position, rotation, twist)

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A joint trajectory between its points, as joint_trajectory_controller goes it.
+
+May import: numpy, pkm_twin's core, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.ros.messages import Trajectory
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a path asks for at one time, shape (n,) each; effort zero where it has none."""
+
+    q: Array
+    qd: Array
+    effort: Array
+
+
+@dataclass(frozen=True)
+class JointPath:
+    """Points of a joint trajectory with polynomials between: as many derivatives as points have.
+
+    Of degree five with velocities and accelerations, three with velocities, else one. Efforts go
+    straight from point to point. Before the first point and behind the last they stand.
+    """
+
+    points: Trajectory
+
+    @property
+    def duration(self) -> float:
+        """Time of the last point, s."""
+        return float(self.points.times[-1])
+
+    def from_here(self, q: Array) -> JointPath:
+        """The path with where the machine stands as its beginning, unless it has one."""
+        p = self.points
+        if p.times[0] == 0.0:
+            return self
+
+        def begun(values: Array | None, first: Array) -> Array | None:
+            return None if values is None else np.vstack([first, values])
+
+        rest = np.zeros_like(q)
+        return JointPath(
+            dataclasses.replace(
+                p,
+                times=np.concatenate([[0.0], p.times]),
+                q=np.vstack([q, p.q]),
+                qd=begun(p.qd, rest),
+                qdd=begun(p.qdd, rest),
+                effort=None if p.effort is None else np.vstack([p.effort[:1], p.effort]),
+            )
+        )
+
+    def at(self, time: float) -> Wanted:
+        """What the path asks for ``time`` after its start, s."""
+        p = self.points
+        end = len(p.times) - 1
+        after = int(np.searchsorted(p.times, time, side="right"))
+        if after in (0, end + 1):
+            k = min(after, end)
+            effort = np.zeros_like(p.q[k]) if p.effort is None else p.effort[k]
+            return Wanted(p.q[k], np.zeros_like(p.q[k]), effort)
+        before = after - 1
+        span = float(p.times[after] - p.times[before])
+        t = (time - float(p.times[before])) / span
+        q, qd = _between(p, before, after, span, t)
+        if p.effort is None:
+            return Wanted(q, qd, np.zeros_like(q))
+        return Wanted(q, qd, (1.0 - t) * p.effort[before] + t * p.effort[after])
+
+
+def _between(p: Trajectory, a: int, b: int, span: float, t: float) -> tuple[Array, Array]:
+    """Position and velocity at the part t of the way from point a to b (Hermite's polynomials)."""
+    d = p.q[b] - p.q[a]
+    if p.qd is None:
+        return p.q[a] + t * d, d / span
+    u, v = p.qd[a] * span, p.qd[b] * span
+    if p.qdd is None:
+        c = [p.q[a], u, 3.0 * d - 2.0 * u - v, -2.0 * d + u + v]
+    else:
+        x, y = p.qdd[a] * span**2, p.qdd[b] * span**2
+        c = [
+            p.q[a],
+            u,
+            0.5 * x,
+            10.0 * d - 6.0 * u - 4.0 * v - 1.5 * x + 0.5 * y,
+            -15.0 * d + 8.0 * u + 7.0 * v + 1.5 * x - y,
+            6.0 * d - 3.0 * (u + v) - 0.5 * (x - y),
+        ]
+    q, slope = np.zeros_like(d), np.zeros_like(d)
+    for coefficient in reversed(c):
+        slope = slope * t + q
+        q = q * t + coefficient
+    return q, slope / span

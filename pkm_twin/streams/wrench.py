@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measured wrenches: where they are measured, and what they are at the platform's reference point.
+
+Pure: times are arguments. May import: numpy, pkm_twin's core, messages, this package.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.machine import rotations
+from pkm_twin.ros.messages import SECOND, StampRules, WrenchSample, read_wrench
+from pkm_twin.streams.monitor import StreamMonitor
+
+Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
+V = TypeVar("V")
+
+PLATFORM: Final = "platform"
+"""The platform's link in an exported URDF."""
+ZERO: Final = (0.0, 0.0, 0.0)
+MAX_OFFSET: Final = 100.0
+"""Farthest that a sensor may stand from the reference point, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """Where a wrench is measured, from the platform's reference point, in platform axes.
+
+    ``position``: shape (3,), m. ``rotation``: the sensor's axes as columns, shape (3, 3).
+    """
+
+    position: Array
+    rotation: Array
+
+    @classmethod
+    def of(cls, xyz: Triple, rpy: Triple) -> Mount:
+        """From numbers as a URDF's origin has them, m and rad."""
+        return cls(np.array(xyz), rotations.from_rpy(np.array(rpy)))
+
+
+Mounts = Callable[[str, int], Mount]
+"""The mount of a frame at a stamp, ns; raises MessageError where it is not known."""
+
+
+@dataclass(frozen=True)
+class WrenchSettings:
+    """Which wrenches are taken, and where they are measured.
+
+    ``sensor_xyz``, ``sensor_rpy``: the fixed :class:`Mount`, m and rad.
+    """
+
+    wrench_frame: str = PLATFORM
+    base_frame: str = "base_link"
+    accept_empty_frame: bool = False
+    max_state_age: float = 0.1
+    future_tolerance: float = 0.1
+    accept_zero_stamp: bool = False
+    sensor_xyz: Triple = ZERO
+    sensor_rpy: Triple = ZERO
+
+    def __post_init__(self) -> None:
+        bounds = {"sensor.xyz": MAX_OFFSET, "sensor.rpy": 4.0 * math.pi}
+        for name, values in (("sensor.xyz", self.sensor_xyz), ("sensor.rpy", self.sensor_rpy)):
+            bound = bounds[name]
+            if len(values) != 3 or not all(abs(value) <= bound for value in values):
+                raise ParameterError(name, list(values), f"3 numbers from {-bound:g} to {bound:g}")
+        if self.wrench_frame == self.base_frame and any(self.sensor_rpy):
+            raise ParameterError(
+                "sensor.rpy",
+                list(self.sensor_rpy),
+                f"zeros where wrench_frame is base_frame, {self.base_frame!r}",
+            )
+
+    @property
+    def platform_frame(self) -> str:
+        """The frame that turns with the platform, as far as the wrench tells it."""
+        moved = any(self.sensor_xyz) or any(self.sensor_rpy)
+        return PLATFORM if moved or self.wrench_frame == self.base_frame else self.wrench_frame
+
+    @property
+    def stamp_rules(self) -> StampRules:
+        """What stamps have to keep to."""
+        return StampRules(self.accept_zero_stamp, round(self.future_tolerance * SECOND))
+
+
+@dataclass
+class WrenchReader:
+    """Reads wrenches and moves them to the platform's reference point.
+
+    ``mounts``: tells where a frame stands; None is the settings' fixed mount.
+    """
+
+    settings: WrenchSettings
+    mounts: Mounts | None = None
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        self._rules = s.stamp_rules
+        self._fixed = Mount.of(s.sensor_xyz, s.sensor_rpy)
+
+    def read(self, message: Any, now: int) -> tuple[WrenchSample, Mount]:
+        """A geometry_msgs/WrenchStamped as it came, and where it was measured.
+
+        :raises MessageError: it is refused.
+        """
+        s = self.settings
+        sample = read_wrench(message, now, self._rules, s.wrench_frame, s.accept_empty_frame)
+        if self.mounts is None or sample.frame in (s.base_frame, PLATFORM):
+            return sample, self._fixed
+        return sample, self.mounts(sample.frame, sample.stamp)
+
+    def at_reference(self, sample: WrenchSample, mount: Mount, rotation: Array) -> Array:
+        """The wrench at the platform's reference point, base axes, shape (6,), N and N m.
+
+        With the sensor's axes S and place p in the platform's axes, and the platform's rotation R:
+        f = R S f_s, m = R S m_s + (R p) x f (Murray, Li and Sastry 1994, equation 2.66). One in the
+        base frame has base axes already.
+
+        :param rotation: platform axes as columns, shape (3, 3).
+        """
+        force, moment = sample.wrench[:3], sample.wrench[3:]
+        if sample.frame != self.settings.base_frame:
+            axes = rotation @ mount.rotation
+            force, moment = axes @ force, axes @ moment
+        if mount.position.any():
+            moment = moment + np.cross(rotation @ mount.position, force)
+        return np.concatenate((force, moment))
+
+
+@dataclass
+class Recent(Generic[V]):
+    """The newest values of a stream whose stamps do not fall, by stamp, ns."""
+
+    length: int = 256
+    items: deque[tuple[int, V]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.items = deque(maxlen=self.length)
+
+    @property
+    def latest(self) -> tuple[int, V] | None:
+        """The newest one, None before the first."""
+        return self.items[-1] if self.items else None
+
+    def push(self, stamp: int, value: V) -> None:
+        """Add one that is not older than the last.
+
+        :raises MessageError: it is older.
+        """
+        if self.items and stamp < self.items[-1][0]:
+            late = (self.items[-1][0] - stamp) / SECOND
+            raise MessageError("stamp order", f"the stamp is {late:.6f} s before the last")
+        self.items.append((stamp, value))
+
+    def nearest(self, stamp: int) -> tuple[int, V] | None:
+        """The one nearest in time, the older of two; None before the first."""
+        best: tuple[int, V] | None = None
+        for item in reversed(self.items):
+            if best is not None and abs(stamp - item[0]) > abs(stamp - best[0]):
+                break
+            best = item
+        return best
+
+    def held(self, stamp: int) -> tuple[int, V] | None:
+        """The newest one that is not later, else the oldest; None before the first."""
+        for item in reversed(self.items):
+            if item[0] <= stamp:
+                return item
+        return self.items[0] if self.items else None
+
+    def clear(self) -> None:
+        """Forget all."""
+        self.items.clear()
+
+
+def counting() -> StreamMonitor:
+    """Counts messages that each stand for themselves: nothing stops them."""
+    return StreamMonitor(trip_count=2**62, recovery_count=1)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where to push: joint offsets that cancel what a wrench does to the tool point.
+
+May import: numpy, pkm_twin's core, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.rotations import skew
+
+Array = NDArray[np.float64]
+
+REACH: Final = 0.02
+"""Directions in which the joints move the tool point less than this share of their best are left
+alone: they would cost offsets of fifty times the deflection."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Joint offsets and what they leave.
+
+    ``offset``: what to add to the joints' set points, shape (..., n), rad or m. ``before`` and
+    ``left``: displacement of the tool point and rotation of the platform without and with it, base
+    axes, shape (..., 6), m and rad. ``bounded``: whether the bound cut it down, shape (...).
+    """
+
+    offset: Array
+    before: Array
+    left: Array
+    bounded: NDArray[np.bool_]
+
+
+def setpoint_correction(
+    robot: Robot,
+    q: ArrayLike,
+    deflection: ArrayLike,
+    *,
+    tool: ArrayLike = (0.0, 0.0, 0.0),
+    bound: ArrayLike = np.inf,
+) -> Correction:
+    """Joint offsets that bring the tool point back where it would be without load.
+
+    To first order: the offsets' displacement of the tool point is the opposite of the deflection's.
+    The tool point's place comes first; joints that are left over turn the platform back. A machine
+    with fewer freedoms than six turns a little more where that brings its tool point back.
+
+    :param q: joint positions, shape (..., n), rad or m.
+    :param deflection: of the platform at its reference point, base axes, shape (..., 6), m and
+        rad, as ``strain_energy`` gives it.
+    :param tool: from the platform's reference point, platform axes, shape (..., 3), m.
+    :param bound: largest offset of a joint, shape (n,) or one for all; beyond it the whole offset
+        is made smaller, its direction kept.
+    :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
+    :raises ValueError: a wrong last axis, a value that is not finite, or a bound below zero.
+    """
+    limit = np.asarray(bound, np.float64)
+    if not (limit >= 0.0).all():
+        raise ValueError(f"bound is {limit.min():g}, allowed 0 and above")
+    moved = np.asarray(deflection, np.float64)
+    if moved.shape[-1:] != (6,) or not np.isfinite(moved).all():
+        raise ValueError("deflection is not six finite numbers")
+    _, rotation = robot.platform(q)
+    lever = skew((rotation @ np.asarray(tool, np.float64)[..., None])[..., 0])
+    twist = robot.platform_jacobian(q) / robot.joint_scales
+    place, turn = twist[..., :3, :] - lever @ twist[..., 3:, :], twist[..., 3:, :]
+    there = moved[..., :3] - _times(lever, moved[..., 3:])
+    before = np.concatenate((there, np.broadcast_to(moved[..., 3:], there.shape)), -1)
+    offset, spare = _least(place, -there, place)
+    rest = moved[..., 3:] + _times(turn, offset)
+    offset = offset + _times(spare, _least(turn @ spare, -rest, turn)[0])
+    given = offset / robot.joint_scales
+    with np.errstate(divide="ignore", invalid="ignore"):
+        excess = np.where(given == 0.0, 0.0, np.abs(given) / limit).max(-1)
+    share = 1.0 / np.maximum(excess, 1.0)
+    both = np.concatenate((place, turn), -2)
+    return Correction(
+        given * share[..., None],
+        before,
+        before + _times(both, offset * share[..., None]),
+        excess > 1.0,
+    )
+
+
+def _least(matrix: Array, target: Array, best: Array) -> tuple[Array, Array]:
+    """Least solution in the directions within reach, and the projector on those that are not.
+
+    :param best: the matrix whose greatest singular value is the measure of what is within reach.
+    """
+    u, values, vt = np.linalg.svd(matrix, full_matrices=False)
+    greatest = np.linalg.svd(best, compute_uv=False)[..., :1]
+    held = values > REACH * greatest
+    along = np.divide(_times(u.swapaxes(-1, -2), target), values, where=held, out=0.0 * values)
+    kept = np.where(held[..., None], vt, 0.0)
+    spare = np.eye(matrix.shape[-1]) - kept.swapaxes(-1, -2) @ kept
+    return _times(vt.swapaxes(-1, -2), along), spare
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    return np.asarray((matrix @ vector[..., None])[..., 0], np.float64)

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration on poses that another engine computed for another geometry."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from bags.recording.capture import machine_parameters
+from pkm_twin import load
+from pkm_twin.apps.calibrate import read_poses
+from pkm_twin.apps.cli import app
+
+Array = NDArray[np.float64]
+
+NOISE = 2e-5
+OFFSETS = np.array([0.01, -0.015, 0.008])
+SHIFTS = {"base_radius": 1.2e-3, "arm_length": 9e-4, "forearm_length": -1.1e-3}
+TURNS = (0.004, -0.003, 0.002)
+
+
+def measured(path: Path, noise: float = NOISE, count: int = 60) -> None:
+    """Poses of a Delta-CU that is not built as drawn, by Pinocchio's closed loops."""
+    models = pytest.importorskip("bags.recording.pinocchio_models")
+    parameters = machine_parameters("delta_cu")
+    geometry = parameters["geometry"]
+    for name, shift in SHIFTS.items():
+        geometry[name] += shift
+    geometry["azimuths"] = [a + t for a, t in zip(geometry["azimuths"], TURNS, strict=True)]
+    engine = models.DeltaEngine(parameters)
+    rng = np.random.default_rng(0)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*(f"arm_{k}.position" for k in (1, 2, 3)), "x", "y", "z"])
+        for _ in range(count):
+            q = rng.uniform(-0.6, 1.0, 3)
+            place = engine.platform_placement(engine.assemble(q)).translation
+            writer.writerow([*(q + OFFSETS), *(place + noise * rng.normal(size=3))])
+
+
+def run(*arguments: str) -> Any:
+    return CliRunner().invoke(app, ["calibrate", *arguments])
+
+
+def test_a_machine_is_found_that_was_not_built_as_drawn(tmp_path: Path) -> None:
+    poses, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
+    measured(poses)
+    result = run("delta_cu", str(poses), "--out", str(out), "--json")
+    assert result.exit_code == 0, result.output
+    data = json.loads(result.stdout)
+    held = data["held_out"]
+    assert held["before"]["rms_m"] > 4e-3
+    # The measurement's own noise along three axes is in it.
+    assert held["after"]["rms_m"] < 2.0 * NOISE * np.sqrt(3.0)
+    assert 0.7 * NOISE < data["noise_m"] < 1.4 * NOISE
+    found, drawn = data["parameters"], machine_parameters("delta_cu")["geometry"]
+    truth = {f"geometry.{k}": drawn[k] + v for k, v in SHIFTS.items() if k != "base_radius"}
+    truth |= {f"geometry.azimuths[{k}]": drawn["azimuths"][k] + t for k, t in enumerate(TURNS)}
+    truth |= {f"joint_map.arm_{k + 1}.offset": o for k, o in enumerate(OFFSETS)}
+    for path, value in truth.items():
+        assert found[path]["observed"], path
+        assert abs(found[path]["value"] - value) < 4.0 * found[path]["standard_deviation"], path
+    # A Delta feels only the difference of its radii.
+    (combination,) = data["not_observed"]
+    assert set(combination) == {"geometry.base_radius", "geometry.platform_radius"}
+    assert combination["geometry.base_radius"] == pytest.approx(
+        combination["geometry.platform_radius"], rel=1e-3
+    )
+    radii = [found[f"geometry.{name}_radius"]["value"] for name in ("base", "platform")]
+    true = drawn["base_radius"] + SHIFTS["base_radius"] - drawn["platform_radius"]
+    assert radii[0] - radii[1] == pytest.approx(true, abs=1e-4)
+    # The file is a robot that computes what was measured, from the sensors' own numbers.
+    robot = load(out)
+    told = read_poses(poses, robot)
+    places = robot.platform(robot.controller.positions(told.joints))[0]
+    assert np.sqrt(((places - told.position) ** 2).mean()) < 1.5 * NOISE
+    text = out.read_text()
+    assert "# -30, 90, 210 degrees" in text
+    assert "(standard deviation), calibrated with poses.csv" in text
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "text"),
+    [
+        (["arm_1.position", "x", "y", "z"], [[0, 0, 0, 0]], "a column 'arm_2.position'"),
+        (
+            ["arm_1.position", "arm_2.position", "arm_3.position", "x", "y"],
+            [[0, 0, 0, 0, 0]],
+            "a column 'z'",
+        ),
+        (
+            ["arm_1.position", "arm_2.position", "arm_3.position", "x", "y", "z", "roll"],
+            [[0, 0, 0, 0, 0, 0, 0]],
+            "a column 'pitch'",
+        ),
+        (
+            ["arm_1.position", "arm_2.position", "arm_3.position", "arm_4.position", "x"],
+            [[0, 0, 0, 0, 0]],
+            "arm_4.position",
+        ),
+        (
+            ["arm_1.position", "arm_2.position", "arm_3.position", "x", "y", "z"],
+            [[0.1 * k, 0, 0, 0, 0, -0.36] for k in range(4)],
+            "enough for 10 numbers",
+        ),
+    ],
+)
+def test_what_cannot_work_is_refused_by_name(
+    tmp_path: Path, columns: list[str], rows: list[list[float]], text: str
+) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)]))
+    result = run("delta_cu", str(path), "--out", str(tmp_path / "mine.yaml"))
+    assert result.exit_code != 0
+    assert text in str(result.exception) + result.output
+    assert not (tmp_path / "mine.yaml").exists()
+
+
+def test_only_numbers_that_there_are_can_be_chosen(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    measured(path, count=12)
+    result = run("delta_cu", str(path), "--only", "inertia", "--out", str(tmp_path / "mine.yaml"))
+    assert "the beginning of a geometric number's path" in str(result.exception)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gallery's pictures of ``pkm-twin view``: ``python -m test.docs.view docs/gallery``.
+
+Needs a browser; where there is none it says so and leaves the pictures as they are.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from pkm_twin import load
+from pkm_twin.apps.recorded import read_recording
+from pkm_twin.apps.view.door import Door, listen
+from pkm_twin.apps.view.model import Model
+from pkm_twin.apps.view.page import Page, serving
+from pkm_twin.apps.view.panels import BagPanel
+from pkm_twin.apps.view.timeline import Timeline
+from test.atlas.browser import Browser, find_browser
+
+SIZE = (1440, 900)
+CLOSE = "document.querySelectorAll('[class*=Notification] button').forEach(b => b.click())"
+TAB = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText === '%s')"
+SETTLED = 10.0
+"""Seconds that a browser without a graphics card gets to draw what it was sent."""
+
+
+def loaded(page: Page) -> str:
+    """A Delta off its axis under a sideways force."""
+    moved = page.model.to_pose(page.state, [0.08, -0.06, -0.37])
+    page.become(page.model.loaded(moved, [60.0, 20.0, -80.0, 0.0, 0.0, 0.0]))
+    return "Load"
+
+
+def recorded(page: Page) -> str:
+    """A recording, amid a stroke with the payload."""
+    panel = BagPanel(page, Timeline.of(read_recording("bags/delta_cu_pick_and_place.mcap")))
+    panel.show(9.05)
+    return "Move"
+
+
+def leaning(page: Page) -> str:
+    """A hexapod that leans."""
+    page.become(page.model.to_pose(page.state, [0.03, 0.02, 0.66, 0.12, -0.16, 0.2]))
+    return "Move"
+
+
+def milling(page: Page) -> str:
+    """A head under a cutting force."""
+    moved = page.model.to_pose(page.state, np.array([-0.6, 0.25, -0.2]))
+    page.become(page.model.loaded(moved, [30.0, -50.0, -40.0, 10.0, -20.0, 50.0]))
+    return "Load"
+
+
+PICTURES: dict[str, tuple[str, Callable[[Page], str]]] = {
+    "view_load": ("delta_cu", loaded),
+    "view_bag": ("delta_cu", recorded),
+    "view_stewart": ("stewart", leaning),
+    "view_upr_rpu": ("upr_rpu", milling),
+}
+SHOWN = ("view_load", "view_bag")
+"""Those of the gallery."""
+
+
+def take(browser: Browser, name: str, path: Path) -> None:
+    """One picture of one page."""
+    robot, prepare = PICTURES[name]
+    with (
+        listen("127.0.0.1", 0) as listening,
+        serving(Door("127.0.0.1"), listening) as server,
+    ):
+        page = Page(server, Model(load(robot)))
+        tab = prepare(page)
+        browser.visit(f"http://127.0.0.1:{listening.getsockname()[1]}/")
+        browser.until("!!document.getElementById('singularity')")
+        time.sleep(SETTLED)
+        browser.click(TAB % tab)
+        browser.run(CLOSE)
+        time.sleep(SETTLED)
+        path.write_bytes(browser.picture())
+
+
+def main(folder: Path, names: tuple[str, ...]) -> None:
+    """Take all of them."""
+    program = find_browser()
+    if program is None:
+        print("no browser here: the pictures of `pkm-twin view` stay as they are")
+        return
+    with Browser(program, SIZE) as browser:
+        browser.slow_down(0.5)
+        for name in names:
+            take(browser, name, folder / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), tuple(sys.argv[2:]) or SHOWN)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the regressor: the efforts themselves, for every robot; as many base parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from delta_dynamics import (
+    base_parameters,
+    inverse_dynamics,
+    parameter_names,
+    parameter_units,
+    parameter_values,
+    regressor,
+)
+from delta_dynamics.base_parameters import random_states
+from pkm_twin import Robot, load
+from test.support.robots import loaded, massive, random_motion
+
+
+def complete(name: str) -> Robot:
+    """A loaded robot with offsets and rotors."""
+    robot = loaded(name)
+    return robot.changed(
+        friction={"offset": [0.1, -0.2, 0.3, 0.1, -0.2, 0.3][: robot.joints_count]}
+    )
+
+
+@massive
+def test_regressor_times_parameters_is_inverse_dynamics(name):
+    robot = complete(name)
+    q, qd, qdd, wrench = random_motion(robot, np.random.default_rng(1), 30)
+    table, pi = regressor(robot, q, qd, qdd, wrench), parameter_values(robot)
+    assert table.shape == (30, robot.joints_count, len(pi))
+    assert len(pi) == len(set(parameter_names(robot))) == len(parameter_units(robot))
+    efforts = inverse_dynamics(robot, q, qd, qdd, wrench)
+    error = np.abs(table @ pi - efforts) / np.abs(efforts).max(-1, keepdims=True)
+    assert error.max() < 1e-12
+    # Without a wrench its column is nothing.
+    assert not regressor(robot, q[0], qd[0], qdd[0])[:, -1].any()
+
+
+@massive
+def test_a_column_hangs_on_no_parameter(name):
+    robot = complete(name)
+    q, qd, qdd, _ = random_motion(robot, np.random.default_rng(2), 5)
+    other = robot.changed(payload={"mass": 1.0, "com": [0.1, 0.2, 0.3]}, friction={"coulomb": 3.0})
+    assert (regressor(robot, q, qd, qdd) == regressor(other, q, qd, qdd)).all()
+    efforts = inverse_dynamics(other, q, qd, qdd)
+    again = regressor(robot, q, qd, qdd) @ parameter_values(other)
+    np.testing.assert_allclose(again, efforts, atol=1e-12 * np.abs(efforts).max())
+
+
+@massive
+def test_base_parameters_are_as_many_from_other_states_and_say_the_same(name):
+    robot = complete(name)
+    first, second = base_parameters(robot, seed=1), base_parameters(robot, seed=2)
+    assert first.count == second.count == len(first.names) == len(set(first.names))
+    states = random_states(robot, 20, seed=3)
+    efforts = inverse_dynamics(robot, *states)
+    for base in (first, second):
+        table = regressor(robot, *states)[..., list(base.columns)]
+        assert np.abs(table @ base.values - efforts).max() < 1e-9 * np.abs(efforts).max()
+        assert "wrench" not in base.unseen
+
+
+def test_a_delta_cannot_tell_its_platform_from_a_payload_nor_where_it_is_held():
+    base = base_parameters(load("delta"))
+    (told,) = [name for name in base.names if "platform.mass" in name]
+    assert "payload.mass" in told
+    assert {"platform.mx", "payload.mx", "payload.izz", "platform.iyy"} <= set(base.unseen)
+    # Each drive's friction stands for itself.
+    assert {"arm_1.viscous", "arm_2.coulomb", "arm_3.viscous"} <= set(base.names)
+
+
+@pytest.mark.parametrize("what", ["mass", "izz"])
+def test_units_say_what_a_parameter_is(what):
+    robot = load("linear_delta")
+    units = dict(zip(parameter_names(robot), parameter_units(robot), strict=True))
+    assert units[f"platform.{what}"] == {"mass": "kg", "izz": "kg m2"}[what]
+    assert units["rail_1.viscous"] == "N s/m"
+    assert units["rail_1.rotor_inertia"] == "kg"

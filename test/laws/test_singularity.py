@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The singularity measure beside maximal coordinates, which know no tree, and beside statics."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.optimize import minimize_scalar
+
+from delta_dynamics import reactions
+from pkm_twin import Robot, load, robot_names
+from pkm_twin.apps.certificate.maximal import Maximal
+from pkm_twin.apps.certificate.rows import stacked
+from pkm_twin.errors import SingularityError
+from pkm_twin.kinematics.singularity import Placed
+from pkm_twin.machine.graph_description import graph_description
+from pkm_twin.machine.robot_urdf import robot_description
+from stiffness_monitor import compliance
+from test.machine.random_machines import NAMES, plain
+from test.support.robots import joint_range, random_joints
+
+SURFACE = np.array([0.34222, -0.09515, -0.18159])
+"""A pose of the Delta-CU, inside its limits and its reach, where its platform is free to turn."""
+UP = np.array([0.0, 0.0, 1.0])
+SHORT = ("five_bar", "four_bar", "gantry", "rps3", "upr_rpu")
+"""Machines of few operations: with redundant closures, with none, with three of balls."""
+MACHINES = [name for name in robot_names() if name not in ("delta", "delta_cu")]
+
+
+def built(data, tmp_path):
+    path = tmp_path / "machine.yaml"
+    # What JSON has been through has no aliases.
+    path.write_text(yaml.safe_dump(json.loads(json.dumps(data)), sort_keys=False))
+    return load(path)
+
+
+def with_both_rods(robot):
+    """The robot's plain description with the rods of every pair, and nothing that stands for them.
+
+    Their distance is the platform's rim.
+    """
+    graph = robot.graph
+    data = graph_description(graph) | {"pose": ["x", "y", "z"]}
+    del data["joints"]["translation"]
+    for name, rod in graph.rods.items():
+        whole = data["rods"].pop(name)
+        for side, sign in (("left", 0.5), ("right", -0.5)):
+            ends = (rod.ends + sign * graph.rim * rod.pair).tolist()
+            data["rods"][f"{name} {side}"] = {**whole, "ends": ends, "mass": whole["mass"] / 2}
+    return data
+
+
+def frame(graph, body):
+    """A body's point at home and the length of its turning, as the measure's definition has it."""
+    if body == graph.platform:
+        return graph.origin, graph.rim
+    points = np.array(graph.joint_points(body))
+    middle = points.mean(0)
+    return middle, max(graph.rim, np.linalg.norm(points - middle, axis=1).max())
+
+
+def twists(judge, graph):
+    """Motion of all bodies by rates of maximal coordinates, shape (6 bodies, rates)."""
+    rows = []
+    for name in graph.bodies:
+        middle, reach = frame(graph, name)
+        rows += [judge.point(name, middle).columns, reach * judge.spin(name).columns]
+    return np.vstack(rows)
+
+
+def expected(robot, judge, q):
+    """The measure by its definition, on numbers, from a matrix of all bodies' free motion."""
+    graph = robot.graph
+    judge.assemble(q)
+    placed = Placed(robot.engine.at(robot.engine.tree.home, graph.home)[0])
+    bodies, rim = twists(judge, graph), graph.rim
+    exact = [judge.drives().columns]
+    wrong = [judge.rod_rows(rod).columns / rod.length for rod in judge.machine.rods]
+    for joint in judge.machine.joints:
+        rows = stacked(judge._joint_rows(joint), judge.size).columns
+        if joint.name not in placed.tree.cut:
+            exact.append(rows)
+            continue
+        # Rows without a velocity of the centres are about directions.
+        angles = ~rows.reshape(len(rows), -1, 6)[..., :3].any((1, 2))
+        wrong.append(np.where(angles[:, None], rim * rows, rows))
+    held = 1.0
+    _, s, vt = np.linalg.svd(np.vstack(exact))
+    free = vt[int((s > 1e-9 * s[0]).sum()) :].T
+    if free.size:
+        a = np.vstack(wrong) @ free
+        response = np.linalg.norm(bodies @ free @ np.linalg.pinv(a))
+        held = 0.5 * a.shape[1] / np.sqrt(len(a)) / response
+    tangent = judge._tangent()
+    k = list(graph.bodies).index(graph.platform)
+    every = bodies @ tangent
+    platform = every[6 * k : 6 * k + 6]
+    moved = np.sqrt(len(q)) / np.linalg.norm(every @ np.linalg.pinv(platform))
+    return min(1.0, held, moved)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in SHORT else pytest.mark.long)
+        for name in dict.fromkeys([*MACHINES, *NAMES])
+    ],
+)
+def test_the_definition_in_maximal_coordinates(name, tmp_path):
+    robot = load(name) if name in MACHINES else built(plain(name), tmp_path)
+    judge = Maximal(robot_description(robot))
+    q = random_joints(robot, np.random.default_rng(3), 8, clear=0.01)
+    by_twin = robot.singularity(q)
+    assert ((by_twin > 0.0) & (by_twin <= 1.0)).all()
+    by_judge = [expected(robot, judge, here) for here in q]
+    assert by_twin == pytest.approx(by_judge, rel=1e-6)
+    assert [float(robot.singularity(here)) for here in q] == by_twin.tolist()
+
+
+def test_both_rods_of_a_parallelogram_say_what_its_couple_says(tmp_path):
+    """One rod and a couple, beside two rods, which nothing but the lengths of rods holds."""
+    whole = load("delta_cu")
+    split = built(with_both_rods(whole), tmp_path)
+    q = np.random.default_rng(4).uniform(*whole.limits.position.T, (300, 3))
+    one, other = whole.singularity(q), split.singularity(q)
+    # Errors of two rods are not those of one and a couple, so they agree in kind, not in digits.
+    assert (one / other > 0.3).all()
+    assert (one / other < 3.0).all()
+    assert (one < 0.03).any()
+
+
+class TestConstraintSingularity:
+    """The Delta-CU's: two parallelograms and the universal joint lose the platform's turning."""
+
+    robot = load("delta_cu")
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def place(cls):
+        """Where the measure is least on a short upright line through the surface's pose."""
+        line = {"method": "bounded", "bounds": (-1e-4, 1e-4), "options": {"xatol": 1e-14}}
+        found = minimize_scalar(lambda z: cls.measure(SURFACE + z * UP), **line)
+        return SURFACE + found.x * UP
+
+    @classmethod
+    def measure(cls, pose):
+        return float(cls.robot.singularity(cls.robot.inverse(pose)))
+
+    def test_measure_is_zero_in_it_and_small_beside(self, place):
+        robot = self.robot
+        assert np.abs(place - SURFACE).max() < 2e-5
+        q = robot.inverse(place)
+        assert ((q > robot.limits.position[:, 0]) & (q < robot.limits.position[:, 1])).all()
+        assert self.measure(place) < 1e-8
+        for shift in (*np.eye(3), *-np.eye(3)):
+            assert 1e-4 < self.measure(place + 1e-3 * shift) < 2e-3
+        assert self.measure(robot.home()) > 0.15
+
+    def test_it_is_where_maximal_coordinates_have_it(self, place):
+        """By their determinant, extrapolated: their way from home ends next to the surface."""
+        judge = Maximal(with_both_rods(self.robot))
+        ways = np.array([2e-4, 4e-4, 6e-4])
+        values = []
+        for way in ways:
+            judge.assemble(self.robot.inverse(place - way * UP))
+            columns = np.vstack([judge.closures().columns, judge.drives().columns])
+            assert columns.shape == (judge.size, judge.size)
+            values.append(np.linalg.slogdet(columns / np.abs(columns).max())[1])
+        roots = np.roots(np.polyfit(ways, np.exp(np.array(values) - values[0]), 2))
+        assert np.abs(roots).min() < 1e-7
+
+    def test_statics_fails_where_the_measure_does(self, place):
+        robot, rest = self.robot, np.zeros(3)
+        greatest = []
+        for shift in (1e-5, 1e-4, 1e-3, 1e-2):
+            q = robot.inverse(place - shift * UP)
+            load_ = np.abs(reactions(robot, q, rest, rest).values).max()
+            assert 0.02 < load_ * robot.singularity(q) < 2.0
+            greatest.append(np.abs(compliance(robot, place - shift * UP)).max())
+        # Compliance goes with the square.
+        assert np.diff(np.log10(greatest)) == pytest.approx([-2.0] * 3, abs=0.2)
+        try:
+            load_ = np.abs(reactions(robot, robot.inverse(place), rest, rest).values).max()
+        except SingularityError:
+            load_ = np.inf
+        # What lies within rounding of the surface bears 1e6 times what a good pose does.
+        assert load_ > 1e6
+
+
+def scaled(robot: Robot, factor: float) -> Any:
+    """A robot's description, limbs written out, with every length times a factor."""
+    data = robot_description(robot)
+
+    def times(values: Any) -> Any:
+        return (factor * np.asarray(values)).tolist()
+
+    data["origin"] = times(data["origin"])
+    for body in data["bodies"].values():
+        body["com"] = times(body["com"])
+    for joint in data["joints"].values():
+        joint.pop("limits", None)
+        joint["at"] = times(joint["at"])
+        if joint["type"] == "prismatic":
+            joint["home"] = factor * joint.get("home", 0.0)
+    for rod in data.get("rods", {}).values():
+        rod["ends"] = times(rod["ends"])
+    return data
+
+
+@pytest.mark.parametrize("name", ["linear_delta", "five_bar"])
+@pytest.mark.parametrize("factor", [0.01, 7.0])
+def test_no_scale_counts(name, factor, tmp_path):
+    here = load(name)
+    there = built(scaled(here, factor), tmp_path)
+    q = random_joints(here, np.random.default_rng(5), 20)
+    grown = np.where([unit == "m" for unit in here.joint_units], factor, 1.0)
+    assert there.singularity(q * grown) == pytest.approx(here.singularity(q), rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["five_bar", "linear_delta"])
+def test_no_order_of_bodies_counts(name, tmp_path):
+    robot = load(name)
+    data = robot_description(robot)
+    data["bodies"] = dict(reversed(data["bodies"].items()))
+    other = built(data, tmp_path)
+    q = random_joints(robot, np.random.default_rng(6), 20)
+    assert other.singularity(q) == pytest.approx(robot.singularity(q), rel=1e-9)
+
+
+class TestWays:
+    """Along a way to a singularity the measure goes to zero with the way."""
+
+    def test_edge_of_reach(self):
+        robot = load("five_bar")
+        home = robot.home()
+        # Straight down until an arm and its rod are in line.
+        low, high = 0.0, 1.0
+        for _ in range(60):
+            middle = (low + high) / 2
+            good = robot.try_inverse(home - [0.0, middle])[1]
+            low, high = (middle, high) if good else (low, middle)
+        way = np.array([1e-8, 1e-6, 1e-4, 1e-2])
+        poses = home - np.stack([np.zeros(4), low - way], -1)
+        measure = robot.singularity(robot.inverse(poses))
+        assert (np.diff(measure) > 0.0).all()
+        # With the square root of what is left.
+        assert np.diff(np.log10(measure[:3])) == pytest.approx([1.0, 1.0], abs=0.1)
+
+    def test_dead_points_of_one_joint(self, tmp_path):
+        """One joint and one coordinate: no ratio of singular values tells anything there."""
+        robot = built(plain("slider_crank"), tmp_path)
+        home = float(robot.graph.home[0])
+        q = home + np.linspace(-3.0, 3.0, 20_001)[:, None]
+        measure, good = robot.try_singularity(q)
+        inside = measure[good]
+        assert inside.max() > 0.1
+        assert inside.min() < 0.01
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_where_there_is_no_assembly_there_is_no_measure(name):
+    robot = load(name)
+    middle, half = joint_range(robot)
+    q = middle + 30.0 * half * np.linspace(0.0, 1.0, 40)[:, None]
+    measure, good = robot.try_singularity(q)
+    assert (measure[~good] == 0.0).all()
+    assert (measure[good] > 0.0).all()
+    assert good.tolist() == robot.try_forward(q)[1].tolist()

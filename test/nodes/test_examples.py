@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The examples, run as they are against machine_sim in processes of their own."""
+
+import re
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from std_msgs.msg import Float64MultiArray
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import load
+from test.nodes.harness import REPOSITORY
+
+EXAMPLES = REPOSITORY / "examples"
+SIM = "delta_dynamics.sim_node"
+ROBOT = load("delta_cu")
+PATIENCE = 120.0
+SIM_TIME = "use_sim_time:=true"
+
+
+def example(launch, name, *words, **options):
+    return launch(None, *options.pop("parameters", ()), script=[EXAMPLES / name, *words], **options)
+
+
+def numbers(text):
+    return [float(word) for word in re.findall(r"-?\d+\.?\d*(?:e[+-]\d+)?", text)]
+
+
+@pytest.fixture(scope="module")
+def twin_and_machine(launch):
+    """Both nodes, until the module's end."""
+    return (
+        launch(SIM, "clock:=simulated", "real_time_factor:=5.0"),
+        launch("delta_dynamics.node"),
+    )
+
+
+class TestComputedTorque:
+    """In lockstep, so that a loaded machine closes the same loop."""
+
+    @pytest.fixture(autouse=True)
+    def commands(self, peer):
+        peer.hear(Float64MultiArray, "/machine_sim/commands")
+        return peer.received("/machine_sim/commands")
+
+    def test_it_follows_a_machine_that_is_one_percent_another(self, launch, peer, commands):
+        kinds = "spread_kinds:=[masses, inertias, friction]"
+        sim = launch(SIM, "clock:=lockstep", "spread:=0.01", kinds)
+        # Silence is of the wall's time, which a loaded machine has little of.
+        controller = example(
+            launch, "computed_torque.py", "--deadline", "60", "--seconds", "0.4",
+            parameters=(SIM_TIME,),
+        )  # fmt: skip
+        peer.until(lambda: not controller.alive(), PATIENCE)
+        assert controller.wait() == 0, controller.output
+        samples, worst = numbers(controller.output.splitlines()[-1])
+        assert samples == 401
+        assert worst < 5e-3 * 0.1 * 2.2
+        peer.until(lambda: list(commands[-1].data) == [0.0] * 3)
+        assert any(any(c.data) for c in commands)
+        assert sim.stop() == 0
+
+    def test_a_machine_that_falls_silent_stops_it_with_zeros(self, launch, peer, commands):
+        sim = launch(SIM, "clock:=lockstep")
+        controller = example(
+            launch, "computed_torque.py", "--deadline", "2", "--seconds", "1000",
+            parameters=(SIM_TIME,),
+        )  # fmt: skip
+        peer.until(lambda: len(commands) > 50, PATIENCE)
+        assert controller.alive() and any(any(c.data) for c in commands)
+        sim.process.kill()
+        peer.until(lambda: not controller.alive(), PATIENCE)
+        assert controller.wait() == 1, controller.output
+        assert "stopped: no joint state for" in controller.output
+        peer.until(lambda: list(commands[-1].data) == [0.0] * 3)
+
+
+class TestByTheTwin:
+    """Trajectories that the twin has filled with effort."""
+
+    @pytest.fixture(autouse=True)
+    def nodes(self, twin_and_machine):
+        assert all(process.alive() for process in twin_and_machine)
+
+    def test_the_trajectory_client_reaches_its_goal_with_the_twin_s_efforts(self, launch):
+        client = example(launch, "trajectory_client.py")
+        assert client.wait(PATIENCE) == 0, client.output
+        points, *peak, miss = numbers(client.output.replace(" from the goal", ""))
+        q = ROBOT.inverse(ROBOT.home())
+        x = np.linspace(0.0, 1.0, 101)
+        way = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
+        rows = [np.outer(np.polyval(np.polyder(way, k), x), np.full(3, 0.22)) for k in range(3)]
+        expected = np.abs(inverse_dynamics(ROBOT, q + rows[0], *rows[1:])).max(0)
+        assert points == 101
+        assert np.abs(np.array(peak) - expected).max() < 5e-3 * expected.max()
+        assert miss < 1e-4
+
+    def test_the_feed_is_slower_where_the_machine_is_softer(self, launch):
+        cut = example(launch, "feed_rate.py")
+        assert cut.wait(PATIENCE) == 0, cut.output
+        _, slow, fast, bent, tolerance, states = numbers(cut.output)
+        assert 1.2 * slow < fast <= 200.0
+        assert 0.99 * tolerance < bent <= tolerance == 100.0
+        assert states > 100

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The running machine_sim: its topics are the core's numbers, and what it refuses."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import WrenchStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.simulation import MachineSettings, Simulation, WrenchSignal, tuned
+from pkm_twin import load
+from pkm_twin.machine.variation import varied
+from test.nodes.harness import SECOND, counts_of, one_line_refusal, stamp_of
+
+MODULE = "delta_dynamics.sim_node"
+ROBOT = load("delta_cu")
+HOME = ROBOT.inverse(ROBOT.home())
+KINDS = ("masses", "inertias")
+SPREAD = (
+    "spread:=0.02",
+    "spread_kinds:=[masses, inertias]",
+    "seed:=7",
+    "distribution:=uniform",
+)
+COMMANDS = "/machine_sim/commands"
+
+
+@pytest.fixture(scope="module")
+def machine(peer, launch):
+    """A machine in lockstep: one period with every command."""
+    for kind, topic in (
+        (JointState, "/joint_states"),
+        (WrenchStamped, "/wrench"),
+        (Clock, "/clock"),
+        (DiagnosticArray, "/diagnostics"),
+    ):
+        peer.hear(kind, topic)
+    peer.talk(Float64MultiArray, COMMANDS)
+    wrench = "wrench.constant:=[1.0, 0.0, -2.0, 0.0, 0.0, 0.0]"
+    resolution = "encoder_resolution:=[1.0e-5]"
+    process = launch(MODULE, "clock:=lockstep", wrench, resolution, "deadline:=10.0", *SPREAD)
+    peer.until(lambda: peer.received("/joint_states") and peer.matched())
+    return process
+
+
+def answer(peer, data):
+    """Command, and the joint state that follows it; a period gone alone may lie between."""
+    states = peer.received("/joint_states")
+    last = stamp_of(states[-1]) if states else 0
+    peer.send(COMMANDS, Float64MultiArray(data=data))
+
+    def answered():
+        return stamp_of(states[-1]) > last and list(states[-1].effort) == data
+
+    peer.until(answered)
+    return states[-1]
+
+
+def test_lockstep_gives_the_core_s_numbers(peer, machine):
+    robot = varied(ROBOT, dict.fromkeys(KINDS, 0.02), 7, "uniform").robot
+    core = Simulation(
+        robot,
+        MachineSettings(
+            HOME,
+            robot.limits.effort,
+            *tuned(robot, 10.0),
+            resolution=np.full(3, 1e-5),
+            deadline=10.0,
+            wrench=WrenchSignal(np.array([1.0, 0.0, -2.0, 0.0, 0.0, 0.0])),
+        ),
+        stamp_of(peer.received("/joint_states")[-1]),
+    )
+    weight = inverse_dynamics(ROBOT, HOME, np.zeros(3), np.zeros(3))
+    effort = weight + np.array([0.3, -0.2, 0.1])
+    for k in range(50):
+        state = answer(peer, effort.tolist())
+        core.commands(Float64MultiArray(data=effort.tolist()))
+        core.advance()
+        want = core.measured()
+        if k == 0:
+            # Braked, its clock went on alone.
+            ahead = stamp_of(state) - want.stamp
+        assert stamp_of(state) - want.stamp == ahead
+        assert list(state.name) == list(ROBOT.joint_names)
+        assert np.abs(np.array(state.position) - want.q).max() < 1e-12
+        assert np.abs(np.array(state.velocity) - want.qd).max() < 1e-9
+        assert (np.array(state.effort) == effort).all()
+    peer.until(lambda: stamp_of(peer.received("/wrench")[-1]) >= stamp_of(state))
+    force = peer.received("/wrench")[-1]
+    assert force.header.frame_id == "platform"
+    assert (force.wrench.force.x, force.wrench.force.z) == (1.0, -2.0)
+    clocks = [c.clock.sec * SECOND + c.clock.nanosec for c in peer.received("/clock")]
+    assert clocks == sorted(clocks) and stamp_of(state) - clocks[-1] <= 5_000_000
+
+
+def test_a_bad_command_is_refused_and_time_stands(peer, machine):
+    before = stamp_of(answer(peer, [0.0, 0.0, 0.0]))
+    for bad in ([float("nan"), 0.0, 0.0], [0.0, 0.0]):
+        peer.send(COMMANDS, Float64MultiArray(data=bad))
+    array = peer.diagnostics(
+        "/machine_sim", lambda a: len(counts_of(a, "effort commands rejected")) == 2
+    )
+    assert counts_of(array, "effort commands rejected") == {"not finite": 1, "length": 1}
+    # One period alone a second and nothing else.
+    assert stamp_of(peer.received("/joint_states")[-1]) - before < SECOND // 10
+
+
+def test_who_comes_late_gets_what_was_drawn(peer, machine):
+    received = []
+    kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    peer.node.create_subscription(DiagnosticArray, "/machine_sim/drawn", received.append, kept)
+    peer.until(lambda: received)
+    drawn = varied(ROBOT, dict.fromkeys(KINDS, 0.02), 7, "uniform").drawn
+    (status,) = received[0].status
+    assert {pair.key: float(pair.value) for pair in status.values} == drawn
+    assert all(f"drawn: {name} " in machine.output for name in drawn)
+
+
+def test_it_ends_on_a_signal(peer, machine):
+    assert machine.stop() == 0
+    assert "Traceback" not in machine.output
+
+
+@pytest.mark.parametrize(
+    ("parameters", "word"),
+    [
+        (("start:=[0.0, 2.0, 0.0]",), "start, arm_2: 2.0 is refused; allowed: -0.9 to 1.3"),
+        (("use_sim_time:=true",), "use_sim_time: True is refused; allowed: false"),
+        (("payload.masses:=[1.0, 2.0]",), "payload.masses"),
+    ],
+)
+def test_a_bad_parameter_is_refused_in_one_line(launch, parameters, word):
+    assert word in one_line_refusal(launch(MODULE, *parameters))

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin view`` as a process, and in a real browser without a window."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from pkm_twin import load
+from pkm_twin.apps.view.door import listen
+from pkm_twin.apps.view.texts import number
+from stiffness_monitor import strain_energy
+from test.atlas.browser import Browser, find_browser
+from test.commands.conftest import DELTA, REPOSITORY, process, twin  # noqa: F401
+from test.nodes.harness import end_with_parent
+
+TOKEN = "a-token-that-is-long-enough"
+needs_viser = pytest.mark.usefixtures("viser")
+
+
+@pytest.fixture
+def viser():
+    return pytest.importorskip("viser", reason="viser is not installed: pkm_twin[view]")
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--host", "0.0.0.0"), "--host: '0.0.0.0' is refused; allowed: 127.0.0.1; any other"),
+        (("--host", "0.0.0.0", "--token", "short"), "--token: '5 characters' is refused"),
+        (("--port", "70000"), "--port: 70000 is refused; allowed: 0 to 65535"),
+        (("--host", "no.such.host.invalid", "--token", TOKEN), "is no address here"),
+        (("--bag", "nothing.mcap", "--port", "0"), "nothing.mcap"),
+    ],
+)
+@needs_viser
+def test_what_cannot_be_served_is_one_line(twin, options, told):  # noqa: F811
+    result = twin("view", "delta_cu", *options)
+    assert result.code == 1
+    assert told in result.one_line_error()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--bag", str(DELTA), "--live"),
+        ("--namespace", "cell"),
+        ("--payload", "0.2"),
+        ("--topic", "/joint_states"),
+    ],
+)
+def test_options_that_need_another_are_usage(twin, options):  # noqa: F811
+    result = twin("view", "delta_cu", *options)
+    assert result.code == 2
+    assert result.out == ""
+
+
+@needs_viser
+def test_an_unknown_robot_is_told_before_anything_is_served(twin):  # noqa: F811
+    result = twin("view", "delt", "--port", "0")
+    assert result.code == 1
+    assert "did you mean 'delta'" in result.one_line_error()
+
+
+@needs_viser
+def test_a_port_in_use_is_one_line(twin):  # noqa: F811
+    with listen("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        result = twin("view", "delta_cu", "--port", port)
+    assert result.code == 1
+    assert f"cannot listen on 127.0.0.1 port {port}" in result.one_line_error()
+
+
+def test_without_viser_the_line_says_what_brings_it(twin, monkeypatch):  # noqa: F811
+    monkeypatch.setitem(sys.modules, "viser", None)
+    result = twin("view", "delta_cu")
+    assert result.code == 1
+    assert "viser is not installed; pip install 'pkm_twin[view]'" in result.one_line_error()
+
+
+@contextlib.contextmanager
+def serving(*arguments):
+    """A running command and the address that it prints."""
+    running = subprocess.Popen(
+        [sys.executable, "-m", "pkm_twin.apps.cli", "view", *map(str, arguments), "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONUNBUFFERED": "1"},
+        preexec_fn=end_with_parent,
+    )
+    try:
+        line = running.stdout.readline()
+        found = re.search(r"http://\S+", line)
+        assert found, f"{line}{running.stderr.read()}"
+        yield running, found.group()
+    finally:
+        if running.poll() is None:
+            running.kill()
+        running.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@needs_viser
+def test_a_signal_ends_it_quietly(number):
+    with serving("five_bar") as (running, _):
+        running.send_signal(number)
+        out, err = running.communicate(timeout=60)
+        assert (running.returncode, out, err) == (130, "", "")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    pytest.importorskip("tornado")
+    pytest.importorskip("viser")
+    program = find_browser()
+    if program is None:
+        pytest.skip("no browser: set PKM_TWIN_BROWSER to a Chromium")
+    with Browser(program, (1000, 700)) as browser:
+        browser.slow_down(0.5)
+        browser.call("Network.enable")
+        yield browser
+
+
+SLIDER = "document.querySelectorAll('[role=slider]')[%d]"
+VALUE = SLIDER + ".getAttribute('aria-valuenow')"
+TEXT = "(document.getElementById('%s') || {}).innerText"
+LOAD = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText === 'Load')"
+
+
+def moved(browser, slider, key):
+    """Press a key on a slider: its value then."""
+    value = VALUE % slider
+    before = browser.run(value)
+    browser.run(f"{SLIDER % slider}.focus()")
+    browser.press(key)
+    return float(browser.until(f"{value} !== '{before}' && {value}"))
+
+
+def read(browser, key):
+    return browser.run(TEXT % key)
+
+
+def addresses(browser):
+    """Hosts that the page asked, by its scripts and workers too."""
+    asked = [
+        event["params"].get("request", event["params"]).get("url", "")
+        for event in browser.events
+        if event["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated")
+    ]
+    return {urlsplit(url).hostname for url in asked if not url.startswith(("data:", "blob:"))}
+
+
+def test_a_slider_moves_the_machine_and_the_numbers_are_the_cores(browser):
+    robot = load("delta_cu")
+    with serving("delta_cu") as (_, address):
+        browser.visit(address)
+        browser.until(f"{TEXT % 'q_0'} === '{number(0.2)}'")
+        assert float(browser.run(VALUE % 0)) == 0.2
+        q = robot.inverse(robot.home())
+        q[0] = moved(browser, 0, "ArrowRight")
+        browser.until(f"{TEXT % 'q_0'} === '{number(q[0])}'")
+        pose = robot.forward(q)
+        assert read(browser, "singularity") == number(float(robot.singularity(q)))
+        # The pose's sliders have followed, to a slider's step.
+        shown = [
+            float(browser.run(f"{SLIDER % k}.getAttribute('aria-valuenow')")) for k in (3, 4, 5)
+        ]
+        np.testing.assert_allclose(shown, pose, atol=1e-3)
+        # And the other way round.
+        pose[2] = moved(browser, 5, "ArrowLeft")
+        q = robot.inverse(pose)
+        browser.until(f"{TEXT % 'q_1'} === '{number(q[1])}'")
+        assert read(browser, "q_0") == number(q[0])
+        # An end of the range that cannot be: words, and the machine stays.
+        moved(browser, 5, "Home")
+        browser.until(f"({TEXT % 'refusal'}).length > 10")
+        assert "limits" in read(browser, "refusal") or "unreachable" in read(browser, "refusal")
+        assert read(browser, "q_0") == number(q[0])
+        # A force of one step, and what it does.
+        browser.click(LOAD)
+        browser.until(browser.until(f"{VALUE % 0} === '0'"))
+        wrench = np.zeros(6)
+        wrench[0] = moved(browser, 0, "ArrowRight")
+        energy = strain_energy(robot, pose, wrench)
+        browser.until(f"{TEXT % 'dominant'} === '{energy.dominant}'")
+        assert read(browser, "deflection_0") == number(1e6 * energy.deflection[0])
+        assert read(browser, "energy") == number(float(energy.total))
+        assert addresses(browser) == {"127.0.0.1"}
+        assert colours(browser.picture()) > 200
+
+
+def colours(png):
+    """How many colours a picture has: a page that draws nothing has a handful."""
+    from matplotlib.image import imread
+
+    pixels = (255 * imread(io.BytesIO(png))[..., :3]).astype(int).reshape(-1, 3)
+    return len(np.unique(pixels @ [1, 256, 65536]))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("stewart",),
+        ("five_bar",),
+        ("prru",),
+        ("upr_rpu",),
+        (REPOSITORY / "test/machine/five_bar.urdf", "--platform", "platform"),
+        ("delta_cu", "--bag", DELTA),
+    ],
+    ids=str,
+)
+def test_every_kind_of_machine_is_shown(browser, arguments, tmp_path):
+    with serving(*arguments) as (_, address):
+        browser.visit(address)
+        assert float(browser.until(TEXT % "singularity")) > 0.0
+        if "--bag" in arguments:
+            assert read(browser, "bag_time") == "0"
+        assert addresses(browser) == {"127.0.0.1"}
+        assert colours(browser.picture()) > 200

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pure half of the page: sliders in, numbers out, on every robot and a URDF."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import load, robot_names
+from pkm_twin.apps.view import texts
+from pkm_twin.apps.view.model import Model, _round, _step
+from pkm_twin.apps.view.scene import SCALE, Scene, plate, round_mesh, share_colours
+from pkm_twin.kinematics.clearance import clearance
+from stiffness_monitor import compliance
+
+URDF = Path(__file__).resolve().parents[1] / "machine/five_bar.urdf"
+NAMES = [*robot_names(), URDF.name]
+every_model = pytest.mark.parametrize("name", NAMES)
+
+
+@cache
+def model_of(name):
+    return Model(load(URDF, platform="platform") if name == URDF.name else load(name))
+
+
+def states(model, count, rng):
+    """States from joint values all over the sliders, those that can be."""
+    low, high = (np.array([getattr(r, end) for r in model.joint_ranges]) for end in ("low", "high"))
+    tried = low + (high - low) * rng.random((count, len(low)))
+    moved = [model.to_joints(model.start, q) for q in tried]
+    good = [state for state in moved if not state.refusal]
+    assert len(good) >= count / 5, name_of(model)
+    return good
+
+
+def name_of(model):
+    return model.robot.name
+
+
+@every_model
+def test_sliders_span_the_limits_and_the_start_is_within(name):
+    model = model_of(name)
+    robot = model.robot
+    limits = robot.limits.position
+    if limits is not None:
+        ends = np.array([[r.low, r.high] for r in model.joint_ranges])
+        assert np.array_equal(ends[np.isfinite(limits)], limits[np.isfinite(limits)])
+        assert np.isfinite(ends).all()
+    for ranges, values, names in (
+        (model.joint_ranges, model.start.q, robot.joint_names),
+        (model.pose_ranges, model.start.pose, robot.pose_names),
+        (model.wrench_ranges, model.start.wrench, ("fx", "fy", "fz", "mx", "my", "mz")),
+    ):
+        assert tuple(r.name for r in ranges) == tuple(names)
+        for r, value in zip(ranges, values, strict=True):
+            assert r.low <= value <= r.high
+            assert 400 <= (r.high - r.low) / r.step <= 5000 or r.high == r.low
+
+
+@every_model
+def test_joints_and_pose_lead_to_the_same_state(name, rng):
+    model = model_of(name)
+    robot = model.robot
+    for state in states(model, 10, rng):
+        np.testing.assert_array_equal(state.pose, robot.forward(state.q))
+        back = model.to_pose(model.start, state.pose)
+        assert back.refusal == ""
+        np.testing.assert_array_equal(back.pose, state.pose)
+        if name == URDF.name:  # drives that turn all the way reach a pose with either elbow
+            np.testing.assert_allclose(robot.forward(back.q), state.pose, rtol=0, atol=1e-7)
+        else:
+            np.testing.assert_allclose(back.q, state.q, rtol=0, atol=1e-7)
+
+
+@every_model
+def test_no_slider_leads_to_an_exception(name, rng):
+    """Whatever is asked for inside the sliders is shown, or refused in words and left alone."""
+    model = model_of(name)
+    low, high = (np.array([getattr(r, end) for r in model.pose_ranges]) for end in ("low", "high"))
+    refused = 0
+    for pose in low + (high - low) * rng.random((15, len(low))):
+        state = model.to_pose(model.start, pose)
+        if state.refusal:
+            refused += 1
+            assert "\n" not in state.refusal
+            np.testing.assert_array_equal(state.q, model.start.q)
+            np.testing.assert_array_equal(state.pose, model.start.pose)
+        else:
+            np.testing.assert_allclose(model.robot.forward(state.q), pose, rtol=0, atol=1e-6)
+        assert np.isfinite(model.numbers(state).singularity)
+    far = model.to_pose(model.start, np.full(len(low), 50.0))
+    assert far.refusal
+    assert model.to_joints(model.start, np.full(len(model.start.q), np.nan)).refusal
+    assert refused < 15 or len(low) == 6
+
+
+@every_model
+def test_beyond_a_limit_is_told_with_joint_value_and_range(name):
+    model = model_of(name)
+    if model.robot.limits.position is None:
+        pytest.skip("this machine has no limits")
+    q = model.start.q.copy()
+    q[0] = model.joint_ranges[0].high + 0.25
+    told = model.to_joints(model.start, q).refusal
+    joint, unit = model.robot.joint_names[0], model.robot.joint_units[0]
+    assert told.startswith(f"{joint}.position is {q[0]:.6g} {unit}, limits ")
+    assert "--" not in told
+
+
+@every_model
+def test_numbers_are_the_cores(name, rng):
+    model = model_of(name)
+    robot = model.robot
+    wrench = np.array([3.0, -2.0, 5.0, 0.1, 0.2, -0.3])
+    for state in states(model, 5, rng)[:2]:
+        got = model.numbers(model.loaded(state, wrench))
+        assert got.singularity == pytest.approx(float(robot.singularity(state.q)), rel=1e-12)
+        assert got.singularity_grade == ("good" if got.singularity >= 0.05 else "warn")
+        position, rotation = robot.platform(state.q)
+        np.testing.assert_array_equal(got.position, position)
+        np.testing.assert_array_equal(got.rotation, rotation)
+        if "clearance" in got.why:
+            assert got.clearance is None
+        else:
+            assert got.clearance == pytest.approx(float(clearance(robot, state.pose)), abs=1e-12)
+        if "effort" not in got.why:
+            rest = np.zeros(robot.joints_count)
+            expected = inverse_dynamics(robot, state.q, rest, rest, wrench)
+            np.testing.assert_array_equal(got.effort, expected)
+        if "energy" not in got.why:
+            moved = compliance(robot, state.pose) @ wrench
+            np.testing.assert_allclose(got.energy.deflection, moved, rtol=1e-7)
+        html = texts.status(model, state, got) + texts.load(got)
+        for key in ("singularity", "clearance", "q_0", "refusal"):
+            assert html.count(f'id="{key}"') == 1
+
+
+def test_what_is_not_known_is_said():
+    numbers = model_of("stewart").numbers(model_of("stewart").start)
+    assert numbers.energy is None
+    assert "member" in numbers.why["energy"]
+    assert "diameters" in numbers.why["clearance"]
+    assert "member" in texts.load(numbers)
+
+
+def test_names_cannot_write_into_the_page():
+    model = model_of("five_bar")
+    state = model.to_joints(model.start, model.start.q)
+    bad = type(state)(state.q, state.pose, state.wrench, "<script>alert(1)</script>")
+    assert "<script>" not in texts.status(model, bad, model.numbers(bad))
+
+
+def test_steps_and_rounding():
+    assert [_step(span) for span in (2.2, 0.42, 200.0)] == [0.001, 0.001, 0.1]
+    assert [_round(value) for value in (0.7, 1.0, 1.3, 34.0, 61.0)] == [1.0, 1.0, 2.0, 50.0, 100.0]
+
+
+@every_model
+def test_bars_keep_their_lengths_and_the_platform_carries_what_is_on_it(name, rng):
+    """Bars of one body and rods are rigid, whatever the drawing does; a telescope is not."""
+    model = model_of(name)
+    scene = Scene(model.robot)
+    rods = model.robot.graph.rods
+    rigid = [k for k, b in enumerate(scene.bars) if b.start[0] == b.end[0] or b.part in rods]
+    assert rigid or name == "upr_rpu"
+    for state in states(model, 8, rng)[:3]:
+        shapes = scene.shapes(state.q)
+        for k in rigid:
+            bar = scene.bars[k]
+            length = np.linalg.norm(bar.end[1] - bar.start[1])
+            assert shapes.cylinder_sizes[k, 2] == pytest.approx(length, abs=1e-8)
+        np.testing.assert_allclose(shapes.platform_at, model.robot.platform(state.q)[0], atol=1e-12)
+        shift = np.array([0.01, -0.02, 0.03, 0.0, 0.0, 0.0])
+        moved = scene.shapes(state.q, shift)
+        np.testing.assert_allclose(moved.platform_at - shapes.platform_at, shift[:3], atol=1e-12)
+        for (_, spot), before, after in zip(
+            scene._balls, shapes.ball_at, moved.ball_at, strict=False
+        ):
+            expected = shift[:3] if scene._on_platform(spot) else np.zeros(3)
+            np.testing.assert_allclose(after - before, expected, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(shapes.cylinder_turns, axis=1), 1.0)
+
+
+def test_every_element_has_a_place_and_its_colour():
+    for name in ("delta_cu", "prru", "upr_rpu"):
+        model = model_of(name)
+        energy = model.numbers(model.loaded(model.start, [10.0, 5, -20, 0, 0, 0])).energy
+        shares = dict(zip(energy.elements, energy.factors.tolist(), strict=True))
+        shapes = Scene(model.robot).shapes(model.start.q, energy.deflection, shares)
+        assert set(energy.elements) <= set(shapes.places)
+        last = tuple(SCALE[-1].astype(int))
+        assert last in {tuple(c) for c in [*shapes.cylinder_colours, *shapes.ball_colours]}
+        assert share_colours(shares)[energy.dominant] == last
+    assert share_colours({"a": 0.0}) == {}
+
+
+def test_meshes_are_closed():
+    """Every edge is of two triangles, once in each direction."""
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    ball = round_mesh()[1]
+    vertices, faces = plate(square, 0.1)
+    half = faces[: len(faces) // 2]
+    for points, triangles in (ball, (vertices, half)):
+        _, place = np.unique(np.round(points, 9), axis=0, return_inverse=True)
+        corners = place.reshape(-1)[triangles]
+        corners = corners[[len(set(row)) == 3 for row in corners.tolist()]]
+        edges = {
+            (a, b) for row in corners.tolist() for a, b in zip(row, row[1:] + row[:1], strict=True)
+        }
+        assert {(b, a) for a, b in edges} == edges
