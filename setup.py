@@ -107,6 +107,7 @@ setup(
         "certificate": ["mpmath", "mujoco", "pin", "pytest", "scipy"],
         "fit": ["cvxpy>=1.4"],
         "mjcf": ["mujoco"],
+        "audit": ["pip-audit"],
         "view": ["viser>=1.1"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },

@@ -42,6 +42,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 R = TypeVar("R", bound="Robot")
 
+MIN_LENGTH: Final = 1e-6
 MAX_LENGTH: Final = 100.0
 MAX_MASS: Final = 1e5
 SINGULARITY_BOUND: Final = 1e-9
@@ -51,8 +52,8 @@ _NONE: Final = np.zeros(0)
 
 
 def length(**options: Any) -> Any:
-    """Field: a length above zero, m."""
-    return schema.number(above=0.0, at_most=MAX_LENGTH, unit="m", **options)
+    """Field: a length that may be divided by, m."""
+    return schema.number(at_least=MIN_LENGTH, at_most=MAX_LENGTH, unit="m", **options)
 
 
 def mass(**options: Any) -> Any:

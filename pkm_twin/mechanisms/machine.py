@@ -125,8 +125,10 @@ class DriveSpec:
     """
 
     inertia: float = schema.number(at_least=0.0, unit="kg m2")
-    ratio: float | None = schema.number(above=0.0, unit="turns a turn", default=None)
-    lead: float | None = schema.number(above=0.0, unit="m a turn", default=None)
+    ratio: float | None = schema.number(
+        at_least=1e-6, at_most=1e6, unit="turns a turn", default=None
+    )
+    lead: float | None = schema.number(at_least=1e-6, at_most=1e6, unit="m a turn", default=None)
 
     def verify(self, path: str) -> None:
         """One of the two."""
