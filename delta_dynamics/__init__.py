@@ -24,6 +24,7 @@ from delta_dynamics.regressor import (
     regressor,
 )
 from delta_dynamics.terms import Terms, dynamics_terms
+from delta_dynamics.uncertainty import torque_deviation
 from delta_dynamics.virtual_work import (
     Energy,
     energy,
@@ -65,4 +66,5 @@ __all__ = [
     "sphere_directions",
     "spread",
     "tilted_pose",
+    "torque_deviation",
 ]
