@@ -7,7 +7,7 @@ MINUTES ?= 3
 SECONDS ?= 60
 SEED ?= 1
 # Tests that run for as long as they are told.
-ENDLESS := test/bags/test_fuzz.py test/nodes/test_fuzz.py test/nodes/test_soak.py
+ENDLESS := test/bags/test_fuzz.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
 
 .PHONY: demo test lint types unit long bags bench certificate fuzz soak scale pages clean help

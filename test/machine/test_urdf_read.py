@@ -481,7 +481,7 @@ def test_damaged_files_are_read_or_refused_by_name(tmp_path):
     rng = np.random.default_rng(8)
     good = 0
     path = tmp_path / "damaged.urdf"
-    for _ in range(400):
+    for _ in range(120):
         content = bytearray((SMALL, five_bar().urdf()[0])[rng.integers(2)].encode())
         for _ in range(rng.integers(1, 3)):
             at = int(rng.integers(len(content)))

@@ -48,14 +48,14 @@ import numpy as np
 import delta_dynamics.node as node
 from delta_dynamics import feedforward
 solve = feedforward.inverse_dynamics
-def late(robot, q, qd, qdd):
+def late(robot, q, *rest):
     if q.ndim > 1:
         return np.full(q.shape, np.inf)
     if q[0] == 0.125:
         time.sleep(0.02)
     if q[0] == 0.1125:
         os.kill(os.getpid(), signal.SIGSTOP)
-    return solve(robot, q, qd, qdd)
+    return solve(robot, q, *rest)
 feedforward.inverse_dynamics = late
 node.main()
 """
@@ -291,7 +291,8 @@ class TestLoad:
                 if array.status[0].name == "/late"
             )
 
-        late.peer.until(told, repeat=lambda: at_pace(late, 5, 5e-3, position=(0.125, 0.2, 0.3)))
+        # One right after the other: their period is short however slow this machine is.
+        late.peer.until(told, repeat=lambda: late.stream(4, position=(0.125, 0.2, 0.3)))
 
     def test_a_trajectory_that_overflows_the_model_stops_the_stream(self, fleet):
         late = fleet["late"]

@@ -46,7 +46,7 @@ def machine(peer, launch):
     wrench = "wrench.constant:=[1.0, 0.0, -2.0, 0.0, 0.0, 0.0]"
     resolution = "encoder_resolution:=[1.0e-5]"
     process = launch(MODULE, "clock:=lockstep", wrench, resolution, "deadline:=10.0", *SPREAD)
-    peer.until(lambda: peer.received("/joint_states") and peer.matched(), 90.0)
+    peer.until(lambda: peer.received("/joint_states") and peer.matched())
     return process
 
 

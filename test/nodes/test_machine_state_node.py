@@ -82,7 +82,7 @@ def answers(node, peer):
         full = [m for m in received("markers") if any(x.ns == "wrench" for x in m.markers)]
         return full and all(received(topic) for topic in OUTPUTS)
 
-    peer.until(drawn, 90.0, ask)
+    peer.until(drawn, repeat=ask)
     return {topic: received(topic)[-1] for topic in OUTPUTS} | {
         "markers": next(
             m for m in reversed(received("markers")) if any(x.ns == "wrench" for x in m.markers)
@@ -220,7 +220,7 @@ def test_a_rigid_robot_and_refusals(launch, peer):
         assert rigid.alive(), rigid.output
         peer.send("/rigid/states", MAKE.joint_state(robot.joint_names, q, stamp=peer.now()))
 
-    peer.until(lambda: received, 90.0, ask)
+    peer.until(lambda: received, repeat=ask)
     assert {marker.ns for marker in received[-1].markers} == {"bars"}
     # Without velocities there is no twist, never one of zeros.
     assert not peer.received("/rigid/twist")
@@ -252,7 +252,7 @@ def test_the_monitors_numbers_have_stamped_siblings(launch, peer):
         received = peer.received(f"/plotted/{topic}")
         return received[-1] if received else None
 
-    peer.until(lambda: all(last(topic) for topic in (*kinds, *siblings)), 90.0, ask)
+    peer.until(lambda: all(last(topic) for topic in (*kinds, *siblings)), repeat=ask)
     matrix = np.array(last("compliance").data).reshape(6, 6)
     message = last("compliance_stamped")
     assert stamp_of(message) > 0 and message.header.frame_id == "base_link"
