@@ -2,6 +2,7 @@
 """Rigid-body dynamics of parallel kinematic machines."""
 
 from delta_dynamics.base_parameters import BaseParameters, base_parameters
+from delta_dynamics.contact import Contact, ContactMonitor
 from delta_dynamics.isotropy import (
     Extremes,
     JointMotion,
@@ -36,6 +37,8 @@ from pkm_twin.kinematics.tracking import sphere_directions
 
 __all__ = [
     "BaseParameters",
+    "Contact",
+    "ContactMonitor",
     "Energy",
     "Extremes",
     "JointMotion",
