@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 
 from delta_dynamics.contact import SIGMAS, ContactMonitor
 from delta_dynamics.feedforward import Torques
+from delta_dynamics.observer import platform_wrench
 from delta_dynamics.payload import PayloadEstimator
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
@@ -46,6 +47,22 @@ class Estimates:
         known = robot()
         self._payload = self._create_payload(known)
         self._contact = self._create_contact(known)
+        self._warm_up(known)
+
+    def _warm_up(self, robot: Robot) -> None:
+        """Compile what a stream's samples call, before there are any."""
+        still = np.zeros(robot.joints_count)
+        motion = robot.inverse(robot.home()), still, still
+        for k in range(2):
+            if self._payload is not None:
+                self._payload.push(float(k), *motion, still)
+            if self._contact is not None:
+                self._contact.push(float(k), motion, still)
+        if self._contact is not None:
+            platform_wrench(robot, motion[0], still)
+            self._contact.reset()
+        if self._payload is not None:
+            self._payload = PayloadEstimator(robot)
 
     def _create_payload(self, robot: Robot) -> PayloadEstimator | None:
         node = self._node

@@ -16,7 +16,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 
 ROBOT = load("delta_cu")
-PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=5.0")
+PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=600.0")
 OUTPUTS = {
     "/delta_dynamics/payload": InertiaStamped,
     "/delta_dynamics/payload_deviation": InertiaStamped,
