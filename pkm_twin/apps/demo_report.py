@@ -109,8 +109,8 @@ def report_dynamics(
     sent = sum(1 for _ in read_messages(bag, ["/delta_dynamics/joint_trajectory"]))
     filled = read_messages(recording, [f"/{prefix}/delta_dynamics/joint_trajectory_ff"])
     findings = [
-        _share(prefix, "joint states answered", len(stamps), len(r.stamps)),
-        _share(prefix, "trajectories answered", sum(1 for _ in filled), sent),
+        share(prefix, "joint states answered", len(stamps), len(r.stamps)),
+        share(prefix, "trajectories answered", sum(1 for _ in filled), sent),
     ]
     if not stamps:
         return findings, series
@@ -233,7 +233,7 @@ def report_stiffness(
         (np.array(judged) - start) / 1e9,
         true,
     )
-    findings = [_share(prefix, "wrenches answered", len(common), len(wrenches))]
+    findings = [share(prefix, "wrenches answered", len(common), len(wrenches))]
     if not common:
         return findings, series
     dominant = Counter(energies[s].status[0].message for s in common)
@@ -246,7 +246,7 @@ def report_stiffness(
     )
     largest = np.linalg.norm(fixed, axis=1).max()
     findings.append(Finding(prefix, "largest deflection", f"{1e6 * largest:.2f} um"))
-    findings.append(_share(prefix, "deflections with ground truth", len(judged), len(truth)))
+    findings.append(share(prefix, "deflections with ground truth", len(judged), len(truth)))
     if judged:
         place = np.searchsorted(common, judged)
         greatest = 1e6 * np.linalg.norm(true, axis=1).max()
@@ -311,7 +311,8 @@ def _efforts(messages: Mapping[int, Any], stamps: list[int], robot: Robot) -> Ar
     return np.array(efforts).reshape(-1, len(robot.joint_names))
 
 
-def _share(bag: str, what: str, count: int, total: int) -> Finding:
+def share(bag: str, what: str, count: int, total: int) -> Finding:
+    """How many of so many there are, judged by :data:`MIN_ANSWERED`."""
     return Finding(
         bag,
         what,

@@ -3,6 +3,7 @@
 
 import re
 from importlib.util import find_spec
+from xml.etree import ElementTree
 
 import pytest
 
@@ -91,3 +92,41 @@ def test_parameters(node, peer):
     table = list(rows(node))
     begin = next(i for i, cells in enumerate(table) if cells[0] == "parameter")
     assert {name for cells in table[begin:] for name in re.findall(r"`([^`]+)`", cells[0])} == known
+
+
+def allowed(node, what, how):
+    """Full names that the security policy's profile of a node allows."""
+    folder = REPOSITORY / "docs" / "security"
+    policy = ElementTree.parse(folder / "policy.xml")
+    profiles = policy.findall(f".//profile[@node='{node}']")
+    assert len(profiles) == 1
+    common = ElementTree.parse(folder / "node.xml").getroot()
+    names = [
+        name.text
+        for profile in (profiles[0], common)
+        for group in profile.findall(f"{what}s[@{how}='ALLOW']")
+        for name in group.findall(what)
+    ]
+    assert len(set(names)) == len(names)
+    full = {n.replace("~", f"/{node}") for n in names}
+    return {n if n.startswith("/") else f"/{n}" for n in full}
+
+
+def test_the_security_policy_is_that_of_the_node(node, peer):
+    """Not less, or the node would not work; and not more but for a clock that it may be given."""
+    ask = peer.node
+
+    def names(found):
+        return {re.sub("/reactions/.*", "/reactions/*", name) for name, _ in found}
+
+    def agree():
+        published = names(ask.get_publisher_names_and_types_by_node(node, "/"))
+        heard = names(ask.get_subscriber_names_and_types_by_node(node, "/"))
+        served = names(ask.get_service_names_and_types_by_node(node, "/"))
+        return (
+            published == allowed(node, "topic", "publish")
+            and heard | {"/clock", "/parameter_events"} == allowed(node, "topic", "subscribe")
+            and served == allowed(node, "service", "reply")
+        )
+
+    peer.until(agree)
