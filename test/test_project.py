@@ -17,10 +17,12 @@ PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
 MAY_IMPORT_ROS = {
     "delta_dynamics/action_node.py",
+    "delta_dynamics/estimates_node.py",
     "delta_dynamics/gate_node.py",
     "delta_dynamics/node.py",
     "delta_dynamics/sim_node.py",
     "stiffness_monitor/node.py",
+    "pkm_twin/ros/context.py",
     "pkm_twin/ros/listener.py",
     "pkm_twin/ros/node.py",
     "pkm_twin/ros/outputs.py",
