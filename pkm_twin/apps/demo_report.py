@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 MAX_RESIDUAL = 0.05
 """Largest residual RMS without payload, part of the joint's peak effort."""
 
+MAX_CUTTING_RESIDUAL = 0.01
+"""Largest residual RMS while cutting, likewise: without the wrench it is 0.15."""
+
 MIN_ANSWERED = 0.95
 """Least part of the samples that has to be answered."""
 
@@ -62,7 +65,7 @@ class DynamicsSeries:
     predicted: Array
     residual: Array
     free: NDArray[np.bool_]
-    """Where neither payload nor cutting force is on the platform, which the node cannot know."""
+    """Where neither payload nor cutting force is on the platform."""
     loaded: tuple[float, float] | None
 
 
@@ -126,9 +129,24 @@ def report_dynamics(
             bool((part < MAX_RESIDUAL).all()),
         )
     )
+    if r.wrench is not None:
+        findings.append(_cutting(prefix, series))
     if series.loaded is not None:
         findings += _payload(prefix, r, answered, series)
     return findings, series
+
+
+def _cutting(prefix: str, series: DynamicsSeries) -> Finding:
+    """The residual where a force acts, which the node was told."""
+    cut = series.residual[~series.free]
+    part = np.sqrt(np.mean(cut**2, 0)) / np.abs(series.measured).max(0)
+    return Finding(
+        prefix,
+        "residual RMS while cutting",
+        _listed(100 * part, "% of peak"),
+        f"below {100 * MAX_CUTTING_RESIDUAL:g} %",
+        bool((part < MAX_CUTTING_RESIDUAL).all()),
+    )
 
 
 def _loaded(r: Recording) -> tuple[float, float] | None:
