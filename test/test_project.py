@@ -79,8 +79,8 @@ def test_files_are_small_and_name_no_machines_folder():
     for name in files():
         data = (REPOSITORY / name).read_bytes()
         assert len(data) <= 5 * 1024**2, name
-        if b"\0" not in data:
-            found = home.search(data.decode("utf-8"))
+        if name.suffix not in (".mcap", ".png"):
+            found = home.search(data.decode("utf-8", errors="replace"))
             assert found is None, f"{name}: {found}"
 
 
