@@ -90,16 +90,18 @@ class ContactMonitor:
         if external is None:
             return None
         self._since += step
-        square = external**2
-        learning = self._since <= LEARNING
-        if not learning:
-            square = np.minimum(square, CLIPPED * self._noise)
-        part = min(1.0, step / min(self._since, AVERAGED))
-        least = (SHARE * self._greatest) ** 2
-        self._noise = np.maximum(self._noise + part * (square - self._noise), least)
-        if learning:
+        if self._since <= LEARNING:
+            self._learn(external**2, step)
             return None
         model = torque_deviation(self.robot, q, qd, qdd, wrench)
         bound = self.sigmas * np.sqrt(model**2 + self._noise)
         touching = bool((np.abs(external) > bound).any())
+        if not touching:
+            # A lasting push must not become noise.
+            self._learn(np.minimum(external**2, CLIPPED * self._noise), step)
         return Contact(external, bound, platform_wrench(self.robot, q, external), touching)
+
+    def _learn(self, square: Array, step: float) -> None:
+        part = min(1.0, step / min(self._since, AVERAGED))
+        least = (SHARE * self._greatest) ** 2
+        self._noise = np.maximum(self._noise + part * (square - self._noise), least)

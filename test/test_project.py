@@ -17,6 +17,7 @@ PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
 MAY_IMPORT_ROS = {
     "delta_dynamics/action_node.py",
+    "delta_dynamics/estimates_node.py",
     "delta_dynamics/gate_node.py",
     "delta_dynamics/node.py",
     "delta_dynamics/sim_node.py",
@@ -24,10 +25,10 @@ MAY_IMPORT_ROS = {
     "pkm_twin/ros/context.py",
     "pkm_twin/ros/listener.py",
     "pkm_twin/ros/node.py",
+    "pkm_twin/ros/outputs.py",
     "pkm_twin/ros/player.py",
     "pkm_twin/ros/transforms.py",
     "pkm_twin/state/node.py",
-    "pkm_twin/state/outputs.py",
     "pkm_twin/apps/demo.py",
     "pkm_twin/apps/demo_recorder.py",
     "pkm_twin/apps/demo_tracking.py",
