@@ -43,7 +43,7 @@ HEAD = (
 )
 NODES_TEXT = """
 
-Real nodes over DDS, seed {seed}, {seconds:.0f} s: 
+Real nodes over DDS, seed {seed}, {seconds:.0f} s:
 {sent}. All nodes alive, no exception;
 {torques:,} torques came back, each finite and with the stamp of a sound message; {requests:,}
 requests and {clocks:,} clocks were refused and counted.
