@@ -155,7 +155,7 @@ def kinds_of(what: str) -> tuple[Any, ...]:
 
 
 def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tuple[Any, Any]:
-    from delta_dynamics.fit import Recorded
+    from delta_dynamics.fit_rows import Recorded
     from pkm_twin.apps.recorded import read_recording
 
     r = read_recording(path, robot=machine, topics=topics, carried=carried, limited=False)
@@ -168,7 +168,7 @@ def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tu
 
 
 def _of_csv(path: Path, machine: Any) -> Any:
-    from delta_dynamics.fit import Recorded
+    from delta_dynamics.fit_rows import Recorded
     from pkm_twin.apps.columns import read_columns
     from pkm_twin.apps.torques import WRENCH_AXES
 
