@@ -39,10 +39,12 @@ def node(request, peer, launch):
             "on_stop:=nothing",
             "publish_reactions:=true",
             "use_wrench:=true",
+            "estimate_payload:=true",
+            "observe_wrench:=true",
         ),
         "command_gate": ("on_stop:=gravity",),
         # The robot in whose file the masses are.
-        "stiffness_monitor": ("mechanism:=delta_cu",),
+        "stiffness_monitor": ("mechanism:=delta_cu", "correct_setpoint:=true"),
         "machine_state": (),
         "machine_sim": (),
     }
@@ -108,6 +110,8 @@ def allowed(node, what, how):
         for name in group.findall(what)
     ]
     assert len(set(names)) == len(names)
+    if not TF:
+        names = [name for name in names if name not in ("/tf", "/tf_static")]
     full = {n.replace("~", f"/{node}") for n in names}
     return {n if n.startswith("/") else f"/{n}" for n in full}
 
