@@ -294,8 +294,9 @@ def compliance(
     from pkm_twin import load
     from pkm_twin.apps.limits import beyond_limits as find_beyond
     from pkm_twin.apps.limits import refuse_beyond
+    from pkm_twin.machine.uncertainty import deviation
     from stiffness_monitor import compliance as matrix
-    from stiffness_monitor import strain_energy
+    from stiffness_monitor import compliance_deviation, strain_energy
 
     machine = load(robot)
     names = ", ".join(
@@ -325,6 +326,7 @@ def compliance(
             "pose": dict(zip(machine.pose_names, pose, strict=True)),
             "wrench": load_case,
             "compliance": c.tolist(),
+            "compliance_deviation": compliance_deviation(machine, pose).tolist(),
             "deflection": energy.deflection.tolist(),
             "total_energy": float(energy.total),
             "factors": dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
@@ -355,6 +357,10 @@ def compliance(
         if tied
         else f"dominant element {energy.dominant}"
     )
+    if machine.uncertainty:
+        turned = deviation(machine, lambda r: strain_energy(r, pose, load_case).deflection)
+        doubts = ", ".join(f"{n} {1e6 * v:.2g}" for n, v in zip(axes, turned, strict=True))
+        typer.echo(f"its standard deviation by the file's uncertainty: {doubts}")
     typer.echo(f"strain energy {energy.total:.4g} J, {dominant}")
     if energy.dominant != "none":
         typer.echo("shares: " + ", ".join(f"{name} {100 * part:.1f} %" for part, name in shares))

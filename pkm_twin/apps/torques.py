@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics import dynamics_terms, inverse_dynamics, reactions
+from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
 from pkm_twin import load
 from pkm_twin.apps.check import motion
 from pkm_twin.apps.columns import read_columns
@@ -163,6 +163,7 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
     The terms ``NAME.effort_gravity``, ``NAME.effort_inertia`` ... sum to ``NAME.effort``. A
     reaction that rigid bodies do not determine is left empty (NaN) in the table. Where a sample is
     beyond the limits, there is a column :data:`BEYOND_LIMITS`, 1 for such samples, 0 for others.
+    Of a robot whose file has an ``uncertainty``, ``NAME.effort_deviation`` is what that makes.
 
     :raises UnreachableError: by the sample's index in the motion.
     :raises SingularityError: likewise.
@@ -179,6 +180,7 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
         state = (robot, m.q[part], m.qd[part], m.qdd[part], m.wrench[part])
         try:
             tau, terms, react = inverse_dynamics(*state), dynamics_terms(*state), reactions(*state)
+            spread = torque_deviation(*state) if robot.uncertainty else None
         except UnreachableError as e:
             at = (begin + e.index[0],)
             raise UnreachableError("joint state", e.limb, at, e.miss) from None
@@ -198,6 +200,8 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
             put(f"{joint}.velocity", m.qd[part][:, i])
             put(f"{joint}.acceleration", m.qdd[part][:, i])
             put(f"{joint}.effort", tau[:, i])
+            if spread is not None:
+                put(f"{joint}.effort_deviation", spread[:, i])
             if m.measured is not None:
                 put(f"{joint}.measured", m.measured[part][:, i])
             for field in fields(terms):

@@ -170,6 +170,11 @@ def torques(motion: Any, table: Mapping[str, Any]) -> Any:
         if motion.measured is not None:
             ax.plot(table["time"], table[f"{joint}.measured"], color="0.7", lw=2, label="measured")
         ax.plot(table["time"], table[f"{joint}.effort"], color="black", lw=1, label="sum")
+        if f"{joint}.effort_deviation" in table:
+            band = 2.0 * table[f"{joint}.effort_deviation"]
+            low, high = (table[f"{joint}.effort"] + sign * band for sign in (-1.0, 1.0))
+            label = "two deviations"
+            ax.fill_between(table["time"], low, high, color="0.3", alpha=0.25, lw=0, label=label)
         for colour, term in zip(COLOURS, terms, strict=False):
             values = table[f"{joint}.effort_{term}"]
             if np.any(values != 0.0):

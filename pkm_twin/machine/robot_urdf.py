@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.passive import Axis, passive_axes
 from pkm_twin.machine import schema
+from pkm_twin.machine.entries import has_entry
 from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.robot import Robot
@@ -56,13 +57,6 @@ def robot_description(robot: Robot) -> dict[str, Any]:
         data["payload"] = {
             "mass": load.mass, "com": load.com.tolist(), "inertia": load.inertia.tolist()
         }  # fmt: skip
-    for key in ("joint_map", "uncertainty"):
-        told = schema.plain(getattr(robot, key))
-        if told:
-            data[key] = {
-                name: {field: value for field, value in entry.items() if value is not None}
-                for name, entry in told.items()
-            }
     for name, drive in _drives(robot).items():
         joint = data["joints"][name]
         limits: dict[str, Any] = {}
@@ -78,6 +72,15 @@ def robot_description(robot: Robot) -> dict[str, Any]:
             joint["friction"] = {"viscous": drive.damping, "coulomb": drive.friction}
         if offset:
             joint["friction"]["offset"] = offset
+    for key in ("joint_map", "uncertainty"):
+        told = {
+            name: {field: value for field, value in entry.items() if value is not None}
+            for name, entry in schema.plain(getattr(robot, key)).items()
+            # Numbers that the graph does not have are unsure no more.
+            if key == "joint_map" or has_entry(data, name)
+        }
+        if told:
+            data[key] = told
     return data
 
 
