@@ -24,7 +24,7 @@ help:
 	@echo "make soak         ten million poses, and all nodes in all weathers, in flat memory (MINUTES)"
 	@echo "make audit        known vulnerabilities of what is installed"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
-	@echo "make pages        docs/parameters.md from the schemas, pictures of imports and of robots"
+	@echo "make pages        docs/parameters.md from the schemas, pictures of imports, robots and the page"
 	@echo "make clean        remove .venv, out and caches"
 
 # One stamp a set of extras, made anew when the requirements change.
@@ -95,6 +95,7 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m test.docs.engine docs/engine.md
 	$(BIN)/python -m test.docs.architecture docs/architecture.png
 	$(BIN)/python -m test.docs.robots docs/gallery
+	$(BIN)/python -m test.docs.view docs/gallery
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

@@ -10,6 +10,7 @@ May import: numpy, scipy, cvxpy where semidefinite constraints bind, pkm_twin's 
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -199,7 +200,7 @@ def _nearest(
         root = np.sqrt(information)[:, None] * vectors.T
         return _bounded(root, root @ z, start, scales, cones)
     try:
-        import cvxpy
+        cvxpy: Any = importlib.import_module("cvxpy")
     except ImportError:
         raise PkmTwinError(
             "the data want a mass or an inertia that no body has, and the nearest possible one "
@@ -246,7 +247,8 @@ def _bounded(root: Array, aim: Array, start: Array, scales: Array, cones: Cones)
         k = int(np.flatnonzero(cone[0, 0])[0])
         low[where.start + k] = -start[where.start + k] / scales[where.start + k]
     found = lsq_linear(root, aim, (np.minimum(low, -1e-15), np.inf), method="bvls")
-    return np.maximum(start + scales * found.x, np.where(np.isfinite(low), 0.0, -np.inf))
+    least = np.where(np.isfinite(low), 0.0, -np.inf)
+    return np.asarray(np.maximum(start + scales * found.x, least), np.float64)
 
 
 def _inside(values: Array, start: Array, cones: Cones) -> Array:

@@ -7,7 +7,7 @@ May import: numpy, pkm_twin's core, this package, the standard library.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics.regressor import TEN, parameter_names
+from delta_dynamics.virtual_work import mass_matrix
 from pkm_twin.machine.inertia import transport
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.shared import KINDS, Kind, Shared
@@ -66,12 +67,20 @@ class FileParameters:
         return tuple((where, cone) for where, group in pairs for cone in group.cones)
 
 
+def _scaled(group: Shared, robot: Robot) -> Shared:
+    """A rotor may weigh as much as all that the joints move at home."""
+    if group.kind != "rotor":
+        return group
+    moved = float(np.diag(mass_matrix(robot, robot.graph.home)).max())
+    return replace(group, scales=np.array([max(moved, float(group.values[0]))]))
+
+
 def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameters:
     """The parameters of some kinds.
 
     :raises ParameterError: the robot's file gives no masses.
     """
-    kept = [g for g in robot.shared_parameters() if g.kind in what]
+    kept = [_scaled(g, robot) for g in robot.shared_parameters() if g.kind in what]
     place = {name: k for k, name in enumerate(parameter_names(robot))}
     tree = robot.engine.tree
     mixing = np.zeros((len(place), sum(len(group.names) for group in kept)))

@@ -144,13 +144,22 @@ def tracks(
     width = window or choose_window(positions, period, noise)
     result = []
     for t, (place, force, load, carried) in pieces:
-        rates = [
+        smooth, rate, second = (
             np.asarray(signal.savgol_filter(place, width, DEGREE, k, period, axis=0))
             for k in range(3)
-        ]
+        )
         cut = slice(width // 2, len(t) - width // 2)
         result.append(
-            Track(t[cut], *(r[cut] for r in rates), force[cut], load[cut], carried[cut], period)
+            Track(
+                t[cut],
+                smooth[cut],
+                rate[cut],
+                second[cut],
+                force[cut],
+                load[cut],
+                carried[cut],
+                period,
+            )
         )
     speed = np.sqrt(np.mean(np.concatenate([p.qd for p in result]) ** 2, 0))
     change = np.sqrt(np.mean(np.concatenate([p.qdd for p in result]) ** 2, 0))

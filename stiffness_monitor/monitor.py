@@ -32,6 +32,7 @@ class Answer:
     """
 
     stamp: int
+    q: Array
     pose: Array
     wrench: Array
     compliance: Array
@@ -126,7 +127,7 @@ class Monitor:
         fixed = self._wrenches.at_reference(sample, mount, rotation)
         energy = strain_energy(self.robot, pose, fixed)
         matrix = compliance(self.robot, pose)
-        return Answer(sample.stamp, pose, fixed, matrix, energy, rotation)
+        return Answer(sample.stamp, q, pose, fixed, matrix, energy, rotation)
 
     def _nearest(self, stamp: int) -> Array:
         """Joint positions of the state nearest in time."""

@@ -29,6 +29,7 @@ from pkm_twin.ros.intake import JointStateDecoder
 from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench
 from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.compliance import kernels
+from stiffness_monitor.correction_node import SetpointCorrection
 from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings
 
@@ -58,6 +59,7 @@ class StiffnessMonitor(health.TwinNode):
         self._platform_frame = given or ("" if mounts is None else PLATFORM)
         self._monitor = Monitor(robot, settings, mounts)
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
+        self._correction = SetpointCorrection(self, robot, settings.stamp_rules, self._decode)
         self._compliance = self.create_guarded_publisher(Float64MultiArray, "~/compliance")
         # What has no stamp, or texts for numbers, has a sibling that plots can draw.
         self._compliance_stamped = self.create_guarded_publisher(JointState, "~/compliance_stamped")
@@ -99,6 +101,7 @@ class StiffnessMonitor(health.TwinNode):
     def time_jumped_backward(self) -> None:
         """No pose across the seam."""
         self._monitor.reset()
+        self._correction.reset()
         self._known = 0
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
@@ -113,6 +116,8 @@ class StiffnessMonitor(health.TwinNode):
             "wrenches answered": core.wrenches.accepted,
             "older stamps dropped": core.dropped,
         }
+        if self._correction.wanted:
+            values["corrections at their bound"] = self._correction.bounded
         values |= {f"joint states rejected: {k}": v for k, v in core.states.rejected.items()}
         values |= {f"wrenches rejected: {k}": v for k, v in core.wrenches.rejected.items()}
         return level, message, values
@@ -187,6 +192,7 @@ class StiffnessMonitor(health.TwinNode):
         deflection.header.frame_id = frame
         deflection.child_frame_id = f"{frame}_deflected"
         self._deflection.publish(deflection)
+        self._correction.take(answer)
 
     def _publish_frequencies(self) -> None:
         """Of the latest joint state: a pose costs milliseconds, so not of every one."""

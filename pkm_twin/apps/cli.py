@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pkm_twin.apps.calibrate import calibrate_command
+from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.apps.options import (
@@ -503,6 +504,7 @@ app.command("calibrate")(calibrate_command)
 app.command()(guard_check)
 app.command()(view)
 app.command()(fit)
+app.command()(excite)
 app.command()(atlases.show)
 
 

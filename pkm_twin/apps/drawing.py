@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.graph import BASE, Graph
-from pkm_twin.machine.outline import body_points, platform_face
+from pkm_twin.machine.outline import body_points, crosspieces, platform_face
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -52,6 +52,9 @@ def draw(robot: Robot, ax: Any = None) -> Any:
         for shift in (0.0,) if rod.pair is None else (-rod.width / 2, rod.width / 2):
             aside = shift * (np.zeros(3) if rod.pair is None else rod.pair)
             ax.plot(*(rod.ends + aside).T, color=ROD, linewidth=2)
+    for bar in crosspieces(graph):
+        colour = PLATFORM if bar.part == graph.platform else BODY
+        ax.plot(*np.array([bar.start[1], bar.end[1]]).T, color=colour, linewidth=2)
     for joint in graph.joints.values():
         if joint.kind == "translation":
             continue

@@ -61,9 +61,10 @@ def fit(
     What the motion does not show keeps the file's value and is named. --payload and --load-times
     tell of a payload that is known, or, with `payload` among what is fitted, when it is held.
     """
-    from pkm_twin.apps.fit_files import fitted_yaml, robot_text
+    from pkm_twin.apps.fit_files import fitted_yaml, robot_text, yaml_head
+    from pkm_twin.machine.edited import write_edited
 
-    kinds = _kinds(what)
+    kinds = kinds_of(what)
     page = out.with_suffix(".html")
     if out.suffix not in (".yaml", ".yml"):
         raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
@@ -75,7 +76,7 @@ def fit(
         result = fit_recordings(machine, recordings, kinds, topic, carried, update)
     names = [path.name for path in recordings]
     try:
-        out.write_text(fitted_yaml(text, result, names), encoding="utf-8")
+        write_edited(out, yaml_head(result, names), fitted_yaml(text, result, names))
         if report:
             from pkm_twin.apps.fit_report import fit_page
 
@@ -139,7 +140,11 @@ def _away_from_changes(recorded: Any, load: Any) -> Any:
     )
 
 
-def _kinds(what: str) -> tuple[Any, ...]:
+def kinds_of(what: str) -> tuple[Any, ...]:
+    """The kinds of numbers in words with commas between.
+
+    :raises UnknownNameError: another word.
+    """
     from pkm_twin.machine.shared import KINDS
 
     words = tuple(word.strip() for word in what.split(","))
@@ -150,7 +155,7 @@ def _kinds(what: str) -> tuple[Any, ...]:
 
 
 def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tuple[Any, Any]:
-    from delta_dynamics.fit import Recorded
+    from delta_dynamics.fit_rows import Recorded
     from pkm_twin.apps.recorded import read_recording
 
     r = read_recording(path, robot=machine, topics=topics, carried=carried, limited=False)
@@ -163,7 +168,7 @@ def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tu
 
 
 def _of_csv(path: Path, machine: Any) -> Any:
-    from delta_dynamics.fit import Recorded
+    from delta_dynamics.fit_rows import Recorded
     from pkm_twin.apps.columns import read_columns
     from pkm_twin.apps.torques import WRENCH_AXES
 
@@ -258,7 +263,7 @@ def _print(result: Any) -> None:
     e = result.estimate
     typer.echo(f"condition number {e.condition:.3g} over {e.directions} combinations")
     if e.bound:
-        typer.echo("the nearest possible masses and inertias: the data alone want impossible ones")
+        typer.echo("held by a bound: the data alone want negative friction or no possible body")
     for judged, delay in zip(result.judged, result.delays, strict=True):
         typer.echo(f"{judged.name}: efforts late by {1e3 * delay:.3g} ms")
         before, after = judged.rms(judged.before), judged.rms(judged.after)

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from delta_dynamics.fit import Fit, Number
 from pkm_twin import Robot, load
-from pkm_twin.machine.catalogue import TREES, config_folder, robot_of_data
+from pkm_twin.machine.catalogue import TREES, robot_of_data, robot_path
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.robot_urdf import robot_description
 from pkm_twin.machine.shared import Key
@@ -23,20 +22,34 @@ def robot_text(name: str, *, per_copy: bool = False) -> tuple[str, Robot]:
     :raises ParameterError: the file is refused.
     """
     robot = load(name)
-    path = Path(name)
+    path = robot_path(name)
     if per_copy or path.suffix in TREES:
         data = read_urdf(path) if path.suffix in TREES else robot_description(robot)
         return describe_machine_yaml(data), robot_of_data(data, path.stem)
-    if path.suffix not in (".yaml", ".yml") and "/" not in name:
-        path = config_folder() / f"{name}.yaml"
     return path.read_text(encoding="utf-8"), robot
+
+
+def yaml_head(result: Fit, recordings: Sequence[str]) -> list[str]:
+    """Lines for the head of the file: from what, how well."""
+    e = result.estimate
+    lines = [
+        f"Fitted from {', '.join(recordings)}: {e.directions} combinations, condition number "
+        f"{e.condition:.3g}."
+    ]
+    for judged in result.judged:
+        before, after = (
+            ", ".join(f"{v:.3g}" for v in judged.rms(which))
+            for which in (judged.before, judged.after)
+        )
+        lines.append(f"Residual rms held out of {judged.name}: {before} before, {after} now.")
+    return lines
 
 
 def fitted_yaml(text: str, result: Fit, recordings: Sequence[str]) -> str:
     """The robot's file with what was fitted, each number's deviation and source in a comment."""
     groups: dict[Key, list[Number]] = {}
     for number in result.numbers:
-        base = tuple(k for k in number.key if not isinstance(k, int))
+        base: Key = tuple(k for k in number.key if not isinstance(k, int))
         # A section of a list is no place in a vector.
         if number.key[:1] == ("limbs",) and isinstance(number.key[1], int):
             base = (*number.key[:2], *base[1:])

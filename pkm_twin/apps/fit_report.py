@@ -47,8 +47,8 @@ def fit_page(result: Fit, recordings: Sequence[str]) -> str:
     )
     if e.bound:
         parts.append(
-            "<p>The data alone want masses or inertias that no body has; these are the nearest "
-            "possible ones.</p>"
+            "<p>The data alone want negative friction, or masses and inertias that no body has; "
+            "these are the nearest possible ones.</p>"
         )
     idle = result.of("not excited")
     if idle:

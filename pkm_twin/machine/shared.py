@@ -195,4 +195,4 @@ def bar(pivot: Array, along: Array) -> Array:
             [0.0, 0, 0, 0, *np.diag(across), across[0, 1], across[0, 2], across[1, 2]],
         ]
     )
-    return transport(np.eye(3), pivot) @ local.T
+    return np.asarray(transport(np.eye(3), pivot) @ local.T, np.float64)

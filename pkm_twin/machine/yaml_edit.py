@@ -74,7 +74,7 @@ def _set(text: str, path: Path, value: Any) -> str:
         if below is None:
             return _add(text, node, path[depth:], value)
         node = below
-    begin, end = node.start_mark.index, node.end_mark.index
+    begin, end = int(node.start_mark.index), int(node.end_mark.index)
     block = isinstance(node, yaml.CollectionNode) and not node.flow_style
     if block:
         # A list of lines, or an empty value: it ends where the next key begins.
@@ -93,7 +93,7 @@ def _add(text: str, node: Any, rest: Path, value: Any) -> str:
     if not isinstance(node, yaml.MappingNode):
         raise ParameterError(str(rest[0]), None, "a section of the file")
     if node.flow_style:
-        end = node.end_mark.index - 1
+        end = int(node.end_mark.index) - 1
         before = text[:end].rstrip()
         comma = "" if before.endswith(("{", ",")) else ","
         return f"{before}{comma}{' ' if comma or before.endswith(',') else ''}{entry}{text[end:]}"
@@ -107,7 +107,7 @@ def _add(text: str, node: Any, rest: Path, value: Any) -> str:
     else:
         at = text.find("\n", node.value[0][1].end_mark.index - 1) + 1
         at = at or len(text)
-    return text[:at] + " " * marks[0].column + entry + "\n" + text[at:]
+    return "".join((text[:at], " " * int(marks[0].column), entry, "\n", text[at:]))
 
 
 def flow(value: Any) -> str:

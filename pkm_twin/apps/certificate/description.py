@@ -185,6 +185,14 @@ def _turned(entry: dict[str, Any], turn: Array, own: set[str], number: int) -> d
             entry[key] = [(turn @ vector(v)).tolist() for v in entry[key]]
     if "inertia" in entry:
         entry["inertia"] = (turn @ tensor(entry["inertia"]) @ turn.T).tolist()
+    # Drives of copies may differ: one number a copy.
+    if isinstance(entry.get("rotor_inertia"), list):
+        entry["rotor_inertia"] = entry["rotor_inertia"][number - 1]
+    if entry.get("friction"):
+        entry["friction"] = {
+            key: value[number - 1] if isinstance(value, list) else value
+            for key, value in entry["friction"].items()
+        }
     if "between" in entry:
         entry["between"] = [
             f"{name}_{number}" if name in own else name for name in entry["between"]

@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A trajectory that identifies well: finite Fourier series, D-optimal, within all limits.
+
+Swevers, Ganseman, Tukel, De Schutter, Van Brussel, Optimal robot excitation and identification,
+1997, doi:10.1109/70.631234. The determinant of the information over the base parameters is made
+large, by random steps from the best so far; what leaves a limit is made smaller until it does not.
+
+May import: numpy, pkm_twin's core, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.base_parameters import independent, random_states
+from delta_dynamics.file_parameters import FileParameters
+from delta_dynamics.regressor import regressor
+from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.kinematics.workspace import reachable
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+SAMPLES: Final = 120
+"""States of a trial at which the information is taken."""
+DENSE: Final = 1200
+"""States at which the result's limits are looked at."""
+THIN: Final = 4
+"""Of the states, each of which the workspace is asked about."""
+SHRINK: Final = 0.85
+FREQUENCY: Final = 1.0
+"""Highest frequency, Hz, of a robot whose file has no velocity limits."""
+FASTEST: Final = 5.0
+"""Highest frequency, Hz, whatever the limits."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What a trajectory keeps to. ``share``: of the file's limits, and of the position range.
+
+    ``acceleration``: of every joint, rad/s2 or m/s2, None: none. ``singularity``: least measure.
+    """
+
+    share: float = 0.9
+    acceleration: float | None = None
+    singularity: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """A periodic trajectory that begins and ends at rest, without acceleration.
+
+    q_j(t) = centre_j + sum over i of sine_ji sin(w k_i t) + cosine_ji cos(w k_i t), w = 2 pi /
+    duration; ``harmonics``: k, shape (h,); ``sines``, ``cosines``: shape (n, h), rad or m.
+    ``condition``: condition number of the scaled regressor over the base parameters.
+    """
+
+    duration: float
+    harmonics: Array
+    centre: Array
+    sines: Array
+    cosines: Array
+    condition: float
+
+    def at(self, time: Array) -> tuple[Array, Array, Array]:
+        """Positions, rates and accelerations, shape (k, n) each."""
+        return _series(
+            time, self.duration, self.harmonics, self.centre, np.stack([self.sines, self.cosines])
+        )
+
+
+def _series(
+    time: Array, duration: float, harmonics: Array, centre: Array, pair: Array
+) -> tuple[Array, Array, Array]:
+    w = 2 * np.pi * harmonics / duration
+    s, c = np.sin(np.outer(time, w)), np.cos(np.outer(time, w))
+    a, b = pair[0].T, pair[1].T
+    q = centre + s @ a + c @ b
+    return q, (c * w) @ a - (s * w) @ b, -(s * w**2) @ a - (c * w**2) @ b
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """What the information of a motion is measured by: base columns of a file's parameters."""
+
+    robot: Robot
+    parameters: FileParameters
+    columns: tuple[int, ...]
+    scales: Array
+    weights: Array
+
+    @classmethod
+    def of(cls, robot: Robot, parameters: FileParameters) -> Judge:
+        """By random states: which columns are independent, what makes them of one size.
+
+        :raises PkmTwinError: nothing of the parameters shows in any motion.
+        """
+        count = max(60, 3 * len(parameters.names) // robot.joints_count)
+        states = random_states(robot, count, seed=0)
+        table = regressor(robot, *states) @ parameters.mixing
+        size = np.sqrt(np.mean(inverse_dynamics(robot, *states) ** 2, 0))
+        weights = 1.0 / np.maximum(size, 1e-9 * size.max())
+        rows = (table * weights[:, None]).reshape(-1, table.shape[-1])
+        norms = np.sqrt(np.mean(rows**2, 0))
+        known = np.where(np.isnan(parameters.scales), 0.0, parameters.scales)
+        scales = np.where(known > 0.0, known, 1.0 / np.where(norms > 0.0, norms, 1.0))
+        if not (rows * scales).any():
+            raise PkmTwinError("no motion of this robot tells anything of what is asked for")
+        columns, _ = independent(rows * scales)
+        return cls(robot, parameters, columns, scales, weights)
+
+    def singular_values(self, q: Array, qd: Array, qdd: Array) -> Array:
+        """Of the weighted, scaled regressor over the base parameters, per sample, (b,)."""
+        table = regressor(self.robot, q, qd, qdd) @ self.parameters.mixing[:, list(self.columns)]
+        table = table * self.weights[:, None] * self.scales[list(self.columns)]
+        values = np.linalg.svd(table.reshape(-1, len(self.columns)), compute_uv=False)
+        return np.asarray(values / np.sqrt(len(table)), np.float64)
+
+    def condition(self, q: Array, qd: Array, qdd: Array) -> float:
+        """Condition number of a motion; infinite where it does not show a base parameter."""
+        values = self.singular_values(q, qd, qdd)
+        return float(values[0] / values[-1]) if values[-1] > 1e-12 * values[0] else np.inf
+
+
+def excite(
+    judge: Judge,
+    duration: float = 10.0,
+    terms: int = 6,
+    bounds: Bounds | None = None,
+    *,
+    trials: int = 300,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> Excitation:
+    """The best of many trajectories.
+
+    :param duration: s. ``terms``: harmonics of each joint, at least 3.
+    :param trials: how many trajectories are looked at; ``progress`` is called with the number.
+    :raises PkmTwinError: no trajectory at all keeps to the limits.
+    """
+    robot, keep = judge.robot, bounds or Bounds()
+    centre, reach = _range(robot, keep.share)
+    harmonics = _harmonics(robot, duration, terms, reach, keep.share)
+    basis = _resting(harmonics)
+    rng = np.random.default_rng(seed)
+    shape = (len(centre), basis.shape[1])
+    coarse = np.linspace(0.0, duration, SAMPLES, endpoint=False)
+    best: tuple[float, Array, Array] | None = None
+    step = 1.0
+    for trial in range(trials):
+        fresh = best is None or trial < max(10, trials // 5)
+        amount = rng.normal(size=shape)
+        free = amount if fresh or best is None else best[1] + step * amount
+        pair = np.moveaxis((free @ basis.T).reshape(shape[0], 2, -1), 1, 0)
+        fitted = _within(robot, keep, duration, harmonics, centre, reach, pair, coarse)
+        if fitted is not None:
+            motion = _series(coarse, duration, harmonics, centre, fitted)
+            values = judge.singular_values(*motion)
+            score = float(np.sum(np.log(np.maximum(values, 1e-12))))
+            if best is None or score > best[0]:
+                size = np.abs(fitted).max() / np.abs(pair).max()
+                best = score, free * size, fitted
+                step = float(np.sqrt(np.mean((free * size) ** 2))) * (0.5 if fresh else 0.4)
+            elif not fresh:
+                step *= 0.98
+        if progress is not None:
+            progress(trial + 1)
+    if best is None:
+        raise PkmTwinError(
+            "no trajectory keeps to the limits and clear of singularities: a smaller --singularity "
+            "or wider limits.position"
+        )
+    dense = np.linspace(0.0, duration, DENSE, endpoint=False)
+    final = _within(robot, keep, duration, harmonics, centre, reach, best[2], dense)
+    assert final is not None  # noqa: S101
+    condition = judge.condition(*_series(dense, duration, harmonics, centre, final))
+    return Excitation(duration, harmonics, centre, final[0], final[1], condition)
+
+
+def _range(robot: Robot, share: float) -> tuple[Array, Array]:
+    """Middle and half width of the joints' positions that are used, shape (n,) each."""
+    home, size = robot.graph.home, robot.engine.tree.size
+    half = np.array([0.15 * size if unit == "m" else 0.3 for unit in robot.joint_units])
+    low, high = home - half, home + half
+    if robot.limits.position is not None:
+        given = np.isfinite(robot.limits.position).all(1)
+        low = np.where(given, robot.limits.position[:, 0], low)
+        high = np.where(given, robot.limits.position[:, 1], high)
+    return (low + high) / 2, share * (high - low) / 2
+
+
+def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, share: float) -> Array:
+    """Different multiples of 1 / duration, up to where velocity and position limits meet."""
+    top = FREQUENCY
+    if robot.limits.velocity is not None:
+        velocity = np.where(np.isfinite(robot.limits.velocity), robot.limits.velocity, np.inf)
+        meeting = share * velocity / (2 * np.pi * reach)
+        top = float(np.min(meeting, initial=FASTEST))
+    most = max(terms, round(top * duration))
+    return np.unique(np.round(np.linspace(1, most, terms))).astype(np.float64)
+
+
+def _resting(harmonics: Array) -> Array:
+    """Basis of sines and cosines of no velocity and acceleration at the ends, (2 h, 2 h - 2)."""
+    h = len(harmonics)
+    rows = np.zeros((2, 2 * h))
+    rows[0, :h], rows[1, h:] = harmonics, harmonics**2
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    # High harmonics begin small: they are what velocity limits bind first.
+    damped = np.concatenate([1.0 / harmonics, 1.0 / harmonics])
+    free = np.linalg.svd(rows)[2][2:].T
+    return np.asarray(_projected(rows, damped[:, None] * free), np.float64)
+
+
+def _projected(rows: Array, basis: Array) -> Array:
+    return basis - rows.T @ (rows @ basis)
+
+
+def _within(
+    robot: Robot,
+    keep: Bounds,
+    duration: float,
+    harmonics: Array,
+    centre: Array,
+    reach: Array,
+    pair: Array,
+    time: Array,
+) -> Array | None:
+    """The series made smaller until it keeps to all limits; None where it never does."""
+    q, qd, qdd = _series(time, duration, harmonics, np.zeros(len(centre)), pair)
+    use = [np.abs(q).max(0) / reach]
+    if robot.limits.velocity is not None:
+        use.append(np.abs(qd).max(0) / (keep.share * robot.limits.velocity))
+    if keep.acceleration is not None:
+        use.append(np.abs(qdd).max(0) / (keep.share * keep.acceleration))
+    size = 1.0 / np.max(use, 0, initial=1e-300)
+    if time.size == DENSE:
+        # What was within its limits stays as it is.
+        size = np.minimum(size, 1.0)
+    pair = pair * size[:, None]
+    for _ in range(20):
+        motion = _series(time, duration, harmonics, centre, pair)
+        if _clear(robot, keep, *motion):
+            return pair
+        pair = SHRINK * pair
+    return None
+
+
+def _clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array) -> bool:
+    """Assembly, singularity margin, workspace and efforts."""
+    measure, good = robot.try_singularity(q)
+    if not good.all() or (measure < keep.singularity).any():
+        return False
+    # Passive joints and limbs that meet: dear, so at some of the states.
+    if not reachable(robot, robot.forward(q[::THIN])).all():
+        return False
+    if robot.limits.effort is None:
+        return True
+    efforts = inverse_dynamics(robot, q, qd, qdd)
+    return bool((np.abs(efforts) <= keep.share * robot.limits.effort).all())

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording as rows of a least-squares problem: regressor and efforts, filtered alike.
+
+May import: numpy, scipy, pkm_twin's core, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d  # type: ignore[import-untyped]
+
+from delta_dynamics.estimation import estimate
+from delta_dynamics.file_parameters import FileParameters
+from delta_dynamics.regressor import parameter_values, regressor
+from delta_dynamics.samples import LEAST, WINDOWS, Filtering, Track, by_blocks, low_pass, tracks
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+BLOCK: Final = 2048
+OUTLIER: Final = 8.0
+"""Robust deviations beyond which a measured effort is no measurement."""
+STILL: Final = 4.0
+"""Deviations of a rate's noise below which a joint stands still."""
+LATE: Final = 2.0
+"""Samples by which efforts may well be late."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A recording: ``time`` (k,), s; q and efforts (k, n); wrench (k, 6) or None.
+
+    ``held``: 1 where the payload that is looked for is on the platform, shape (k,). ``carried``:
+    a robot with the payload that is known, while it is held; None where there is none.
+    """
+
+    name: str
+    time: Array
+    q: Array
+    effort: Array
+    wrench: Array | None = None
+    held: Array | None = None
+    carried: Robot | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Filtered rows of one recording: time (k,), table (k, n, parameters), target (k, n).
+
+    ``rest``: what the parameters that stay need; ``counts``: what is judged; ``change``: of the
+    efforts in time, (k, n) each. ``period``: of the samples, s.
+    """
+
+    time: Array
+    table: Array
+    target: Array
+    rest: Array
+    counts: Array
+    change: Array
+    outliers: int
+    period: float
+
+    def part(self, rows: slice) -> Rows:
+        """Some of the rows."""
+        return Rows(
+            self.time[rows], self.table[rows], self.target[rows], self.rest[rows],
+            self.counts[rows], self.change[rows], self.outliers, self.period,
+        )  # fmt: skip
+
+
+def next_window(window: int) -> int:
+    """The window that is fitted beside: the next shorter one, of the shortest the next."""
+    k = WINDOWS.index(window)
+    return WINDOWS[k - 1] if k else WINDOWS[1]
+
+
+def rows_of(
+    robot: Robot, parameters: FileParameters, recording: Recorded, window: int | None
+) -> tuple[Rows, Filtering]:
+    """A recording's filtered rows.
+
+    :raises PkmTwinError: it is too short, or its joints stand still.
+    """
+    r = recording
+    if len(r.time) < LEAST:
+        raise PkmTwinError(
+            f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row"
+        )
+    none = np.zeros((len(r.time), 6))
+    held = np.ones(len(r.time)) if r.held is None else r.held
+    pieces, how = tracks(
+        r.time, r.q, r.effort, none if r.wrench is None else r.wrench, held, window
+    )
+    if not pieces:
+        raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
+    parts = [_piece(robot, parameters, r.carried, track) for track in pieces]
+    if all(not part.moves.any() for part in parts):
+        raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
+    first, outliers = _drop_outliers(parts, parameters, how.keep_every)
+    made = [part.filtered(first, track, how) for part, track in zip(parts, pieces, strict=True)]
+    time, table, target, rest, counts, change = (
+        np.concatenate([one[k] for one in made]) for k in range(6)
+    )
+    period = pieces[0].period
+    return Rows(time, table, target, rest, counts, change, outliers, period), how
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """One even piece before the filter."""
+
+    table: Array
+    target: Array
+    rest: Array
+    moves: Array
+    """1 where a joint moves, or where standing still is no matter, shape (k, n)."""
+
+    def filtered(self, first: Array, track: Track, how: Filtering) -> tuple[Array, ...]:
+        """Time, table, target, rest, what counts and the efforts' change, all filtered alike."""
+        samples = len(self.table)
+        change = np.gradient(self.rest + self.table @ first, track.period, axis=0)
+        flat = np.concatenate(
+            [self.table.reshape(samples, -1), self.target, self.rest, self.moves, change,
+             track.time[:, None]], 1,
+        )  # fmt: skip
+        smooth = low_pass(flat, track.period, how)
+        n = self.target.shape[1]
+        ends = np.cumsum([self.table[0].size, n, n, n, n])
+        table, target, rest, moves, change, time = np.split(smooth, ends, 1)
+        # Where standing still is in the filter's reach, friction's sign is not known.
+        counts = (moves > 0.8).astype(np.float64)
+        return time[:, 0], table.reshape(len(table), n, -1), target, rest, counts, change
+
+
+def _piece(robot: Robot, parameters: FileParameters, carried: Robot | None, track: Track) -> _Piece:
+    pi = parameter_values(robot)
+    extra = np.zeros(len(pi)) if carried is None else parameter_values(carried) - pi
+    loads = [
+        where
+        for where, group in zip(parameters.slices, parameters.groups, strict=True)
+        if group.kind == "payload"
+    ]
+
+    def block(rows: slice) -> Array:
+        full = regressor(robot, track.q[rows], track.qd[rows], track.qdd[rows], track.wrench[rows])
+        own = full @ parameters.mixing
+        held = track.held[rows]
+        rest = full @ pi - own @ parameters.values + held[:, None] * (full @ extra)
+        for where in loads:
+            own[..., where] *= held[:, None, None]
+        return np.concatenate([own, rest[..., None]], -1)
+
+    both = by_blocks(len(track.q), BLOCK, block)
+    table, rest = both[..., :-1], both[..., -1]
+    rate_noise = STILL * np.abs(track.qd - np.asarray(_smooth(track.qd))).mean(0)
+    moves = np.abs(track.qd) > np.maximum(rate_noise, 1e-9)
+    return _Piece(table, track.effort - rest, rest, moves.astype(np.float64))
+
+
+def _smooth(values: Array) -> Array:
+    """A running mean of three."""
+    inner = (values[:-2] + values[1:-1] + values[2:]) / 3.0
+    return np.concatenate([values[:1], inner, values[-1:]])
+
+
+def _drop_outliers(
+    parts: list[_Piece], parameters: FileParameters, every: int
+) -> tuple[Array, int]:
+    """Efforts far from a first robust fit take its values, but not where they are many.
+
+    :returns: that fit's parameters, and how many efforts.
+    """
+    table = np.concatenate([part.table[::every] for part in parts])
+    target = np.concatenate([part.target[::every] for part in parts])
+    rest = np.concatenate([part.rest[::every] for part in parts])
+    scales = prior_scales(parameters, table, target + rest)
+    first = estimate(table, target, parameters.values, scales).values
+    count = 0
+    for part in parts:
+        told = part.table @ first
+        away = np.abs(part.target - told)
+        bound = OUTLIER * 1.4826 * np.median(away, axis=0)
+        # Where friction turns over, an effort that is some samples late is no outlier.
+        near = maximum_filter1d(np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0)
+        far = (away > bound + LATE * near) & (bound > 1e-6 * np.abs(part.target).max(0))
+        if far.mean() > 0.05:
+            continue
+        part.target[far] = told[far]
+        count += int(far.sum())
+    return first, count
+
+
+def prior_scales(parameters: FileParameters, table: Array, effort: Array) -> Array:
+    """The prior's deviations; of friction and rotors what would be all of the joints' efforts."""
+    scales = parameters.scales.copy()
+    size = np.sqrt(np.mean(effort**2, 0))
+    columns = np.sqrt(np.mean(table**2, 0))
+    for k in np.flatnonzero(np.isnan(scales)):
+        joint = int(np.argmax(columns[:, k]))
+        shown = columns[joint, k]
+        scales[k] = size[joint] / shown if shown > 0.0 else 0.0
+    kinds = [name.rpartition(".")[2] for name in parameters.names]
+    for k in np.flatnonzero(scales == 0.0):
+        # As uncertain as the others of its sort, where its joint does not move.
+        alike = [s for s, kind in zip(scales, kinds, strict=True) if kind == kinds[k] and s > 0.0]
+        scales[k] = max(alike, default=1.0)
+    return scales

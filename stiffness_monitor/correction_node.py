@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Set points that cancel the tool point's deflection under the measured wrench.
+
+Only the node ``stiffness_monitor`` imports this module.
+"""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+from rclpy.time import Time
+from sensor_msgs.msg import JointState
+
+from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros import node as health
+from pkm_twin.ros.messages import SECOND, JointReader, StampRules
+from stiffness_monitor.correction import setpoint_correction
+from stiffness_monitor.monitor import Answer
+
+MAX_BOUND = 1.0
+"""Largest bound of an offset, rad or m."""
+
+
+class SetpointCorrection:
+    """``~/setpoint_offset`` of every wrench; ``setpoint`` with it is ``~/corrected_setpoint``."""
+
+    def __init__(self, node: health.TwinNode, robot: Robot, rules: StampRules, decode: Any) -> None:
+        """Declare the parameters and create the topics that they ask for.
+
+        :param rules: what the stamps of set points have to keep to.
+        :param decode: of raw joint states.
+        """
+        self._node, self._robot, self._rules, self._decode = node, robot, rules, decode
+        self._reader = JointReader(robot)
+        self._offset: tuple[int, Any] | None = None
+        self.bounded = 0
+        wanted = node.declare(
+            "correct_setpoint",
+            False,
+            "publish joint offsets that cancel the tool point's deflection",
+            read_only=True,
+        )
+        self._tool = np.array(
+            node.declare(
+                "tool.xyz",
+                [0.0, 0.0, 0.0],
+                "tool point from the platform's reference point, platform axes",
+                unit="m",
+                read_only=True,
+            ),
+            float,
+        )
+        if self._tool.shape != (3,):
+            raise ParameterError("tool.xyz", self._tool.tolist(), "3 numbers, m")
+        self._bound = node.declare(
+            "correction_bound",
+            1e-3,
+            "largest joint offset; beyond it all are made smaller alike",
+            unit="rad or m",
+            low=0.0,
+            high=MAX_BOUND,
+            read_only=True,
+        )
+        self._age = node.declare(
+            "correction_age",
+            0.1,
+            "from a set point back to the wrench that corrects it",
+            unit="s",
+            low=0.0,
+            high=3600.0,
+            read_only=True,
+        )
+        self.wanted = bool(wanted)
+        if not wanted:
+            return
+        q = robot.inverse(robot.home())
+        setpoint_correction(robot, q, np.zeros(6), tool=self._tool, bound=self._bound)
+        self._offsets = node.create_guarded_publisher(JointState, "~/setpoint_offset")
+        self._corrected = node.create_guarded_publisher(JointState, "~/corrected_setpoint")
+        node.create_guarded_subscription(JointState, "setpoint", self._on_setpoint, raw=True)
+
+    def reset(self) -> None:
+        """Forget the last wrench, as when the clock jumps."""
+        self._offset = None
+
+    def take(self, answer: Answer) -> None:
+        """What a wrench did: how the joints undo it."""
+        if not self.wanted:
+            return
+        found = setpoint_correction(
+            self._robot,
+            answer.q,
+            answer.energy.deflection,
+            tool=self._tool,
+            bound=self._bound,
+        )
+        self.bounded += bool(found.bounded)
+        self._offset = answer.stamp, found.offset
+        self._publish(self._offsets, answer.stamp, self._rates(found.offset))
+
+    def _rates(self, offset: Any) -> Any:
+        """A difference of positions in the controller's numbers."""
+        return offset * self._robot.controller.factors
+
+    def _on_setpoint(self, data: bytes) -> None:
+        sample = self._reader.positions(self._decode(data), self._node.now(), self._rules)
+        if self._offset is None:
+            raise MessageError("no wrench", "no wrench has arrived that tells a correction")
+        stamp, offset = self._offset
+        age = abs(sample.stamp - stamp) / SECOND
+        if age > self._age:
+            raise MessageError(
+                "no wrench",
+                f"the last wrench is {age:.3f} s away, allowed {self._age:g} s",
+            )
+        controller = self._robot.controller
+        told = controller.offsets + controller.factors * sample.q + self._rates(offset)
+        self._publish(self._corrected, sample.stamp, told)
+
+    def _publish(self, publisher: Any, stamp: int, positions: Any) -> None:
+        message = JointState(name=list(self._robot.controller.names))
+        message.header.stamp = Time(nanoseconds=stamp).to_msg()
+        message.position = array("d", positions)
+        publisher.publish(message)

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`pkm-twin fit` and `pkm-twin excite` as a user runs them."""
+
+import json
+
+import numpy as np
+import pytest
+from support.command import command
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import load
+from pkm_twin.bags.reader import open_bag
+from test.commands.conftest import DELTA, STIFFNESS, rewrite
+from test.laws.recordings import smooth_motion
+
+HEAD = ("five_bar", "friction,payload")
+
+
+def table(path, robot, seconds=6.0, efforts=True):
+    """A CSV of a motion, with what the robot needs for it."""
+    time, q, qd, qdd = smooth_motion(robot, np.random.default_rng(1), seconds, 200.0)
+    columns = {"time": time}
+    columns |= {f"{j}.position": q[:, k] for k, j in enumerate(robot.joint_names)}
+    if efforts:
+        tau = inverse_dynamics(robot, q, qd, qdd)
+        columns |= {f"{j}.effort": tau[:, k] for k, j in enumerate(robot.joint_names)}
+    np.savetxt(
+        path, np.stack(list(columns.values()), -1), "%.17g", ",", header=",".join(columns),
+        comments="",
+    )  # fmt: skip
+    return path
+
+
+def test_fit_of_a_table_writes_a_robot_with_deviations_and_a_report(capsys, tmp_path):
+    true = load("five_bar").changed(
+        friction={"viscous": [0.03, 0.05], "coulomb": [0.2, 0.15]},
+        payload={"mass": 0.2, "com": [0.03, 0.0, 0.01], "inertia": [1e-4, 1e-4, 1e-4]},
+    )
+    source = table(tmp_path / "motion.csv", true)
+    out = tmp_path / "fitted.yaml"
+    done = command(capsys, "fit", *HEAD[:1], source, "--what", HEAD[1], "--out", out, "--json")
+    assert done.code == 0, done.err
+    data = json.loads(done.out)
+    fitted = load(str(out))
+    assert fitted.friction.viscous == pytest.approx([0.03, 0.05], rel=0.02)
+    assert fitted.friction.coulomb == pytest.approx([0.2, 0.15], rel=0.02)
+    assert fitted.payload.mass == pytest.approx(0.2, rel=0.01)
+    assert fitted.payload.com[[0, 2]] == pytest.approx([0.03, 0.01], abs=2e-3)
+    assert "payload.com[1]" in data["not_excited"]
+    text = out.read_text()
+    assert "fitted from motion.csv, +- " in text
+    assert "Residual rms held out" in text
+    page = (tmp_path / "fitted.html").read_text()
+    assert page.count("data:image/png;base64,") == 2
+    (held,) = data["held_out"]
+    assert max(held["residual_rms_after"]) < 0.01 * max(held["residual_rms_before"])
+    again = command(capsys, "fit", *HEAD[:1], source, "--out", out)
+    assert again.code == 1
+    assert "exists" in again.err
+
+
+def test_fit_of_a_recorded_bag_finds_the_payload(capsys, tmp_path):
+    bag = rewrite(DELTA, tmp_path / "held.mcap", seconds=8.0, begin=6.5)
+    out = tmp_path / "fitted.yaml"
+    done = command(
+        capsys, "fit", "delta_cu", bag, "--what", "payload", "--payload", "0", "--load-times",
+        "1.775,8", "--out", out, "--no-report", "--json",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    found = {p["key"]: p for p in json.loads(done.out)["parameters"]}
+    mass = found["payload.mass"]
+    assert mass["value"] == pytest.approx(0.15, rel=0.01)
+    assert abs(mass["value"] - 0.15) < 3 * mass["standard_deviation"] + 1e-3
+    assert found["payload.com[0]"]["status"] == "not excited"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("upr_rpu", STIFFNESS), "no efforts on /joint_states"),
+        (("five_bar", "without.csv"), "left.effort"),
+        (("five_bar", "short.csv"), "too short to fit"),
+        (("five_bar", "with.csv", "--what", "frction"), "did you mean 'friction'"),
+        (("five_bar", "with.csv", "--out", "fitted.json"), ".yaml"),
+    ],
+)
+def test_refusals(capsys, tmp_path, monkeypatch, arguments, text):
+    robot = load("five_bar")
+    table(tmp_path / "with.csv", robot, 2.0)
+    table(tmp_path / "without.csv", robot, 2.0, efforts=False)
+    table(tmp_path / "short.csv", robot, 0.5)
+    monkeypatch.chdir(tmp_path)
+    done = command(capsys, "fit", *arguments)
+    assert done.code == 1
+    assert text in done.one_line_error()
+
+
+def test_excite_writes_a_trajectory_within_the_limits_that_rests_at_both_ends(capsys, tmp_path):
+    out = tmp_path / "excite.mcap"
+    done = command(
+        capsys, "excite", "delta_cu", "--trials", "20", "--beside", DELTA, "--acceleration", "60",
+        "--out", out, "--json",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    data = json.loads(done.out)
+    assert 1.0 < data["condition"] < data["condition_beside"]
+    (message,) = open_bag(out).messages()
+    points = message.message.points
+    robot = load("delta_cu")
+    q, qd, qdd = (
+        np.array([list(getattr(p, k)) for p in points])
+        for k in ("positions", "velocities", "accelerations")
+    )
+    assert list(message.message.joint_names) == list(robot.joint_names)
+    for end in (0, -1):
+        assert np.abs(qd[end]).max() < 1e-9
+        assert np.abs(qdd[end]).max() < 1e-6
+    assert (q >= robot.limits.position[:, 0]).all() and (q <= robot.limits.position[:, 1]).all()
+    assert np.abs(qd).max() <= robot.limits.velocity.max()
+    assert np.abs(qdd).max() <= 60.0
+    assert (np.abs(inverse_dynamics(robot, q, qd, qdd)) <= robot.limits.effort).all()
+    assert (robot.singularity(q) > 0.1 * 0.99).all()
+    columns = np.genfromtxt(out.with_suffix(".csv"), delimiter=",", names=True)
+    assert len(columns) == len(points)

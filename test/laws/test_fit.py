@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits of what another engine needs: close to the truth, honest about the rest."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics, regressor
+from delta_dynamics.estimation import estimate, possible
+from delta_dynamics.file_parameters import file_parameters
+from delta_dynamics.fit import Fit, Recorded, fit
+from pkm_twin import Robot, load
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.inertia import ten_numbers
+from pkm_twin.machine.shared import pseudo_inertia
+from test.laws.recordings import smooth_motion
+from test.support.robots import massive, parameters_of, random_motion
+
+Array = NDArray[np.float64]
+
+TRUTH = {
+    "friction": {"viscous": [40.0, 60.0, 55.0], "coulomb": [15.0, 22.0, 9.0]},
+    "payload": {
+        "mass": 4.0, "com": [0.03, -0.02, 0.08], "inertia": np.diag([0.02, 0.03, 0.025]).tolist()
+    },
+}  # fmt: skip
+"""Of a 3-PRRU whose file tells of neither."""
+
+
+@cache
+def pinocchio_recording(duration: float) -> tuple[Recorded, Robot]:
+    """Efforts by Pinocchio with loop constraints, and the robot as it is in truth."""
+    pytest.importorskip("pinocchio")
+    from bags.recording.pinocchio_models import PrruEngine
+
+    data = parameters_of("prru") | TRUTH
+    engine, near = PrruEngine(data), None
+    motion = smooth_motion(load("prru"), np.random.default_rng(5), duration, 100.0)
+    efforts = []
+    for state in zip(*motion[1:], strict=True):
+        tree = engine.state(*state, near)
+        near = tree.q
+        efforts.append(engine.actuator_effort(tree)[0] + engine.friction(state[1]))
+    recorded = Recorded("recording", motion[0], motion[1], np.array(efforts))
+    return recorded, robot_of_data(data, "truth")
+
+
+def by_name(result: Fit) -> dict[str, Any]:
+    return {number.name: number for number in result.numbers}
+
+
+def truths(robot: Robot, kinds: Any) -> dict[str, float]:
+    """The numbers of a file by name."""
+    found = {}
+    for group in file_parameters(robot, kinds).groups:
+        for key, value in group.keys(group.values).items():
+            found["".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in key)[1:]] = value
+    return found
+
+
+@massive
+def test_columns_of_the_file_are_the_efforts(name):
+    robot = load(name)
+    q, qd, qdd, _ = random_motion(robot, np.random.default_rng(1), 5)
+    parameters = file_parameters(robot)
+    table = regressor(robot, q, qd, qdd) @ parameters.mixing
+    assert len(set(parameters.names)) == len(parameters.names) == len(parameters.values)
+    efforts = inverse_dynamics(robot, q, qd, qdd)
+    passive = np.zeros_like(efforts)
+    np.testing.assert_allclose(
+        table @ parameters.values + passive, efforts, atol=1e-11 * np.abs(efforts).max()
+    )
+    assert possible(parameters.values, parameters.cones)
+    for group in parameters.groups:
+        for key, value in group.keys(group.values).items():
+            assert np.isfinite(value), key
+
+
+def test_clean_efforts_of_pinocchio_give_friction_and_payload():
+    recorded, _ = pinocchio_recording(6.0)
+    result = fit(load("prru"), [recorded], ("friction", "payload"))
+    numbers = by_name(result)
+    for joint in range(3):
+        for what in ("viscous", "coulomb"):
+            true = TRUTH["friction"][what][joint]
+            assert numbers[f"friction.{what}[{joint}]"].after == pytest.approx(true, rel=0.02)
+    assert numbers["payload.mass"].after == pytest.approx(4.0, rel=0.01)
+    for axis in range(3):
+        true = TRUTH["payload"]["com"][axis]
+        assert numbers[f"payload.com[{axis}]"].after == pytest.approx(true, abs=2e-3)
+    assert all(number.status == "fitted" for number in result.numbers)
+    (judged,) = result.judged
+    assert (judged.rms(judged.after) < 1e-3 * judged.rms(judged.before)).all()
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_true_values_are_within_three_deviations_in_95_of_100_noisy_fits():
+    recorded, truth = pinocchio_recording(12.0)
+    kinds = ("friction", "payload")
+    true, good = truths(truth, kinds), 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        noisy = dataclasses.replace(
+            recorded,
+            q=np.round((recorded.q + rng.normal(0.0, 1e-6, recorded.q.shape)) / 1e-6) * 1e-6,
+            effort=recorded.effort + rng.normal(0.0, 2.0, recorded.effort.shape),
+        )
+        numbers = fit(load("prru"), [noisy], kinds).numbers
+        good += all(abs(n.after - true[n.name]) <= 3.0 * n.deviation for n in numbers)
+    assert good >= 95
+
+
+def still_joint() -> Recorded:
+    """A five-bar whose right motor holds still."""
+    robot = load("five_bar")
+    time, q, qd, qdd = smooth_motion(robot, np.random.default_rng(2), 5.0, 100.0)
+    for values, held in ((q, q[0, 1]), (qd, 0.0), (qdd, 0.0)):
+        values[:, 1] = held
+    changed = robot.changed(friction={"viscous": [0.05, 0.08], "coulomb": [0.2, 0.3]})
+    return Recorded("still", time, q, inverse_dynamics(changed, q, qd, qdd))
+
+
+def test_what_the_motion_does_not_show_keeps_the_file_s_value_and_is_named():
+    robot = load("five_bar")
+    numbers = by_name(fit(robot, [still_joint()], ("friction",)))
+    assert numbers["joints.left.friction.viscous"].after == pytest.approx(0.05, rel=0.02)
+    assert numbers["joints.left.friction.coulomb"].after == pytest.approx(0.2, rel=0.02)
+    for what in ("viscous", "coulomb"):
+        number = numbers[f"joints.right.friction.{what}"]
+        assert number.status == "not excited"
+        assert number.after == number.before
+        assert number.deviation > 0.1 * number.before
+
+
+def test_a_payload_of_a_delta_has_a_mass_and_no_place():
+    robot = load("delta").changed(payload={"mass": 0.3, "com": [0.01, 0.02, -0.03]})
+    time, q, qd, qdd = smooth_motion(robot, np.random.default_rng(3), 5.0, 100.0)
+    recorded = Recorded("delta", time, q, inverse_dynamics(robot, q, qd, qdd))
+    result = fit(load("delta"), [recorded], ("payload",))
+    assert by_name(result)["payload.mass"].after == pytest.approx(0.3, rel=0.01)
+    idle = {number.name for number in result.of("not excited")}
+    assert {f"payload.com[{k}]" for k in range(3)} <= idle
+
+
+def test_late_efforts_and_outliers_are_no_friction():
+    robot = load("delta")
+    time, q, qd, qdd = smooth_motion(robot, np.random.default_rng(4), 6.0, 500.0)
+    true = robot.changed(friction={"viscous": 0.05, "coulomb": 0.1})
+    efforts = inverse_dynamics(true, q, qd, qdd)
+    late = np.array([np.interp(time - 1e-3, time, column) for column in efforts.T]).T
+    late[::101] += 5.0
+    result = fit(robot, [Recorded("late", time, q, late)], ("friction",))
+    assert result.delays[0] == pytest.approx(1e-3, abs=1e-4)
+    assert result.outliers >= len(late[::101]) * 3 - 10
+    for name, number in by_name(result).items():
+        aim = 0.05 if "viscous" in name else 0.1 if "coulomb" in name else 0.0
+        assert number.after == pytest.approx(aim, rel=0.02, abs=2e-3), name
+
+
+def test_refusals_by_name():
+    robot, whole = load("five_bar"), still_joint()
+    short = dataclasses.replace(
+        whole, time=whole.time[:50], q=whole.q[:50], effort=whole.effort[:50]
+    )
+    with pytest.raises(PkmTwinError, match="still: too short"):
+        fit(robot, [short], ("friction",))
+    asleep = dataclasses.replace(whole, q=np.tile(whole.q[0], (len(whole.q), 1)))
+    with pytest.raises(PkmTwinError, match="no excitation"):
+        fit(robot, [asleep], ("friction",))
+
+
+def test_the_nearest_possible_body_takes_an_impossible_one_s_place():
+    pytest.importorskip("cvxpy")
+    rng = np.random.default_rng(6)
+    cone = ((slice(0, 10), pseudo_inertia()),)
+    true = ten_numbers(2.0, np.array([0.1, 0.0, 0.0]), np.diag([0.0, 0.02, 0.02]))
+    table = rng.normal(size=(60, 3, 10))
+    target = table @ true + rng.normal(0.0, 0.3, (60, 3))
+    start = ten_numbers(1.0, np.zeros(3), 0.01 * np.eye(3))
+    alone = estimate(table, target, start, np.ones(10))
+    held = estimate(table, target, start, np.ones(10), cone)
+    assert not possible(alone.values, cone)
+    assert held.bound and possible(held.values, cone)
+    # The nearest: not farther from the truth, which is possible.
+    measure = np.linalg.inv(alone.covariance)
+    apart = [v - true for v in (alone.values, held.values)]
+    assert apart[1] @ measure @ apart[1] <= apart[0] @ measure @ apart[0] * 1.2

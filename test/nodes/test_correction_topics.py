@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Corrected set points of stiffness_monitor, over the real middleware, beside the core's."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from geometry_msgs.msg import WrenchStamped
+from sensor_msgs.msg import JointState
+
+from pkm_twin import load
+from stiffness_monitor import setpoint_correction, strain_energy
+
+ROBOT = load("upr_rpu")
+Q = np.array([0.62, 0.6, 0.65])
+FORCE = (160.0, 90.0, 120.0)
+TOOL = [0.0, 0.0, -0.15]
+OFFSET, CORRECTED = "/stiffness_monitor/setpoint_offset", "/stiffness_monitor/corrected_setpoint"
+
+
+def state(peer, positions):
+    message = JointState(name=list(ROBOT.joint_names), position=list(positions))
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(peer.now(), 10**9)
+    return message
+
+
+def test_set_points_are_corrected_by_the_measured_wrench(peer, launch):
+    launch(
+        "stiffness_monitor.node", "correct_setpoint:=true", "tool.xyz:=[0.0, 0.0, -0.15]",
+        "max_state_age:=600.0", "correction_age:=600.0", "future_tolerance:=600.0",
+    )  # fmt: skip
+    peer.talk(JointState, "/joint_states")
+    peer.talk(JointState, "/setpoint")
+    peer.talk(WrenchStamped, "/wrench")
+    peer.hear(JointState, OFFSET)
+    peer.hear(JointState, CORRECTED)
+    peer.until(peer.matched)
+
+    def push():
+        peer.send("/joint_states", state(peer, Q))
+        load_case = WrenchStamped()
+        load_case.header = state(peer, Q).header
+        load_case.header.frame_id = "base_link"
+        force = load_case.wrench.force
+        force.x, force.y, force.z = FORCE
+        peer.send("/wrench", load_case)
+        load_case.header.frame_id = "platform"
+        peer.send("/wrench", load_case)
+        peer.send("/setpoint", state(peer, Q + 1e-3))
+
+    peer.until(lambda: peer.received(CORRECTED), repeat=push)
+    rotation = ROBOT.platform(Q)[1]
+    wrench = np.concatenate([rotation @ FORCE, np.zeros(3)])
+    energy = strain_energy(ROBOT, ROBOT.forward(Q), wrench)
+    expected = setpoint_correction(ROBOT, Q, energy.deflection, tool=TOOL).offset
+    offset = peer.received(OFFSET)[-1]
+    assert list(offset.name) == list(ROBOT.joint_names)
+    np.testing.assert_allclose(offset.position, expected, rtol=1e-9, atol=1e-15)
+    assert np.abs(expected).max() > 1e-5
+    found = peer.received(CORRECTED)[-1].position
+    np.testing.assert_allclose(found, Q + 1e-3 + expected, rtol=0, atol=1e-12)
