@@ -175,10 +175,13 @@ def on_cluster(sweep: Sweep, work: Work, scheduler: str) -> Iterator[tuple[int, 
     distributed = require("distributed", "cluster")
     # Its own log tells at length what one line of ours says.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    arguments = distributed.Security().get_connection_args("client")
+    if scheduler.startswith("tls:") and arguments.get("ssl_context") is None:
+        # A client that is made without one fails at once, and again at its end.
+        raise ClusterError(f"{scheduler} asks for TLS, and Dask is configured with no certificate")
     try:
         client = distributed.Client(scheduler, timeout=CONNECT, set_as_default=False)
-    except (OSError, TimeoutError, TypeError, ValueError, RuntimeError) as error:
-        # A TypeError is how it misses a certificate.
+    except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         raise ClusterError(f"no Dask scheduler answers at {scheduler}: {error}") from None
     with client:
         threads = sum(client.nthreads().values())
