@@ -7,10 +7,10 @@ MINUTES ?= 3
 SECONDS ?= 60
 SEED ?= 1
 # Tests that run for as long as they are told.
-ENDLESS := test/bags/test_fuzz.py test/nodes/test_soak.py
+ENDLESS := test/bags/test_fuzz.py test/fuzz/test_nodes.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit long bags bench certificate fuzz soak scale pages clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale pages clean help
 
 help:
 	@echo "make demo         set up .venv, run both nodes on the recorded bags, table and picture in out/"
@@ -19,10 +19,12 @@ help:
 	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
 	@echo "make bench        side-by-side timings into docs/benchmarks.md"
 	@echo "make certificate  torques and compliance against other engines, into docs/certificate*.md"
-	@echo "make fuzz         every bit of a bag; files, command lines and both nodes at random (SECONDS, SEED)"
-	@echo "make soak         ten million poses, and both nodes in all weathers, in flat memory (MINUTES)"
+	@echo "make fuzz         every bit of a bag; messages, files and command lines at random (SECONDS, SEED)"
+	@echo "make faults       the catalogue of faults row by row, into docs/faults.md"
+	@echo "make soak         ten million poses, and all nodes in all weathers, in flat memory (MINUTES)"
+	@echo "make audit        known vulnerabilities of what is installed"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
-	@echo "make pages        docs/parameters.md from the schemas, pictures of imports and of robots"
+	@echo "make pages        docs/parameters.md from the schemas, pictures of imports, robots and the page"
 	@echo "make clean        remove .venv, out and caches"
 
 # One stamp a set of extras, made anew when the requirements change.
@@ -68,12 +70,22 @@ certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m test.certificate
 	$(BIN)/python -m test.machine.certificate_page
 
+# Every bit of a bag; then at random in this process, at real nodes, and the figures.
 fuzz: $(VENV)/test.stamp
-	FUZZ_SECONDS=$(SECONDS) FUZZ_SEED=$(SEED) $(BIN)/python -m pytest -m long test/bags test/nodes/test_fuzz.py
-	$(BIN)/python -m test.bags.fuzz --seconds $(SECONDS) --seed $(SEED) --page docs/fuzz.md
+	$(BIN)/python -m pytest -m long test/bags
+	OMP_NUM_THREADS=1 $(BIN)/python -m test.fuzz --seconds $(SECONDS) --seed $(SEED) --out out/fuzz
+	FUZZ_SECONDS=$(SECONDS) FUZZ_SEED=$(SEED) FUZZ_OUT=$(CURDIR)/out/fuzz $(BIN)/python -m pytest -m long test/fuzz
+	$(BIN)/python -m test.fuzz --out out/fuzz --page
+
+faults: $(VENV)/test.stamp
+	$(BIN)/python -m test.faults
 
 soak: $(VENV)/test.stamp
 	SOAK_MINUTES=$(MINUTES) SOAK_OUT=$(CURDIR)/out $(BIN)/python -m pytest -m long test/atlas/test_run.py test/nodes/test_soak.py
+	$(BIN)/python -m test.nodes.soak out
+
+audit: $(VENV)/audit.stamp
+	$(BIN)/pip-audit --skip-editable
 
 scale: $(VENV)/test.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.atlas.scale docs/scale.md
@@ -83,6 +95,7 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m test.docs.engine docs/engine.md
 	$(BIN)/python -m test.docs.architecture docs/architecture.png
 	$(BIN)/python -m test.docs.robots docs/gallery
+	$(BIN)/python -m test.docs.view docs/gallery
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

@@ -96,7 +96,7 @@ setup(
             "ruff",
             "threadpoolctl",
             "types-PyYAML",
-            "viser>=1.0",
+            "viser>=1.1",
             "wheel",
             "xarray",
             "yourdfpy",
@@ -107,7 +107,8 @@ setup(
         "certificate": ["mpmath", "mujoco", "pin", "pytest", "scipy"],
         "fit": ["cvxpy>=1.4"],
         "mjcf": ["mujoco"],
-        "view": ["viser>=1.0"],
+        "audit": ["pip-audit"],
+        "view": ["viser>=1.1"],
         "bench": ["pin", "pytest", "pytest-benchmark"],
     },
     entry_points={

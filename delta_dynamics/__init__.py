@@ -2,6 +2,7 @@
 """Rigid-body dynamics of parallel kinematic machines."""
 
 from delta_dynamics.base_parameters import BaseParameters, base_parameters
+from delta_dynamics.contact import Contact, ContactMonitor
 from delta_dynamics.isotropy import (
     Extremes,
     JointMotion,
@@ -24,6 +25,7 @@ from delta_dynamics.regressor import (
     regressor,
 )
 from delta_dynamics.terms import Terms, dynamics_terms
+from delta_dynamics.uncertainty import torque_deviation
 from delta_dynamics.virtual_work import (
     Energy,
     energy,
@@ -35,6 +37,8 @@ from pkm_twin.kinematics.tracking import sphere_directions
 
 __all__ = [
     "BaseParameters",
+    "Contact",
+    "ContactMonitor",
     "Energy",
     "Extremes",
     "JointMotion",
@@ -65,4 +69,5 @@ __all__ = [
     "sphere_directions",
     "spread",
     "tilted_pose",
+    "torque_deviation",
 ]

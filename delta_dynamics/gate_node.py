@@ -42,6 +42,8 @@ class CommandGate(health.TwinNode):
         self._gate = Gate(robot, settings)
         self._closed = True
         self._commands = self.create_guarded_publisher(Float64MultiArray, "~/commands")
+        # The same with names and a stamp, for recordings and plots.
+        self._stamped = self.create_guarded_publisher(JointState, "~/commands_stamped")
         self._declare_robot(settings)
         self._pending: Robot | None = None
         self.create_guarded_subscription(
@@ -199,7 +201,11 @@ class CommandGate(health.TwinNode):
             self.get_logger().info("open: torques are forwarded")
 
     def _send(self, command: np.ndarray[Any, Any]) -> None:
-        self._commands.publish(Float64MultiArray(data=array("d", command.tobytes())))
+        values = array("d", command.tobytes())
+        self._commands.publish(Float64MultiArray(data=values))
+        told = JointState(name=list(self._gate.robot.controller.names), effort=values)
+        told.header.stamp = self.get_clock().now().to_msg()
+        self._stamped.publish(told)
 
     def _on_set(self, changes: list[Parameter]) -> Any:
         values = health.values_of(changes)

@@ -40,6 +40,8 @@ _NONE: Final = np.zeros(3)
 _STARTS: Final = 256
 """Directions that a descent begins from, best first, where no solution in closed form is known."""
 _DESCENTS: Final = 24
+_ROUNDS: Final = 8
+"""Most rounds of a descent."""
 
 
 class JointMotion(NamedTuple):
@@ -284,7 +286,8 @@ def least_direction(forms: Array) -> Array:
     stationary along the cone y' H y = 0 on which they are, or three are equal. For m up to 3 all
     such points are known: eigenvectors; common points, in the projective plane, of the cone and
     the cubic det(y, G y, H y) = 0; common points of two cones. The best of them all is the answer,
-    to rounding. For greater m it is the best of many descents, without proof.
+    to rounding. For greater m it is the best of many descents: a local minimum, not above what
+    any of them found, and without proof that none is lower.
     """
     points = _candidates(forms)
     if forms.shape[-1] > 3:
@@ -387,8 +390,25 @@ def _common_points(conic: Array, curve: Array) -> Array:
 
 
 def _descended(forms: Array, start: Array) -> Array:
-    """A local minimum of max_a |y' G_a y| below a point: least t with -t <= y' G_a y <= t."""
-    g = _scaled(forms)
+    """A local minimum of max_a |y' G_a y| below a point, to rounding of the least form.
+
+    Least t with -t <= y' G_a y <= t. Each round counts in what the one before it has left: of forms
+    of several scales the small ones would be lost beside the large.
+    """
+    best, least = start, float(_largest(forms, start))
+    for _ in range(_ROUNDS):
+        if not least > 0.0:
+            break
+        y = _descent(forms / least, best)
+        value = math.inf if y is None else float(_largest(forms, y))
+        if y is None or not value < least * (1 - 1e-12):
+            break
+        best, least = y, value
+    return best
+
+
+def _descent(g: Array, start: Array) -> Array | None:
+    """One round from a point where the greatest form is one; None where it leads nowhere."""
     size = len(start)
 
     def room(x: Array) -> Array:
@@ -412,10 +432,10 @@ def _descended(forms: Array, start: Array) -> Array:
 
     found = minimize(
         lambda x: x[size],
-        np.append(start, _largest(g, start)),
+        np.append(start, 1.0),
         jac=lambda x: np.append(np.zeros(size), 1.0),
         constraints=rules,
         method="SLSQP",
         options={"ftol": 1e-15, "maxiter": 200},
     ).x[:size]
-    return _directions(found) if np.isfinite(found).all() and found.any() else start
+    return _directions(found) if np.isfinite(found).all() and found.any() else None

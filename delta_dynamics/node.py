@@ -18,6 +18,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
+from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
@@ -102,6 +103,9 @@ class DeltaDynamics(health.TwinNode):
             else None
         )
         self._reactions = self._create_reaction_publishers(robot)
+        self._estimates = Estimates(
+            self, lambda: self._feedforward.robot, (self._base_frame, "platform")
+        )
         names = list(robot.controller.names)
         numbers = [0.0] * len(names)
         definition = message_definition(JOINT_STATE)
@@ -158,6 +162,7 @@ class DeltaDynamics(health.TwinNode):
     def activated(self) -> None:
         """A stream begins anew."""
         self._feedforward.reset()
+        self._estimates.reset()
         self._last_heard = 0
 
     def deactivated(self) -> None:
@@ -200,6 +205,9 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"joint states rejected: {k}": v for k, v in core.stream.rejected.items()}
         values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
+        values |= self._estimates.diagnose()
+        if self._estimates.touching and level == health.OK:
+            level, message = health.WARN, "something pushes: an external effort is beyond its bound"
         if core.wrenches is not None:
             taken = core.wrenches.stream
             values["wrenches taken"] = taken.accepted
@@ -436,6 +444,7 @@ class DeltaDynamics(health.TwinNode):
             self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))
         if self._commands is not None:
             self._commands.publish(self._numbers_message.fill(core.sent(torques.effort)))
+        self._estimates.take(torques)
         # A dense solve a sample is too much for the stream's own rate.
         if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
             self._reactions_due = torques.stamp
@@ -509,6 +518,7 @@ class DeltaDynamics(health.TwinNode):
         before = core.settings
         if robot is not core.robot:
             core.change_robot(robot)
+            self._estimates.change_robot(robot)
         core.change_settings(settings)
         if settings.stale_after != before.stale_after:
             self._watch_every(settings.stale_after)

@@ -53,16 +53,19 @@ class MomentumObserver:
         self._last = None
         self._estimate = np.zeros_like(self._still)
 
-    def push(self, time: float, q: Array, qd: Array, effort: Array) -> Array | None:
+    def push(
+        self, time: float, q: Array, qd: Array, effort: Array, wrench: Array | None = None
+    ) -> Array | None:
         """Take a sample; the external efforts (n,), N m or N, None for the first sample.
 
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), rad or m, with their rates ``qd`` and measured ``effort``.
+        :param wrench: on the platform, known otherwise, base axes at its reference point, (6,).
         :raises UnreachableError: a joint state without an assembly.
         :raises SingularityError: the Jacobian of the closure has no inverse.
         """
         mass = mass_matrix(self.robot, q)
-        driving = effort - inverse_dynamics(self.robot, q, qd, self._still)
+        driving = effort - inverse_dynamics(self.robot, q, qd, self._still, wrench)
         last, self._last = self._last, (time, qd, mass, driving)
         if last is None:
             return None

@@ -62,7 +62,7 @@ class MachineSim(health.TwinNode):
         robot.massive()
         self._variation = self._declare_spread(robot)
         self._declare_clock()
-        settings = self._declare_settings(self._variation.robot)
+        settings = self._declare_settings(robot)
         begin = BEGIN if self._simulated else self.now()
         self._simulation = Simulation(self._variation.robot, settings, begin)
         self._skipped = 0
@@ -159,6 +159,7 @@ class MachineSim(health.TwinNode):
             self._factor = 1.0
 
     def _declare_settings(self, robot: Robot) -> MachineSettings:
+        """Drives and sensors by the model: who tunes them does not know what was drawn."""
         fixed: dict[str, Any] = {"read_only": True}
         seconds: dict[str, Any] = {"unit": "s", "high": 10.0, "read_only": True}
         bandwidth = self.declare(

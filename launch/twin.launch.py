@@ -19,29 +19,36 @@ ARGUMENTS = {
     "delta_dynamics": ("true", "run this node"),
     "stiffness_monitor": ("true", "run this node"),
     "command_gate": ("false", "run this node: torques that end, for effort controllers"),
+    "machine_state": (
+        "false",
+        "run this node: all joints, transforms, markers; see view.launch.py",
+    ),
     "joint_states": ("joint_states", "topic of the measured joint states"),
     "wrench": ("wrench", "topic of the measured wrench"),
     "joint_trajectory_ff": ("~/joint_trajectory_ff", "topic of the trajectories with effort"),
     "controller_action": ("", "of delta_dynamics: the controller's action that goals go on to"),
     "commands": ("~/commands", "topic that command_gate sends to, an effort controller's"),
     "acceleration": ("", "of delta_dynamics: trajectory or differentiate"),
-    "wrench_frame": ("", "of stiffness_monitor: frame of the measured wrench"),
+    "use_wrench": ("", "of delta_dynamics: true where torques bear the measured wrench"),
+    "wrench_frame": ("", "frame of the measured wrench"),
     "use_sim_time": ("false", "true where a bag is replayed with --clock"),
     "respawn": ("true", "start a node again that has ended; command_gate always is"),
     "log_level": ("info", "debug, info, warn, error or fatal"),
 }
 
 PARAMETERS = {
-    "delta_dynamics": ("acceleration", "controller_action"),
+    "delta_dynamics": ("acceleration", "controller_action", "use_wrench", "wrench_frame"),
     "stiffness_monitor": ("wrench_frame",),
     "command_gate": (),
+    "machine_state": ("wrench_frame",),
 }
 """Nodes, and the arguments that are parameters of each."""
 
 TOPICS = {
-    "delta_dynamics": ("joint_states", "~/joint_trajectory_ff"),
+    "delta_dynamics": ("joint_states", "wrench", "~/joint_trajectory_ff"),
     "stiffness_monitor": ("joint_states", "wrench"),
     "command_gate": ("joint_states", "~/commands"),
+    "machine_state": ("joint_states", "wrench"),
 }
 """Topics of each node that an argument of that name can move."""
 

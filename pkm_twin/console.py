@@ -89,8 +89,13 @@ def print_json(data: Any) -> None:
     typer.echo(json.dumps(data, indent=2, allow_nan=False))
 
 
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Refuse a target that is there, a dangling link too, unless it may be replaced."""
+def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:
+    """Refuse a target that is there, a dangling link too, unless it may be replaced.
+
+    What is read from is never replaced.
+    """
+    if source is not None and path.exists() and source.exists() and path.samefile(source):
+        raise PkmTwinError(f"{path}: the target is the source itself")
     if os.path.lexists(path) and not overwrite:
         raise PkmTwinError(f"{path} exists; give --overwrite to replace it")
 

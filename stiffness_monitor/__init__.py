@@ -9,6 +9,7 @@ from pkm_twin.kinematics.workspace import (
 )
 from stiffness_monitor.compliance import StrainEnergy, compliance, stiffness, strain_energy
 from stiffness_monitor.correction import Correction, setpoint_correction
+from stiffness_monitor.uncertainty import compliance_deviation
 
 __all__ = [
     "Correction",
@@ -16,6 +17,7 @@ __all__ = [
     "StrainEnergy",
     "clearance",
     "compliance",
+    "compliance_deviation",
     "reachable",
     "regular_workspace",
     "setpoint_correction",

@@ -30,6 +30,7 @@ MAY = {
 NODES = {
     "delta_dynamics.node",
     "delta_dynamics.action_node",
+    "delta_dynamics.estimates_node",
     "delta_dynamics.gate_node",
     "delta_dynamics.sim_node",
     "stiffness_monitor.node",

@@ -20,7 +20,8 @@ import pkm_twin
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 EXECUTABLES = {
-    "delta_dynamics", "stiffness_monitor", "command_gate", "machine_sim", "pkm-twin"
+    "delta_dynamics", "stiffness_monitor", "command_gate", "machine_state", "machine_sim",
+    "pkm-twin",
 }  # fmt: skip
 COLCON = Path(sys.executable).with_name("colcon")
 needs_colcon = pytest.mark.skipif(
@@ -139,7 +140,9 @@ class TestColcon:
         share = prefix / "share/pkm_twin"
         assert (share / "package.xml").is_file()
         launched = {file.name for file in (share / "launch").iterdir()}
-        assert launched == {name.name for name in tracked() if name.parts[0] == "launch"}
+        assert launched == {name.name for name in tracked() if str(name.parent) == "launch"}
+        layouts = {"machine.rviz", "machine.foxglove.json", "machine.plotjuggler.xml"}
+        assert {file.name for file in (share / "view").iterdir()} == layouts
         assert {file.stem for file in (share / "config").glob("*.yaml")} == robots()
         marker = prefix / "share/ament_index/resource_index/packages/pkm_twin"
         assert marker.is_file()

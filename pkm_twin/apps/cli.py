@@ -239,7 +239,7 @@ def torques(
     check_target(out)
     drawing = out.with_suffix(".png")
     for target in (out, drawing) if picture else (out,):
-        refuse_existing(target, overwrite)
+        refuse_existing(target, overwrite, motion)
     carried = load_of(payload, load_times)
     if is_bag(motion):
         data = motion_of_bag(motion, robot, topic, carried)

@@ -68,8 +68,13 @@ STAGES = (
     Stage(
         "prru_milling",
         "delta_dynamics.node",
-        ("mechanism:=prru", *PATIENT),
-        ("/joint_states", "/delta_dynamics/joint_trajectory"),
+        (
+            "mechanism:=prru",
+            "use_wrench:=true",
+            *PATIENT,
+            "qos_overrides./wrench.subscription.depth:=1000",
+        ),
+        ("/joint_states", "/wrench", "/delta_dynamics/joint_trajectory"),
         DYNAMICS_OUTPUTS,
     ),
     Stage(

@@ -31,6 +31,9 @@ Array = NDArray[np.float64]
 MAX_RESIDUAL = 0.05
 """Largest residual RMS without payload, part of the joint's peak effort."""
 
+MAX_CUTTING_RESIDUAL = 0.01
+"""Largest residual RMS while cutting, likewise: without the wrench it is 0.15."""
+
 MIN_ANSWERED = 0.95
 """Least part of the samples that has to be answered."""
 
@@ -62,7 +65,7 @@ class DynamicsSeries:
     predicted: Array
     residual: Array
     free: NDArray[np.bool_]
-    """Where neither payload nor cutting force is on the platform, which the node cannot know."""
+    """Where neither payload nor cutting force is on the platform."""
     loaded: tuple[float, float] | None
 
 
@@ -106,8 +109,8 @@ def report_dynamics(
     sent = sum(1 for _ in read_messages(bag, ["/delta_dynamics/joint_trajectory"]))
     filled = read_messages(recording, [f"/{prefix}/delta_dynamics/joint_trajectory_ff"])
     findings = [
-        _share(prefix, "joint states answered", len(stamps), len(r.stamps)),
-        _share(prefix, "trajectories answered", sum(1 for _ in filled), sent),
+        share(prefix, "joint states answered", len(stamps), len(r.stamps)),
+        share(prefix, "trajectories answered", sum(1 for _ in filled), sent),
     ]
     if not stamps:
         return findings, series
@@ -126,9 +129,24 @@ def report_dynamics(
             bool((part < MAX_RESIDUAL).all()),
         )
     )
+    if r.wrench is not None:
+        findings.append(_cutting(prefix, series))
     if series.loaded is not None:
         findings += _payload(prefix, r, answered, series)
     return findings, series
+
+
+def _cutting(prefix: str, series: DynamicsSeries) -> Finding:
+    """The residual where a force acts, which the node was told."""
+    cut = series.residual[~series.free]
+    part = np.sqrt(np.mean(cut**2, 0)) / np.abs(series.measured).max(0)
+    return Finding(
+        prefix,
+        "residual RMS while cutting",
+        _listed(100 * part, "% of peak"),
+        f"below {100 * MAX_CUTTING_RESIDUAL:g} %",
+        bool((part < MAX_CUTTING_RESIDUAL).all()),
+    )
 
 
 def _loaded(r: Recording) -> tuple[float, float] | None:
@@ -215,7 +233,7 @@ def report_stiffness(
         (np.array(judged) - start) / 1e9,
         true,
     )
-    findings = [_share(prefix, "wrenches answered", len(common), len(wrenches))]
+    findings = [share(prefix, "wrenches answered", len(common), len(wrenches))]
     if not common:
         return findings, series
     dominant = Counter(energies[s].status[0].message for s in common)
@@ -228,7 +246,7 @@ def report_stiffness(
     )
     largest = np.linalg.norm(fixed, axis=1).max()
     findings.append(Finding(prefix, "largest deflection", f"{1e6 * largest:.2f} um"))
-    findings.append(_share(prefix, "deflections with ground truth", len(judged), len(truth)))
+    findings.append(share(prefix, "deflections with ground truth", len(judged), len(truth)))
     if judged:
         place = np.searchsorted(common, judged)
         greatest = 1e6 * np.linalg.norm(true, axis=1).max()
@@ -293,7 +311,8 @@ def _efforts(messages: Mapping[int, Any], stamps: list[int], robot: Robot) -> Ar
     return np.array(efforts).reshape(-1, len(robot.joint_names))
 
 
-def _share(bag: str, what: str, count: int, total: int) -> Finding:
+def share(bag: str, what: str, count: int, total: int) -> Finding:
+    """How many of so many there are, judged by :data:`MIN_ANSWERED`."""
     return Finding(
         bag,
         what,

@@ -9,13 +9,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.graph import BASE, Graph
-from pkm_twin.machine.outline import body_points, platform_face
+from pkm_twin.machine.outline import body_points, crosspieces, platform_face
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
+PICTURES: Final = (".png", ".svg")
+"""What a picture's name may end in."""
 BODY: Final = "#7F7F7F"
 ROD: Final = "#56B4E9"
 PLATFORM: Final = "#D55E00"
@@ -50,6 +52,9 @@ def draw(robot: Robot, ax: Any = None) -> Any:
         for shift in (0.0,) if rod.pair is None else (-rod.width / 2, rod.width / 2):
             aside = shift * (np.zeros(3) if rod.pair is None else rod.pair)
             ax.plot(*(rod.ends + aside).T, color=ROD, linewidth=2)
+    for bar in crosspieces(graph):
+        colour = PLATFORM if bar.part == graph.platform else BODY
+        ax.plot(*np.array([bar.start[1], bar.end[1]]).T, color=colour, linewidth=2)
     for joint in graph.joints.values():
         if joint.kind == "translation":
             continue
@@ -65,8 +70,11 @@ def draw(robot: Robot, ax: Any = None) -> Any:
 def picture(robot: Robot, path: Path) -> None:
     """Draw a robot into a file.
 
-    :raises PkmTwinError: the file cannot be written.
+    :raises PkmTwinError: the file cannot be written, or its name ends in something else.
     """
+    if path.suffix not in PICTURES:
+        # Another one would get an ending that nobody has asked for.
+        raise ParameterError("picture", str(path), f"a name that ends in {' or '.join(PICTURES)}")
     figure = draw(robot).figure
     try:
         figure.savefig(path, dpi=90)

@@ -28,8 +28,17 @@ JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 BASE_FRAME: Final = "base_link"
 PLATFORM_FRAME: Final = "platform"
-TWIN_OUTPUTS: Final = ("joint_torques", "torque_residual", "reactions")
-"""Last names of the twin's own topics of these two types, ``reactions`` before a joint's."""
+TWIN_OUTPUTS: Final = (
+    "joint_torques",
+    "torque_residual",
+    "reactions",
+    "machine_state",
+    "commands_stamped",
+    "compliance_stamped",
+    "strain_energy_stamped",
+    "natural_frequencies_stamped",
+)
+"""Last names of the twin's own topics of these two types, or a name before the last."""
 
 _STAMPED = "std_msgs/Header header\n"
 _HEADER = """

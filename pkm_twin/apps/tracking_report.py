@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin import load
-from pkm_twin.apps.demo_report import Finding
+from pkm_twin.apps.demo_report import Finding, share
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.errors import BagError
 from pkm_twin.ros.messages import SECOND, JointReader, stamp_of
@@ -22,12 +22,15 @@ Array = NDArray[np.float64]
 TIMES_BETTER = 5.0
 """How much smaller feedforward has to make the tracking error at the smallest spread."""
 ROBOT = "delta_cu"
+PERIOD = 2e-3
+"""Of the machine's joint states, s: what a loaded computer can still record."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One way along the path: times (s), errors (rad) and the drives' efforts (N m), (p, n)."""
+    """One way along the path: its duration and times, s; errors (rad) and efforts (N m), (p, n)."""
 
+    duration: float
     time: Array
     error: Array
     effort: Array
@@ -61,6 +64,7 @@ def report_tracking(
     for spread in spreads:
         name = prefix(spread)
         plain, ahead = runs[spread] = _runs(recording, name)
+        findings.append(share(name, "joint states recorded", *_whole(plain, ahead)))
         ratio = plain.rms / ahead.rms
         bound = f"{TIMES_BETTER:g} or more" if spread == min(spreads) else ""
         for what, way in (("PD", plain), ("PD and feedforward", ahead)):
@@ -81,24 +85,34 @@ def report_tracking(
     return findings, TrackingSeries(robot.joint_names, runs)
 
 
+def _whole(*runs: Run) -> tuple[int, int]:
+    """How many of the runs' periods are there, and how many they had."""
+    there = sum(len(run.time) for run in runs)
+    return there, sum(round(run.duration / PERIOD) for run in runs)
+
+
 def _runs(recording: Path, name: str) -> tuple[Run, Run]:
     """The two trajectories that the machine got, and the joint states while it went them."""
     reader = JointReader(load(ROBOT), with_effort=True)
     messages = read_messages(recording, [f"/{name}/joint_states"])
     states = {stamp_of(m.message.header): m.message for m in messages}
     stamps = np.array(sorted(states))
+    moving = np.array([any(states[stamp].velocity) for stamp in stamps.tolist()])
+    # A trajectory begins with the last joint state that stands still.
+    starts = stamps[:-1][~moving[:-1] & moving[1:]]
+    topic = f"/{name}/machine_sim/joint_trajectory"
+    trajectories = [reader.trajectory(m.message, 0) for m in read_messages(recording, [topic])]
     found: dict[bool, Run] = {}
-    for record in read_messages(recording, [f"/{name}/machine_sim/joint_trajectory"]):
-        trajectory = reader.trajectory(record.message, 0)
+    for trajectory, start in zip(trajectories, starts.tolist(), strict=False):
         path = JointPath(trajectory)
-        end = trajectory.stamp + round(path.duration * SECOND)
-        during = stamps[(stamps > trajectory.stamp) & (stamps <= end)].tolist()
+        end = start + round(path.duration * SECOND)
+        during = stamps[(stamps > start) & (stamps <= end)].tolist()
         # In the machine's order of joints, the robot's.
         q = np.array([states[s].position for s in during])
-        times = (np.array(during) - trajectory.stamp) / SECOND
+        times = (np.array(during) - start) / SECOND
         wanted = np.array([path.at(t).q for t in times.tolist()])
         effort = np.array([states[s].effort for s in during])
-        found[trajectory.effort is not None] = Run(times, q - wanted, effort)
-    if len(found) != 2 or not all(len(run.time) for run in found.values()):
+        found[trajectory.effort is not None] = Run(path.duration, times, q - wanted, effort)
+    if len(found) != 2 or len(starts) != 2:
         raise BagError(f"{name}: {len(found)} of two runs were recorded", path=recording)
     return found[False], found[True]

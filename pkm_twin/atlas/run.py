@@ -177,7 +177,8 @@ def on_cluster(sweep: Sweep, work: Work, scheduler: str) -> Iterator[tuple[int, 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(scheduler, timeout=CONNECT, set_as_default=False)
-    except (OSError, TimeoutError, ValueError, RuntimeError) as error:
+    except (OSError, TimeoutError, TypeError, ValueError, RuntimeError) as error:
+        # A TypeError is how it misses a certificate.
         raise ClusterError(f"no Dask scheduler answers at {scheduler}: {error}") from None
     with client:
         threads = sum(client.nthreads().values())

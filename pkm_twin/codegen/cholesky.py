@@ -6,6 +6,7 @@ May import: numpy, this package, the standard library.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from pkm_twin.codegen.expressions import Objects, maximum
@@ -18,17 +19,19 @@ Entries = dict[tuple[int, int], Any]
 """Lower triangle, by row and column, row >= column."""
 
 
-def trace_over(numerator: Objects, matrix: Objects) -> Any:
-    """Trace of matrix^-1 numerator: the sum of what x' numerator x can be at x' matrix x = 1.
+def traces_over(numerators: Sequence[Objects], matrix: Objects) -> list[Any]:
+    """Trace of matrix^-1 numerator of each: what x' numerator x sums up to at x' matrix x = 1.
 
     By L D L' without pivoting, which a positive matrix does not need, in the order of least degree;
     of the inverse only the entries in the pattern of L (Takahashi, Fagan, Chen 1973). Where the
     matrix has no inverse the result is large and finite.
 
-    :param numerator: symmetric, positive, shape (n, n), expressions or numbers.
+    :param numerators: symmetric, not negative, shape (n, n) each, expressions or numbers; the
+        diagonal of their sum is positive.
     :param matrix: symmetric, not negative, the same shape and unit.
     """
     n = len(matrix)
+    numerator = sum(numerators[1:], numerators[0])
     order = _order(numerator, matrix)
     place = {index: k for k, index in enumerate(order)}
     factors, pivots = _factors(numerator, matrix, order)
@@ -48,9 +51,14 @@ def trace_over(numerator: Objects, matrix: Objects) -> Any:
         for k in below[j]:
             diagonal = diagonal - factors[k, j] * inverse[k, j]
         inverse[j, j] = diagonal
+    return [_product(each, entry, place) for each in numerators]
+
+
+def _product(numerator: Objects, entry: Callable[[int, int], Any], place: dict[int, int]) -> Any:
+    """Sum of the products of both matrices' entries."""
     result: Any = 0.0
-    for a in range(n):
-        result = result + numerator[a][a] * inverse[place[a], place[a]]
+    for a in range(len(numerator)):
+        result = result + numerator[a][a] * entry(place[a], place[a])
         for b in range(a):
             if not is_zero(numerator[a][b]):
                 result = result + 2.0 * (numerator[a][b] * entry(place[a], place[b]))

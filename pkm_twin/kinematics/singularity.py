@@ -15,9 +15,9 @@ where anything moves although the actuators are locked: where they lose the plat
 constraint singularity, of platform, limbs or bodies between. Here closures are all that holds in
 truth: of a parallelogram also the couple that a pair of rods passes.
 
-**Moved**: the platform's twist per joint rate T, shape (6, n), of all bodies' motion D:
+**Moved**: the platform's twist per joint rate T, shape (6, n), of each body's motion D:
 
-    moved = sqrt(n) / |D T+|,          |D T+|^2 = tr((T'T)^-1 D'D)
+    moved = min over bodies sqrt(n) / |D T+|,          |D T+|^2 = tr((T'T)^-1 D'D)
 
 The platform is one of the bodies, hence the bound of 1. It is zero where joints move and the
 platform does not: at the edge of reach.
@@ -33,8 +33,8 @@ from typing import Any
 
 import numpy as np
 
-from pkm_twin.codegen.cholesky import trace_over
-from pkm_twin.codegen.expressions import Objects, minimum, sqrt
+from pkm_twin.codegen.cholesky import traces_over
+from pkm_twin.codegen.expressions import Objects, maximum, minimum, sqrt
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine, Traced
@@ -130,28 +130,26 @@ def _held(t: Traced) -> Any:
         turning = placed.turn_columns(name)
         bodies += [{k: v[i] for k, v in linear.items()} for i in range(3)]
         bodies += [{k: reach * v[i] for k, v in turning.items()} for i in range(3)]
-    response = trace_over(_gram(bodies, unknown), _gram(errors, unknown))
+    (response,) = traces_over([_gram(bodies, unknown)], _gram(errors, unknown))
     return minimum(1.0, 0.5 * unknown / np.sqrt(len(rows)) / sqrt(response))
 
 
 def _moved(t: Traced) -> Any:
     n, graph = t.joints, t.engine.graph
-    platform: list[Columns] = []
-    bodies: list[Columns] = []
-    table: dict[str, list[Objects]] = {name: [] for name in graph.bodies}
+    table: dict[str, list[Columns]] = {name: [{} for _ in range(6)] for name in graph.bodies}
     for j, u in enumerate(t.rate_columns()):
         t.motion.set_rates(u, np.eye(n)[j])
-        for name in graph.bodies:
+        for name, rows in table.items():
             middle, reach = _frame(graph, name)
-            velocity = t.motion.velocity(name, middle)
-            table[name].append(np.array([*velocity, *(reach * t.motion.omega[name])], object))
-    for name, columns in table.items():
-        rows = [{("u", j): columns[j][i] for j in range(n)} for i in range(6)]
-        bodies += rows
-        if name == graph.platform:
-            platform = rows
-    response = trace_over(_gram(bodies, n), _gram(platform, n))
-    return np.sqrt(n) / sqrt(response)
+            parts = [*t.motion.velocity(name, middle), *(reach * t.motion.omega[name])]
+            for row, part in zip(rows, parts, strict=True):
+                row["u", j] = part
+    grams = {name: _gram(rows, n) for name, rows in table.items()}
+    responses = traces_over(list(grams.values()), grams[graph.platform])
+    farthest: Any = float(n)
+    for response in responses:
+        farthest = maximum(farthest, response)
+    return sqrt(n / farthest)
 
 
 def _frame(graph: Graph, body: str) -> tuple[Array, float]:

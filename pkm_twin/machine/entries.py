@@ -27,7 +27,7 @@ def keys_of(path: str) -> list[Key]:
 
 def entries(robot: Robot) -> dict[str, tuple[float, str]]:
     """Every number that the robot's file gives, by dotted path, with its unit."""
-    data = given(robot.parameter_sections())
+    data = {k: v for k, v in given(robot.parameter_sections()).items() if k != "uncertainty"}
     return dict(_walk(data, robot.parameter_units(), ""))
 
 

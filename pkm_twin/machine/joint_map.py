@@ -29,7 +29,9 @@ class JointMapEntry:
     name: str | None = schema.text(default=None)
     sign: float = schema.number(at_least=-1.0, at_most=1.0, default=1.0)
     offset: float = schema.number(unit="the controller's", default=0.0)
-    ratio: float = schema.number(above=0.0, unit="the controller's per the model's", default=1.0)
+    ratio: float = schema.number(
+        at_least=1e-6, at_most=1e6, unit="the controller's per the model's", default=1.0
+    )
 
     def verify(self, path: str) -> None:
         """A sign is 1 or -1."""

@@ -10,7 +10,9 @@ May import: mujoco, numpy, the URDF file's parts.
 
 from __future__ import annotations
 
+import math
 import warnings
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.rotations import about, from_quaternion
 from pkm_twin.machine.urdf_file import Joint, Link, Urdf
 from pkm_twin.machine.urdf_loops import Closure
@@ -27,6 +30,11 @@ Array = NDArray[np.float64]
 
 WORLD: Final = "world"
 """The root's name."""
+MAX_INCLUDES: Final = 8
+"""How deep files may include others."""
+REPEATED: Final = ("count", "nrow", "ncol", "width", "height")
+MAX_PARTS: Final = 100_000
+"""Most of anything that a file asks for by a number: elements, copies, pixels along a side."""
 
 
 def read(path: Path) -> Urdf:
@@ -41,12 +49,51 @@ def read(path: Path) -> Urdf:
         raise ParameterError(
             str(path), "an MJCF file without the mujoco package", "pip install 'pkm_twin[mjcf]'"
         ) from None
+    _require_bounded(path)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         text = " ".join(str(error).split())
         raise ParameterError(str(path), text, "a model that MuJoCo compiles") from None
     return _Reader(mujoco, model, path).urdf()
+
+
+def _require_bounded(path: Path, depth: int = 0) -> None:
+    """Look at a file, and at what it includes, before MuJoCo does, which waits and counts for ever.
+
+    :raises ParameterError: something is named that is no regular file, or asked for too often.
+    """
+    top = urdf_xml.elements(path)
+    if depth > MAX_INCLUDES:
+        raise ParameterError(str(path), "nested includes", f"a nesting of at most {MAX_INCLUDES}")
+    folders = [path.parent]
+    for compiler in top.iter("compiler"):
+        folders += [path.parent / value for key, value in compiler.items() if key.endswith("dir")]
+    pairs = [(element, key, text) for element in top.iter() for key, text in element.items()]
+    for element, key, text in pairs:
+        places = [folder / text for folder in folders] if key.startswith("file") else []
+        for place in places:
+            if place.exists() and not place.is_file():
+                raise ParameterError(f"{element.tag}.{key}", text, "a regular file")
+        if element.tag == "include" and key == "file" and places[0].exists():
+            _require_bounded(places[0], depth + 1)
+        if key in REPEATED and math.prod(map(_whole, text.split())) > MAX_PARTS:
+            raise ParameterError(f"{element.tag}.{key}", text, f"at most {MAX_PARTS}")
+    if _copies(top) > MAX_PARTS:
+        raise ParameterError("replicate", "nested copies", f"at most {MAX_PARTS} bodies")
+
+
+def _whole(text: str) -> int:
+    try:
+        return max(1, math.ceil(float(text)))
+    except (ValueError, OverflowError):
+        return 1  # Which MuJoCo refuses.
+
+
+def _copies(element: ET.Element) -> int:
+    """How many parts an element stands for, with all that is replicated in it."""
+    count = _whole(element.get("count", "1")) if element.tag == "replicate" else 1
+    return count * (1 + sum(map(_copies, element)))
 
 
 class _Reader:

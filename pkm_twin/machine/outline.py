@@ -86,7 +86,7 @@ def body_points(graph: Graph) -> dict[str, list[Array]]:
 
 
 def bars(graph: Graph) -> tuple[Bar, ...]:
-    """Rods, both of a pair; a body as bars from one of its points to the others."""
+    """Rods, both of a pair with what they hang on; a body as bars from one point to the others."""
     radius = BAR * graph.size
     result = []
     for body, found in body_points(graph).items():
@@ -102,7 +102,7 @@ def bars(graph: Graph) -> tuple[Bar, ...]:
         for shift in (0.0,) if rod.pair is None else (-rod.width / 2, rod.width / 2):
             ends = rod.ends if rod.pair is None else rod.ends + shift * rod.pair
             result.append(Bar(rod.name, (rod.inner, ends[0]), (rod.outer, ends[1]), radius / 2))
-    return tuple(result)
+    return (*result, *crosspieces(graph))
 
 
 def robot_bars(robot: Robot) -> tuple[Bar, ...]:
@@ -113,7 +113,8 @@ def robot_bars(robot: Robot) -> tuple[Bar, ...]:
         for beam in robot.beams
     ]
     rest = [bar for bar in bars(robot.graph) if bar.part not in known]
-    return (*members, *rest, *_rails(robot))
+    hidden = [bar for bar in crosspieces(robot.graph) if bar.part in known]
+    return (*members, *rest, *hidden, *_rails(robot))
 
 
 def face(points: Sequence[Array]) -> Array:
@@ -156,6 +157,17 @@ def _others(points: Sequence[Array], radius: float) -> list[Array]:
 
 def _apart(points: Sequence[Array], radius: float) -> bool:
     return bool(points) and bool(_others(points, radius))
+
+
+def crosspieces(graph: Graph) -> Iterable[Bar]:
+    """Of a pair of rods: from one rod's end to the other's, on the bodies that they join."""
+    for rod in graph.rods.values():
+        if rod.pair is None or not rod.width > 0.0:
+            continue
+        aside = rod.width / 2 * rod.pair
+        for body, end in zip((rod.inner, rod.outer), rod.ends, strict=True):
+            radius = BAR * graph.size / 2
+            yield Bar(body, (body, end - aside), (body, end + aside), radius)
 
 
 def _rails(robot: Robot) -> Iterable[Bar]:

@@ -37,11 +37,18 @@ from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import position_box
 from pkm_twin.machine.shared import Shared, drive_units, shared_number, shared_payload
+from pkm_twin.machine.uncertainty import (
+    Factor,
+    UncertaintyEntry,
+    check_uncertainty,
+    factors_of,
+)
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 R = TypeVar("R", bound="Robot")
 
+MIN_LENGTH: Final = 1e-6
 MAX_LENGTH: Final = 100.0
 MAX_MASS: Final = 1e5
 SINGULARITY_BOUND: Final = 1e-9
@@ -51,8 +58,8 @@ _NONE: Final = np.zeros(0)
 
 
 def length(**options: Any) -> Any:
-    """Field: a length above zero, m."""
-    return schema.number(above=0.0, at_most=MAX_LENGTH, unit="m", **options)
+    """Field: a length that may be divided by, m."""
+    return schema.number(at_least=MIN_LENGTH, at_most=MAX_LENGTH, unit="m", **options)
 
 
 def mass(**options: Any) -> Any:
@@ -187,6 +194,7 @@ class Robot:
     gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])
     limits: JointLimits = schema.section(limits_of(3), default={})
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
+    uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
     changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
@@ -202,6 +210,7 @@ class Robot:
         """
         robot = dataclasses.replace(schema.build(cls, data), name=name)
         _ = robot.controller
+        check_uncertainty(robot)
         return robot
 
     # What a mechanism gives.
@@ -341,6 +350,14 @@ class Robot:
         branch = self.branch if self.has_branch else None
         mark = f"{self.mechanism} {self.closed_key}"
         return engine_of(self.graph, self.coordinates, start, branch, mark)
+
+    @cached_property
+    def factors(self) -> tuple[Factor, ...]:
+        """The independent causes of doubt that ``uncertainty`` names.
+
+        :raises ParameterError: a number that cannot vary.
+        """
+        return factors_of(self)
 
     @cached_property
     def calls(self) -> dict[str, Any]:

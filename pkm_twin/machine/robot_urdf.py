@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.passive import Axis, passive_axes
+from pkm_twin.machine import schema
 from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.robot import Robot
@@ -55,6 +56,13 @@ def robot_description(robot: Robot) -> dict[str, Any]:
         data["payload"] = {
             "mass": load.mass, "com": load.com.tolist(), "inertia": load.inertia.tolist()
         }  # fmt: skip
+    for key in ("joint_map", "uncertainty"):
+        told = schema.plain(getattr(robot, key))
+        if told:
+            data[key] = {
+                name: {field: value for field, value in entry.items() if value is not None}
+                for name, entry in told.items()
+            }
     for name, drive in _drives(robot).items():
         joint = data["joints"][name]
         limits: dict[str, Any] = {}

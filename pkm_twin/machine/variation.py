@@ -26,7 +26,15 @@ FARTHEST: Final = 3.0
 KINDS: Final = ("masses", "inertias", "friction", "lengths")
 POINTS: Final = ("at", "ends")
 """Places of a machine's joints and rods."""
-_LEFT_ALONE: Final = ("limits", "payload", "joint_map", "members", "member", "section")
+_LEFT_ALONE: Final = (
+    "limits",
+    "payload",
+    "joint_map",
+    "members",
+    "member",
+    "section",
+    "uncertainty",
+)
 """What is told of the machine beside its rigid bodies."""
 
 

@@ -48,6 +48,7 @@ from pkm_twin.machine.robot import (
 )
 from pkm_twin.machine.robot_urdf import robot_description
 from pkm_twin.machine.shared import Key, Shared, drive_units, shared_body, shared_number
+from pkm_twin.machine.uncertainty import UncertaintyEntry, check_uncertainty
 
 Array = NDArray[np.float64]
 
@@ -125,8 +126,10 @@ class DriveSpec:
     """
 
     inertia: float = schema.number(at_least=0.0, unit="kg m2")
-    ratio: float | None = schema.number(above=0.0, unit="turns a turn", default=None)
-    lead: float | None = schema.number(above=0.0, unit="m a turn", default=None)
+    ratio: float | None = schema.number(
+        at_least=1e-6, at_most=1e6, unit="turns a turn", default=None
+    )
+    lead: float | None = schema.number(at_least=1e-6, at_most=1e6, unit="m a turn", default=None)
 
     def verify(self, path: str) -> None:
         """One of the two."""
@@ -245,6 +248,7 @@ KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "ro
 """The three mappings of a graph, and the schema of their entries."""
 _KEYS: Final = (
     "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs", "joint_map",
+    "uncertainty",
 )  # fmt: skip
 _TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
 _SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
@@ -299,6 +303,9 @@ class Machine(Robot):
             "joint_map": schema.checked(
                 schema.mapping(JointMapEntry), "joint_map", data.get("joint_map") or {}
             ),
+            "uncertainty": schema.checked(
+                schema.mapping(UncertaintyEntry), "uncertainty", data.get("uncertainty") or {}
+            ),
             "gravity": schema.checked(
                 schema.vector(3), "gravity", data.get("gravity", [0, 0, -9.81])
             ),
@@ -315,6 +322,7 @@ class Machine(Robot):
         _ = robot.controller
         robot.engine.check()
         robot.check_masses()
+        check_uncertainty(robot)
         return robot
 
     @property

@@ -43,7 +43,7 @@ from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Section, Structure, compliances, disc, modulus
 from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import Inverse, LimbElements, Robot, length, mass
+from pkm_twin.machine.robot import MIN_LENGTH, Inverse, LimbElements, Robot, length, mass
 from pkm_twin.machine.shared import Shared, shared_body, shared_number
 
 Array = NDArray[np.float64]
@@ -78,7 +78,7 @@ class Members:
 
     youngs_modulus: float = modulus()
     shear_modulus: float = modulus()
-    diameter: Array = schema.vector(3, above=0.0, spread=True, unit="m")
+    diameter: Array = schema.vector(3, at_least=MIN_LENGTH, spread=True, unit="m")
     shear_factor: float = schema.number(at_least=0.0, at_most=10.0, default=1.0)
 
     def verify(self, path: str) -> None:

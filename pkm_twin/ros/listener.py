@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.ros.context import own_node
 
 
 @contextmanager
@@ -25,29 +25,11 @@ def listening_node(
 
     :raises PkmTwinError: there is no ROS, or the namespace is none.
     """
-    try:
-        import rclpy
-        from rclpy.exceptions import InvalidNamespaceException
+    needs = name.replace("_", "-")
+    with own_node(name, needs, sim_time=sim_time, namespace=namespace) as node:
         from rclpy.executors import SingleThreadedExecutor
-        from rclpy.parameter import Parameter
-        from rclpy.signals import SignalHandlerOptions
-    except ImportError as error:
-        raise PkmTwinError(
-            f"{name.replace('_', '-')} needs ROS 2: source its setup, or pip install "
-            f"pkm_twin[jazzy] ({error})"
-        ) from error
-    context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        clock = Parameter("use_sim_time", value=sim_time)
-        try:
-            node = rclpy.create_node(
-                name, context=context, namespace=namespace, parameter_overrides=[clock]
-            )
-        except InvalidNamespaceException as error:
-            first = str(error).splitlines()[0]
-            raise PkmTwinError(f"--namespace {namespace!r} is no namespace: {first}") from None
-        executor = SingleThreadedExecutor(context=context)
+
+        executor = SingleThreadedExecutor(context=node.context)
         executor.add_node(node)
 
         def spin(seconds: float) -> None:
@@ -57,9 +39,6 @@ def listening_node(
 
         yield node, spin
         executor.shutdown()
-        node.destroy_node()
-    finally:
-        context.try_shutdown()
 
 
 def subscribe_best_effort(node: Any, kind: str, topic: str, take: Callable[[Any], None]) -> None:

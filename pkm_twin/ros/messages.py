@@ -313,6 +313,7 @@ class JointReader:
 
     def _match(self, names: Sequence[str]) -> list[int]:
         """Where each of the robot's joints stands among the names."""
+        # Of a tuple that is itself.
         key = tuple(names)
         known = self._known.get(key)
         if known is not None:
@@ -352,7 +353,7 @@ class JointReader:
                 if all(map(math.isnan, picked)):
                     return None
                 raise self._refusal(what, i, value, low, high)
-        return np.array(picked)
+        return np.array(picked, np.float64)
 
     def _columns(
         self,
@@ -461,10 +462,10 @@ def duration_of(duration: Any) -> int:
 
 
 def _nanoseconds(what: str, time: Any) -> int:
-    sec, nanosec = int(time.sec), int(time.nanosec)
+    sec, nanosec = time.sec, time.nanosec
     if sec < 0 or not 0 <= nanosec < SECOND:
         raise MessageError("time", f"{what} is {sec} s and {nanosec} ns")
-    return sec * SECOND + nanosec
+    return int(sec * SECOND + nanosec)
 
 
 def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:

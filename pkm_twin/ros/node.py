@@ -75,7 +75,7 @@ MAX_TEXT: Final = 500
 MAX_TASKS: Final = 10
 """How much work may wait beside the callbacks."""
 
-SELDOM_PERIOD: Final = 0.05
+SELDOM_PERIOD: Final = 0.1
 SELDOM_TURNS: Final = 3
 """How often requests and events are looked for, s, and how many at a time at least."""
 LOOK: Final = 0.5
@@ -102,7 +102,8 @@ class SeldomGroup(MutuallyExclusiveCallbackGroup):
 
     def turned(self) -> None:
         """A turn of the executor is over."""
-        self._turns = max(0, self._turns - 1)
+        if self._turns:
+            self._turns -= 1
 
     def can_execute(self, entity: Any) -> bool:
         """Whether the executor looks at it."""
@@ -205,7 +206,8 @@ class TwinNode(LifecycleNode):
             service.callback = self._guarded_service(service.srv_type, service.callback)
             service.callback_group = self.seldom
             self.seldom.add_entity(service)
-        self.create_guarded_timer(SELDOM_PERIOD, self.seldom.open)
+        if self.executor_kind == "single":
+            self.create_guarded_timer(SELDOM_PERIOD, self.seldom.open)
         # Kept: the middleware calls the handle without holding it.
         self._jump_handle = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -397,11 +399,12 @@ class TwinNode(LifecycleNode):
                     statistics.count_missed()
                 if not self.active:
                     return
-                waited = time.time_ns() - info["received_timestamp"]
-                if expires is not None and waited > expires() * SECOND:
-                    # More comes than can be answered: the newest are.
-                    statistics.missed += 1
-                    return
+                if expires is not None:
+                    waited = time.time_ns() - info["received_timestamp"]
+                    if waited > expires() * SECOND:
+                        # More comes than can be answered: the newest are.
+                        statistics.missed += 1
+                        return
                 self._seen["messages"] += 1
                 callback(message)
             except MessageError as error:
@@ -513,10 +516,13 @@ class TwinNode(LifecycleNode):
             raise MessageError("busy", f"{MAX_TASKS} wait to be answered already")
         self._tasks.append((where, task))
 
-    def work(self) -> None:
-        """One step of what waits."""
-        if not self._tasks:
-            return
+    def turned(self) -> None:
+        """A turn of the executor is over: one step of what waits."""
+        self.seldom.turned()
+        if self._tasks:
+            self._work()
+
+    def _work(self) -> None:
         entry = where, task = self._tasks[0]
         try:
             next(task)
@@ -761,11 +767,11 @@ def spin(node: TwinNode, ended: Callable[[], bool] = lambda: False) -> None:
     executor.add_node(node)
     # Without a bound the one waits for ever; with one the other makes a timer a message.
     patience = LOOK if events else None
-    while node.context.ok() and not ended():
+    going, turn = node.context.ok, executor.spin_once
+    while going() and not ended():
         try:
-            executor.spin_once(timeout_sec=0.0 if node.busy else patience)
-            node.seldom.turned()
-            node.work()
+            turn(0.0 if node.busy else patience)
+            node.turned()
         except (KeyboardInterrupt, ExternalShutdownException):
             raise
         except Exception as error:

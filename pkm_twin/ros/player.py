@@ -20,7 +20,8 @@ from typing import Any
 from pkm_twin.bags.cdr import message_class, message_definition, parse_definition
 from pkm_twin.bags.qos import OfferedQos, parse_qos, require_topic
 from pkm_twin.bags.reader import Bag, TopicInfo, open_bag
-from pkm_twin.errors import BagError, ParameterError, PkmTwinError
+from pkm_twin.errors import BagError, ParameterError
+from pkm_twin.ros.context import own_node
 
 CLOCK_TOPIC = "/clock"
 MAX_CLOCK = 2**31 - 1
@@ -208,20 +209,9 @@ def _publishers(
     bag: Bag, targets: Mapping[str, str], with_clock: bool
 ) -> Iterator[tuple[dict[str, Any], Any]]:
     """Yield a publisher for each recorded topic, and one for the clock or None."""
-    try:
-        import rclpy
-        from rclpy.node import Node
+    with own_node("pkm_twin_player", "playing") as node:
         from rclpy.qos import QoSProfile
-        from rclpy.signals import SignalHandlerOptions
-    except ImportError as error:
-        raise PkmTwinError(
-            f"playing needs ROS 2: source its setup, or pip install pkm_twin[jazzy] ({error})"
-        ) from error
-    context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    node = None
-    try:
-        node = Node("pkm_twin_player", context=context, start_parameter_services=False)
+
         publishers = {
             name: node.create_publisher(
                 message_class(bag.report.topics[name].type),
@@ -235,10 +225,6 @@ def _publishers(
             kind = message_class("rosgraph_msgs/msg/Clock")
             clock = node.create_publisher(kind, CLOCK_TOPIC, QoSProfile(depth=10))
         yield publishers, clock
-    finally:
-        if node:
-            node.destroy_node()
-        context.try_shutdown()
 
 
 def _qos(offer: OfferedQos) -> Any:

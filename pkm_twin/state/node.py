@@ -21,10 +21,10 @@ from pkm_twin.machine import rotations
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.robot_urdf import robot_urdf
 from pkm_twin.ros import node as health
+from pkm_twin.ros import outputs
 from pkm_twin.ros.intake import JointStateDecoder
 from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench, triple
-from pkm_twin.state import outputs
 from pkm_twin.state.scene import Load, Scales, Scene
 from pkm_twin.state.state import MachineState, State
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.machine import rotations
-from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.members import Place
-from pkm_twin.machine.outline import robot_bars
+from pkm_twin.machine.outline import Posture, robot_bars
 from pkm_twin.machine.robot import Robot
 from pkm_twin.state.state import State
 
@@ -135,12 +134,8 @@ class Scene:
         return self._points(q, ends).reshape(len(self.bars), 2, 3)
 
     def _points(self, q: Array, places: Sequence[Place]) -> Array:
-        turned, origins = self.robot.placements(q)
-        at = self.robot.engine.tree.at
-        return np.array([
-            point if body == BASE else turned[body] @ (point - at[body]) + origins[body]
-            for body, point in places
-        ]).reshape(-1, 3)  # fmt: skip
+        posture = Posture(self.robot, q)
+        return np.array([posture.place(*place) for place in places]).reshape(-1, 3)
 
     def _bars(self, places: Array, shares: Mapping[str, float]) -> list[Shape]:
         shapes = []

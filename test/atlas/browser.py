@@ -160,14 +160,6 @@ class Browser:
         """Put the mouse to a place, in pixels of the window."""
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
 
-    def click(self, element: str) -> None:
-        """Press and release the mouse on the middle of an element, given by a script."""
-        box = f"(() => {{ const b = ({element}).getBoundingClientRect();"
-        x, y = self.run(f"{box} return [b.x + b.width / 2, b.y + b.height / 2]; }})()")
-        self.move(x, y)
-        for kind in ("mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
     def press(self, key: str) -> None:
         """Press and release a key, by its name (ArrowRight)."""
         for kind in ("keyDown", "keyUp"):

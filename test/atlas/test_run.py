@@ -150,6 +150,9 @@ def test_no_scheduler(strain, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "CONNECT", "1s")
     with pytest.raises(ClusterError, match="no Dask scheduler answers"):
         run(strain[0], tmp_path / "a.nc", scheduler="tcp://127.0.0.1:9")
+    # Without a certificate.
+    with pytest.raises(ClusterError, match="TLS"):
+        run(strain[0], tmp_path / "a.nc", scheduler="tls://127.0.0.1:9")
 
 
 def test_chunks_of_another_sweep_are_refused(tmp_path):

@@ -5,11 +5,7 @@ Run by ``make bench``, which turns the result into docs/benchmarks.md.
 """
 
 import os
-import subprocess
-import sys
 import time
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,14 +14,16 @@ from support.robots import parameters_of, random_joints
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from stiffness_monitor import strain_energy
-from test.nodes.harness import Domain, end_with_parent
+from test.benchmarks.round_trip import TWIN, Client, start, stop
+from test.nodes.harness import Domain
 
 pytestmark = pytest.mark.benchmark_run
 
 BATCHES = [1, 1_000, 100_000]
-PERIOD = 1e-3
 SECONDS, SLICES = 1.5, 12
 """Length of a slice of the round trip, s, and how many."""
+MINUTE = 60.0
+STARTS = 5
 
 
 def motion(robot, count):
@@ -86,25 +84,31 @@ def test_pinocchio_rnea(benchmark, name):
     run(benchmark, 1, engine.rnea_only, tree)
 
 
-def test_round_trip(benchmark):
-    """joint_states to ~/joint_torques at 1 kHz, against the echo of the same messages."""
+@pytest.fixture
+def ros():
+    """rclpy, a context and a domain of their own."""
     rclpy = pytest.importorskip("rclpy")
     domain = Domain()
     os.environ.update(domain.environment())
-    twin = ["-m", "delta_dynamics.node", "--ros-args", "-p", "mechanism:=delta_cu", "-p"]
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    yield rclpy, context, domain
+    rclpy.try_shutdown(context=context)
+    domain.close()
+
+
+def test_round_trip(benchmark, ros):
+    """joint_states to ~/joint_torques at 1 kHz, against the echo of the same messages."""
+    rclpy, context, domain = ros
     commands = {
         "echo": ["-m", "test.benchmarks.echo_node", "single"],
         "echo_events": ["-m", "test.benchmarks.echo_node", "events"],
-        "delta_dynamics": [*twin, "executor:=single"],
-        "delta_dynamics_events": [*twin, "executor:=events"],
+        "delta_dynamics": [*TWIN, "-p", "executor:=single"],
+        "delta_dynamics_events": [*TWIN, "-p", "executor:=events"],
     }
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    children = {}
+    client = Client(rclpy, context, commands)
+    children = {name: start(domain, name, command) for name, command in commands.items()}
     try:
-        client = Client(rclpy, context, commands)
-        for name, command in commands.items():
-            children[name] = start(domain, name, command)
         for name in commands:
             client.wait_for(name)
         slices = [
@@ -112,12 +116,7 @@ def test_round_trip(benchmark):
             for _ in range(SLICES)
         ]
     finally:
-        for child in children.values():
-            child.terminate()
-        for child in children.values():
-            child.wait(10)
-        rclpy.try_shutdown(context=context)
-        domain.close()
+        stop(*children.values())
 
     # The machine is elsewhere now and then: the median of slices, each beside its own echo.
     def median(name, value, beside=None):
@@ -131,109 +130,58 @@ def test_round_trip(benchmark):
         "p50_us": lambda m: float(np.percentile(m.times, 50)) * 1e6,
         "p99_us": lambda m: float(np.percentile(m.times, 99)) * 1e6,
         "cpu_us": lambda m: m.cpu / m.sent * 1e6,
-        "lost": lambda m: m.sent - m.answered,
     }
     figures = {
         name: {what: median(name, value) for what, value in values.items()} for name in commands
     }
     ratios = {
         name: {
-            what: median(name, values[what], name.replace("delta_dynamics", "echo"))
-            for what in ("p50_us", "p99_us", "cpu_us")
+            what: median(name, value, name.replace("delta_dynamics", "echo"))
+            for what, value in values.items()
         }
         for name in commands
         if "echo" not in name
     }
-    benchmark.extra_info.update(what="round trip", figures=figures, ratios=ratios, slices=SLICES)
-    benchmark.pedantic(lambda: None, rounds=1)
+    record(benchmark, "round trip", figures=figures, ratios=ratios, slices=SLICES)
 
 
-def start(domain, name, command):
-    environment = domain.environment()
-    # Each in a namespace of its own, so that the client speaks to one at a time.
-    remap = ["-r", f"__ns:=/{name}"]
-    if "--ros-args" not in command:
-        remap = ["--ros-args", *remap]
-    return subprocess.Popen(
-        [sys.executable, *command, *remap],
-        env=environment,
-        start_new_session=True,
-        preexec_fn=end_with_parent,
+@pytest.mark.parametrize("executor", ["single", "events"])
+def test_a_minute_without_a_lost_message(benchmark, ros, executor):
+    """Queue depth as by default. A state's age is no matter here: what is late is not lost."""
+    rclpy, context, domain = ros
+    client = Client(rclpy, context, [executor])
+    child = start(
+        domain, executor, [*TWIN, "-p", f"executor:={executor}", "-p", "stale_after:=60.0"]
     )
+    try:
+        client.wait_for(executor)
+        client.stream(executor, 1.0)
+        sent, answered = client.stream(executor, MINUTE)
+    finally:
+        stop(child)
+    record(benchmark, "minute", executor=executor, sent=sent, answered=answered)
+    assert answered == sent
 
 
-def cpu_of(process):
-    """CPU time of a process so far, s."""
-    fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-@dataclass
-class Measurement:
-    """Times to the answer, s, and what else a slice told."""
-
-    times: list[float]
-    sent: int
-    answered: int
-    cpu: float
-
-
-class Client:
-    """Publishes joint states and takes the time until the answer with the same stamp."""
-
-    def __init__(self, rclpy, context, names):
-        from rclpy.executors import SingleThreadedExecutor
-        from sensor_msgs.msg import JointState
-
-        self.kind = JointState
-        self.node = rclpy.create_node("bench_client", context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.publishers, self.answered = {}, None
-        self.names = list(load("delta_cu").joint_names)
-        for name in names:
-            self.publishers[name] = self.node.create_publisher(
-                JointState, f"/{name}/joint_states", 10
-            )
-            self.node.create_subscription(JointState, self._topic(name), self._answer, 10)
-
-    @staticmethod
-    def _topic(name):
-        return f"/{name}/{name.removesuffix('_events')}/joint_torques"
-
-    def _answer(self, message):
-        self.answered = message.header.stamp.sec, message.header.stamp.nanosec
-
-    def wait_for(self, name):
-        deadline = time.monotonic() + 60
-        while not (
-            self.publishers[name].get_subscription_count()
-            and self.node.count_publishers(self._topic(name))
-        ):
-            assert time.monotonic() < deadline, f"{name} did not come up"
-            self.executor.spin_once(timeout_sec=0.1)
-
-    def measure(self, name, seconds, process):
-        times = []
-        used = cpu_of(process)
+def test_start_to_first_answer(benchmark, ros):
+    """From the start of the process to the first torque of a stream that runs already."""
+    rclpy, context, domain = ros
+    names = [f"start_{i}" for i in range(STARTS + 1)]
+    client = Client(rclpy, context, names)
+    seconds = []
+    for name in names:
         begin = time.perf_counter()
-        for i in range(round(seconds / PERIOD)):
-            due = begin + i * PERIOD
-            while time.perf_counter() < due:
-                pass
-            now = self.node.get_clock().now().to_msg()
-            phase = 2.0 * i * PERIOD
-            message = self.kind(name=self.names)
-            message.header.stamp = now
-            message.position = [0.3 * np.sin(phase)] * 3
-            message.velocity = [0.6 * np.cos(phase)] * 3
-            sent = time.perf_counter()
-            self.publishers[name].publish(message)
-            while self.answered != (now.sec, now.nanosec):
-                self.executor.spin_once(timeout_sec=0.005)
-                if time.perf_counter() - sent > 0.02:
-                    break  # the node's window fills, or the machine is elsewhere
-            else:
-                times.append(time.perf_counter() - sent)
-        used = cpu_of(process) - used
-        return Measurement(times[200:], round(seconds / PERIOD), len(times), used)
+        child = start(domain, name, TWIN)
+        try:
+            seconds.append(client.first_answer(name, begin))
+        finally:
+            stop(child)
+    # The first one fills the caches.
+    record(benchmark, "first answer", seconds=seconds[1:])
+
+
+def record(benchmark, what, **figures):
+    """Figures of a benchmark that takes its times itself."""
+    real_time = os.sched_getscheduler(0) != os.SCHED_OTHER
+    benchmark.extra_info.update(what=what, real_time=real_time, **figures)
+    benchmark.pedantic(lambda: None, rounds=1)

@@ -371,6 +371,7 @@ def with_others(source, target, seconds=0.5):
         "/gripper/joint_states": {"name": ["finger"], "position": [0.1]},
         "/delta_dynamics/joint_torques": {"effort": [1.0, 1.0, 1.0]},
         "/cell/delta_dynamics/torque_residual": {"effort": [9.0, 9.0, 9.0]},
+        "/machine_state/joint_states": {"position": [9.0, 9.0, 9.0]},
     }
     with BagWriter(target, metadata=bag.report.metadata, flush_period=None) as writer:
         for topic in (JOINTS, *others):
@@ -397,7 +398,7 @@ class TestTopics:
         assert "/gripper/joint_states (joints finger)" in first
         data = json.loads(twin("check", bag, "--json").out)
         assert data["topics"]["joint_states"] == JOINTS
-        assert len(data["topics"]["left_out"]) == 3
+        assert len(data["topics"]["left_out"]) == 4
         out = tmp_path / "t.csv"
         assert twin("torques", "delta_cu", bag, "--no-picture", "--out", out).code == 0
 

@@ -342,6 +342,17 @@ def test_a_target_that_exists_is_refused_and_left_alone(twin, tmp_path, there):
     assert len(columns_of(tmp_path / "t.csv")["time"]) == 50
 
 
+def test_a_motion_is_never_replaced_by_its_own_torques(twin, tmp_path):
+    source = write(tmp_path / "motion.csv", motion("delta"))
+    before = source.read_bytes()
+    link = tmp_path / "t.csv"
+    link.symlink_to("motion.csv")
+    for target in (source, link):
+        result = twin("torques", "delta", source, "--out", target, "--overwrite", "--no-picture")
+        assert "the target is the source itself" in result.one_line_error()
+        assert source.read_bytes() == before
+
+
 def test_parquet_has_the_same_columns(twin, tmp_path):
     source = write(tmp_path / "motion.csv", motion("delta"))
     result = twin("torques", "delta", source, "--out", tmp_path / "t.parquet", "--no-picture")

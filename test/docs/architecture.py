@@ -15,10 +15,12 @@ PLACES = {
     "apps": (2.0, 5.2),
     "delta_dynamics.node": (0.0, 4.2),
     "stiffness_monitor.node": (4.0, 4.2),
+    "state.node": (6.6, 4.2),
     "atlas": (2.0, 4.2),
     "ros": (5.6, 3.3),
     "delta_dynamics": (0.6, 3.0),
     "stiffness_monitor": (3.4, 3.0),
+    "state": (6.8, 2.9),
     "streams": (5.0, 2.2),
     "mechanisms": (2.0, 2.0),
     "machine": (1.0, 1.0),
@@ -43,7 +45,10 @@ def part(module):
         node = len(names) > 1 and names[1].endswith("node")
         return f"{names[0]}.node" if node else names[0]
     inside = len(names) > 1 and (ROOT / CORE / names[1]).is_dir()
-    return names[1] if inside else CORE
+    if not inside:
+        return CORE
+    # The base class of nodes is in ros.
+    return ".".join(names[1:]) if names[2:] == ["node"] and names[1] != "ros" else names[1]
 
 
 def is_module(name):
@@ -110,7 +115,7 @@ def draw(path):
     for name, (x, y) in PLACES.items():
         box = {"boxstyle": "round,pad=0.5", "facecolor": "white", "edgecolor": "black"}
         ax.text(x, y, name, ha="center", va="center", bbox=box, fontsize=11)
-    ax.set(xlim=(-2, 6.2), ylim=(-0.5, 5.5))
+    ax.set(xlim=(-2, 7.5), ylim=(-0.5, 5.5))
     ax.axis("off")
     figure.savefig(path, dpi=90)
 

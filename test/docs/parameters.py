@@ -12,6 +12,7 @@ from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.members import Tube
 from pkm_twin.machine.robot import Payload, friction_of, limits_of
 from pkm_twin.machine.schema import plain
+from pkm_twin.machine.uncertainty import UncertaintyEntry
 from pkm_twin.mechanisms import delta, machine, prru, upr_rpu
 
 HEAD = """# Parameters
@@ -43,6 +44,7 @@ example in [new_machine.md](new_machine.md). `friction` and `limits` stand at th
 | `pose` |  | of x, y, z, roll, pitch, yaw as many as the mobility | the first that will do |
 | `bodies`, `joints`, `rods` |  | mappings of names to entries | none |
 | `joint_map` |  | a mapping of names to entries | none |
+| `uncertainty` |  | a mapping of paths to entries | none |
 | `limbs` |  | one section or a list: `azimuths` (rad), `bodies`, `joints`, `rods` | none |
 
 What stands in `limbs` is given for azimuth 0, copied and turned about base z by each azimuth, its
@@ -51,6 +53,11 @@ names with _1, _2 and so on; bodies of the section itself are the copy's, others
 
 FRICTION = "At the actuated joints, against the rate: viscous by its amount, Coulomb by its sign."
 LIMITS = "What nodes and commands refuse or warn of; without them there is no limit."
+UNCERTAINTY = """How sure a number is, by its dotted path in this file (`inertia.arm_mass`),
+or all numbers below a name together (`joints_compliance`): each an independent cause, from which
+`torque_deviation` and `compliance_deviation` follow. Either `deviation`, the standard deviation in
+the number's own unit, or `relative`, that of a common factor."""
+
 JOINT_MAP = """Between a controller's numbers and the model's: its name for the joint, and
 controller = offset + sign * ratio * model."""
 GRAVITY = """### `gravity`
@@ -128,6 +135,7 @@ def page():
     parts.append(table("`friction`, by actuated joint (here three)", friction_of(3), FRICTION))
     parts.append(table("`limits`, by actuated joint (here three)", limits_of(3), LIMITS))
     parts.append(table("`joint_map.NAME`, by actuated joint", JointMapEntry, JOINT_MAP))
+    parts.append(table("`uncertainty.PATH`", UncertaintyEntry, UNCERTAINTY))
     parts.append(table("Tube", Tube))
     parts.append(GRAVITY)
     return "\n\n".join(parts) + "\n"

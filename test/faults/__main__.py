@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run what the catalogue names and print it row by row into docs/faults.md: ``make faults``."""
+"""Run what the catalogue names and print it row by row into docs/faults.md: ``make faults``.
+
+``python -m test.faults --again`` runs only the rows that did not pass the last time.
+"""
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import sys
 from collections import Counter, defaultdict
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,8 +19,10 @@ import pytest
 from test.faults.catalogue import TESTS, Row, rows
 from test.faults.page import write_section
 
-INTRODUCTION = """Printed by `make faults`: {passed} of {total} rows passed, {cases:,} cases of
-{tests} tests.
+RESULTS = Path("out/faults.json")
+"""Of every row, by its number, how many cases ran and what came of them."""
+PASS = "pass"
+INTRODUCTION = """Printed by `make faults`: {passed} of {total} rows passed.
 
 **R** the message is refused whole, nothing is published from it, it is counted and told in
 `/diagnostics`. **S** as R, and the stream stops until good samples come. **F** the node refuses to
@@ -35,49 +43,48 @@ class Outcomes:
             self.of[name][report.outcome] += 1
 
 
-def result(row: Row, outcomes: Outcomes) -> str:
-    """ "pass", or what else came of a row."""
+def result(row: Row, outcomes: Outcomes) -> tuple[int, str]:
+    """How many cases of a row ran, and what came of them."""
     found = [outcomes.of[test] for test in row.tests]
-    if any(set(one) - {"passed"} for one in found):
-        return "**fail**"
-    return "pass" if all(found) else "**not run**"
+    cases = sum(count.total() for count in found)
+    if any(set(count) - {"passed"} for count in found):
+        return cases, "**fail**"
+    return cases, PASS if all(found) else "**not run**"
 
 
-def section(outcomes: Outcomes) -> str:
+def section(results: dict[str, Any]) -> str:
     """The catalogue as a part of the page."""
     found = rows()
     text, table = [], ""
     for row in found:
         if row.table != table:
             table = row.table
-            text += [
-                "",
-                f"### {table}",
-                "",
-                "| # | fault | answer | cases | |",
-                "|---|---|---|---|---|",
-            ]
-        cases = sum(outcomes.of[test].total() for test in row.tests)
-        how = result(row, outcomes)
+            head = ["| # | fault | answer | cases | |", "|---|---|---|---|---|"]
+            text += ["", f"### {table}", "", *head]
+        cases, how = results[str(row.number)]
         text.append(f"| {row.number} | {row.fault} | {row.answer} | {cases} | {how} |")
-        print(f"{row.number:3} {how:8} {row.fault}")
-    head = INTRODUCTION.format(
-        passed=sum(result(row, outcomes) == "pass" for row in found),
-        total=len(found),
-        cases=sum(count.total() for count in outcomes.of.values()),
-        tests=len(outcomes.of),
-    )
-    return head + "\n".join(text)
+        print(f"{row.number:3} {how:12} {row.fault}")
+    passed = sum(results[str(row.number)][1] == PASS for row in found)
+    return INTRODUCTION.format(passed=passed, total=len(found)) + "\n".join(text)
 
 
 def main() -> int:
     """Run from a command line; 0 where every row passed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--again", action="store_true", help="rows that did not pass")
+    again = parser.parse_args().again
+    results: dict[str, Any] = json.loads(RESULTS.read_text()) if again else {}
+    asked = [row for row in rows() if results.get(str(row.number), (0, ""))[1] != PASS]
     os.environ.setdefault("SOAK_MINUTES", "1")
     outcomes = Outcomes()
-    tests = sorted({str(TESTS / test) for row in rows() for test in row.tests})
-    code = pytest.main(["-q", "-n", "2", "-m", "", *tests], plugins=[outcomes])
-    write_section("catalogue", section(outcomes))
-    return int(code)
+    tests = sorted({str(TESTS / test) for row in asked for test in row.tests})
+    # A file's nodes are started once, for all of its tests in their order.
+    pytest.main(["-q", "-n", "2", "--dist", "loadfile", "-m", "", *tests], plugins=[outcomes])
+    results |= {str(row.number): result(row, outcomes) for row in asked}
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+    write_section("catalogue", section(results))
+    return int(any(how != PASS for _, how in results.values()))
 
 
 if __name__ == "__main__":

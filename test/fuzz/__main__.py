@@ -43,7 +43,8 @@ HEAD = (
 )
 NODES_TEXT = """
 
-Real nodes over DDS, seed {seed}, {seconds:.0f} s: {sent}. All nodes alive, no exception;
+Real nodes over DDS, seed {seed}, {seconds:.0f} s:
+{sent}. All nodes alive, no exception;
 {torques:,} torques came back, each finite and with the stamp of a sound message; {requests:,}
 requests and {clocks:,} clocks were refused and counted.
 """
@@ -55,7 +56,7 @@ def section(figures: list[dict[str, Any]], nodes: dict[str, Any] | None) -> str:
     for found in figures:
         common = ", ".join(f"{why} {n:,}" for why, n in list(found["refused"].items())[:4])
         times = " | ".join(
-            f"{1e3 * found[f'{which} (s)']:.2g}" for which in ("median", "99.9 %", "slowest")
+            f"{1e3 * found[f'{which} (s)']:,.2f}" for which in ("median", "99.9 %", "slowest")
         )
         rows.append(
             f"| {found['kind']} | {found['seed']} | {found['examples']:,} | {found['taken']:,} | "

@@ -12,6 +12,7 @@ from support.robots import every_robot, random_joints
 from pkm_twin import load
 from pkm_twin.codegen import expressions as ex
 from pkm_twin.codegen import kernels
+from pkm_twin.codegen.cholesky import FLOOR, traces_over
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU, independent_rows
 from pkm_twin.codegen.plain import PlainCode
@@ -182,3 +183,26 @@ def test_the_cache_is_an_optimisation(tmp_path):
     out, lines = finished(start(blocked))
     assert out == first[0]
     assert len(lines) == 1 and "compiled programs are not kept" in lines[0]
+
+
+def test_traces_over_sparse_matrices(rng):
+    """On numbers and compiled; the numerators' pattern is another than the matrix'."""
+    for size in (1, 2, 5, 9):
+        sparse = rng.uniform(size=(3, 2 * size, size)) < 0.4
+        a, b, c = rng.normal(size=(3, 2 * size, size)) * sparse + np.eye(2 * size, size)
+        matrix, numerators = a.T @ a, [b.T @ b, c.T @ c]
+        expected = [np.trace(np.linalg.solve(matrix, m)) for m in numerators]
+        assert traces_over(numerators, matrix) == pytest.approx(expected, rel=1e-9)
+        flat = np.concatenate([matrix.ravel(), *(m.ravel() for m in numerators)])[None]
+
+        def write(x, size=size):
+            first, *others = np.array(x, dtype=object).reshape(3, size, size)
+            return traces_over(others, first)
+
+        for found in both(write, flat, f"traces {size}"):
+            assert found[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_traces_over_a_matrix_without_inverse_are_large_and_finite():
+    (found,) = traces_over([np.eye(2)], np.ones((2, 2)))
+    assert 1e12 < found <= 2.0 / FLOOR

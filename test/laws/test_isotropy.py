@@ -207,6 +207,20 @@ def test_the_least_direction_of_any_number_of_forms_and_coordinates(count, size)
     assert _largest(forms, y) <= _largest(forms, dense).min() * (1 + 1e-12)
 
 
+@pytest.mark.parametrize("count", [4, 6])
+def test_the_least_direction_of_forms_of_several_scales(count):
+    """Below what descents from ten times as many places find."""
+    rng = np.random.default_rng(0)
+    forms = rng.normal(size=(count, count, count))
+    forms = (forms + forms.swapaxes(-1, -2)) * np.geomspace(1e-3, 30.0, count)[:, None, None]
+    value = _largest(forms, least_direction(forms))
+    start = rng.normal(size=(2560, count))
+    start /= np.linalg.norm(start, axis=-1, keepdims=True)
+    best = np.argsort(_largest(forms, start))[:24]
+    others = [float(_largest(forms, _descended(forms, y))) for y in start[best]]
+    assert value <= min(others) * (1 + 1e-9)
+
+
 @massive
 def test_acceleration_enters_as_a_constant(name, robot, rng):
     pose = robot.forward(random_joints(robot, rng, 3))

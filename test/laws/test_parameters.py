@@ -189,6 +189,8 @@ class TestValues:
         [
             ("geometry.base_radius", 0.0),
             ("geometry.platform_radius", -0.05),
+            ("geometry.platform_radius", 1e-300),
+            ("geometry.arm_length", 1e300),
             ("geometry.arm_length", 0),
             ("geometry.forearm_length", 100.1),
             ("inertia.platform_mass", -1e-9),

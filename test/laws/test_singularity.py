@@ -97,9 +97,11 @@ def expected(robot, judge, q):
         held = 0.5 * a.shape[1] / np.sqrt(len(a)) / response
     tangent = judge._tangent()
     k = list(graph.bodies).index(graph.platform)
-    every = bodies @ tangent
-    platform = every[6 * k : 6 * k + 6]
-    moved = np.sqrt(len(q)) / np.linalg.norm(every @ np.linalg.pinv(platform))
+    inverse = np.linalg.pinv(bodies[6 * k : 6 * k + 6] @ tangent)
+    farthest = max(
+        np.linalg.norm(body @ tangent @ inverse) for body in np.split(bodies, len(bodies) // 6)
+    )
+    moved = np.sqrt(len(q)) / farthest
     return min(1.0, held, moved)
 
 

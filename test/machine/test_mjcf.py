@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 import numpy as np
@@ -198,3 +199,27 @@ def test_without_the_package_it_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ParameterError, match=r"without the mujoco package.*pkm_twin\[mjcf\]"):
         read_urdf(five_bar(tmp_path))
+
+
+def test_what_would_wait_or_count_for_ever_is_refused_by_name(tmp_path):
+    os.mkfifo(tmp_path / "pipe.xml")
+    os.mkfifo(tmp_path / "pipe.stl")
+    mesh = '<asset><mesh name="m" file="pipe.stl"/></asset>'
+    nested = '<replicate count="9000"><replicate count="9000"><body/></replicate></replicate>'
+    for inside, field in {
+        '<include file="pipe.xml"/>': "include.file",
+        mesh: "mesh.file",
+        '<worldbody><replicate count="99999999"/></worldbody>': "replicate.count",
+        f"<worldbody>{nested}</worldbody>": "replicate",
+        '<asset><hfield name="h" nrow="1000000" ncol="9"/></asset>': "hfield.nrow",
+        '<include file="machine.xml"/>': str(tmp_path / "machine.xml"),
+    }.items():
+        with pytest.raises(ParameterError) as refused:
+            read_urdf(save(tmp_path, f"<mujoco>{inside}</mujoco>"))
+        assert refused.value.field == field
+
+
+def test_included_files_are_read(tmp_path):
+    (tmp_path / "part.xml").write_text('<mujoco><option gravity="0 0 -1"/></mujoco>')
+    path = five_bar(tmp_path, old='<option gravity="0 -9.81 0"/>', new='<include file="part.xml"/>')
+    assert read_urdf(path)["gravity"] == [0.0, 0.0, -1.0]

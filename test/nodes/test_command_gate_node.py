@@ -9,7 +9,7 @@ from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
-from test.nodes.harness import SECOND, counts_of, one_line_refusal, values_of
+from test.nodes.harness import SECOND, counts_of, one_line_refusal, stamp_of, values_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -37,6 +37,7 @@ class Gated:
         self.peer, self.name, self._launch = peer, name, launch
         self._parameters = (*SETTINGS, *parameters)
         peer.hear(Float64MultiArray, f"/{name}/commands")
+        peer.hear(JointState, f"/{name}/commands_stamped")
         offered = QoSProfile(depth=10)
         offered.deadline = offered.lifespan = Duration(seconds=DEADLINE)
         self._torques = peer.node.create_publisher(JointState, f"/{name}/torques", offered)
@@ -94,6 +95,9 @@ def test_torques_are_forwarded_and_silence_makes_them_zeros(gated):
     effort = (0.5, -0.25, 1.0)
     gated.until_last(effort, lambda: gated.send(effort))
     assert values_of(gated.diagnostics())["controllers"] == "1"
+    told = gated.peer.received(f"/{gated.name}/commands_stamped")
+    gated.peer.until(lambda: effort in [tuple(message.effort) for message in told])
+    assert all(tuple(m.name) == tuple(NAMES) and stamp_of(m) > 0 for m in told)
     gated.until_last(ZEROS)
     array = gated.diagnostics(lambda a: values_of(a)["open"] == "False")
     assert counts_of(array, "closed")["stale torques"] >= 1

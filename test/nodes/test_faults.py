@@ -325,6 +325,15 @@ class TestLoad:
 class TestClocks:
     start = 1_000 * SECOND
 
+    @pytest.fixture
+    def timed(self, fleet):
+        """The node on a clock that this side sends."""
+        twin = fleet["timed"]
+        if "/clock" not in twin.peer._publishers:
+            twin.peer.talk(Clock, "/clock")
+            twin.peer.until(twin.peer.matched, 90.0)
+        return twin
+
     def tick(self, timed, now):
         """Bring the node's clock there, told by its diagnostics."""
         clock = Clock(clock=MAKE.header(now).stamp)
@@ -377,8 +386,7 @@ class TestClocks:
         assert counts_of(array, "stopped") == {"clock jump": 1}
         assert self.stream(timed, self.start, 20) == list(range(AGAIN - 1, 20))
 
-    def test_a_clock_that_is_no_time_is_refused(self, fleet):
-        timed = fleet["timed"]
+    def test_a_clock_that_is_no_time_is_refused(self, timed):
         self.tick(timed, self.start + SECOND)
         for sec, nanosec in ((-1, 0), (-(2**31), 5), (5, SECOND), (5, 2**32 - 1)):
             clock = Clock()
@@ -389,8 +397,10 @@ class TestClocks:
         assert stamp_of(array) == self.start + SECOND
         assert values_of(array)["exceptions"] == "0"
 
-    def test_a_stream_that_ends_is_stopped_while_the_clock_stands(self, fleet):
-        timed = fleet["timed"]
+    def test_a_stream_that_ends_is_stopped_while_the_clock_stands(self, timed):
+        begin = self.start + 2 * SECOND
+        self.tick(timed, begin)
+        self.stream(timed, begin, 20)
         array = timed.diagnostics(lambda a: "stale input" in counts_of(a, "stopped"))
         assert "stopped: stale input: no joint state for 5." in array.status[0].message
 

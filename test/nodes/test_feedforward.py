@@ -327,8 +327,9 @@ class TestSingularities:
         part = edge(limitless, self.inside, outside)
         twin = core(limitless, trip_count=10**6)
         warned = False
-        # Slowly, so that the band is not stepped over: the measure falls as the distance's root.
-        way = np.concatenate([np.linspace(1.0, 0.1, 1500), 0.1 * 0.9 ** np.arange(1, 300)])
+        # Slowly, so that the band is not stepped over: the measure falls as the distance's root to
+        # the edge, and a surface of constraint singularities may lie anywhere before it.
+        way = np.concatenate([np.linspace(1.0, 0.1, 1500), 0.1 * 0.985 ** np.arange(1, 2000)])
         for i, left in enumerate(way):
             q = self.inside + part * (1.0 - left) * (outside - self.inside)
             try:
@@ -369,16 +370,17 @@ class TestSingularities:
             assert twin.trajectory(message, NOW).shape == (6, 3)
             assert twin.near_singularities == 6
 
-    @pytest.mark.parametrize("name", ["delta", "delta_cu", "prru"])
+    @pytest.mark.parametrize("name", ["delta", "delta_cu", "linear_delta", "prru", "upr_rpu"])
     def test_the_defaults_leave_the_workspace_alone(self, name):
+        """The Delta-CU's limits hold a surface of constraint singularities, in a corner."""
         robot = load(name)
         limits = robot.limits.position
         q = np.random.default_rng(1).uniform(limits[:, 0], limits[:, 1], (20_000, 3))
-        q = q[robot.try_forward(q)[1]]
-        measures = robot.singularity(q)
+        measures, good = robot.try_singularity(q)
         s = Settings()
-        assert (measures < s.singularity_warn).mean() < 1e-3
-        assert (measures < s.singularity_stop).mean() < 1e-4
+        assert (measures[good] < s.singularity_warn).mean() < 0.03
+        assert (measures[good] < s.singularity_stop).mean() < 1e-3
+        assert robot.singularity(robot.inverse(robot.home())) > 3 * s.singularity_warn
 
     def test_a_warning_below_the_stop_is_refused(self):
         with pytest.raises(ParameterError, match="singularity_warn"):

@@ -11,21 +11,28 @@ import os
 import re
 import signal
 from importlib.util import find_spec
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics
-from test.nodes.harness import REPOSITORY, Process
+from pkm_twin import load, robot_names
+from pkm_twin.machine import rotations
+from pkm_twin.machine.robot_urdf import robot_urdf
+from test.nodes.harness import REPOSITORY, Maker, Process, Ros
 
 LAUNCH = REPOSITORY / "launch"
-FILES = ("twin", "cell", "control")
+FILES = ("twin", "cell", "control", "view")
 NODES = {
     "delta_dynamics": "delta_dynamics/node.py",
     "stiffness_monitor": "stiffness_monitor/node.py",
     "command_gate": "delta_dynamics/gate_node.py",
+    "machine_state": "pkm_twin/state/node.py",
 }
+SHARED = "pkm_twin/ros/wrench.py"
+"""Where nodes declare what they share."""
 
 
 def literal(name, variable):
@@ -62,7 +69,8 @@ class TestText:
         parameters, arguments = literal("twin", "PARAMETERS"), literal("twin", "ARGUMENTS")
         assert set(parameters) == set(NODES) <= set(arguments)
         for node, names in parameters.items():
-            source = (REPOSITORY / NODES[node]).read_text(encoding="utf-8")
+            files = (NODES[node], SHARED)
+            source = "".join((REPOSITORY / file).read_text(encoding="utf-8") for file in files)
             assert all(f'"{name}"' in source for name in names)
             assert set(names) <= set(arguments)
 
@@ -186,7 +194,9 @@ class TestRunning:
             assert self.parameter(peer, node, "use_sim_time") is False
 
     def test_a_namespace_takes_every_topic_along(self, launched, peer):
-        process = launched("twin", "namespace:=left", "command_gate:=true", "robot:=prru")
+        process = launched(
+            "twin", "namespace:=left", "command_gate:=true", "machine_state:=true", "robot:=prru"
+        )
         names = [f"/left/{node}" for node in NODES]
         self.until_nodes(peer, process, *names)
         peer.until(lambda: "/left/wrench" in self.subscribed(peer))
@@ -256,6 +266,51 @@ class TestRunning:
         assert self.parameter(peer, "/a/delta_dynamics", "mechanism") == "delta_cu"
         assert self.parameter(peer, "/b/delta_dynamics", "mechanism") == "prru"
         assert self.parameter(peer, "/b/stiffness_monitor", "mechanism") == "prru"
+
+    @pytest.mark.skipif(
+        not installed("robot_state_publisher"), reason="robot_state_publisher is not installed"
+    )
+    @pytest.mark.parametrize("space", ["", "left"])
+    @pytest.mark.parametrize("robot", robot_names())
+    def test_every_link_stands_in_one_tree(self, launched, peer, robot, space):
+        """robot_state_publisher finds every joint, and the platform stands where the twin says."""
+        from rclpy.time import Time
+        from sensor_msgs.msg import JointState
+        from tf2_ros import Buffer, TransformListener
+
+        model = load(robot)
+        q = model.inverse(model.home())
+        position, rotation = model.platform(q)
+        links = {
+            element.get("name")
+            for element in ElementTree.fromstring(robot_urdf(model))
+            if element.tag == "link"
+        }
+        prefix = f"{space}/" if space else ""
+        chosen = [f"namespace:={space}"] if space else []
+        process = launched("view", f"robot:={robot}", "rviz:=false", *chosen)
+        buffer = Buffer()
+        listener = TransformListener(buffer, peer.node)
+        topic = f"/{prefix}joint_states"
+        peer.talk(JointState, topic)
+        message = Maker(Ros()).joint_state
+
+        def connected():
+            assert process.process.poll() is None, process.output
+            now = Time()
+            names = [f"{prefix}{link}" for link in (*links, "tool0")]
+            return all(buffer.can_transform(f"{prefix}base_link", name, now) for name in names)
+
+        def send():
+            peer.send(topic, message(model.joint_names, q, stamp=peer.now()))
+
+        peer.until(connected, repeat=send)
+        found = buffer.lookup_transform(f"{prefix}base_link", f"{prefix}platform", Time()).transform
+        at, turn = found.translation, found.rotation
+        assert np.allclose([at.x, at.y, at.z], position, atol=1e-9)
+        turned = rotations.from_quaternion(turn.x, turn.y, turn.z, turn.w)
+        assert np.allclose(turned, rotation, atol=1e-9)
+        listener.unregister()
 
     @pytest.mark.skipif(not installed("controller_manager"), reason="ros2_control is not installed")
     @pytest.mark.parametrize("space", ["", "left"])
@@ -342,9 +397,9 @@ class TestRunning:
         assert said in process.output
 
     def test_ctrl_c_ends_all_of_it_cleanly(self, launched, peer):
-        process = launched("twin", "command_gate:=true")
+        process = launched("twin", "command_gate:=true", "machine_state:=true")
         self.until_nodes(peer, process, *(f"/{node}" for node in NODES))
         process.process.send_signal(signal.SIGINT)
         process.wait()
-        assert process.output.count("process has finished cleanly") == 3
+        assert process.output.count("process has finished cleanly") == 4
         assert "Traceback" not in process.output

@@ -20,7 +20,7 @@ from pkm_twin.apps.view.door import listen
 from pkm_twin.apps.view.texts import number
 from stiffness_monitor import strain_energy
 from test.atlas.browser import Browser, find_browser
-from test.commands.conftest import DELTA, REPOSITORY, process, twin  # noqa: F401
+from test.commands.conftest import DELTA, REPOSITORY
 from test.nodes.harness import end_with_parent
 
 TOKEN = "a-token-that-is-long-enough"
@@ -43,7 +43,7 @@ def viser():
     ],
 )
 @needs_viser
-def test_what_cannot_be_served_is_one_line(twin, options, told):  # noqa: F811
+def test_what_cannot_be_served_is_one_line(twin, options, told):
     result = twin("view", "delta_cu", *options)
     assert result.code == 1
     assert told in result.one_line_error()
@@ -58,21 +58,21 @@ def test_what_cannot_be_served_is_one_line(twin, options, told):  # noqa: F811
         ("--topic", "/joint_states"),
     ],
 )
-def test_options_that_need_another_are_usage(twin, options):  # noqa: F811
+def test_options_that_need_another_are_usage(twin, options):
     result = twin("view", "delta_cu", *options)
     assert result.code == 2
     assert result.out == ""
 
 
 @needs_viser
-def test_an_unknown_robot_is_told_before_anything_is_served(twin):  # noqa: F811
+def test_an_unknown_robot_is_told_before_anything_is_served(twin):
     result = twin("view", "delt", "--port", "0")
     assert result.code == 1
     assert "did you mean 'delta'" in result.one_line_error()
 
 
 @needs_viser
-def test_a_port_in_use_is_one_line(twin):  # noqa: F811
+def test_a_port_in_use_is_one_line(twin):
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
         result = twin("view", "delta_cu", "--port", port)
@@ -80,7 +80,7 @@ def test_a_port_in_use_is_one_line(twin):  # noqa: F811
     assert f"cannot listen on 127.0.0.1 port {port}" in result.one_line_error()
 
 
-def test_without_viser_the_line_says_what_brings_it(twin, monkeypatch):  # noqa: F811
+def test_without_viser_the_line_says_what_brings_it(twin, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     result = twin("view", "delta_cu")
     assert result.code == 1
@@ -114,7 +114,7 @@ def serving(*arguments):
 def test_a_signal_ends_it_quietly(number):
     with serving("five_bar") as (running, _):
         running.send_signal(number)
-        out, err = running.communicate(timeout=60)
+        out, err = running.communicate()
         assert (running.returncode, out, err) == (130, "", "")
 
 
@@ -126,15 +126,15 @@ def browser():
     if program is None:
         pytest.skip("no browser: set PKM_TWIN_BROWSER to a Chromium")
     with Browser(program, (1000, 700)) as browser:
-        browser.slow_down(0.5)
+        browser.slow_down(1.0)
         browser.call("Network.enable")
         yield browser
 
 
-SLIDER = "document.querySelectorAll('[role=slider]')[%d]"
+SLIDER = "(document.querySelectorAll('[role=slider]')[%d] || document.body)"
 VALUE = SLIDER + ".getAttribute('aria-valuenow')"
 TEXT = "(document.getElementById('%s') || {}).innerText"
-LOAD = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText === 'Load')"
+TAB = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText === 'Move').focus()"
 
 
 def moved(browser, slider, key):
@@ -160,6 +160,7 @@ def addresses(browser):
     return {urlsplit(url).hostname for url in asked if not url.startswith(("data:", "blob:"))}
 
 
+@pytest.mark.timeout(1800)  # without a graphics card, on a machine that has much else to do
 def test_a_slider_moves_the_machine_and_the_numbers_are_the_cores(browser):
     robot = load("delta_cu")
     with serving("delta_cu") as (_, address):
@@ -172,9 +173,7 @@ def test_a_slider_moves_the_machine_and_the_numbers_are_the_cores(browser):
         pose = robot.forward(q)
         assert read(browser, "singularity") == number(float(robot.singularity(q)))
         # The pose's sliders have followed, to a slider's step.
-        shown = [
-            float(browser.run(f"{SLIDER % k}.getAttribute('aria-valuenow')")) for k in (3, 4, 5)
-        ]
+        shown = [float(browser.run(VALUE % k)) for k in (3, 4, 5)]
         np.testing.assert_allclose(shown, pose, atol=1e-3)
         # And the other way round.
         pose[2] = moved(browser, 5, "ArrowLeft")
@@ -187,10 +186,12 @@ def test_a_slider_moves_the_machine_and_the_numbers_are_the_cores(browser):
         assert "limits" in read(browser, "refusal") or "unreachable" in read(browser, "refusal")
         assert read(browser, "q_0") == number(q[0])
         # A force of one step, and what it does.
-        browser.click(LOAD)
-        browser.until(browser.until(f"{VALUE % 0} === '0'"))
+        browser.run(TAB)
+        browser.press("ArrowRight")
+        # A tab that was seen stays where it is: its six sliders come first.
+        browser.until(f"{VALUE % 6} === '0'")
         wrench = np.zeros(6)
-        wrench[0] = moved(browser, 0, "ArrowRight")
+        wrench[0] = moved(browser, 6, "ArrowRight")
         energy = strain_energy(robot, pose, wrench)
         browser.until(f"{TEXT % 'dominant'} === '{energy.dominant}'")
         assert read(browser, "deflection_0") == number(1e6 * energy.deflection[0])

@@ -93,6 +93,7 @@ def test_no_slider_leads_to_an_exception(name, rng):
     far = model.to_pose(model.start, np.full(len(low), 50.0))
     assert far.refusal
     assert model.to_joints(model.start, np.full(len(model.start.q), np.nan)).refusal
+    assert model.loaded(model.start, np.full(6, np.inf)).refusal
     assert refused < 15 or len(low) == 6
 
 

@@ -130,18 +130,18 @@ class Model:
     def pose_ranges(self) -> tuple[Range, ...]:
         """Of the pose: what joint states all over their ranges reach, rounded outwards."""
         robot = self.robot
-        low, high = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in _ENDS)
+        lows, highs = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in _ENDS)
         random = np.random.default_rng(0).random((SAMPLES, robot.joints_count))
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=robot.joints_count)))
-        poses, good = robot.try_forward(low + (high - low) * np.concatenate([corners, random]))
+        poses, good = robot.try_forward(lows + (highs - lows) * np.concatenate([corners, random]))
         kept = [pose for pose in poses[good] if not self._angle_beyond(pose)]
         found = np.array([*kept, self.start.pose])
         rows = []
         for k, (name, unit) in enumerate(zip(robot.pose_names, robot.pose_units, strict=True)):
             least, most = float(found[:, k].min()), float(found[:, k].max())
             step = _step(most - least)
-            ends = math.floor(least / step) * step, math.ceil(most / step) * step
-            rows.append(Range(name, unit, *(round(end, 12) for end in ends), step))
+            low, high = (round(end * step, 12) for end in (least // step, -(-most // step)))
+            rows.append(Range(name, unit, low, high, step))
         return tuple(rows)
 
     @cached_property
@@ -214,8 +214,11 @@ class Model:
         return f"a passive joint stands at {most:.6g} rad, limit {float(bound):g}"
 
     def loaded(self, state: State, wrench: ArrayLike) -> State:
-        """The state under another wrench, shape (6,), N and N m."""
-        return replace(state, wrench=np.array(wrench, np.float64), refusal="")
+        """The state under another wrench, shape (6,), N and N m; the old one where that is none."""
+        values = np.array(wrench, np.float64)
+        if not np.isfinite(values).all():
+            return _refused(state, "the wrench is not finite")
+        return replace(state, wrench=values, refusal="")
 
     def numbers(self, state: State) -> Numbers:
         """All that is known of a state; what fails at this place is said in ``why``."""

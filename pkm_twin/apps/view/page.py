@@ -157,16 +157,16 @@ class Page:
 
     def _move_joint(self, k: int) -> None:
         q = self.state.q.copy()
-        q[k] = self._joints[k].value
+        q[k] = _read(self._joints[k])
         self.become(self.model.to_joints(self.state, q))
 
     def _move_pose(self, k: int) -> None:
         pose = self.state.pose.copy()
-        pose[k] = self._pose[k].value
+        pose[k] = _read(self._pose[k])
         self.become(self.model.to_pose(self.state, pose))
 
     def _load(self, _: int) -> None:
-        wrench = [handle.value for handle in self._wrench]
+        wrench = [_read(handle) for handle in self._wrench]
         self.become(self.model.loaded(self.state, wrench))
 
     def _unload(self) -> None:
@@ -195,7 +195,13 @@ class Page:
 
     def draw_deflected(self, deflection: Array, shares: dict[str, float], dominant: str) -> None:
         """The state with a deflection (6,), m and rad, base axes, enlarged as the slider says."""
-        self.stage.draw(self.state.q, deflection * self._enlarge.value, shares, dominant)
+        self.stage.draw(self.state.q, deflection * _read(self._enlarge), shares, dominant)
+
+
+def _read(handle: Any) -> float:
+    """A slider's value: what a visitor sends need not be within its ends."""
+    value = float(handle.value)
+    return float(min(max(value, handle.min), handle.max))
 
 
 def _put(handles: Sequence[Any], values: Array) -> None:

@@ -23,7 +23,6 @@ WIDTH: Final = 400
 """Of the panel, pixels."""
 MARKED: Final = 0.25
 """How often the curves' mark of the present moves while a bag plays, s."""
-_NO_POINTS: Final = {"show": False}
 
 
 class BagPanel:
@@ -113,6 +112,7 @@ class LivePanel:
 
     def __init__(self, page: Page, live: Live) -> None:
         self._page, self._live = page, live
+        self._seen: tuple[dict[str, int], int] | None = None
         gui = page.server.gui
         panel = gui.add_panel()
         with panel.add_tab("Live"):
@@ -129,6 +129,10 @@ class LivePanel:
     def step(self) -> None:
         """Show what was heard last."""
         page, heard = self._page, self._live.heard()
+        news = (heard.counts, heard.refused)
+        if news == self._seen:
+            return
+        self._seen = news
         waiting = ", ".join(TOPICS[name][1] for name in TOPICS if not heard.counts.get(name))
         self._heard.content = texts.heard(page.model.robot, heard, waiting)
         for name, (times, values) in heard.traces.items():
@@ -149,14 +153,15 @@ def _chart(page: Page, title: str, times: Array, values: Array, *, mark: bool = 
     from viser import uplot
 
     robot = page.model.robot
+    points = uplot.Series_Points(show=False)
     series = [uplot.Series(label="t, s")]
     series += [
-        uplot.Series(label=name, stroke=COLOURS[k % len(COLOURS)], width=1.5, points=_NO_POINTS)
+        uplot.Series(label=name, stroke=COLOURS[k % len(COLOURS)], width=1.5, points=points)
         for k, name in enumerate(robot.joint_names)
     ]
     curves = list(map(np.ascontiguousarray, values.T))
     if mark:
-        series.append(uplot.Series(label="now", stroke="#555555", width=1, points=_NO_POINTS))
+        series.append(uplot.Series(label="now", stroke="#555555", width=1, points=points))
         curves.append(_mark(times, values, 0.0))
     return page.server.gui.add_uplot(
         (times, *curves),

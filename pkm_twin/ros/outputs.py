@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of what the core of ``machine_state`` tells, and its transforms.
+"""Numbers and shapes as messages, and the publishers of transforms.
 
-Needs message classes, not rclpy. May import: numpy, pkm_twin's core, this package.
+Needs message classes, not rclpy. May import: numpy, pkm_twin's core, streams, this package.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from pkm_twin.machine import rotations
 from pkm_twin.ros.messages import SECOND
-from pkm_twin.state.scene import Shape
 from pkm_twin.streams.wrench import Mount
 
 if TYPE_CHECKING:
     from pkm_twin.ros.node import TwinNode
+    from pkm_twin.state.scene import Shape
 
 KINDS: Final = {
     "cylinder": Marker.CYLINDER,

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the measured efforts tell beside the torques: the load, and who pushes.
+
+Only the node ``delta_dynamics`` imports this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import InertiaStamped, WrenchStamped
+from rclpy.time import Time
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from delta_dynamics.contact import SIGMAS, ContactMonitor
+from delta_dynamics.feedforward import Torques
+from delta_dynamics.observer import platform_wrench
+from delta_dynamics.payload import PayloadEstimator
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros import node as health
+from pkm_twin.ros.messages import SECOND
+
+PAYLOAD_PERIOD = 4_000_000
+"""Between two samples that the payload is estimated from, ns: errors last longer."""
+GAP = 0.1
+"""Silence after which a stream begins anew, s."""
+
+
+class Estimates:
+    """``~/payload``, ``~/external_wrench`` and ``~/contact`` of a stream that measures efforts."""
+
+    def __init__(self, node: health.TwinNode, robot: Callable[[], Robot], frames: tuple[str, str]):
+        """Declare the parameters and create the topics that they ask for.
+
+        :param robot: the robot as it is now.
+        :param frames: of the base and of the platform.
+        """
+        self._node, self._robot, self._frames = node, robot, frames
+        self.touching = False
+        self.contacts = 0
+        self._last = 0
+        self._due = 0
+        known = robot()
+        self._payload = self._create_payload(known)
+        self._contact = self._create_contact(known)
+        self._warm_up(known)
+
+    def _warm_up(self, robot: Robot) -> None:
+        """Compile what a stream's samples call, before there are any."""
+        still = np.zeros(robot.joints_count)
+        motion = robot.inverse(robot.home()), still, still
+        for k in range(2):
+            if self._payload is not None:
+                self._payload.push(float(k), *motion, still)
+            if self._contact is not None:
+                self._contact.push(float(k), motion, still)
+        if self._contact is not None:
+            platform_wrench(robot, motion[0], still)
+            self._contact.reset()
+        if self._payload is not None:
+            self._payload = PayloadEstimator(robot)
+
+    def _create_payload(self, robot: Robot) -> PayloadEstimator | None:
+        node = self._node
+        if not node.declare(
+            "estimate_payload",
+            False,
+            "publish ~/payload: what the platform carries, from the measured efforts",
+            read_only=True,
+        ):
+            return None
+        self._load = node.create_guarded_publisher(InertiaStamped, "~/payload")
+        self._load_deviation = node.create_guarded_publisher(InertiaStamped, "~/payload_deviation")
+        node.create_service(Trigger, "~/reset_payload", self._reset_payload)
+        return PayloadEstimator(robot)
+
+    def _create_contact(self, robot: Robot) -> ContactMonitor | None:
+        node = self._node
+        wanted = node.declare(
+            "observe_wrench",
+            False,
+            "publish ~/external_wrench and ~/contact: who pushes, from the measured efforts",
+            read_only=True,
+        )
+        bandwidth = node.declare(
+            "observer.bandwidth",
+            60.0,
+            "of ~/external_wrench: the inverse of its time constant",
+            unit="1/s",
+            low=0.1,
+            high=1e4,
+            read_only=True,
+        )
+        sigmas = node.declare(
+            "observer.sigmas",
+            SIGMAS,
+            "deviations of model and noise together that are a contact",
+            low=1.0,
+            high=1e3,
+            read_only=True,
+        )
+        if not wanted:
+            return None
+        self._wrench = node.create_guarded_publisher(WrenchStamped, "~/external_wrench")
+        self._effort = node.create_guarded_publisher(JointState, "~/external_effort")
+        self._event = node.create_guarded_publisher(Bool, "~/contact", latched=True)
+        return ContactMonitor(robot, bandwidth, sigmas)
+
+    def reset(self) -> None:
+        """A stream begins anew: the load stays, time does not."""
+        self._last = self._due = 0
+        if self._contact is not None:
+            self._contact.reset()
+
+    def change_robot(self, robot: Robot) -> None:
+        """Another payload, gravity or friction was set."""
+        if self._payload is not None:
+            self._payload = PayloadEstimator(robot)
+        if self._contact is not None:
+            self._contact.change_robot(robot)
+
+    def take(self, torques: Torques) -> None:
+        """A sample whose torques were published; without measured efforts it tells nothing."""
+        if torques.residual is None:
+            return
+        if torques.stamp - self._last > GAP * SECOND:
+            self.reset()
+        self._last = torques.stamp
+        effort = torques.effort + torques.residual
+        if self._contact is not None:
+            self._take_contact(self._contact, torques, effort)
+        if self._payload is not None and torques.stamp - self._due >= PAYLOAD_PERIOD:
+            self._due = torques.stamp
+            self._take_payload(self._payload, torques, effort)
+
+    def diagnose(self) -> dict[str, object]:
+        """Values of the node's diagnostic status."""
+        values: dict[str, object] = {}
+        if self._contact is not None:
+            values |= {"contact": self.touching, "contacts": self.contacts}
+        if self._payload is not None:
+            found = self._payload.estimate()
+            values["payload estimate (kg)"] = f"{found.mass:.4g} +- {found.mass_deviation:.2g}"
+            values["payload changes seen"] = found.resets
+        return values
+
+    def _take_contact(self, core: ContactMonitor, torques: Torques, effort: Any) -> None:
+        found = core.push(torques.stamp / SECOND, torques.motion, effort, torques.wrench)
+        if found is None:
+            return
+        stamp = Time(nanoseconds=torques.stamp).to_msg()
+        message = WrenchStamped()
+        message.header.stamp, message.header.frame_id = stamp, self._frames[0]
+        force, torque = message.wrench.force, message.wrench.torque
+        force.x, force.y, force.z, torque.x, torque.y, torque.z = found.wrench.tolist()
+        self._wrench.publish(message)
+        controller = self._robot().controller
+        efforts = JointState(name=list(controller.names))
+        efforts.header.stamp = stamp
+        efforts.effort = controller.controller_efforts(found.external).tolist()
+        self._effort.publish(efforts)
+        if found.touching != self.touching:
+            self.touching = found.touching
+            self.contacts += found.touching
+            self._event.publish(Bool(data=found.touching))
+
+    def _take_payload(self, core: PayloadEstimator, torques: Torques, effort: Any) -> None:
+        found = core.push(torques.stamp / SECOND, *torques.motion, effort, torques.wrench)
+        if found is None:
+            return
+        pairs = (
+            (self._load, found.mass, found.com),
+            (self._load_deviation, found.mass_deviation, found.com_deviation),
+        )
+        for publisher, mass, com in pairs:
+            message = InertiaStamped()
+            message.header.stamp = Time(nanoseconds=torques.stamp).to_msg()
+            message.header.frame_id = self._frames[1]
+            message.inertia.m = mass
+            place = message.inertia.com
+            place.x, place.y, place.z = np.asarray(com, float).tolist()
+            publisher.publish(message)
+
+    def _reset_payload(self, _request: Any, response: Any) -> Any:
+        if self._payload is not None:
+            self._payload.reset()
+        response.success, response.message = True, "the load is forgotten"
+        return response

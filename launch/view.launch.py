@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot to look at: machine_state and, where they are installed, robot_state_publisher and rviz2.
+
+``machine_state`` gives every joint of the tree, passive ones too; robot_state_publisher makes the
+transforms of all links of them. Without it machine_state publishes that of the platform.
+"""
+
+import tempfile
+from pathlib import Path
+
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, RegisterEventHandler
+from launch.event_handlers import OnShutdown
+from launch.launch_context import LaunchContext
+from launch.launch_description_entity import LaunchDescriptionEntity
+from launch_ros.actions import Node
+
+from launch import LaunchDescription
+from pkm_twin import load
+from pkm_twin.machine.robot_urdf import robot_urdf
+
+HERE = Path(__file__).parent
+LAYOUT = "view/machine.rviz"
+
+ARGUMENTS = {
+    "robot": ("delta_cu", "a name or a path"),
+    "namespace": ("", "of the nodes and of every topic; and the prefix of all frames"),
+    "params_file": ("", "parameters of machine_state, a YAML file"),
+    "joint_states": ("joint_states", "topic of the measured joint states"),
+    "wrench": ("wrench", "topic of the measured wrench"),
+    "robot_state_publisher": ("auto", "true, false, or auto: where it is installed"),
+    "rviz": ("auto", "true, false, or auto: where rviz2 is installed"),
+    "use_sim_time": ("false", "true where a bag is replayed with --clock"),
+    "log_level": ("info", "of machine_state: debug, info, warn, error or fatal"),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription(
+        [
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=text)
+                for name, (default, text) in ARGUMENTS.items()
+            ),
+            OpaqueFunction(function=view),
+        ]
+    )
+
+
+def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    """The nodes, once the arguments have their values."""
+    given = {name: context.launch_configurations[name] for name in ARGUMENTS}
+    namespace = given["namespace"].strip("/")
+    prefix = f"{namespace}/" if namespace else ""
+    sim_time = {"use_sim_time": _wanted(given, "use_sim_time")}
+    links = _wanted(given, "robot_state_publisher", "robot_state_publisher")
+    actions: list[LaunchDescriptionEntity] = [
+        Node(
+            package="pkm_twin",
+            executable="machine_state",
+            name="machine_state",
+            namespace=namespace,
+            parameters=[
+                {
+                    "base_frame": f"{prefix}base_link",
+                    "platform_frame": f"{prefix}platform",
+                    "tool_frame": f"{prefix}tool0",
+                },
+                *([given["params_file"]] if given["params_file"] else []),
+                {
+                    "mechanism": given["robot"],
+                    # A frame has one parent.
+                    "publish_tf": "tool" if links else "all",
+                    **sim_time,
+                },
+            ],
+            remappings=[(topic, given[topic]) for topic in ("joint_states", "wrench")],
+            ros_arguments=["--log-level", given["log_level"]],
+            output="screen",
+        )
+    ]
+    if links:
+        actions.append(
+            Node(
+                package="robot_state_publisher",
+                executable="robot_state_publisher",
+                namespace=namespace,
+                parameters=[
+                    {
+                        "robot_description": robot_urdf(load(given["robot"])),
+                        "frame_prefix": prefix,
+                        "publish_frequency": 100.0,
+                        **sim_time,
+                    }
+                ],
+                remappings=[("joint_states", "machine_state/joint_states")],
+                output="screen",
+            )
+        )
+    if _wanted(given, "rviz", "rviz2"):
+        actions += _rviz(prefix, sim_time)
+    return actions
+
+
+def _rviz(prefix: str, sim_time: dict[str, bool]) -> list[LaunchDescriptionEntity]:
+    """RViz on the layout, its topics and frames those of the namespace."""
+    text = (_share() / LAYOUT).read_text(encoding="utf-8")
+    for old, new in (
+        ("Value: /", f"Value: /{prefix}"),
+        ("Fixed Frame: ", f"Fixed Frame: {prefix}"),
+        ('TF Prefix: ""', f"TF Prefix: {prefix[:-1]!r}"),
+    ):
+        text = text.replace(old, new)
+    folder = tempfile.TemporaryDirectory(prefix="pkm_twin_")
+    file = Path(folder.name) / "machine.rviz"
+    file.write_text(text, encoding="utf-8")
+    return [
+        RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: folder.cleanup())),
+        Node(
+            package="rviz2",
+            executable="rviz2",
+            arguments=["-d", str(file)],
+            parameters=[sim_time],
+            output="screen",
+        ),
+    ]
+
+
+def _share() -> Path:
+    """Where the layouts are: beside this folder where installed, in it in a checkout."""
+    return HERE if (HERE / LAYOUT).is_file() else HERE.parent
+
+
+def _wanted(given: dict[str, str], name: str, package: str = "") -> bool:
+    value = given[name].lower()
+    if value == "auto" and package:
+        try:
+            get_package_prefix(package)
+        except PackageNotFoundError:
+            return False
+        return True
+    if value not in ("true", "false"):
+        words = "true, false or auto" if package else "true or false"
+        raise RuntimeError(f"{name}: {given[name]!r} is not {words}")
+    return value == "true"

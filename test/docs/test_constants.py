@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bounds that the pages tell in running text are those of the code."""
+
+from __future__ import annotations
+
+from delta_dynamics.feedforward import Settings
+from pkm_twin.codegen import program
+from pkm_twin.codegen.kernels import STEPS
+from pkm_twin.codegen.lu import SparseLU
+from test.support.pages import numbers, text_of
+
+ENGINE = "docs/engine.md"
+WORDS = {"quarter": 0.25, "threefold": 3.0, "tenth": 0.1}
+
+
+def word(pattern):
+    """A number that is written out."""
+    (found,) = [w for w in WORDS if pattern.format(w) in text_of(ENGINE)]
+    return WORDS[found]
+
+
+def test_newtons_judgement():
+    assert numbers(ENGINE, r"until one is below (\S+) \(unit one; .*?\), at most (\d+)\.") == [
+        program.CLOSED,
+        program.TURNS,
+    ]
+    assert word("at most a **{}** of the one before it") == program.CONTRACTION
+    assert word("changes at most **{}** in a correction") == program.CHANGE
+    assert numbers(ENGINE, r"stays above (\S+), with its sign \((\S+) from a closed form") == [
+        program.DIRECT,
+        program.STEPPED,
+    ]
+    assert numbers(ENGINE, r"redundant ones too, is at most (\S+) \(") == [program.RESIDUAL]
+    pattern = r"tried again in (\d+), (\d+), (\d+), (\d+) and (\d+) \*\*steps"
+    assert numbers(ENGINE, pattern) == list(STEPS)
+    assert numbers(ENGINE, r"determinant's least is then (\S+): short") == [program.STEPPED]
+
+
+def test_pivots():
+    share = SparseLU.__init__.__defaults__[0]
+    assert word("at least a {} of the largest entry") == share
+
+
+def test_bounds_of_the_stream():
+    pattern = r"`singularity_warn`, `singularity_stop` \| (\S+), (\S+) \|"
+    assert numbers("README.md", pattern) == [
+        Settings().singularity_warn,
+        Settings().singularity_stop,
+    ]

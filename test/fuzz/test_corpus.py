@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What once fell stays refused, each by an error of the package: one file a fault."""
+
+import pytest
+
+from test.fuzz.__main__ import KINDS
+from test.fuzz.tally import CORPUS, refusal
+
+FILES = sorted(path for path in CORPUS.rglob("*") if path.is_file())
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The kinds, each made once."""
+    kinds = {}
+
+    def make(kind):
+        if kind not in kinds:
+            kinds[kind] = kind(tmp_path_factory.mktemp(kind.__name__))
+        return kinds[kind]
+
+    return make
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_it_is_refused(made, kind):
+    subject = made(kind)
+    for name, example in subject.corpus():
+        assert subject.check(example) != "good", name
+
+
+def test_every_file_is_of_a_kind():
+    assert {path.parent.name for path in FILES} <= {kind.__name__ for kind in KINDS}
+    assert len(FILES) > 50
+
+
+def test_an_error_of_another_kind_is_no_refusal():
+    with pytest.raises(ZeroDivisionError):
+        refusal(lambda: 1 / 0)

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deviations of torques and compliance: against machines drawn at random."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics, torque_deviation
+from pkm_twin import Robot, load
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.entries import entries, given, with_entries
+from stiffness_monitor import compliance, compliance_deviation
+from test.support.robots import joint_range
+
+Array = NDArray[np.float64]
+
+DELTA = {
+    "inertia.platform_mass": {"deviation": 0.01},
+    "inertia.arm_mass": {"deviation": 0.005},
+    "friction": {"relative": 0.1},
+    "gravity[2]": {"deviation": 0.05},
+}
+HEAD = {"members.youngs_modulus": {"relative": 0.02}, "joints_compliance": {"relative": 0.04}}
+
+
+def unsure(name: str, uncertainty: dict[str, Any], **sections: Any) -> Robot:
+    """A shipped robot whose file says how sure it is."""
+    robot = load(name)
+    robot = robot.changed(**sections) if sections else robot
+    data = {**given(robot.parameter_sections()), "mechanism": robot.mechanism}
+    return robot_of_data({**data, "uncertainty": uncertainty}, name)
+
+
+def drawn(robot: Robot, rng: np.random.Generator) -> Robot:
+    """One of the machines that the file allows, every cause by a normal deviate of its own."""
+    known = {path: value for path, (value, _) in entries(robot).items()}
+    values = {}
+    for name, entry in robot.uncertainty.items():
+        deviate = rng.normal()
+        for path, value in known.items():
+            if path == name or path.startswith((f"{name}.", f"{name}[")):
+                if entry.deviation is None:
+                    values[path] = value * (1.0 + deviate * entry.relative)
+                else:
+                    values[path] = value + deviate * entry.deviation
+    return with_entries(robot, values)
+
+
+def spread(robot: Robot, call: Any, count: int) -> Array:
+    rng = np.random.default_rng(2)
+    return np.asarray(np.std([call(drawn(robot, rng)) for _ in range(count)], axis=0))
+
+
+def delta() -> tuple[Robot, Array, Array, Array]:
+    friction = {"viscous": [0.05, 0.06, 0.07], "coulomb": [0.1, 0.2, 0.1]}
+    robot = unsure("delta_cu", DELTA, friction=friction)
+    middle, half = joint_range(robot)
+    rng = np.random.default_rng(4)
+    return robot, middle + 0.5 * half * rng.uniform(-1, 1, (5, 3)), *rng.normal(size=(2, 5, 3))
+
+
+def check(count: int, tolerance: float) -> None:
+    """Of a standard deviation over k draws the relative error is 1 / sqrt(2 k)."""
+    robot, q, qd, qdd = delta()
+    found = torque_deviation(robot, q, qd, qdd)
+    expected = spread(robot, lambda r: inverse_dynamics(r, q, qd, qdd), count)
+    np.testing.assert_allclose(found, expected, rtol=tolerance)
+    head = unsure("upr_rpu", HEAD)
+    pose = [-0.6, 0.1, 0.05]
+    found = compliance_deviation(head, pose)
+    expected = spread(head, lambda r: compliance(r, pose), count)
+    np.testing.assert_allclose(found, expected, rtol=tolerance, atol=1e-3 * expected.max())
+
+
+def test_random_machines_spread_as_is_said() -> None:
+    check(120, 0.25)
+
+
+@pytest.mark.long
+def test_ten_thousand_random_machines_spread_as_is_said() -> None:
+    check(10_000, 0.03)
+
+
+def test_a_file_that_names_none_is_sure() -> None:
+    robot = load("delta")
+    q = robot.inverse(robot.home())
+    np.testing.assert_array_equal(torque_deviation(robot, q, q, q), 0.0)
+
+
+def test_what_scales_all_scales_the_answer() -> None:
+    """All that is elastic softer by a share: the compliance by the same."""
+    head = unsure("upr_rpu", {"joints_compliance": {"relative": 0.05}})
+    pose = head.home()
+    part = compliance_deviation(head, pose)
+    whole = compliance_deviation(unsure("upr_rpu", {"members": {"relative": 0.05}}), pose)
+    assert 0.0 < np.trace(part) < 0.05 * np.trace(compliance(head, pose)) * 1.001
+    assert np.trace(whole) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("entry", "text"),
+    [
+        ({"inertia.mass": {"deviation": 0.1}}, r"uncertainty\.inertia\.mass"),
+        ({"inertia": {"deviation": 0.1}}, "it stands for several numbers"),
+        ({"inertia.arm_mass": {}}, "either deviation or relative"),
+        ({"inertia.arm_mass": {"deviation": -1.0}}, "at least 0"),
+        ({"inertia.arm_mass": {"relative": 1.5}}, "at most 1"),
+        ({"uncertainty": {"relative": 0.5}}, r"uncertainty\.uncertainty"),
+    ],
+)
+def test_what_is_no_number_of_the_file_is_refused(entry: dict[str, Any], text: str) -> None:
+    with pytest.raises(ParameterError, match=text):
+        unsure("delta_cu", entry)
+
+
+def test_a_machine_keeps_what_its_file_says_beside_its_graph() -> None:
+    robot = unsure("five_bar", {"gravity": {"relative": 0.02}})
+    joint = robot.joint_names[0]
+    data = {**given(robot.parameter_sections()), "mechanism": "machine"}
+    mapped = robot_of_data({**data, "joint_map": {joint: {"offset": 0.1}}}, "mine")
+    again = with_entries(mapped, {"origin[2]": entries(mapped)["origin[2]"][0]})
+    assert again.controller.offsets[0] == 0.1
+    q = again.inverse(again.home())
+    still = np.zeros_like(q)
+    share = torque_deviation(again, q, still, still) / np.abs(
+        inverse_dynamics(again, q, still, still)
+    )
+    np.testing.assert_allclose(share, 0.02, rtol=1e-6)
