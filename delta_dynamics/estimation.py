@@ -26,7 +26,7 @@ Cones = Sequence[tuple[slice, Array]]
 HUBER: Final = 1.5
 """Robust deviations up to which a residual counts with its square."""
 TURNS: Final = 15
-TOLD: Final = 3.0
+TOLD: Final = 5.0
 """A direction is the data's where they tell it by this much better than the prior."""
 MODEL: Final = 1e-5
 """Part of the efforts that no model is better than: a direction that shows less is not seen."""

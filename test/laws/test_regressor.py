@@ -16,6 +16,8 @@ from delta_dynamics import (
 )
 from delta_dynamics.base_parameters import random_states
 from pkm_twin import Robot, load
+from pkm_twin.machine.catalogue import robot_of_data
+from test.machine.random_machines import NAMES, variant
 from test.support.robots import loaded, massive, random_motion
 
 
@@ -39,6 +41,20 @@ def test_regressor_times_parameters_is_inverse_dynamics(name):
     assert error.max() < 1e-12
     # Without a wrench its column is nothing.
     assert not regressor(robot, q[0], qd[0], qdd[0])[:, -1].any()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["five_bar", *(pytest.param(n, marks=pytest.mark.long) for n in NAMES if n != "five_bar")],
+)
+def test_the_same_of_random_machines(name):
+    rng = np.random.default_rng([7, NAMES.index(name)])
+    robot = robot_of_data(variant(name, rng), name)
+    q, qd, qdd = random_states(robot, 3, seed=4)
+    wrench = rng.normal(0.0, 10.0, (3, 6))
+    efforts = inverse_dynamics(robot, q, qd, qdd, wrench)
+    error = regressor(robot, q, qd, qdd, wrench) @ parameter_values(robot) - efforts
+    assert np.abs(error).max() < 1e-12 * np.abs(efforts).max()
 
 
 @massive
