@@ -49,13 +49,13 @@ lint: $(VENV)/test.stamp
 types: $(VENV)/test.stamp
 	$(BIN)/mypy
 
-# Two at a time: a test that needs quiet waits for conditions, none for a clock.
+# Three at a time, as most wait for processes: a test that needs quiet waits for conditions, none for a clock.
 # A file is one worker's: what its tests share is made once.
 unit: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 3 --dist loadfile
 
 long: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m long $(ENDLESS:%=--ignore=%)
+	$(BIN)/python -m pytest -n 3 --dist loadfile -m long $(ENDLESS:%=--ignore=%)
 
 bags: $(VENV)/bags.stamp
 	$(BIN)/python -m bags.recording

@@ -9,10 +9,12 @@ import subprocess
 import sys
 from functools import cache
 
+import numpy as np
 import pytest
 from support.command import Result
 from typer.main import get_command
 
+from pkm_twin import load
 from pkm_twin.apps.cli import app
 from test.commands.conftest import DELTA, REPOSITORY, rewrite
 
@@ -106,7 +108,19 @@ def folder(tmp_path_factory):
         (path / name).symlink_to(REPOSITORY / name)
     whole = rewrite(DELTA, path / "whole.mcap", seconds=0.5).read_bytes()
     (path / "damaged.mcap").write_bytes(whole[: len(whole) * 3 // 4])
+    write_poses(path / "poses.csv")
     return path
+
+
+def write_poses(path):
+    """Measured poses of a machine as its file has it: the joints' names, and a place each."""
+    robot = load("delta_cu")
+    rng = np.random.default_rng(1)
+    q = rng.uniform(-0.5, 0.9, (40, 3))
+    head = [*(f"{name}.position" for name in robot.joint_names), "x", "y", "z"]
+    rows = np.hstack([q, robot.platform(q)[0] + 1e-5 * rng.normal(size=q.shape)])
+    lines = [",".join(head), *(",".join(map(repr, row)) for row in rows.tolist())]
+    path.write_text("\n".join(lines) + "\n")
 
 
 def by_shell(line):

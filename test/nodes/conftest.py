@@ -66,6 +66,17 @@ def launch(domain):
         pose = head.forward(np.full((*batch, 3), 0.7))
         strain_energy(head, pose, np.ones(6))
         compliance(head, pose)
+    yield from started(domain)
+
+
+@pytest.fixture
+def launch_alone(domain):
+    """The same for one test: what it leaves is no other test's peer."""
+    yield from started(domain)
+
+
+def started(domain):
+    """Gives a function that starts processes, then ends them."""
     processes = []
 
     def start(module, *parameters, **options):
