@@ -79,6 +79,7 @@ class MachineSim(health.TwinNode):
         self._create_topics()
         self._due = time.monotonic()
         self._heard = self._due
+        self._flying = 0
         if self._lockstep:
             self.create_guarded_timer(LOOK, self._go_alone)
         else:
@@ -259,7 +260,10 @@ class MachineSim(health.TwinNode):
         self._simulation.commands(message)
         self._heard = time.monotonic()
         if self._lockstep:
-            self._advance()
+            # Answers to states that went out alone are no steps: one state is on its way at a time.
+            self._flying = max(0, self._flying - 1)
+            if self._flying == 0:
+                self._advance()
 
     def _on_trajectory(self, data: bytes) -> None:
         self._simulation.trajectory(RawTrajectory.of(data).fields)
@@ -289,7 +293,11 @@ class MachineSim(health.TwinNode):
         """Time goes on where nobody commands: before the first command, and without an answer."""
         if not self.active:
             return
-        if self._simulation.braked or time.monotonic() - self._heard > ALONE:
+        silent = time.monotonic() - self._heard > ALONE
+        if silent:
+            # What has no answer by now has nobody who answers.
+            self._flying = 0
+        if self._simulation.braked or silent:
             self._advance()
 
     def _advance(self) -> None:
@@ -312,6 +320,7 @@ class MachineSim(health.TwinNode):
         state.position = _numbers(robot.offsets + robot.factors * measured.q)
         state.velocity = _numbers(robot.factors * measured.qd)
         state.effort = _numbers(robot.controller_efforts(measured.effort))
+        self._flying += 1
         # Last: who answers it has all else.
         self._states.publish(state)
 
