@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -244,8 +245,13 @@ def test_reader_finds_what_was_written(tmp_path: Path) -> None:
 
 
 def test_no_threads_or_descriptors_are_left(tmp_path: Path) -> None:
-    before = len(os.listdir("/proc/self/task")), len(os.listdir("/proc/self/fd"))
+    def held() -> tuple[int, int]:
+        return threading.active_count(), len(os.listdir("/proc/self/fd"))
+
+    before = held()
     for index in range(20):
         with text_writer(tmp_path / f"{index}.mcap") as writer:
             writer.write("/text", {"data": "x"}, 1)
-    assert (len(os.listdir("/proc/self/task")), len(os.listdir("/proc/self/fd"))) <= before
+    # Of Python's threads: libraries start and end some of their own when they like.
+    after = held()
+    assert after[0] <= before[0] and after[1] <= before[1]

@@ -183,11 +183,14 @@ def test_loop_ends_by_sigint(bag: Path, listener: Listener, player: Callable[...
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=DEADLINE)
     assert (process.returncode, "Traceback" in err) == (0, False), err
-    assert "interrupted=True" in out and "loops=2" in out
+    assert "interrupted=True" in out
+    # A busy machine has the signal some loops later.
+    loops = int(out.partition("loops=")[2].partition(",")[0])
+    assert loops >= 2
     positions = [message.position[0] for message in listener.of("joint_states")]
     assert positions[: 2 * COUNT] == [float(index) for index in range(COUNT)] * 2
     times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.of("clock")]
-    assert times.count(FIRST) == 3
+    assert 3 <= times.count(FIRST) <= loops + 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
