@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,7 +13,7 @@ from support.robots import ELASTIC, elastic, parameters_of, random_joints
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
-from pkm_twin.errors import ParameterError, UnreachableError
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from stiffness_monitor import compliance
 from stiffness_monitor.beams import assemble
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
@@ -287,6 +288,13 @@ def test_rods_that_touch_hold_no_rotation(variant):
     """Such a file is refused; and the nearer they are, the softer is what they hold."""
     with pytest.raises(ParameterError, match="parallelogram_width"):
         variant("delta", members={"parallelogram_width": 1e-9})
+    # The model itself refuses what would come past the file.
+    sound = load("delta")
+    touching = dataclasses.replace(sound.members, parallelogram_width=1e-9)
+    robot = dataclasses.replace(sound, members=touching)
+    with pytest.raises(SingularityError, match="elastic frame") as caught:
+        natural_frequencies(robot, robot.home()[None])
+    assert caught.value.index == (0,)
     lowest = []
     for width in (1e-2, 1e-4):
         robot = variant("delta", members={"parallelogram_width": width})[0]
