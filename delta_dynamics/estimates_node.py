@@ -18,7 +18,6 @@ from std_srvs.srv import Trigger
 
 from delta_dynamics.contact import SIGMAS, ContactMonitor
 from delta_dynamics.feedforward import Torques
-from delta_dynamics.observer import platform_wrench
 from delta_dynamics.payload import PayloadEstimator
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
@@ -53,16 +52,12 @@ class Estimates:
         """Compile what a stream's samples call, before there are any."""
         still = np.zeros(robot.joints_count)
         motion = robot.inverse(robot.home()), still, still
+        load, contact = PayloadEstimator(robot), ContactMonitor(robot)
         for k in range(2):
             if self._payload is not None:
-                self._payload.push(float(k), *motion, still)
+                load.push(float(k), *motion, still)
             if self._contact is not None:
-                self._contact.push(float(k), motion, still)
-        if self._contact is not None:
-            platform_wrench(robot, motion[0], still)
-            self._contact.reset()
-        if self._payload is not None:
-            self._payload = PayloadEstimator(robot)
+                contact.push(float(k), motion, still)
 
     def _create_payload(self, robot: Robot) -> PayloadEstimator | None:
         node = self._node

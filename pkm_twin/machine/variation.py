@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.entries import given
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -76,7 +77,7 @@ def varied(
         if kind not in KINDS or not 0.0 <= size <= MAX_SPREAD:
             raise ParameterError(f"spread.{kind}", size, f"0 to {MAX_SPREAD:g} for {KINDS}")
     rng = np.random.default_rng(seed)
-    data = _given(robot.parameter_sections())
+    data = given(robot.parameter_sections())
     drawn: dict[str, float] = {}
     for number in _numbers(data, robot.parameter_units(), ()):
         # Drawn for every number: a spread of one kind leaves the draws of the others.
@@ -116,13 +117,6 @@ def _built(robot: Robot, data: dict[str, Any], spread: Mapping[str, float]) -> R
             ) from error
         raise
     return made
-
-
-def _given(data: Any) -> Any:
-    """Without what a file would leave out: that is derived."""
-    if not isinstance(data, Mapping):
-        return data
-    return {key: _given(value) for key, value in data.items() if value is not None}
 
 
 def _numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_Number]:
