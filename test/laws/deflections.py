@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of loads and deflections by the independent frame engine, for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pkm_twin.apps.elastic_fit import Deflected
+
+
+@cache
+def frame_recording(factors: tuple[tuple[str, float], ...] = (), count: int = 120) -> Deflected:
+    """The milling bag's motion and loads on PyNite's frame with softer elements, without noise."""
+    pytest.importorskip("Pynite")
+    from bags.recording.capture import machine_parameters
+    from bags.recording.frame_model import UprRpuFrame
+    from bags.recording.record_upr_rpu import CUTTER, pose
+
+    frame = UprRpuFrame(machine_parameters("upr_rpu") | {"element_compliance": dict(factors)})
+    rows = []
+    for time in np.linspace(0.0, 20.0, count, endpoint=False):
+        here, wrench = pose(time), CUTTER.wrench(time)
+        axes = frame.placement(here)[1]
+        fixed = np.concatenate((axes @ wrench[:3], axes @ wrench[3:]))
+        rows.append((time, frame.limb_lengths(here), fixed, frame.solve(here, fixed).deflection))
+    return Deflected("frame", *(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def noisy(clean: Deflected, rng: np.random.Generator, sizes: Mapping[str, float]) -> Deflected:
+    """With noise of the sensors: lengths, forces, moments, shifts and turns, SI."""
+    n = rng.normal
+
+    def pairs(values: np.ndarray, first: str, second: str) -> np.ndarray:
+        return values + n(size=values.shape) * np.repeat([sizes[first], sizes[second]], 3)
+
+    return Deflected(
+        clean.name, clean.time, clean.q + n(size=clean.q.shape) * sizes["length"],
+        pairs(clean.wrench, "force", "moment"), pairs(clean.deflection, "shift", "turn"),
+    )  # fmt: skip
+
+
+SENSORS = {"length": 0.5e-6, "force": 0.5, "moment": 0.02, "shift": 0.1e-6, "turn": 0.2e-6}
