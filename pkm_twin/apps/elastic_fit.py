@@ -97,6 +97,13 @@ class ElasticFit:
     measured: NDArray[np.bool_]
     samples: int
 
+    @property
+    def told(self) -> int:
+        """How many combinations of factors are known."""
+        count = len(self.numbers)
+        own = self.estimate.covariance[:count, :count] / PRIOR**2
+        return int(np.sum(np.linalg.eigvalsh(own) < SURE**2))
+
     def of(self, status: str) -> tuple[Number, ...]:
         """The numbers of a status."""
         return tuple(number for number in self.numbers if number.status == status)
@@ -141,7 +148,8 @@ def fit_elements(
         _check(recording)
         thin = recording.thinned()
         response = element_response(robot, robot.forward(thin.q))
-        parts.append(_Part(thin, response, np.isfinite(thin.deflection).any(0)))
+        measured = np.asarray(np.isfinite(thin.deflection).any(0))
+        parts.append(_Part(thin, response, measured))
         if update is not None:
             update(i + 1)
     _check_loads(recordings, robot)
@@ -152,11 +160,10 @@ def fit_elements(
     deviations = np.sqrt(np.diag(found.covariance)[: len(names)])
     numbers = tuple(
         known(
-            ("element_compliance", name), "times the file's", float(b), float(b * f), float(b * d),
-            float(PRIOR * b),
+            ("element_compliance", name), "", float(b), float(b * f), float(b * d), float(PRIOR * b)
         )
         for name, b, f, d in zip(names, before, factors, deviations, strict=True)
-    )  # fmt: skip
+    )
     if all(number.status == "not excited" for number in numbers):
         raise PkmTwinError("no excitation: the loads tell nothing of any element's compliance")
     zeros = found.values[len(names) :].reshape(len(parts), 6)
@@ -250,7 +257,7 @@ def groups_of(names: Sequence[str], factors: Array, covariance: Array) -> tuple[
         group, edge = set(), {min(left)}
         while edge:
             group |= edge
-            edge = {j for i in edge for j in left - group if shared[i, j] > SHOWN**2}
+            edge = {j for i in edge for j in left - group if shared[i, j] > SHOWN}
         left -= group
         if len(group) > 1:
             groups.append(_group(sorted(group), names, factors, own))

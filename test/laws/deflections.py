@@ -13,7 +13,7 @@ from pkm_twin.apps.elastic_fit import Deflected
 
 
 @cache
-def frame_recording(factors: tuple[tuple[str, float], ...] = (), count: int = 120) -> Deflected:
+def frame_recording(factors: tuple[tuple[str, float], ...] = (), count: int = 300) -> Deflected:
     """The milling bag's motion and loads on PyNite's frame with softer elements, without noise."""
     pytest.importorskip("Pynite")
     from bags.recording.capture import machine_parameters
