@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit of elastic elements says: numbers, lines, and one HTML page with its pictures in it."""
+"""What a fit of elastic elements says: numbers, lines, and one HTML page with its pictures."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def print_fit(result: ElasticFit) -> None:
 
 
 def _residual_rows(result: ElasticFit) -> list[tuple[str, ...]]:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for judged, measured in zip(result.judged, result.measured, strict=True):
         before, after = judged.rms(judged.before), judged.rms(judged.after)
         for k in np.flatnonzero(measured).tolist():

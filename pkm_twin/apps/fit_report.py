@@ -39,7 +39,11 @@ def fit_page(result: Fit, recordings: Sequence[str]) -> str:
     """The whole page."""
     title = f"{html.escape(result.robot.name)}: fitted from {html.escape(', '.join(recordings))}"
     e = result.estimate
-    parts = [HEAD_OF_PAGE.format(title=title), "<h2>What was fitted</h2>", numbers_table(_shown(result))]
+    parts = [
+        HEAD_OF_PAGE.format(title=title),
+        "<h2>What was fitted</h2>",
+        numbers_table(_shown(result)),
+    ]
     parts.append(
         f"<p>{e.directions} combinations of numbers are told by {result.samples} filtered samples; "
         f"condition number {e.condition:.3g}. +- is one standard deviation, of the noise, of the "
