@@ -36,10 +36,13 @@ LEAST_SAMPLES: Final = 20
 MOST_SAMPLES: Final = 1000
 LOADED: Final = 0.05
 """A sample is loaded whose predicted deflection is above this part of the window's greatest."""
+LOUD: Final = 10.0
+"""Least change of the measured deflections over their noise: less is no load, but the noise of
+wrenches."""
 APART: Final = 4.0
 """Deviations by which an element explains the samples worse than the best, to be ruled out."""
 SHARE: Final = 1e-3
-"""Least noise of a direction, as a share of the deflections' root mean square there."""
+"""Least noise of a direction, as a share of the deflections' deviation there."""
 RANGE: Final = (0.05, 100.0)
 """Factors that are looked for."""
 STRIDE: Final = 3.0
@@ -229,7 +232,9 @@ class StiffnessAlarm:
         sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])
         if int((sizes > LOADED * sizes.max()).sum()) < LEAST_SAMPLES or not sizes.max() > 0.0:
             return None
-        window, alike = self._window()
+        window, alike, loudest = self._window()
+        if loudest < LOUD:
+            return None
         values, deviations = window.alone(len(self.names))
         bounds = self._bounds(np.sqrt(alike) * deviations, range(len(self.names)))
         if not (np.abs(values - 1.0) > NEAR * bounds).any():
@@ -297,8 +302,12 @@ class StiffnessAlarm:
             )  # fmt: skip
         return tuple(found)
 
-    def _window(self) -> tuple[_Window, float]:
-        """The samples over their noise, and how many of them are one by their correlation."""
+    def _window(self) -> tuple[_Window, float, float]:
+        """The samples over their noise.
+
+        :returns: and how many of them are one by their correlation, and by how much the
+            deflections' changes are above the noise in the clearest direction.
+        """
         kept = np.flatnonzero(self.settings.directions)
         moved, reach, rest, carried, effects, measured = (
             np.array([getattr(sample, name) for sample in self._samples])
@@ -310,12 +319,14 @@ class StiffnessAlarm:
         prior = np.repeat([1.0, 0.0], [effects.shape[-1], len(kept)])
         plain = _Window(self._owner, reach, rest, carried, common, residual, prior)
         _, slopes = plain.added(range(len(self.names)), np.ones(len(self.names)))
-        size = np.sqrt(np.mean(measured[:, kept] ** 2, 0))
+        size = np.std(measured[:, kept], 0)
         noise, alike = _noise(residual, np.concatenate([slopes, common], -1), SHARE * size)
+        loudest = float((size / noise).max())
         over = noise[:, None]
-        return _Window(
+        scaled = _Window(
             self._owner, reach / over, rest, carried, common / over, residual / noise, prior
-        ), alike
+        )
+        return scaled, alike, loudest
 
 
 def _noise(residual: Array, table: Array, least: Array) -> tuple[Array, float]:

@@ -1,19 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of loads and deflections by the independent frame engine, for tests."""
+"""Recordings of loads and deflections, for tests: of the independent frame, and of the twin."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pkm_twin import load
 from pkm_twin.apps.elastic_fit import Deflected
+from pkm_twin.apps.elastic_recordings import read_deflected
+from stiffness_monitor.response import ElementResponse, element_response
+
+BAGS = Path(__file__).resolve().parents[2] / "bags"
 
 
 @cache
-def frame_recording(factors: tuple[tuple[str, float], ...] = (), count: int = 300) -> Deflected:
+def frame_recording(factors: tuple[tuple[str, float], ...] = (), count: int = 200) -> Deflected:
     """The milling bag's motion and loads on PyNite's frame with softer elements, without noise."""
     pytest.importorskip("Pynite")
     from bags.recording.capture import machine_parameters
@@ -28,6 +35,22 @@ def frame_recording(factors: tuple[tuple[str, float], ...] = (), count: int = 30
         fixed = np.concatenate((axes @ wrench[:3], axes @ wrench[3:]))
         rows.append((time, frame.limb_lengths(here), fixed, frame.solve(here, fixed).deflection))
     return Deflected("frame", *(np.array(column) for column in zip(*rows, strict=True)))
+
+
+@cache
+def bag_recording() -> tuple[Deflected, ElementResponse]:
+    """What the bag of a soft joint has, and the sound twin in its poses."""
+    robot = load("upr_rpu")
+    recording = read_deflected(BAGS / "upr_rpu_soft_joint.mcap", robot)
+    return recording, element_response(robot, robot.forward(recording.q))
+
+
+def twin_recording(factors: Mapping[str, float]) -> Deflected:
+    """The bag's poses and loads, and what they do to the twin with softer elements."""
+    recording, response = bag_recording()
+    each = [factors.get(name, 1.0) for name in response.names]
+    moved, _ = response.deflection(recording.wrench, each)
+    return replace(recording, deflection=moved)
 
 
 def noisy(clean: Deflected, rng: np.random.Generator, sizes: Mapping[str, float]) -> Deflected:
