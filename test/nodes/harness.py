@@ -321,7 +321,7 @@ class Peer:
             if repeat is not None and now >= due:
                 repeat()
                 due = now + 0.05
-            self._executor.spin_once(timeout_sec=0.01)
+            self._executor.spin_once(timeout_sec=0.05)
 
     def spin(self):
         """Take one message, if one comes within a millisecond."""
