@@ -369,7 +369,7 @@ def _doubts(robot: Robot, causes: Sequence[Factor], pose: Array, names: Sequence
     loads = np.diag(np.repeat([1.0, 1.0 / robot.size], 3))
 
     def energies(one: Robot) -> Array:
-        return strain_energy(one, pose, loads).energies.sum(0)
+        return np.asarray(strain_energy(one, pose, loads).energies.sum(0), np.float64)
 
     own = energies(robot)
     changes = [(energies(f.high) - energies(f.low)) / (2.0 * STEP) for f in causes]

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.deflection import DeflectionSample, in_base_axes, read_deflection
 from pkm_twin.ros.messages import SECOND, StampRules, shown
+from pkm_twin.streams.deflection import DeflectionSample, in_base_axes, read_deflection
 from pkm_twin.streams.wrench import Recent, counting
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
 from stiffness_monitor.monitor import Answer

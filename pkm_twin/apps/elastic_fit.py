@@ -218,13 +218,34 @@ def _solve(parts: Sequence[_Part], count: int) -> Estimate:
             zeros[..., 6 * i : 6 * i + 6] = counts[..., None] * np.eye(6)
             tables.append(np.concatenate([slopes, zeros], -1))
         target, judged = (np.concatenate([one[k] for one in rows]) for k in (1, 2))
-        found = estimate(np.concatenate(tables), target, start, scales, cones, judged)
+        table = np.concatenate(tables)
+        begin = _noise(table * scales, target - table @ start, judged)
+        found = estimate(table, target, start, scales, cones, judged, begin)
         new = np.maximum(found.values[:count], STIFFEST)
         moved = np.abs(new - factors) / np.sqrt(np.diag(found.covariance)[:count])
         factors = new
         if moved.max() < CONVERGED:
             return found
     raise PkmTwinError(f"the compliances do not settle in {STEPS} steps: loads that tell more")
+
+
+def _noise(table: Array, change: Array, judged: Array) -> Array | None:
+    """What all factors and zeros together leave of a change, by direction (6,).
+
+    None where there are hardly more equations than those.
+    """
+    size = np.sqrt(np.sum(change**2 * judged, 0) / np.maximum(np.sum(judged, 0), 1.0))
+    weights = judged / np.maximum(size, 1e-300)
+    rows = (table * weights[..., None]).reshape(-1, table.shape[-1])
+    equations, unknowns = int(judged.sum()), int((np.abs(rows).max(0) > 0.0).sum())
+    if equations < 1.5 * unknowns:
+        return None
+    found = np.linalg.lstsq(rows, (change * weights).ravel(), rcond=1e-9)[0]
+    left = (change - table @ found) * judged
+    free = 1.0 - unknowns / equations
+    return np.asarray(
+        np.sqrt(np.sum(left**2, 0) / np.maximum(free * np.sum(judged, 0), 1.0)), np.float64
+    )
 
 
 def _measured(part: _Part) -> Array:

@@ -18,8 +18,8 @@ from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import BagError, MessageError, ParameterError
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.deflection import in_base_axes, read_deflection
 from pkm_twin.ros.messages import SECOND, StampRules
+from pkm_twin.streams.deflection import in_base_axes, read_deflection
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]

@@ -11,10 +11,10 @@ from pkm_twin import load
 from pkm_twin.bags.reader import BagWriter, open_bag
 from stiffness_monitor import compliance
 from test.bags.test_recordings import FOLDER
-from test.commands.conftest import DELTA
 from test.laws.deflections import SENSORS, noisy, twin_recording
 
 SOFT = FOLDER / "upr_rpu_soft_joint.mcap"
+COLLISION = FOLDER / "delta_cu_collision.mcap"
 WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 DEFLECTION = ("dx", "dy", "dz", "rx", "ry", "rz")
 
@@ -80,7 +80,9 @@ def test_fit_of_a_table_with_three_gauges_says_what_it_found(capsys, tmp_path, m
     assert "apart; known is" in done.out
     assert "static.csv, held out, dz: residual" in done.out
     assert "held out, rx" not in done.out
-    assert load(str(tmp_path / "fitted.yaml")).element_compliance["1B"] == pytest.approx(1.0, abs=0.36)
+    assert load(str(tmp_path / "fitted.yaml")).element_compliance["1B"] == pytest.approx(
+        1.0, abs=0.36
+    )
 
 
 @pytest.fixture
@@ -101,8 +103,8 @@ def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
     plain = table(tmp_path / "with.csv", rows=slice(0, 60))
     for arguments, text in (
         (("upr_rpu", without_wrench), "no wrench in the bag"),
-        (("upr_rpu", FOLDER / "upr_rpu_milling.mcap", "--topic", "/wrnch"), "is not in the bag"),
-        (("delta_cu", DELTA), "no deflection in the bag"),
+        (("upr_rpu", SOFT, "--topic", "/wrnch"), "is not in the bag"),
+        (("delta_cu", COLLISION), "no deflection in the bag"),
         (("stewart", plain), "nothing is elastic"),
         (("upr_rpu", table(tmp_path / "a.csv", wrench=(), rows=slice(60))), "no wrench"),
         (("upr_rpu", table(tmp_path / "b.csv", deflection=(), rows=slice(60))), "no deflection"),

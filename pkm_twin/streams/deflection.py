@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured deflections of a platform, as messages: by attributes only, live or decoded.
+"""Measured deflections of a platform out of messages, by attributes only: live or decoded.
 
-May import: numpy, pkm_twin's core, messages, the standard library.
+Pure: times are arguments. May import: numpy, pkm_twin's core, messages, the standard library.
 """
 
 from __future__ import annotations
