@@ -31,6 +31,7 @@ from test.nodes.twin import (
     WINDOW,
     Q,
     Twin,
+    count_of,
     state,
     trajectory,
 )
@@ -149,65 +150,27 @@ def text_of(array):
     return f"{array.status[0].message}; {values_of(array)['also']}"
 
 
-def count_of(array):
-    """Joint states that the node took and that it says were lost."""
-    return count_of_values(values_of(array))
-
-
-def count_of_values(values):
-    return sum(int(values[key]) for key in ("messages", "lost: joint_states"))
-
-
-def count_settled(twin):
-    """Diagnostics after which nothing more waits: two in a row with the same count."""
-    last = twin.diagnostics()
-    while True:
-        array = twin.diagnostics()
-        if count_of(array) == count_of(last):
-            return array
-        last = array
+def lost_of(array):
+    return int(values_of(array)["lost: joint_states"])
 
 
 def count_at_rest(quick):
     """The count once the stream has stopped, and nothing more waits."""
     quick.peer.until(lambda: is_zeros(quick.received("joint_torques")[-1]))
-    return count_of(count_settled(quick))
-
-
-def balance(twin, total):
-    """The diagnostics up to where every one of ``total`` samples is taken or counted as lost.
-
-    More are sent until it is so: what is lost last is seen by what comes after it.
-    """
-    told = twin.received("/diagnostics")
-    told.clear()
-    sent = total
-
-    def again():
-        nonlocal sent
-        sent += 1
-        at_pace(twin, 1)
-
-    def own():
-        return [a for a in told if a.status[0].name == f"/{twin.name}"]
-
-    twin.peer.until(lambda: any(count_of(a) >= total for a in own()), repeat=again)
-    twin.peer.until(lambda: any(count_of(a) >= sent for a in own()))
-    assert count_of(own()[-1]) == sent
-    return own()
+    return count_of(quick.at_rest())
 
 
 def lost_while_it_stands(twin, count):
     """How many of so many samples are lost that come while the node stands still."""
-    before = values_of(count_settled(twin))
+    before = twin.at_rest()
     at_pace(twin, 1)
     twin.process.process.send_signal(signal.SIGSTOP)
     try:
         at_pace(twin, count)
     finally:
         twin.process.process.send_signal(signal.SIGCONT)
-    told = balance(twin, count_of_values(before) + 1 + count)
-    lost = int(values_of(told[-1])["lost: joint_states"]) - int(before["lost: joint_states"])
+    told = twin.balance(count_of(before) + 1 + count)
+    lost = lost_of(told[-1]) - lost_of(before)
     lines = [re.search(r"(\d+) messages lost in the last second", text_of(a)) for a in told]
     assert sum(int(line[1]) for line in lines if line) == lost
     return lost
@@ -251,7 +214,7 @@ class TestLoad:
                 lambda last=last: any(stamp_of(m) > last and not is_zeros(m) for m in torques),
                 repeat=again,
             )
-        balance(quick, before + sent)
+        quick.balance(before + sent)
         ages = arrivals.ages()
         assert len(ages) > 0
         # Age is checked just before; a machine that does other things too is late now and then.
@@ -343,7 +306,7 @@ class TestLoad:
                 MAKE.trajectory(NAMES, [0, STEP, SECOND], rows, stamp=late.begin()),
             )
             late.peer.until(lambda: any(map(is_zeros, torques)))
-            array = count_settled(late)
+            array = late.at_rest()
             assert array.status[0].level == b"\x02"
             assert array.status[0].message.startswith("stopped: non-finite result")
             assert counts_of(array, "stopped") == before | {"non-finite result": 1}
@@ -530,7 +493,7 @@ class TestNeighbours:
             assert stranger.received("/quick/joint_torques") == []
             assert stranger._publishers["/quick/states"].get_subscription_count() == 1
             at_pace(quick, 10)
-            balance(quick, before + 10)
+            quick.balance(before + 10)
         finally:
             for peer in peers:
                 peer.close()
