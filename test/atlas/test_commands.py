@@ -14,8 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command import forked
+from support.robots import partly_long
 
 from pkm_twin import load
+from pkm_twin.atlas import kinds
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import Parts, open_atlas
 from pkm_twin.atlas.strain_energy import strain_energy_sweep
@@ -24,6 +26,7 @@ from test.atlas.conftest import same
 ROOT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "pkm_twin.apps.cli"]
 SWEEP = ["atlas", "upr_rpu", "strain-energy", "--wrench", "P2", "--points", "20000"]
+SPHERES = ["atlas", "prru", "isotropy", "--points", "2000"]
 
 
 def environment():
@@ -51,22 +54,31 @@ def call(twin, tmp_path, monkeypatch):
     return called
 
 
-def test_atlas_to_pictures_and_show(call, small_atlases, tmp_path):
-    pytest.importorskip("plotly")
-    out = call(*SWEEP, "--out", "a.nc", "--workers", "1").out
+def test_an_atlas_says_what_made_it(call, tmp_path):
+    out = call(*SWEEP, "--out", "a.nc", "--no-picture", "--workers", "1").out
     assert "paper, table 2" in out
-    for name in ("plane", "factors", "slices", "global"):
-        picture = tmp_path / f"a_{name}.png"
-        assert picture.read_bytes().startswith(b"\x89PNG")
-        assert str(picture.name) in out
     with open_atlas(tmp_path / "a.nc") as data:
         assert data.attrs["robot"] == "upr_rpu"
         assert "youngs_modulus" in data.attrs["robot_parameters"]
         assert data.attrs["pkm_twin_version"]
         assert data.energy.dims == ("z", "tilt", "azimuth")
         assert data.energy.attrs["units"] == "J"
-    call("show", small_atlases["workspace delta_cu"], "--out", "b", "--html")
-    assert (tmp_path / "b_sections.png").exists()
+
+
+@pytest.mark.parametrize(
+    "words", partly_long([SWEEP, SPHERES], SPHERES), ids=lambda words: words[2]
+)
+def test_atlas_to_pictures_and_show(words, call, tmp_path):
+    pytest.importorskip("plotly")
+    out = call(*words, "--out", "a.nc", "--workers", "1").out
+    figures = kinds.KINDS[words[2]].figures
+    for name in figures:
+        picture = tmp_path / f"a_{name}.png"
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert str(picture.name) in out
+    call("show", "a.nc", "--out", "b", "--html")
+    for name in figures:
+        assert (tmp_path / f"b_{name}.png").exists()
     assert "Plotly" in (tmp_path / "b.html").read_text()
 
 

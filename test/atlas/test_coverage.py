@@ -54,13 +54,14 @@ VOLUMES = partly_long(
 )
 
 
+@pytest.mark.parametrize("count", partly_long([40_000, 200_000], 40_000))
 @pytest.mark.parametrize("name", VOLUMES)
-def test_the_volume_is_that_of_random_poses(name, rng, monkeypatch, tmp_path):
+def test_the_volume_is_that_of_random_poses(name, count, rng, monkeypatch, tmp_path):
     """By Monte Carlo in the search box, which the atlas's own box has no part in."""
     monkeypatch.setattr(workspace, "LAYERS", 3)
     robot = load(name)
     low, high = robot.search_box().T
-    share = reachable(robot, rng.uniform(low, high, (200_000, len(low)))).mean()
+    share = reachable(robot, rng.uniform(low, high, (count, len(low)))).mean()
     sweep = workspace_sweep(robot, 40 ** len(low))
     with open_atlas(run(sweep, tmp_path / "a.nc", workers=1)) as data:
         expected = share * np.prod(high - low)

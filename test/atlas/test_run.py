@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import pickle
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import pytest
@@ -103,6 +101,7 @@ def test_robots_pass_between_processes(name):
     assert (copy.home() == home).all()
 
 
+@pytest.mark.long
 def test_isotropy_on_processes(small_atlases, tmp_path):
     sweep, _ = small_atlases.get("isotropy prru")
     out = run(sweep, tmp_path / "a.nc", workers=2)
@@ -244,7 +243,8 @@ def test_one_run_at_a_time_works_on_an_atlas(held):
 
 def test_the_lock_of_a_killed_process_is_nobodys(small, tmp_path):
     program = (
-        "import pickle, sys, time; from pathlib import Path; from pkm_twin.atlas.store import Parts;"
+        "import pickle, sys, time; from pathlib import Path;"
+        "from pkm_twin.atlas.store import Parts;"
         "Parts(Path(sys.argv[1]), pickle.load(sys.stdin.buffer)).open();"
         "print('locked', flush=True); time.sleep(600)"
     )
@@ -294,53 +294,31 @@ def test_a_target_that_is_no_file_is_not_replaced(small, tmp_path):
 def test_a_killed_scheduler_is_one_error_and_costs_no_finished_chunk(strain, tmp_path):
     pytest.importorskip("distributed")
     sweep, path = strain
-    folder = tmp_path / "dask"
-    scheduler = subprocess.Popen(
-        [
-            sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1",
-            "--port", "0", "--no-dashboard", "--scheduler-file", str(folder / "address.json"),
-        ],
+    # Its worker is a thread of the same process, and goes with it.
+    program = (
+        "import time, distributed; cluster = distributed.LocalCluster("
+        "n_workers=1, threads_per_worker=1, processes=False, protocol='tcp', host='127.0.0.1', "
+        "dashboard_address=None, silence_logs=50, local_directory=r'%s'); "
+        "print(cluster.scheduler_address, flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program % tmp_path],
+        stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    folder.mkdir(exist_ok=True)
-    worker = None
-    try:
-        worker = subprocess.Popen(
-            [
-                sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file",
-                str(folder / "address.json"), "--nthreads", "1", "--no-dashboard",
-                "--local-directory", str(folder), "--no-nanny",
-            ],
-            stderr=subprocess.DEVNULL,
-            env=environment(),
-        )  # fmt: skip
-        address = address_of(folder / "address.json")
+        env=environment(),
+        text=True,
+    ) as scheduler:
+        try:
+            address = scheduler.stdout.readline().strip()
 
-        def progress(done):
-            if done:
-                scheduler.kill()
+            def progress(done):
+                if done:
+                    scheduler.kill()
 
-        with pytest.raises(ClusterError, match="went away") as caught:
-            run(sweep, tmp_path / "a.nc", scheduler=address, progress=progress)
-        assert "\n" not in str(caught.value)
-    finally:
-        for process in filter(None, (scheduler, worker)):
-            process.kill()
-            process.wait()
+            with pytest.raises(ClusterError, match="went away") as caught:
+                run(sweep, tmp_path / "a.nc", scheduler=address, progress=progress)
+            assert "\n" not in str(caught.value)
+        finally:
+            scheduler.kill()
     assert len(Parts(tmp_path / "a.nc", sweep).pending()) < len(sweep.chunks())
     assert same(path, run(sweep, tmp_path / "a.nc", workers=1))
-
-
-def address_of(file):
-    """Address of a scheduler that has a worker, as soon as it has."""
-    import distributed
-
-    end = time.monotonic() + 120
-    while time.monotonic() < end:
-        if file.exists() and file.read_text():
-            found = json.loads(file.read_text())["address"]
-            with distributed.Client(found, timeout="60s", set_as_default=False) as client:
-                client.wait_for_workers(1, timeout=120)
-            return found
-        time.sleep(0.05)
-    raise AssertionError("the scheduler does not begin")

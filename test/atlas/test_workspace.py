@@ -88,8 +88,8 @@ def test_circles_end_where_the_first_ray_does(name):
     """Each height alone, its rays one test at a time: whole inside, not whole a hair beyond."""
     robot = load(name)
     low, high = height_range(robot)
-    found = circles(robot, np.linspace(low, high, 9))
-    assert (found.radius > 0.0).sum() > 2
+    found = circles(robot, np.linspace(low, high, 41))
+    assert (found.radius > 0.0).sum() > 4
     turn = np.arange(RAYS) * (2 * np.pi / RAYS)
     step = largest_distance(robot) / 340
 
@@ -101,7 +101,7 @@ def test_circles_end_where_the_first_ray_does(name):
         if radius == 0.0:
             assert not clear(z, step)
             continue
-        for distance in (*np.arange(0.0, radius, 4 * step), radius):
+        for distance in (*np.arange(0.0, radius, 20 * step), radius):
             assert clear(z, distance)
         assert not clear(z, radius + 1e-9)
 
@@ -178,15 +178,18 @@ def test_the_box_holds_what_interference_takes_away(variant):
         assert (one == other).all()
 
 
-def test_pictures_show_what_interference_takes_away(tmp_path, few_layers):
+def test_pictures_show_what_interference_takes_away(small_atlases, tmp_path, few_layers):
     """A name for the hatching, in words that say why."""
     from matplotlib import pyplot
 
     from pkm_twin.atlas import kinds
 
-    for least, words in ((0.0, "limbs meet nowhere"), (0.03, "limbs are within 30 mm in ")):
-        sweep = workspace_sweep(load("delta"), 8000, least_clearance=least)
-        with open_atlas(run(sweep, tmp_path / f"{least}.nc", workers=1)) as data:
+    sweep = workspace_sweep(load("delta"), 8000, least_clearance=0.03)
+    for file, words, least in (
+        (small_atlases["workspace delta"], "limbs meet nowhere", 0.0),
+        (run(sweep, tmp_path / "a.nc", workers=1), "limbs are within 30 mm in ", 0.03),
+    ):
+        with open_atlas(file) as data:
             figure = kinds.draw(data)["sections"]
         assert words in figure.get_suptitle()
         legends = [ax.get_legend() for ax in figure.axes if ax.get_legend()]
@@ -209,13 +212,13 @@ def test_all_taken_away_is_still_an_atlas(tmp_path, few_layers):
         pyplot.close(kinds.draw(data)["sections"])
 
 
-def test_without_members_there_is_no_clearance(tmp_path, few_layers, monkeypatch):
+def test_without_members_there_is_no_clearance(small_atlases, tmp_path, few_layers, monkeypatch):
     from matplotlib import pyplot
 
     from pkm_twin.atlas import kinds
 
     robot = load("delta")
-    whole = run(workspace_sweep(robot, 4000), tmp_path / "whole.nc", workers=1)
+    whole = small_atlases["workspace delta"]
     monkeypatch.setattr(type(robot), "beams", ())
     bare = run(workspace_sweep(load("delta"), 4000), tmp_path / "bare.nc", workers=1)
     with open_atlas(whole) as one, open_atlas(bare) as other:
