@@ -9,17 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.sensitivity import GraphChange, platform_change
 from pkm_twin.machine.entries import changed_graph, entries, with_entries
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import skew
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 Array = NDArray[np.float64]
 
@@ -39,6 +41,14 @@ CONVERGED: Final = 1e-3
 FRAME: Final = tuple(f"frame.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 TARGET: Final = ("target.x", "target.y", "target.z")
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
+
+
+def rotations() -> Any:
+    """Scipy's class of rotations."""
+    # Not above: every command would load it, which takes as long as all else at its start.
+    from scipy.spatial.transform import Rotation
+
+    return Rotation
 
 
 @dataclass(frozen=True)
@@ -130,7 +140,7 @@ class _State:
 
     robot: Robot
     offsets: Array
-    frame: Rotation = field(default_factory=Rotation.identity)
+    frame: Rotation = field(default_factory=lambda: rotations().identity())
     place: Array = field(default_factory=lambda: np.zeros(3))
     target: Array = field(default_factory=lambda: np.zeros(3))
 
@@ -148,7 +158,7 @@ class _State:
         position, rotation = self.predicted(poses)
         if poses.rotation is None:
             return poses.position - position, None
-        apart = Rotation.from_matrix(poses.rotation @ np.swapaxes(rotation, -1, -2))
+        apart = rotations().from_matrix(poses.rotation @ np.swapaxes(rotation, -1, -2))
         return poses.position - position, apart.as_rotvec()
 
     def errors(self, poses: Poses) -> Errors:
@@ -264,7 +274,7 @@ def _place_frame(state: _State, poses: Poses) -> None:
     """A first guess of the instrument's frame: the best rigid motion between the point clouds."""
     model = state.predicted(poses)[0]
     centres = poses.position.mean(0), model.mean(0)
-    state.frame, _ = Rotation.align_vectors(poses.position - centres[0], model - centres[1])
+    state.frame, _ = rotations().align_vectors(poses.position - centres[0], model - centres[1])
     state.place = centres[0] - state.frame.apply(centres[1])
 
 
@@ -372,7 +382,7 @@ def _moved(
     offsets = np.array(
         [by_name.get(f"joint_map.{j}.offset", o) - o for j, o in zip(joints, old, strict=True)]
     )
-    turn = Rotation.from_rotvec([steps.get(name, 0.0) for name in FRAME[3:]])
+    turn = rotations().from_rotvec([steps.get(name, 0.0) for name in FRAME[3:]])
     return _State(
         with_entries(start.robot, paths) if paths else start.robot,
         offsets,
