@@ -26,7 +26,11 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.kinematics.engine import Engine, Traced, engine_of
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.kinematics.passive import passive_names, passive_program
+from pkm_twin.kinematics.passive import (
+    passive_names,
+    passive_program,
+    passive_rates_program,
+)
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
@@ -691,6 +695,16 @@ class Robot:
         (flat,), status = self.engine.kernel("passive", passive_program)(_NONE, q)
         if status is not None:
             self.refuse_joints(status, q)
+        return flat
+
+    def passive_rates(self, q: ArrayLike, qd: ArrayLike) -> Array:
+        """Rates of the passive joints, shape (..., k), rad/s or m/s, as :meth:`passive` has them.
+
+        :param qd: joint rates, shape (..., n), rad/s or m/s.
+        """
+        (flat,), status = self.engine.kernel("passive rates", passive_rates_program)(_NONE, q, qd)
+        if status is not None:
+            self.refuse_joints(status, q, (q, qd))
         return flat
 
     def grid(self) -> PoseGrid:
