@@ -34,7 +34,7 @@ from pkm_twin.kinematics.passive import (
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import FREEDOMS, Graph
+from pkm_twin.machine.graph import FREEDOMS, MIN_LENGTH, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
@@ -52,7 +52,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 R = TypeVar("R", bound="Robot")
 
-MIN_LENGTH: Final = 1e-6
 MAX_LENGTH: Final = 100.0
 MAX_MASS: Final = 1e5
 SINGULARITY_BOUND: Final = 1e-9
