@@ -42,6 +42,8 @@ SCALARS: tuple[Any, ...] = (
 
 COMPILED = 25
 """Of new geometries one in so many is compiled: that takes a hundred times what loading does."""
+KEPT = 8
+"""Compiled geometries that are looked for again."""
 DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
@@ -71,7 +73,7 @@ class Machines(Kind):
             self.new += 1
             if self.new % COMPILED:
                 return False
-            if len(self.compiled) >= COMPILED:
+            if len(self.compiled) >= KEPT:
                 self.compiled.pop(next(iter(self.compiled)))
         # The newest stands last; its engine is kept with it.
         self.compiled[key] = self.compiled.pop(key, robot)
