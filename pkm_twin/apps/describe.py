@@ -9,7 +9,6 @@ import numpy as np
 
 from delta_dynamics import reactions
 from pkm_twin.apps.recorded import why_no_torques
-from pkm_twin.machine.entries import keys_of
 from pkm_twin.machine.robot import Robot
 
 
@@ -81,23 +80,12 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
             "; ".join(data["overconstrained"]) or "no: rigid bodies determine every reaction",
         ),
     ]
-    for path, entry in data["parameters"]["uncertainty"].items():
-        rows.append((f"standard deviation of {path}", _doubt(path, entry, data["parameter_units"])))
     for section, value in data["parameters"].items():
-        if section not in ("mechanism", "name", "uncertainty") and not (
+        if section not in ("mechanism", "name") and not (
             section == "joints" and isinstance(value, list)
         ):
             rows += _rows(section, value, data["parameter_units"].get(section, ""))
     return rows
-
-
-def _doubt(path: str, entry: dict[str, float | None], units: Any) -> str:
-    """A standard deviation in the number's unit, or as a part of it."""
-    if entry["deviation"] is None:
-        return f"{100.0 * (entry['relative'] or 0.0):g} %"
-    for key in keys_of(path):
-        units = units.get(key, "") if isinstance(units, dict) else units
-    return f"{entry['deviation']:g} {units}".strip()
 
 
 def _rows(name: str, value: Any, unit: Any) -> list[tuple[str, str]]:

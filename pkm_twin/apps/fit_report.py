@@ -57,8 +57,8 @@ def fit_page(result: Fit, recordings: Sequence[str]) -> str:
     parts += ["<h2>Numbers, before and now</h2>", _picture(_changes(result))]
     parts += ["<h2>Held out: the last third of each recording</h2>", _residuals(result)]
     parts.append(
-        "<p>The band is two standard deviations of the model's own torques, by what the fit does not "
-        "know of its numbers; noise of the measured efforts is not in it.</p>"
+        "<p>The band is two standard deviations of the model's own torques, by what the fit does "
+        "not know of its numbers; noise of the measured efforts is not in it.</p>"
     )
     parts += [_picture(_efforts(result, k)) for k in range(len(result.judged))]
     parts += ["<h2>What was done to the signals</h2>", _signals(result, recordings)]
