@@ -87,8 +87,8 @@ def test_torques_have_a_column_of_deviations(capsys, unsure, tmp_path):
 
 def test_info_and_compliance_tell_it(capsys, unsure):
     shown = " ".join(command(capsys, "info", unsure).out.split())
-    assert "standard deviation of inertia.platform_mass │ 0.004 kg" in shown
-    assert "standard deviation of inertia.forearm_mass │ 5 %" in shown
+    assert "uncertainty: inertia.platform_mass: deviation │ 0.004" in shown
+    assert "uncertainty: inertia.forearm_mass: relative │ 0.05" in shown
     stiff = (
         "compliance",
         "upr_rpu",

@@ -79,6 +79,7 @@ def check(count: int, tolerance: float) -> None:
     np.testing.assert_allclose(found, expected, rtol=tolerance, atol=1e-3 * expected.max())
 
 
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize(
     ("count", "tolerance"),
     [(24, 0.5), *(pytest.param(*case, marks=pytest.mark.long) for case in FULL)],
