@@ -16,17 +16,14 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.apps.calibration import (
-    FRAME,
     HELD_OUT,
     STEPS,
-    TARGET,
     Calibration,
-    Errors,
     Parameter,
-    Poses,
     calibrate,
     geometric,
 )
+from pkm_twin.apps.calibration_state import FRAME, TARGET, Errors, Poses
 from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.options import Json, RobotName
 from pkm_twin.console import print_json, progress, refuse_existing, table_console

@@ -213,6 +213,14 @@ class Robot:
         check_uncertainty(robot)
         return robot
 
+    @classmethod
+    def graph_of(cls, data: Mapping[str, Any]) -> Graph:
+        """The graph of a parameter file's data, without the checks of a whole robot.
+
+        :raises ParameterError: by the field.
+        """
+        return schema.build(cls, data).graph
+
     # What a mechanism gives.
 
     @property

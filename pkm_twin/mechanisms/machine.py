@@ -325,6 +325,13 @@ class Machine(Robot):
         check_uncertainty(robot)
         return robot
 
+    @classmethod
+    def graph_of(cls, data: Mapping[str, Any]) -> Graph:
+        """Of a file that a robot was made of; what its joints hold is not looked at."""
+        graph = _graph(data, _written_out(data)[0])
+        graph.check()
+        return graph
+
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:  # type: ignore[override]
         """The pose coordinates of the file."""

@@ -49,22 +49,6 @@ def run(*arguments: str) -> Any:
     return CliRunner().invoke(app, ["calibrate", *arguments])
 
 
-def test_some_numbers_of_a_machine_that_was_not_built_as_drawn(tmp_path: Path) -> None:
-    poses, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
-    measured(poses)
-    only = [word for name in SHIFTS for word in ("--only", f"geometry.{name}")]
-    result = run("delta_cu", str(poses), *only, "--out", str(out), "--json")
-    assert result.exit_code == 0, result.output
-    data = json.loads(result.stdout)
-    # The limbs' azimuths stay wrong: better than before, not as good as it could be.
-    before, after = (data["held_out"][when]["rms_m"] for when in ("before", "after"))
-    assert 2.0 * NOISE < after < 0.5 * before
-    assert data["not_observed"] == []
-    found = data["parameters"]["geometry.arm_length"]["value"]
-    assert load(out).geometry.arm_length == pytest.approx(found, rel=1e-11)
-
-
-@pytest.mark.long
 def test_a_machine_is_found_that_was_not_built_as_drawn(tmp_path: Path) -> None:
     poses, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
     measured(poses)
@@ -124,7 +108,7 @@ def test_a_machine_is_found_that_was_not_built_as_drawn(tmp_path: Path) -> None:
         (
             ["arm_1.position", "arm_2.position", "arm_3.position", "x", "y", "z"],
             [[0.1 * k, 0, 0, 0, 0, -0.36] for k in range(4)],
-            "enough for 5 numbers",
+            "enough for 10 numbers",
         ),
     ],
 )
@@ -133,8 +117,7 @@ def test_what_cannot_work_is_refused_by_name(
 ) -> None:
     path = tmp_path / "poses.csv"
     path.write_text("\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)]))
-    chosen = ("--only", "geometry.arm", "--only", "geometry.base")
-    result = run("delta_cu", str(path), *chosen, "--out", str(tmp_path / "mine.yaml"))
+    result = run("delta_cu", str(path), "--out", str(tmp_path / "mine.yaml"))
     assert result.exit_code != 0
     assert text in str(result.exception) + result.output
     assert not (tmp_path / "mine.yaml").exists()
