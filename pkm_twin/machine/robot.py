@@ -299,6 +299,13 @@ class Robot:
         """
         raise ParameterError("members", None, "a section with the elastic members")
 
+    def elastic_entries(self) -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+        """What its file tells of elasticity at bodies, joints and rods: plain data, kind and name.
+
+        Empty where the file has other words for it, which a file of those has not.
+        """
+        return {}
+
     def shared_inertia(self) -> tuple[Shared, ...]:
         """What the file says of masses, as linear parameters.
 
