@@ -26,11 +26,15 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.kinematics.engine import Engine, Traced, engine_of
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.kinematics.passive import passive_names, passive_program
+from pkm_twin.kinematics.passive import (
+    passive_names,
+    passive_program,
+    passive_rates_program,
+)
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import FREEDOMS, Graph
+from pkm_twin.machine.graph import FREEDOMS, MIN_LENGTH, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
@@ -48,7 +52,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 R = TypeVar("R", bound="Robot")
 
-MIN_LENGTH: Final = 1e-6
 MAX_LENGTH: Final = 100.0
 MAX_MASS: Final = 1e5
 SINGULARITY_BOUND: Final = 1e-9
@@ -218,6 +221,14 @@ class Robot:
         robot.check_elements()
         return robot
 
+    @classmethod
+    def graph_of(cls, data: Mapping[str, Any]) -> Graph:
+        """The graph of a parameter file's data, without the checks of a whole robot.
+
+        :raises ParameterError: by the field.
+        """
+        return schema.build(cls, data).graph
+
     # What a mechanism gives.
 
     @property
@@ -295,6 +306,13 @@ class Robot:
         :raises ParameterError: the robot's file lacks a section that elasticity needs.
         """
         raise ParameterError("members", None, "a section with the elastic members")
+
+    def elastic_entries(self) -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+        """What its file tells of elasticity at bodies, joints and rods: plain data, kind and name.
+
+        Empty where the file has other words for it, which a file of those has not.
+        """
+        return {}
 
     def shared_inertia(self) -> tuple[Shared, ...]:
         """What the file says of masses, as linear parameters.
@@ -706,6 +724,16 @@ class Robot:
         (flat,), status = self.engine.kernel("passive", passive_program)(_NONE, q)
         if status is not None:
             self.refuse_joints(status, q)
+        return flat
+
+    def passive_rates(self, q: ArrayLike, qd: ArrayLike) -> Array:
+        """Rates of the passive joints, shape (..., k), rad/s or m/s, as :meth:`passive` has them.
+
+        :param qd: joint rates, shape (..., n), rad/s or m/s.
+        """
+        (flat,), status = self.engine.kernel("passive rates", passive_rates_program)(_NONE, q, qd)
+        if status is not None:
+            self.refuse_joints(status, q, (q, qd))
         return flat
 
     def grid(self) -> PoseGrid:

@@ -39,11 +39,11 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
+from pkm_twin.machine.graph import BASE, MIN_LENGTH, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Section, Structure, compliances, disc, modulus
 from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import MIN_LENGTH, Inverse, LimbElements, Robot, length, mass
+from pkm_twin.machine.robot import Inverse, LimbElements, Robot, length, mass
 from pkm_twin.machine.shared import Shared, shared_body, shared_number
 
 Array = NDArray[np.float64]
