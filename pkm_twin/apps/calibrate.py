@@ -15,18 +15,14 @@ from rich.table import Table
 from rich.text import Text
 
 from pkm_twin.apps.calibration import (
-    FRAME,
     HELD_OUT,
     STEPS,
-    TARGET,
     Calibration,
-    Errors,
     Parameter,
-    Poses,
     calibrate,
     geometric,
-    rotations,
 )
+from pkm_twin.apps.calibration_state import FRAME, TARGET, Errors, Poses, rotations
 from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.options import Json, RobotName
 from pkm_twin.console import print_json, progress, refuse_existing, table_console

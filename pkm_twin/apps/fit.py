@@ -225,6 +225,7 @@ def as_json(result: Any) -> dict[str, Any]:
                 "from_s": float(judged.time[0]), "to_s": float(judged.time[-1]),
                 "residual_rms_before": judged.rms(judged.before).tolist(),
                 "residual_rms_after": judged.rms(judged.after).tolist(),
+                "effort_deviation_rms_after": np.sqrt(np.mean(judged.deviation**2, 0)).tolist(),
                 "peak_effort": np.abs(judged.measured).max(0).tolist(),
             }
             for judged in result.judged

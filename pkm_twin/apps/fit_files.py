@@ -8,6 +8,7 @@ from typing import Any
 
 from delta_dynamics.fit import Fit, Number
 from pkm_twin import Robot, load
+from pkm_twin.errors import ParameterError
 from pkm_twin.machine.catalogue import TREES, robot_of_data, robot_path
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.robot_urdf import robot_description
@@ -19,14 +20,31 @@ from pkm_twin.machine.yaml_edit import edit_yaml
 def robot_text(name: str, *, per_copy: bool = False) -> tuple[str, Robot]:
     """A robot and the text of its file; of a URDF, or with ``per_copy``, as a machine's YAML.
 
-    :raises ParameterError: the file is refused.
+    :raises ParameterError: the file is refused; or it is to be written out, and would lose what it
+        says of elasticity.
     """
     robot = load(name)
+    if per_copy and not robot.elastic_entries() and _elastic(robot):
+        raise ParameterError(
+            "--per-copy",
+            robot.name,
+            f"a robot whose elastic members can be written out; a {robot.mechanism}'s cannot: take "
+            "a file without them, or fit without --per-copy",
+        )
     path = robot_path(name)
     if per_copy or path.suffix in TREES:
         data = read_urdf(path) if path.suffix in TREES else robot_description(robot)
         return describe_machine_yaml(data), robot_of_data(data, path.stem)
     return path.read_text(encoding="utf-8"), robot
+
+
+def _elastic(robot: Robot) -> bool:
+    """Whether its file tells of elasticity."""
+    try:
+        robot.structure()
+    except ParameterError:
+        return False
+    return True
 
 
 def yaml_head(result: Fit, recordings: Sequence[str]) -> list[str]:

@@ -56,6 +56,10 @@ def fit_page(result: Fit, recordings: Sequence[str]) -> str:
         parts.append(f"<p>The motion tells nothing of, and the file's value stays: {names}.</p>")
     parts += ["<h2>Numbers, before and now</h2>", _picture(_changes(result))]
     parts += ["<h2>Held out: the last third of each recording</h2>", _residuals(result)]
+    parts.append(
+        "<p>The band is two standard deviations of the model's own torques, by what the fit does "
+        "not know of its numbers; noise of the measured efforts is not in it.</p>"
+    )
     parts += [_picture(_efforts(result, k)) for k in range(len(result.judged))]
     parts += ["<h2>What was done to the signals</h2>", _signals(result, recordings)]
     return "\n".join([*parts, "</body>", "</html>", ""])
@@ -141,6 +145,10 @@ def _efforts(result: Fit, number: int) -> Any:
             (judged.before, COLOURS[1], "before"), (judged.after, COLOURS[0], "now"),
         ):  # fmt: skip
             ax.plot(time, (judged.measured - values)[::step, k], color=colour, lw=0.8, label=label)
+        band = 2.0 * judged.deviation[::step, k]
+        ax.fill_between(
+            time, -band, band, color=COLOURS[0], alpha=0.25, lw=0, label="now, two deviations"
+        )
         ax.set_title(f"{judged.name}, {joint}: measured less predicted, held out")
         ax.set_xlabel("time (s)")
         ax.set_ylabel(f"effort ({result.robot.effort_units[k]})")

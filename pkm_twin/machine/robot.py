@@ -216,6 +216,14 @@ class Robot:
         check_uncertainty(robot)
         return robot
 
+    @classmethod
+    def graph_of(cls, data: Mapping[str, Any]) -> Graph:
+        """The graph of a parameter file's data, without the checks of a whole robot.
+
+        :raises ParameterError: by the field.
+        """
+        return schema.build(cls, data).graph
+
     # What a mechanism gives.
 
     @property
@@ -293,6 +301,13 @@ class Robot:
         :raises ParameterError: the robot's file lacks a section that elasticity needs.
         """
         raise ParameterError("members", None, "a section with the elastic members")
+
+    def elastic_entries(self) -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+        """What its file tells of elasticity at bodies, joints and rods: plain data, kind and name.
+
+        Empty where the file has other words for it, which a file of those has not.
+        """
+        return {}
 
     def shared_inertia(self) -> tuple[Shared, ...]:
         """What the file says of masses, as linear parameters.

@@ -391,11 +391,14 @@ def replace(section_value: T, changes: Mapping[str, object], path: str) -> T:
 
 
 def plain(value: Any) -> Any:
-    """Dataclasses, arrays and tuples as mappings and lists, in mappings too."""
+    """Dataclasses, arrays and tuples as mappings and lists, in mappings too; keys as in a file."""
     if isinstance(value, Mapping):
         return {name: plain(entry) for name, entry in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {
+            f.metadata.get("key") or f.name: plain(getattr(value, f.name))
+            for f in dataclasses.fields(value)
+        }
     if isinstance(value, np.ndarray):
         return value.tolist()
     return list(value) if isinstance(value, tuple) else value

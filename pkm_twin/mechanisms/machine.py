@@ -23,6 +23,7 @@ from pkm_twin.kinematics.engine import choose_coordinates
 from pkm_twin.kinematics.motion import matrices, numbers
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
+from pkm_twin.machine.entries import given
 from pkm_twin.machine.graph import (
     AXES,
     BASE,
@@ -325,6 +326,13 @@ class Machine(Robot):
         check_uncertainty(robot)
         return robot
 
+    @classmethod
+    def graph_of(cls, data: Mapping[str, Any]) -> Graph:
+        """Of a file that a robot was made of; what its joints hold is not looked at."""
+        graph = _graph(data, _written_out(data)[0])
+        graph.check()
+        return graph
+
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:  # type: ignore[override]
         """The pose coordinates of the file."""
@@ -510,6 +518,18 @@ class Machine(Robot):
                 ends = (inner, rod.ends[0]), (outer, rod.ends[1])
                 beams.append(Beam(name, name, limb[name], *ends, (name,), radius))
         return tuple(beams)
+
+    def elastic_entries(self) -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+        """Members of bodies, sections and radii of rods, compliances of joints."""
+        keys = {"bodies": ("member",), "joints": ("compliance",), "rods": ("section", "radius")}
+        told = {
+            kind: {
+                name: given({key: schema.plain(getattr(spec, key)) for key in keys[kind]})
+                for name, spec in specs.items()
+            }
+            for kind, specs in self.specs.items()
+        }
+        return {kind: {n: e for n, e in all_.items() if e} for kind, all_ in told.items()}
 
     def structure(self) -> Structure:
         """Bars with sections, and the compliance of joints.

@@ -661,7 +661,7 @@ class TwinNode(LifecycleNode):
             elif now == self._last_clock:
                 found.append((WARN, "use_sim_time is set and /clock stands still"))
             self._last_clock = now
-        # Every node has one. The list of names keeps one that has ended, where its last words cross.
+        # Every node has one; of the list of names, an ended node's last words may bring it back.
         own = (self.get_name(), self.get_namespace())
         publishers = self.get_publishers_info_by_topic("/parameter_events")
         namesakes = sum((p.node_name, p.node_namespace) == own for p in publishers)
