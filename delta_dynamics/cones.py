@@ -89,8 +89,8 @@ def _goal(least: float) -> float:
 def _is_lowest(forms: Array, y: Array, goal: float) -> bool:
     """Whether a minimum's own multipliers prove it in all directions at once.
 
-    sum u_a G_a y = t y there; no eigenvalue of that sum below the goal is proof. There is such proof
-    for one form and for two (Brickman, Proc. Amer. Math. Soc. 12, 1961), for more often.
+    sum u_a G_a y = t y there; no eigenvalue of that sum below the goal is proof. There is such
+    proof for one form and for two (Brickman, Proc. Amer. Math. Soc. 12, 1961), for more often.
     """
     # Here, as it is half of what a node's start would take.
     from scipy.optimize import nnls  # type: ignore[import-untyped]
