@@ -37,6 +37,8 @@ from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import skew
 
 Array = NDArray[np.float64]
+Noise = tuple[float, float | None]
+"""Standard deviations: m an axis, and rad an axis where rotations were measured."""
 
 MOVES: Final = 1e-6
 """A number that moves the platform less than this, per unit, is no number of the geometry."""
@@ -47,6 +49,10 @@ HELD_OUT: Final = 4
 SHOWN: Final = 0.1
 """Part of the greatest weight below which a number is not named in a combination."""
 STEPS: Final = 12
+WHOLE: Final = 0.75
+"""A step that is best at this part of it, or beyond, is gone as a whole."""
+LEAST: Final = 0.1
+"""Least part of a step that is gone."""
 CONVERGED: Final = 1e-3
 """Part of its deviation by which no parameter moves in the last step."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
@@ -216,50 +222,84 @@ def calibrate(
 def _fit(
     robot: Robot, start: State, poses: Poses, parameters: Sequence[Parameter],
     progress: Callable[[int], None],
-) -> tuple[State, Array, Array, Array, tuple[float, float | None], int]:  # fmt: skip
+) -> tuple[State, Array, Array, Array, Noise, int]:  # fmt: skip
     """Least squares over all parameters, the noise found with them."""
     state = start
     values = np.array([value_of(start, p.name, p.before) for p in parameters])
     centre = np.array([p.before for p in parameters])
     prior = np.array([p.prior for p in parameters])
-    noise: tuple[float, float | None] = (0.0, None)
-    steps = 0
-    while True:
-        steps += 1
+
+    def right(state: State, values: Array, noise: Noise) -> Array:
+        return np.concatenate([_over(state.residuals(poses), noise), (centre - values) / prior])
+
+    for steps in range(1, STEPS + 1):
         progress(1)
-        residual, table, noise = _weighted(robot, state, poses, parameters)
-        left = np.vstack([table, np.diag(1.0 / prior)])
-        right = np.concatenate([residual, (centre - values) / prior])
-        move, *_ = np.linalg.lstsq(left, right, rcond=None)
+        noise = _noise(state, poses, len(parameters))
+        columns = _derivatives(robot, state, parameters)
+        angular = None if poses.rotation is None else columns[:, 3:]
+        table = _over((columns[:, :3], angular), noise).reshape(-1, len(parameters))
+        left, before = np.vstack([table, np.diag(1.0 / prior)]), right(state, values, noise)
+        move: Array = np.asarray(np.linalg.lstsq(left, before, rcond=None)[0], np.float64)
         covariance = np.linalg.inv(left.T @ left)
-        values = values + move
-        names = [p.name for p in parameters]
-        by = dict(zip(names, move.tolist(), strict=True))
-        turn = np.array([by.get(name, 0.0) for name in FRAME[3:]])
-        state = moved(robot, state, poses, dict(zip(names, values.tolist(), strict=True)), turn)
-        if np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))):
-            break
-        if steps == STEPS:
-            raise ParameterError("poses", f"{STEPS} steps", "poses to which a fit settles")
-    return state, values, covariance, table * prior, noise, steps
+        settled = bool(np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))))
+        trial = _stepped(robot, state, poses, parameters, values, move)
+        if not settled:
+            after = right(trial, values + move, noise)
+            share = _share(*(float(row @ row) for row in (before, left @ move, after)))
+            if share < 1.0:
+                move = share * move
+                trial = _stepped(robot, state, poses, parameters, values, move)
+        state, values = trial, values + move
+        if settled:
+            return state, values, covariance, table * prior, noise, steps
+    raise ParameterError("poses", f"{STEPS} steps", "poses to which a fit settles")
 
 
-def _weighted(
-    robot: Robot, state: State, poses: Poses, parameters: Sequence[Parameter]
-) -> tuple[Array, Array, tuple[float, float | None]]:
-    """Residuals and derivatives over the noise that the residuals tell."""
+def _share(before: float, gain: float, after: float) -> float:
+    """Part of a step at which the sum of squares is least, by the parabola through what is known.
+
+    Along a direction that the poses tell badly the machine may turn away from its tangent: a whole
+    step then goes beyond, and back, for ever.
+
+    :param before: the sum at the beginning; ``after``: at the end of the whole step.
+    :param gain: what a linear machine would lose of it; its slope there is twice that.
+    """
+    bend = after - before + 2.0 * gain
+    share = gain / bend if bend > 0.0 else 1.0
+    return 1.0 if share > WHOLE else max(share, LEAST)
+
+
+def _stepped(
+    robot: Robot, state: State, poses: Poses, parameters: Sequence[Parameter], values: Array,
+    move: Array,
+) -> State:  # fmt: skip
+    names = [p.name for p in parameters]
+    by = dict(zip(names, move.tolist(), strict=True))
+    turn = np.array([by.get(name, 0.0) for name in FRAME[3:]])
+    new = dict(zip(names, (values + move).tolist(), strict=True))
+    return moved(robot, state, poses, new, turn)
+
+
+def _noise(state: State, poses: Poses, parameters: int) -> Noise:
+    """Standard deviations of positions and rotations that the residuals tell."""
     linear, angular = state.residuals(poses)
-    count = max(1, linear.size - len(parameters) // (1 if angular is None else 2))
-    sigma = max(float(np.sqrt((linear**2).sum() / count)), 1e-12)
-    columns = _derivatives(robot, state, parameters)
-    residual = linear.ravel() / sigma
-    table = columns[:, :3].reshape(-1, len(parameters)) / sigma
-    if angular is None:
-        return residual, table, (sigma, None)
-    turn = max(float(np.sqrt((angular**2).sum() / count)), 1e-12)
-    residual = np.concatenate([residual, angular.ravel() / turn])
-    table = np.vstack([table, columns[:, 3:].reshape(-1, len(parameters)) / turn])
-    return residual, table, (sigma, turn)
+    count = max(1, linear.size - parameters // (1 if angular is None else 2))
+    sizes = [
+        max(float(np.sqrt((part**2).sum() / count)), 1e-12)
+        for part in (linear, angular)
+        if part is not None
+    ]
+    return sizes[0], sizes[1] if len(sizes) > 1 else None
+
+
+def _over(parts: tuple[Array, Array | None], noise: Noise) -> Array:
+    """Rows of positions, then of rotations, in units of their noise, the poses' axes flat."""
+    rows = [
+        part.reshape(part.shape[0] * 3, *part.shape[2:]) / size
+        for part, size in zip(parts, noise, strict=True)
+        if part is not None and size is not None
+    ]
+    return np.concatenate(rows)
 
 
 def _derivatives(robot: Robot, state: State, parameters: Sequence[Parameter]) -> Array:

@@ -353,12 +353,12 @@ class Robot:
 
         :raises ParameterError: the robot's file gives no masses.
         """
-        graph, load = self.massive().graph, self.payload
+        # The engine's own graph may be that of a machine with other masses.
+        self.massive()
+        graph, load = self.graph, self.payload
         masses = [body.mass for body in graph.bodies.values()]
         heavy = max(graph.bodies[graph.platform].mass, 0.1 * sum(masses))
-        payload = shared_payload(
-            self.graph, load.mass, load.com, load.inertia, heavy, 0.3 * graph.size
-        )
+        payload = shared_payload(graph, load.mass, load.com, load.inertia, heavy, 0.3 * graph.size)
         return (*self.shared_drives(), payload, *self.shared_inertia())
 
     @cached_property

@@ -425,7 +425,9 @@ class UprRpu(Robot):
 
         :raises ParameterError: the robot's file gives no masses.
         """
-        graph, inertia = self.massive().graph, self.inertia
+        # The engine's own graph may be that of a machine with other masses.
+        self.massive()
+        graph, inertia = self.graph, self.inertia
         assert inertia is not None  # noqa: S101
         tubes = {
             name: ten_numbers(body.mass, body.com, body.inertia) / inertia.density

@@ -257,10 +257,12 @@ def test_the_lock_of_a_killed_process_is_nobodys(small, tmp_path):
     ) as process:
         pickle.dump(small, process.stdin)
         process.stdin.flush()
-        assert process.stdout.readline().strip() == b"locked"
-        with pytest.raises(AtlasError, match=f"process {process.pid} on"):
-            run(small, out, workers=1)
-        process.kill()
+        try:
+            assert process.stdout.readline().strip() == b"locked"
+            with pytest.raises(AtlasError, match=f"process {process.pid} on"):
+                run(small, out, workers=1)
+        finally:
+            process.kill()
         process.wait()
         run(small, out, workers=1)
 
