@@ -158,8 +158,9 @@ def _check_efforts(robot: Robot, r: Recorded) -> None:
                 f"{r.name}: effort of {joint} is {worst:g}; below {LARGEST:g} is what a drive has"
             )
         if len(effort) and np.ptp(effort) == 0.0:
+            only = effort[0] + 0.0  # no minus before zero
             raise PkmTwinError(
-                f"{r.name}: effort of {joint} is {effort[0] + 0.0:g} throughout: nothing was measured"
+                f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured"
             )
 
 

@@ -141,12 +141,12 @@ def test_what_cannot_work_is_refused_by_name(
     assert not (tmp_path / "mine.yaml").exists()
 
 
-def crooked(seed: int) -> tuple[Robot, Poses]:
-    """A 3-RPS head that is not built as drawn, and its poses."""
+def crooked(seed: int, only: list[str], count: int) -> tuple[Robot, Poses]:
+    """A 3-RPS head some numbers of which are not as drawn, and its poses."""
     robot, rng = load("rps3"), np.random.default_rng([seed, 77])
-    q = random_joints(robot, rng, 60, 0.05)
+    q = random_joints(robot, rng, count, 0.05)
     sizes = {"m": 1e-3, "": 3e-3}
-    moved = {p: entries(robot)[p] for p in geometric(robot, q) if not p.endswith(".home")}
+    moved = {p: entries(robot)[p] for p in geometric(robot, q, only) if not p.endswith(".home")}
     values = {p: v + sizes[unit] * rng.normal() for p, (v, unit) in moved.items()}
     position, rotation = with_entries(robot, values).platform(q)
     turn = Rotation.from_rotvec(1e-4 * rng.normal(size=position.shape)).as_matrix()
@@ -154,22 +154,22 @@ def crooked(seed: int) -> tuple[Robot, Poses]:
     return robot, Poses(q + 1e-3 * rng.normal(size=3), noisy, turn @ rotation)
 
 
-def settles(seed: int) -> None:
-    robot, poses = crooked(seed)
-    result = calibrate(robot, poses, geometric(robot, poses.joints))
+def settles(seed: int, only: list[str], count: int = 60) -> None:
+    robot, poses = crooked(seed, only, count)
+    result = calibrate(robot, poses, geometric(robot, poses.joints, only))
     assert result.held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0)
     assert 0.7 * NOISE < result.noise < 1.4 * NOISE
 
 
 def test_directions_in_which_the_machine_turns_away_from_its_tangent_settle() -> None:
     """Tilts of the legs are told by their squares alone."""
-    settles(1)
+    settles(1, ["joints.leg_3.", "joints.hinge_3."], 20)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [0, *range(2, 10)])
 def test_others_settle_too(seed: int) -> None:
-    settles(seed)
+    settles(seed, [])
 
 
 def test_only_numbers_that_there_are_can_be_chosen(tmp_path: Path) -> None:
