@@ -211,14 +211,24 @@ def _group(group: Shared, result: Estimate, where: slice) -> tuple[Number, ...]:
     for slope, (key, value) in zip(slopes, after.items(), strict=True):
         deviation = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
         usual = float(np.sqrt(np.sum((slope * prior) ** 2)))
-        share = deviation / usual if usual > 0.0 else 1.0
-        status: Status = "combination"
-        if share < SURE:
-            status = "fitted"
-        elif share > UNSURE and abs(value - before[key]) <= STAYS * usual:
-            status, value = "not excited", before[key]
-        numbers.append(Number(key, _unit(group, key), before[key], value, deviation, share, status))
+        numbers.append(known(key, _unit(group, key), before[key], value, deviation, usual))
     return tuple(numbers)
+
+
+def known(
+    key: Key, unit: str, before: float, value: float, deviation: float, usual: float
+) -> Number:
+    """A number with how well it is known.
+
+    :param usual: its deviation before.
+    """
+    share = deviation / usual if usual > 0.0 else 1.0
+    status: Status = "combination"
+    if share < SURE:
+        status = "fitted"
+    elif share > UNSURE and abs(value - before) <= STAYS * usual:
+        status, value = "not excited", before
+    return Number(key, unit, before, value, deviation, share, status)
 
 
 def _unit(group: Shared, key: Key) -> str:

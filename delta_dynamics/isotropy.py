@@ -17,12 +17,13 @@ May import: numpy, scipy, pkm_twin's core, the standard library; never rclpy.
 from __future__ import annotations
 
 import itertools
-import math
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from delta_dynamics.cones import largest
+from delta_dynamics.least_form import least_direction
 from delta_dynamics.terms import frictionless
 from delta_dynamics.virtual_work import body_mass_matrix, mass_matrix
 from pkm_twin.errors import ParameterError, SingularityError
@@ -36,16 +37,9 @@ ENERGY: Final = 100.0
 STRETCHED: Final = 1e-6
 """Least singular value of the pose's Jacobian, of its greatest or of one, that is inverted."""
 
-_NONE: Final = np.zeros(3)
-_STARTS: Final = 256
-"""Directions that a descent begins from, best first, where no solution in closed form is known."""
-_DESCENTS: Final = 24
-_ROUNDS: Final = 8
-"""Most rounds of a descent."""
-
 
 class JointMotion(NamedTuple):
-    """Joint positions, rates and accelerations, shape (..., 3) each."""
+    """Joint positions, rates and accelerations, shape (..., m) each."""
 
     q: Array
     qd: Array
@@ -55,7 +49,7 @@ class JointMotion(NamedTuple):
 class Extremes(NamedTuple):
     """Least and greatest value over all directions, shape (...), and where they are reached.
 
-    ``directions``: unit vectors of pose rates, shape (..., 2, 3), least then greatest.
+    ``directions``: unit vectors of pose rates, shape (..., 2, m), least then greatest.
     """
 
     least: Array
@@ -69,14 +63,14 @@ class Extremes(NamedTuple):
 
 
 def joint_motion(
-    robot: Robot, pose: ArrayLike, rates: ArrayLike, accelerations: ArrayLike = (0.0, 0.0, 0.0)
+    robot: Robot, pose: ArrayLike, rates: ArrayLike, accelerations: ArrayLike = 0.0
 ) -> JointMotion:
     """Joint motion of a pose motion: qd = J^-1 Xdot, qdd = J^-1 (Xddot - Jdot qd).
 
     Exact: Jdot qd is the pose's acceleration at zero qdd, told by the bodies' motion (3-PRRU
     paper, equations 24 and 25, without its Hessian).
 
-    :param pose: shape (..., 3); ``rates`` and ``accelerations`` are its derivatives in time.
+    :param pose: shape (..., m); ``rates`` and ``accelerations`` are its derivatives in time.
     :raises UnreachableError: a pose out of reach, by limb, sample and miss.
     :raises SingularityError: the Jacobian has no inverse.
     """
@@ -94,8 +88,8 @@ def energy_matrices(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
 
     E = Xdot' M Xdot / 2 (3-PRRU paper, equations 42 and 43).
 
-    :param pose: shape (..., 3).
-    :returns: platform with payload, and all bodies; shape (..., 3, 3) each.
+    :param pose: shape (..., m).
+    :returns: platform with payload, and all bodies; shape (..., m, m) each.
     """
     q, inverse = _inverse_jacobian(robot, np.asarray(pose, np.float64))
     platform = body_mass_matrix(robot, q, robot.graph.platform)
@@ -109,8 +103,8 @@ def energy_matrices(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
 def energy_transfer(robot: Robot, pose: ArrayLike, direction: ArrayLike) -> Array:
     """eta_KE = E_M / E_all, the platform's part of the kinetic energy (equations 44 and 46).
 
-    :param pose: shape (..., 3).
-    :param direction: pose rates of any length above zero, shape (..., 3).
+    :param pose: shape (..., m).
+    :param direction: pose rates of any length above zero, shape (..., m).
     :returns: shape (...), 0 to 1.
     """
     x = _directions(direction, len(robot.pose_names))
@@ -121,15 +115,15 @@ def energy_transfer(robot: Robot, pose: ArrayLike, direction: ArrayLike) -> Arra
 def energy_transfer_range(robot: Robot, pose: ArrayLike) -> Extremes:
     """Extremes of eta_KE over all directions, exact, from generalised eigenvalues.
 
-    :param pose: shape (..., 3).
+    :param pose: shape (..., m).
     :raises ParameterError: bodies without inertia against some direction.
     """
     platform, everything = energy_matrices(robot, pose)
     back = _inverse_root(robot, everything)
     values, vectors = np.linalg.eigh(_congruent(back, platform))
-    ends = vectors[..., [0, 2]]
+    ends = vectors[..., [0, -1]]
     directions = _directions((back @ ends).swapaxes(-1, -2))
-    return Extremes(values[..., 0], values[..., 2], directions)
+    return Extremes(values[..., 0], values[..., -1], directions)
 
 
 def max_driving_force(
@@ -143,10 +137,10 @@ def max_driving_force(
 
     Gravity and payload act, friction does not.
 
-    :param pose: shape (..., 3).
-    :param direction: of the pose rates, shape (..., 3); their length follows from ``energy``.
+    :param pose: shape (..., m).
+    :param direction: of the pose rates, shape (..., m); their length follows from ``energy``.
     :param energy: kinetic energy E_M of the platform, J.
-    :param acceleration: Xddot, a number or shape (..., 3).
+    :param acceleration: Xddot, a number or shape (..., m).
     :returns: shape (...).
     """
     x = _directions(direction, len(robot.pose_names))
@@ -165,18 +159,20 @@ def max_driving_force_range(
 
     On the ellipsoid of Xdot with that energy, scaled to the unit sphere, every F_d is a
     quadratic form y' G y. The greatest |F_d| is an eigenvalue, exact. The least F_max is the
-    minimum of the largest of these forms. With up to three pose coordinates it is the best of all
-    points where a minimum can be (:func:`least_direction`), with more the best of many descents.
+    minimum of the largest of these forms (:func:`least_direction`): exact with up to three pose
+    coordinates, with more proven to be within a millionth of itself (``cones.RESOLUTION``).
 
     :param pose: shape (..., m).
     :param acceleration: Xddot, a number or shape (..., m).
+    :raises SearchError: more than three pose coordinates, and forms that take too long.
     """
     where = np.asarray(pose, np.float64)
     platform, _ = energy_matrices(robot, where)
     back = np.sqrt(2 * _energy(energy)) * _inverse_root(robot, platform)
-    start = joint_motion(robot, where, _NONE, acceleration)
+    size = where.shape[-1]
+    start = joint_motion(robot, where, np.zeros(size), acceleration)
     constant = frictionless(robot, *start)
-    size, count = where.shape[-1], constant.shape[-1]
+    count = constant.shape[-1]
     pairs = list(itertools.combinations(range(size), 2))
     units = np.eye(size)
     mixed = np.array([units[j] + units[k] for j, k in pairs]).reshape(-1, size)
@@ -200,7 +196,7 @@ def max_driving_force_range(
     greatest = np.take_along_axis(ends, best, -1)[..., 0]
     flat = forms.reshape(-1, count, size, size)
     low = np.array([least_direction(form) for form in flat]).reshape(high.shape)
-    least = _largest(forms, low)
+    least = largest(forms, low)
     y = np.stack([low, high], -2)
     return Extremes(least, greatest, _directions(np.einsum("...ij,...kj->...ki", back, y)))
 
@@ -220,11 +216,11 @@ def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array
 
 
 def _inverse_jacobian(robot: Robot, pose: Array) -> tuple[Array, Array]:
-    """Joint positions and joint rates per pose rate, shapes (..., 3) and (..., 3, 3)."""
+    """Joint positions and joint rates per pose rate, shapes (..., n) and (..., n, m)."""
     q = robot.inverse(pose)
     u, s, vt = np.linalg.svd(robot.jacobian(q))
     # Against one m/rad at least: where all limbs are stretched the whole Jacobian vanishes.
-    measure = s[..., 2] / np.maximum(s[..., 0], 1.0)
+    measure = s[..., -1] / np.maximum(s[..., 0], 1.0)
     bad = np.argwhere(~(measure > STRETCHED))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
@@ -234,7 +230,7 @@ def _inverse_jacobian(robot: Robot, pose: Array) -> tuple[Array, Array]:
 
 
 def _inverse_root(robot: Robot, form: Array) -> Array:
-    """B with B' M B = 1, shape (..., 3, 3)."""
+    """B with B' M B = 1, shape (..., m, m)."""
     try:
         root = np.linalg.cholesky(form)
     except np.linalg.LinAlgError:
@@ -272,170 +268,3 @@ def _energy(energy: float) -> float:
     if not 0.0 < energy < np.inf:
         raise ValueError(f"energy has to be above zero and finite, not {energy}")
     return energy
-
-
-def _largest(forms: Array, y: Array) -> Array:
-    """max_a |y' G_a y|, shape (...); forms (..., n, m, m), y (..., m)."""
-    return np.asarray(np.abs(np.einsum("...i,...aij,...j->...a", y, forms, y)).max(-1), np.float64)
-
-
-def least_direction(forms: Array) -> Array:
-    """Unit y, shape (m,), with the least max_a |y' G_a y| of symmetric forms G, shape (n, m, m).
-
-    At a minimum one form is stationary, or two are equal but for their sign and one of them is
-    stationary along the cone y' H y = 0 on which they are, or three are equal. For m up to 3 all
-    such points are known: eigenvectors; common points, in the projective plane, of the cone and
-    the cubic det(y, G y, H y) = 0; common points of two cones. The best of them all is the answer,
-    to rounding. For greater m it is the best of many descents: a local minimum, not above what
-    any of them found, and without proof that none is lower.
-    """
-    points = _candidates(forms)
-    if forms.shape[-1] > 3:
-        start = np.random.default_rng(0).normal(size=(_STARTS, forms.shape[-1]))
-        start = np.concatenate([points, _directions(start)])
-        order = np.argsort(_largest(forms, start))[:_DESCENTS]
-        points = np.concatenate([points, [_descended(forms, y) for y in start[order]]])
-    return np.asarray(points[_largest(forms, points).argmin()], np.float64)
-
-
-def _candidates(forms: Array) -> Array:
-    """Unit vectors, shape (k, m), among which the least one is if m is at most 3."""
-    count, size = forms.shape[:2]
-    pairs = list(itertools.combinations(range(count), 2))
-    cones = [(a, forms[a] - sign * forms[b]) for a, b in pairs for sign in (1.0, -1.0)]
-    found = [np.eye(size), *np.linalg.eigh(forms)[1].swapaxes(-1, -2)]
-    for cone in (*forms, *(cone for _, cone in cones)):
-        values, vectors = np.linalg.eigh(cone)
-        if values[0] < 0.0 < values[-1]:
-            # Of two coordinates both lines of the cone, of more some.
-            x = math.sqrt(values[-1]) * vectors[:, 0]
-            z = math.sqrt(-values[0]) * vectors[:, -1]
-            found.append(np.stack([x + z, x - z]))
-    if size == 3:
-        turned = [_TURN.T @ cone @ _TURN for _, cone in cones]
-        curves = [_conic(cone) for cone in turned]
-        for (a, _), cone, curve in zip(cones, turned, curves, strict=True):
-            stationary = _stationary(_TURN.T @ forms[a] @ _TURN, cone)
-            found.append(_common_points(curve, stationary) @ _TURN.T)
-        for one, other in itertools.combinations(curves, 2):
-            found.append(_common_points(one, other) @ _TURN.T)
-    points = np.concatenate(found)
-    # A point more does no harm: each is judged by the forms themselves.
-    return _directions(points[np.isfinite(points).all(-1) & points.any(-1)])
-
-
-_TURN: Final = np.linalg.qr([[1.0, 0.3, -0.4], [0.2, 0.9, 0.7], [-0.5, 0.6, 1.1]])[0]
-"""A rotation without meaning: planes of symmetry are then no lines u = constant, and no points
-that count lie at infinity."""
-_LINES: Final = np.zeros((3, 2, 2))
-"""y = (1, u, v) as polynomials: entry (i, j) of each is the coefficient of u^i v^j."""
-_LINES[0, 0, 0] = _LINES[1, 1, 0] = _LINES[2, 0, 1] = 1.0
-
-
-def _product(p: Array, q: Array) -> Array:
-    """Product of two polynomials in u and v."""
-    result = np.zeros((p.shape[0] + q.shape[0] - 1, p.shape[1] + q.shape[1] - 1))
-    for i, j in np.ndindex(*p.shape):
-        result[i : i + q.shape[0], j : j + q.shape[1]] += p[i, j] * q
-    return result
-
-
-def _scaled(matrix: Array) -> Array:
-    size = np.abs(matrix).max()
-    return np.asarray(matrix / size if size > 0.0 else matrix, np.float64)
-
-
-def _conic(h: Array) -> Array:
-    """Y' H y at y = (1, u, v)."""
-    rows = np.einsum("ij,juv->iuv", _scaled(h), _LINES)
-    total = np.sum([_product(_LINES[i], rows[i]) for i in range(3)], axis=0)
-    return np.asarray(total, np.float64)
-
-
-def _stationary(g: Array, h: Array) -> Array:
-    """det(y, G y, H y) at y = (1, u, v): zero where y' G y is stationary along y' H y = 0."""
-    a, b = (np.einsum("ij,juv->iuv", _scaled(m), _LINES) for m in (g, h))
-    result = np.zeros((4, 4))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        result += _product(_LINES[i], _product(a[j], b[k]) - _product(a[k], b[j]))
-    return result
-
-
-def _common_points(conic: Array, curve: Array) -> Array:
-    """Points (1, u, v), shape (k, 3), of a conic, all those of another curve among them.
-
-    u are the eigenvalues of the polynomial Sylvester matrix of both in v; v follows from the
-    conic.
-    """
-    d, e = conic.shape[1] - 1, curve.shape[1] - 1
-    n, degree = d + e, max(len(conic), len(curve)) - 1
-    sylvester = np.zeros((degree + 1, n, n))
-    for row in range(e):
-        sylvester[: len(conic), row, row : row + d + 1] = conic[:, ::-1]
-    for row in range(d):
-        sylvester[: len(curve), e + row, row : row + e + 1] = curve[:, ::-1]
-    first, last = np.eye(n * degree, k=n), np.eye(n * degree)
-    first[-n:] = np.hstack(list(-sylvester[:-1]))
-    last[-n:, -n:] = sylvester[-1]
-    from scipy.linalg import eig  # type: ignore[import-untyped]
-
-    u = eig(first, last, right=False)
-    u = u[np.isfinite(u)].real
-    c, b, a = (np.polynomial.polynomial.polyvander(u, len(conic) - 1) @ conic).T
-    with np.errstate(all="ignore"):
-        half = -(b + np.copysign(np.sqrt(np.maximum(b * b - 4 * a * c, 0.0)), b)) / 2
-        v = np.concatenate([half / a, c / half])
-    return np.stack([np.ones(len(v)), np.concatenate([u, u]), v], -1)
-
-
-def _descended(forms: Array, start: Array) -> Array:
-    """A local minimum of max_a |y' G_a y| below a point, to rounding of the least form.
-
-    Least t with -t <= y' G_a y <= t. Each round counts in what the one before it has left: of forms
-    of several scales the small ones would be lost beside the large.
-    """
-    best, least = start, float(_largest(forms, start))
-    for _ in range(_ROUNDS):
-        if not least > 0.0:
-            break
-        y = _descent(forms / least, best)
-        value = math.inf if y is None else float(_largest(forms, y))
-        if y is None or not value < least * (1 - 1e-12):
-            break
-        best, least = y, value
-    return best
-
-
-def _descent(g: Array, start: Array) -> Array | None:
-    """One round from a point where the greatest form is one; None where it leads nowhere."""
-    size = len(start)
-
-    def room(x: Array) -> Array:
-        values = np.einsum("i,aij,j->a", x[:size], g, x[:size])
-        return np.concatenate([x[size] - values, x[size] + values])
-
-    def slope(x: Array) -> Array:
-        gradients = 2 * np.einsum("aij,j->ai", g, x[:size])
-        return np.column_stack([np.vstack([-gradients, gradients]), np.ones(2 * len(g))])
-
-    rules = (
-        {"type": "ineq", "fun": room, "jac": slope},
-        {
-            "type": "eq",
-            "fun": lambda x: x[:size] @ x[:size] - 1.0,
-            "jac": lambda x: np.append(2 * x[:size], 0.0),
-        },
-    )
-    # Here, as it is half of what a node's start would take.
-    from scipy.optimize import minimize  # type: ignore[import-untyped]
-
-    found = minimize(
-        lambda x: x[size],
-        np.append(start, 1.0),
-        jac=lambda x: np.append(np.zeros(size), 1.0),
-        constraints=rules,
-        method="SLSQP",
-        options={"ftol": 1e-15, "maxiter": 200},
-    ).x[:size]
-    return _directions(found) if np.isfinite(found).all() and found.any() else None

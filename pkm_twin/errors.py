@@ -93,6 +93,15 @@ class SingularityError(PkmTwinError, ValueError):
         self.bound = bound
 
 
+class SearchError(PkmTwinError):
+    """A search that has not ended within its bound: ``done`` steps, ``most`` that are allowed."""
+
+    def __init__(self, what: str, done: int, most: int) -> None:
+        super().__init__(f"{what} is not found within {done} steps; allowed: {most}")
+        self.done = done
+        self.most = most
+
+
 class MessageError(PkmTwinError, ValueError):
     """A ROS message that is rejected whole.
 

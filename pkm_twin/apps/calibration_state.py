@@ -8,16 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.kinematics.maximal import GraphChange, Placement, assembled
 from pkm_twin.machine.entries import data_of, number_at, put
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.robot import Robot
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 Array = NDArray[np.float64]
 
@@ -27,6 +29,14 @@ FRAME: Final = tuple(f"frame.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz
 TARGET: Final = ("target.x", "target.y", "target.z")
 BESIDE: Final = (*FRAME, *TARGET, "joint_map.")
 """Names, or their beginnings, of what is fitted beside the machine's own numbers."""
+
+
+def rotations() -> Any:
+    """Scipy's class of rotations."""
+    # Not above: every command would load it, which takes as long as all else at its start.
+    from scipy.spatial.transform import Rotation
+
+    return Rotation
 
 
 @dataclass(frozen=True)
@@ -60,7 +70,7 @@ class Instrument:
     """What is fitted beside the machine: its joints' sensors, where the instrument stands."""
 
     offsets: Array
-    frame: Rotation = field(default_factory=Rotation.identity)
+    frame: Rotation = field(default_factory=lambda: rotations().identity())
     place: Array = field(default_factory=lambda: np.zeros(3))
     target: Array = field(default_factory=lambda: np.zeros(3))
 
@@ -80,7 +90,7 @@ class Instrument:
         position, rotation = self.seen(position, rotation)
         if poses.rotation is None:
             return poses.position - position, None
-        apart = Rotation.from_matrix(poses.rotation @ np.swapaxes(rotation, -1, -2))
+        apart = rotations().from_matrix(poses.rotation @ np.swapaxes(rotation, -1, -2))
         return poses.position - position, apart.as_rotvec()
 
     def errors(self, robot: Robot, poses: Poses) -> Errors:
@@ -144,7 +154,7 @@ def place_frame(state: State, poses: Poses) -> None:
     """A first guess of the instrument's frame: the best rigid motion between the point clouds."""
     tool, model = state.instrument, state.platform[0]
     centres = poses.position.mean(0), model.mean(0)
-    tool.frame, _ = Rotation.align_vectors(poses.position - centres[0], model - centres[1])
+    tool.frame, _ = rotations().align_vectors(poses.position - centres[0], model - centres[1])
     tool.place = centres[0] - tool.frame.apply(centres[1])
 
 
@@ -174,7 +184,7 @@ def moved(
     ]
     new = Instrument(
         np.array(offsets),
-        Rotation.from_rotvec(turn) * tool.frame,
+        rotations().from_rotvec(turn) * tool.frame,
         np.array([values.get(n, v) for n, v in zip(FRAME[:3], tool.place, strict=True)]),
         np.array([values.get(n, v) for n, v in zip(TARGET, tool.target, strict=True)]),
     )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from delta_dynamics.fit import Fit, Number
 from pkm_twin import Robot, load
@@ -15,6 +15,14 @@ from pkm_twin.machine.robot_urdf import robot_description
 from pkm_twin.machine.shared import Key
 from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.machine.yaml_edit import edit_yaml
+
+
+class Fitted(Protocol):
+    """What a fit says of numbers of a file."""
+
+    @property
+    def numbers(self) -> tuple[Number, ...]:
+        """Before and after."""
 
 
 def robot_text(name: str, *, per_copy: bool = False) -> tuple[str, Robot]:
@@ -63,7 +71,7 @@ def yaml_head(result: Fit, recordings: Sequence[str]) -> list[str]:
     return lines
 
 
-def fitted_yaml(text: str, result: Fit, recordings: Sequence[str]) -> str:
+def fitted_yaml(text: str, result: Fitted, recordings: Sequence[str]) -> str:
     """The robot's file with what was fitted, each number's deviation and source in a comment."""
     groups: dict[Key, list[Number]] = {}
     for number in result.numbers:
@@ -84,9 +92,10 @@ def fitted_yaml(text: str, result: Fit, recordings: Sequence[str]) -> str:
         alone = all(n.status == "fitted" for n in told)
         how = "" if alone else "; known only together with others"
         was = ", ".join(f"{n.before:.6g}" for n in told)
+        unit = f" {told[0].unit}" if told[0].unit else ""
         notes[base] = (
-            f"{'.'.join(str(k) for k in base[-2:])}: fitted from {source}, +- {spread} "
-            f"{told[0].unit} (one standard deviation), was {was}{how}"
+            f"{'.'.join(str(k) for k in base[-2:])}: fitted from {source}, +- {spread}{unit} "
+            f"(one standard deviation), was {was}{how}"
         )
     return edit_yaml(text, values, notes)
 

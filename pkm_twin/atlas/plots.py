@@ -63,7 +63,8 @@ def efforts(axes: Sequence[Any], data: DynamicsSeries) -> None:
         whole.plot(data.time, data.predicted[:, i], color=COLOURS[i], lw=0.7, label=joint)
         rest.plot(data.time, data.residual[:, i], color=COLOURS[i], lw=0.5, label=joint)
     if not data.free.all():
-        what = "cutting" if data.loaded is None else "payload held"
+        cut = "cutting ± 0.5 s,\nwrench known to the node"
+        held = "payload held ± 0.5 s,\nunknown to the node"
         rest.fill_between(
             data.time,
             *(0, 1),
@@ -71,7 +72,7 @@ def efforts(axes: Sequence[Any], data: DynamicsSeries) -> None:
             transform=rest.get_xaxis_transform(),
             color="0.9",
             zorder=0,
-            label=f"{what},\nunknown to the node",
+            label=cut if data.loaded is None else held,
         )
     for ax in axes:
         ax.set_xlabel("time (s)")

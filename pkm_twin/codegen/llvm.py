@@ -379,11 +379,10 @@ class _Writer:
             good = b.and_(good, b.fcmp_ordered("<=", residual, out.number(RESIDUAL**2)))
             for value in out.run(list(program.equations.branch), values):
                 good = b.and_(good, b.fcmp_ordered(">", value, out.number(0.0)))
-        total = None
+        total = out.number(0.0)
         for row in rows.values():
             for value in row:
-                size = out.call("fabs", value)
-                total = size if total is None else b.fadd(total, size)
+                total = b.fadd(total, out.call("fabs", value))
         # Inputs that no output hangs on have to be numbers, too.
         for name in program.inputs:
             for value in values[name]:

@@ -76,7 +76,7 @@ def source(results: Sequence[Expression], inputs: Mapping[str, int]) -> str:
             else:
                 text[e.number] = f"v{e.number}"
                 lines.append(f"    v{e.number} = {written}")
-    lines.append(f"    return ({', '.join(text[e.number] for e in results)},)")
+    lines.append(f"    return ({''.join(f'{text[e.number]}, ' for e in results)})")
     return "\n".join(lines)
 
 
@@ -212,7 +212,7 @@ class PlainCode:
             finite &= np.isfinite(value)
         code = np.where(good, np.where(finite, 0.0, 2.0), 1.0)
         outputs = [
-            np.where((good & finite)[:, None], np.stack(row, -1), np.nan)
+            np.where((good & finite)[:, None], _table(row, count).T, np.nan)
             for row in self._split(values)
         ]
         return outputs, np.stack([code, reached], -1)
@@ -226,7 +226,7 @@ class PlainCode:
         x = np.repeat(np.array(q.home, float)[:, None], count, 1)
         if steps == 1 and self._start is not None:
             begun = self._start[1](**{**named, UNKNOWNS: list(x)})
-            x = np.array([np.broadcast_to(v, count) for v in begun], float)
+            x = _table(begun, count)
         least = q.least if steps == 1 else STEPPED
         alive, reached = np.ones(count, bool), np.zeros(count)
         for k in range(1, steps + 1):
@@ -236,8 +236,7 @@ class PlainCode:
             before = np.zeros(count)
             for _ in range(TURNS):
                 *new, square, det = correction(**{**named, UNKNOWNS: list(x), q.target: target})
-                moved = np.array([np.broadcast_to(v, count) for v in new])
-                x = np.where(moving, moved, x)
+                x = np.where(moving, _table(new, count), x)
                 steady = (before <= CHANGE * det) & (det <= CHANGE * before)
                 sound = (
                     (square <= CONTRACTION**2 * size) & (det > least) & (steady | (before == 0.0))
@@ -252,3 +251,11 @@ class PlainCode:
             if not alive.any():
                 break
         return x, alive, reached
+
+
+def _table(values: Sequence[Any], count: int) -> Array:
+    """Numbers or arrays, a row each, shape (len(values), count); there may be none."""
+    table: Array = np.empty((len(values), count))
+    for row, value in zip(table, values, strict=True):
+        row[:] = value
+    return table

@@ -123,7 +123,12 @@ class Engine:
 
     @cached_property
     def _samples(self) -> list[tuple[Array, Array]]:
-        """States (x, q) at home and near it, the same in every run."""
+        """States (x, q) at home and near it, found by the first engine of a geometry for all."""
+        first = _shared(self.graph.key).setdefault("engine", self)
+        return self._near_home() if first is self else first._samples
+
+    def _near_home(self) -> list[tuple[Array, Array]]:
+        """The same in every run."""
         graph, home = self.graph, self.graph.home
         states = [(np.array(self.tree.home, float), home)]
         random = np.random.default_rng(0)

@@ -19,7 +19,9 @@ import numpy as np
 from pkm_twin.codegen.expressions import Numbers, Objects, atan2, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine, Traced
+from pkm_twin.kinematics.motion import cross
 from pkm_twin.machine.graph import Array, Rod, across, unit
+from pkm_twin.machine.tree import Link
 
 _LETTERS = "xyz"
 
@@ -100,34 +102,87 @@ def passive_program(t: Traced) -> Program:
     t.solve()
     motion, tree = t.motion, t.tree
     values: list[Any] = []
-    for link in tree.links.values():
+    for link in _passive_links(t):
         steps = link.steps
-        if not steps or steps[0].actuated:
-            continue
         if steps[0].kind in "SF":
-            parent = motion.turned(link.parent)
             if steps[0].kind == "F":
                 k = steps[0].position
                 values += list(t.x[k + 4 : k + 7])
-            values += _three_angles(parent.T @ motion.turned(link.body))
+            values += _three_angles(_relative(t, link))
             continue
         # A joint of one freedom has its own value at home.
         single = link.joint is not None and len(steps) == 1
         home = tree.graph.joints[str(link.joint)].home if single else 0.0
         values += [t.x[step.position] + home for step in steps]
     for rod in t.engine.graph.rods.values():
-        start, end = motion.point(rod.inner, rod.ends[0]), motion.point(rod.outer, rod.ends[1])
-        along = unit(rod.ends[1] - rod.ends[0])
-        first, second = rod_axes(rod)
-        span = motion.turned(rod.inner).T @ (end - start)
-        x = span @ along
-        # Turned by b about the second axis, then by a about the first: along becomes
-        # (cos b) (cos a along + sin a (first x along)) + sin b (second x along).
-        side, up = np.cross(second, along), np.cross(first, along)
-        b = span @ side
-        a = span @ up
+        span = motion.turned(rod.inner).T @ _across_ends(t, rod)
+        b, a, x = _rod_sides(rod, span)
         values += [atan2(a, x), atan2(b, sqrt(x * x + a * a))]
     return Program({"q": t.joints}, 0, {"passive": t.lift(values)}, t.equations())
+
+
+def passive_rates_program(t: Traced) -> Program:
+    """Q and qd to the rates of all passive numbers."""
+    t.solve()
+    qd = t.tape.inputs("qd", t.joints)
+    u = t.set_rates(qd)
+    motion = t.motion
+    rates: list[Any] = []
+    for link in _passive_links(t):
+        steps = link.steps
+        if steps[0].kind in "SF":
+            k = steps[0].rate
+            if steps[0].kind == "F":
+                rates += list(u[k + 3 : k + 6])
+            inner = motion.turned(link.parent)
+            omega = inner.T @ (motion.omega[link.body] - motion.omega[link.parent])
+            rates += _three_rates(_relative(t, link), omega)
+            continue
+        rates += [u[step.rate] for step in steps]
+    for rod in t.engine.graph.rods.values():
+        inner, apart = motion.turned(rod.inner), _across_ends(t, rod)
+        ends = [
+            motion.velocity(body, end)
+            for body, end in zip((rod.inner, rod.outer), rod.ends, strict=True)
+        ]
+        # As the inner body sees it.
+        slip = inner.T @ (ends[1] - ends[0] - cross(motion.omega[rod.inner], apart))
+        (b, a, x), (vb, va, vx) = _rod_sides(rod, inner.T @ apart), _rod_sides(rod, slip)
+        square = x * x + a * a
+        level = sqrt(square)
+        change = (x * vx + a * va) / level
+        rates += [(x * va - a * vx) / square, (level * vb - b * change) / (square + b * b)]
+    sizes = {"q": t.joints, "qd": t.joints}
+    return Program(sizes, 0, {"rates": t.lift(rates)}, t.equations())
+
+
+def _passive_links(t: Traced) -> list[Link]:
+    links = t.tree.links.values()
+    return [link for link in links if link.steps and not link.steps[0].actuated]
+
+
+def _relative(t: Traced, link: Link) -> Objects:
+    """Rotation of a link as its parent sees it."""
+    turned: Objects = t.motion.turned(link.parent).T @ t.motion.turned(link.body)
+    return turned
+
+
+def _across_ends(t: Traced, rod: Rod) -> Any:
+    """From a rod's inner end to its outer one, base axes."""
+    start, end = rod.ends
+    return t.motion.point(rod.outer, end) - t.motion.point(rod.inner, start)
+
+
+def _rod_sides(rod: Rod, vector: Any) -> tuple[Any, Any, Any]:
+    """A vector of the inner body by what turns a rod: second axis, first axis, along at home.
+
+    Turned by b about the second axis, then by a about the first, along becomes
+    (cos b) (cos a along + sin a (first x along)) + sin b (second x along).
+    """
+    along = unit(rod.ends[1] - rod.ends[0])
+    first, second = rod_axes(rod)
+    side, up = np.cross(second, along), np.cross(first, along)
+    return vector @ side, vector @ up, vector @ along
 
 
 def _three_angles(matrix: Objects) -> list[Any]:
@@ -137,4 +192,20 @@ def _three_angles(matrix: Objects) -> list[Any]:
         atan2(-matrix[1][2], matrix[2][2]),
         atan2(matrix[0][2], root),
         atan2(-matrix[0][1], matrix[0][0]),
+    ]
+
+
+def _three_rates(matrix: Objects, omega: Any) -> list[Any]:
+    """Rates of a, b, c by the angular velocity in the axes before them.
+
+    omega = a' x + b' (0, cos a, sin a) + c' (sin b, -sin a cos b, cos a cos b): not finite where
+    cos b is zero, as no three angles are everywhere.
+    """
+    root = sqrt(matrix[0][0] * matrix[0][0] + matrix[0][1] * matrix[0][1])
+    sine, cosine = -matrix[1][2] / root, matrix[2][2] / root
+    third = (cosine * omega[2] - sine * omega[1]) / root
+    return [
+        omega[0] - third * matrix[0][2],
+        cosine * omega[1] + sine * omega[2],
+        third,
     ]

@@ -36,6 +36,8 @@ AXES: Final = {"revolute": 1, "prismatic": 1, "cylindrical": 1, "universal": 2}
 POSE: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Pose coordinates: the reference point, and R = Rz(yaw) Ry(pitch) Rx(roll) relative to home."""
 
+MIN_LENGTH: Final = 1e-6
+"""Least length that may be divided by, m."""
 _PARALLEL: Final = 1e-3
 
 
@@ -168,12 +170,15 @@ class Graph:
 
     @property
     def size(self) -> float:
-        """Characteristic length, m: greatest distance of two joints' points, or of a rod's ends."""
+        """Characteristic length, m: greatest distance of two joints' points, or of a rod's ends.
+
+        1 where all are one point, as in a spherical machine, whatever rounding makes of it.
+        """
         points = [joint.at for joint in self.joints.values()]
         points += [end for rod in self.rods.values() for end in rod.ends]
         points.append(self.origin)
         extent = float(np.ptp(np.array(points), axis=0).max())
-        return extent if extent > 0.0 else 1.0
+        return extent if extent >= MIN_LENGTH else 1.0
 
     @property
     def rim(self) -> float:

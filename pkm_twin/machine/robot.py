@@ -26,11 +26,15 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.kinematics.engine import Engine, Traced, engine_of
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.kinematics.passive import passive_names, passive_program
+from pkm_twin.kinematics.passive import (
+    passive_names,
+    passive_program,
+    passive_rates_program,
+)
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import FREEDOMS, Graph
+from pkm_twin.machine.graph import FREEDOMS, MIN_LENGTH, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
@@ -48,7 +52,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 R = TypeVar("R", bound="Robot")
 
-MIN_LENGTH: Final = 1e-6
 MAX_LENGTH: Final = 100.0
 MAX_MASS: Final = 1e5
 SINGULARITY_BOUND: Final = 1e-9
@@ -195,9 +198,13 @@ class Robot:
     limits: JointLimits = schema.section(limits_of(3), default={})
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
+    element_compliance: Mapping[str, float] = schema.numbers(above=0.0, at_most=1e6, default={})
+    """Factors on the compliance of elastic elements, by name; 1 where left out."""
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
-    changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
+    changeable: ClassVar[tuple[str, ...]] = (
+        "payload", "friction", "gravity", "limits", "element_compliance",
+    )  # fmt: skip
     has_start: ClassVar[bool] = False
     has_inverse: ClassVar[bool] = False
     has_branch: ClassVar[bool] = False
@@ -211,6 +218,7 @@ class Robot:
         robot = dataclasses.replace(schema.build(cls, data), name=name)
         _ = robot.controller
         check_uncertainty(robot)
+        robot.check_elements()
         return robot
 
     @classmethod
@@ -475,8 +483,18 @@ class Robot:
 
     @cached_property
     def elastic(self) -> Structure:
-        """Elastic beams and joints; errors as :meth:`structure`."""
-        return self.structure()
+        """Elastic beams and joints with the elements' factors; errors as :meth:`structure`."""
+        return self.structure().scaled(self.element_compliance)
+
+    def check_elements(self) -> None:
+        """Refuse factors of elements that there are not.
+
+        :raises ParameterError: by the name, or nothing is elastic.
+        """
+        for name in self.element_compliance:
+            known = self.element_names or self.structure().elements
+            if name not in known:
+                raise UnknownNameError(f"element_compliance.{name}", name, known)
 
     @cached_property
     def joints_count(self) -> int:
@@ -708,6 +726,16 @@ class Robot:
             self.refuse_joints(status, q)
         return flat
 
+    def passive_rates(self, q: ArrayLike, qd: ArrayLike) -> Array:
+        """Rates of the passive joints, shape (..., k), rad/s or m/s, as :meth:`passive` has them.
+
+        :param qd: joint rates, shape (..., n), rad/s or m/s.
+        """
+        (flat,), status = self.engine.kernel("passive rates", passive_rates_program)(_NONE, q, qd)
+        if status is not None:
+            self.refuse_joints(status, q, (q, qd))
+        return flat
+
     def grid(self) -> PoseGrid:
         """How atlases lay out this machine's poses; without an axis of its own, as a box."""
         return PoseGrid("box", self.pose_names)
@@ -738,12 +766,14 @@ class Robot:
         for key, value in sections.items():
             if key not in self.changeable:
                 raise UnknownNameError(key, key, self.changeable)
-            if isinstance(value, Mapping):
+            if isinstance(value, Mapping) and not isinstance(getattr(self, key), Mapping):
                 new[key] = schema.replace(getattr(self, key), value, key)
             else:
                 fields = {f.name: f for f in dataclasses.fields(self)}
                 new[key] = fields[key].metadata["check"](key, value)
-        return dataclasses.replace(self, **new)
+        made = dataclasses.replace(self, **new)
+        made.check_elements()
+        return made
 
     def refuse_joints(self, status: Array, q: ArrayLike, inputs: Sequence[ArrayLike] = ()) -> None:
         """Raise the typed error of the first refused sample, if there is one.

@@ -197,6 +197,27 @@ def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
     return _field(check, default, "a mapping of names to entries", entries=kind)
 
 
+def numbers(
+    *,
+    above: float = -math.inf,
+    at_most: float = math.inf,
+    unit: str = "",
+    default: Any = dataclasses.MISSING,
+) -> Any:
+    """Field: names to numbers within bounds."""
+
+    def check(field: str, value: Any) -> dict[str, float]:
+        if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
+            raise ParameterError(field, value, "a mapping of names to numbers")
+        return {
+            name: _number(_join(field, name), entry, above, at_most=at_most)
+            for name, entry in value.items()
+        }
+
+    bound = "a mapping of names to numbers" + _bound(above, at_most=at_most)
+    return _field(check, default, bound, unit)
+
+
 def flag(*, default: Any = dataclasses.MISSING) -> Any:
     """Field: true or false."""
 

@@ -41,9 +41,13 @@ KINDS: Final = {
 }
 
 
-def joint_state(stamp: Time, names: Sequence[str], values: NDArray[Any]) -> JointState:
-    """Positions by name."""
+def joint_state(
+    stamp: Time, names: Sequence[str], values: NDArray[Any], rates: NDArray[Any] | None = None
+) -> JointState:
+    """Positions, and velocities where there are any, by name."""
     message = JointState(name=list(names), position=array("d", values))
+    if rates is not None:
+        message.velocity = array("d", rates)
     message.header.stamp = stamp
     return message
 

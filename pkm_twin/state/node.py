@@ -6,6 +6,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
@@ -213,7 +214,8 @@ class MachineStateNode(health.TwinNode):
         stamp = Time(nanoseconds=state.stamp).to_msg()
         base = self._core.settings.base_frame
         quaternion = rotations.to_quaternion(state.rotation)
-        self._joints.publish(outputs.joint_state(stamp, self._core.joint_names, state.joints))
+        names = self._core.joint_names
+        self._joints.publish(outputs.joint_state(stamp, names, state.joints, state.rates))
         self._pose.publish(outputs.pose(stamp, base, state.position, quaternion))
         if state.twist is not None:
             self._twist.publish(outputs.twist(stamp, base, state.twist))
@@ -274,6 +276,7 @@ def _warm_up(robot: Robot) -> None:
     q = robot.inverse(robot.home())
     robot.platform(q)
     robot.passive(q)
+    robot.passive_rates(q, np.zeros_like(q))
     robot.platform_jacobian(q)
     robot.placements(q)
 

@@ -25,8 +25,9 @@ class State:
     """The machine at one stamp, ns; base axes.
 
     ``q``: shape (n,). ``joints``: all joints of the exported URDF, actuated ones first, rad or m.
-    ``position`` (3,), ``rotation`` (3, 3): of the platform's reference point. ``twist``: velocity
-    of that point and angular velocity, shape (6,), m/s and rad/s; None without joint velocities.
+    ``position`` (3,), ``rotation`` (3, 3): of the platform's reference point. ``rates``: of all
+    joints, rad/s or m/s; ``twist``: velocity of the reference point and angular velocity, shape
+    (6,), m/s and rad/s; both None without joint velocities.
     """
 
     stamp: int
@@ -34,6 +35,7 @@ class State:
     joints: Array
     position: Array
     rotation: Array
+    rates: Array | None
     twist: Array | None
 
 
@@ -120,8 +122,11 @@ class MachineState:
         robot, q = self.robot, sample.q
         position, rotation = robot.platform(q)
         joints = np.concatenate((q, robot.passive(q)))
-        twist = None if sample.qd is None else robot.platform_jacobian(q) @ sample.qd
-        for values in (position, joints, *([] if twist is None else [twist])):
-            if not np.isfinite(values).all():
+        rates = twist = None
+        if sample.qd is not None:
+            rates = np.concatenate((sample.qd, robot.passive_rates(q, sample.qd)))
+            twist = robot.platform_jacobian(q) @ sample.qd
+        for values in (position, joints, rates, twist):
+            if values is not None and not np.isfinite(values).all():
                 raise MessageError("non-finite result", "the model gave a value that is not finite")
-        return State(sample.stamp, q, joints, position, rotation, twist)
+        return State(sample.stamp, q, joints, position, rotation, rates, twist)

@@ -3,7 +3,7 @@
 
 A kind holds when nothing but the package's own errors comes back, each of them one short printable
 line, and nothing is answered, or read, that should not be. Every kind leaves its figures in a
-folder; ``--page`` puts those that are there into docs/faults.md.
+folder; ``--page`` puts those that are there into docs/faults.md, whose other rows stay.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from test.faults.page import write_section
+from test.faults.page import read_section, write_section
 from test.fuzz.bags import DamagedBags, DamagedSplits, NonsenseBags
-from test.fuzz.commands import Commands
+from test.fuzz.commands import EACH, Commands
 from test.fuzz.definitions import Cdr
-from test.fuzz.files import Csv, Metadata, Urdf, Yaml
+from test.fuzz.files import COMPILED, Csv, Metadata, Urdf, Yaml
 from test.fuzz.messages import Messages
 from test.fuzz.tally import Kind, run
 
@@ -34,8 +34,11 @@ Printed by `make fuzz`: {total:,} examples, 500 from a seed, the seeds from the 
 and before them the corpus of what once fell (`test/fuzz/corpus`). A kind holds when nothing but
 the package's own errors comes back, each of them one short line; nothing is read that was not
 written; a torque, a forwarded command or a deflection comes of a sound message only, by rules that
-`test/fuzz/messages.py` has of its own, and is that of the model. One command line in a hundred runs
-as a process of its own. Times are those of a machine that did other work too.
+`test/fuzz/messages.py` has of its own, and is that of the model. Times are those of a machine that
+did other work too. To be many, command lines share a process, which one in {each:,} has to itself,
+and most changed parameter files are taken as what YAML makes of them; of a machine whose geometry
+is new all is checked that loading checks, and one in {compiled} is compiled and asked for its
+efforts, too.
 """
 HEAD = (
     "| kind | seed | examples | taken | refused, most often for | median | 99.9 % | slowest (ms) "
@@ -50,24 +53,31 @@ requests and {clocks:,} clocks were refused and counted.
 """
 
 
-def section(figures: list[dict[str, Any]], nodes: dict[str, Any] | None) -> str:
-    """The figures as a part of the page."""
-    rows = []
-    for found in figures:
-        common = ", ".join(f"{why} {n:,}" for why, n in list(found["refused"].items())[:4])
-        times = " | ".join(
-            f"{1e3 * found[f'{which} (s)']:,.2f}" for which in ("median", "99.9 %", "slowest")
-        )
-        rows.append(
-            f"| {found['kind']} | {found['seed']} | {found['examples']:,} | {found['taken']:,} | "
-            f"{common} | {times} | {found['memory grown (MiB)']:.1f} | {len(found['failures'])} |"
-        )
-    total = sum(found["examples"] for found in figures)
-    text = f"{INTRODUCTION.format(total=total)}\n{HEAD}\n" + "\n".join(rows)
+def row(found: dict[str, Any]) -> str:
+    """A kind's figures as a row of the table."""
+    common = ", ".join(f"{why} {n:,}" for why, n in list(found["refused"].items())[:4])
+    times = " | ".join(
+        f"{1e3 * found[f'{which} (s)']:,.2f}" for which in ("median", "99.9 %", "slowest")
+    )
+    return (
+        f"| {found['kind']} | {found['seed']} | {found['examples']:,} | {found['taken']:,} | "
+        f"{common} | {times} | {found['memory grown (MiB)']:.1f} | {len(found['failures'])} |"
+    )
+
+
+def section(figures: list[dict[str, Any]], nodes: dict[str, Any] | None, before: str) -> str:
+    """The figures as a part of the page; of what was not run, what stood there before."""
+    old = {line.split("|")[1].strip(): line for line in before.splitlines() if line[:1] == "|"}
+    old |= {found["kind"]: row(found) for found in figures}
+    rows = [old[kind.name] for kind in KINDS if kind.name in old]
+    total = sum(int(line.split("|")[3].replace(",", "")) for line in rows)
+    head = INTRODUCTION.format(total=total, each=EACH, compiled=COMPILED)
+    text = f"{head}\n{HEAD}\n" + "\n".join(rows)
     if nodes is not None:
         sent = ", ".join(f"{what} {n:,}" for what, n in nodes["sent"].items())
-        text += NODES_TEXT.format(**nodes | {"sent": sent})
-    return text
+        return text + NODES_TEXT.format(**nodes | {"sent": sent})
+    _, begin, rest = before.partition(NODES_TEXT.strip().partition(",")[0])
+    return f"{text}\n\n{begin}{rest}"
 
 
 def main() -> int:
@@ -88,7 +98,7 @@ def main() -> int:
         nodes = options.out / NODES
         figures = [json.loads(path.read_text()) for path in files if path.exists()]
         found = json.loads(nodes.read_text()) if nodes.exists() else None
-        write_section("fuzz", section(figures, found))
+        write_section("fuzz", section(figures, found, read_section("fuzz")))
         return 0
     asked = options.only.split(",")
     kinds = [kind for kind in KINDS if any(word in kind.name for word in asked)]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 import os
@@ -14,15 +15,48 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
+
+import typer.main
 
 from pkm_twin.apps import cli
+from pkm_twin.machine import catalogue, schema
+from pkm_twin.machine.robot import Robot
 from test.fuzz.bags import small_bag
 from test.fuzz.tally import Kind
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 CODES = (0, 1, 2, 3)
-EACH = 100
+EACH = 1000
 """One line in so many is run as a process of its own, too."""
+
+
+class Once:
+    """What every command line would make anew, made once: the tree of commands, shipped robots."""
+
+    def __init__(self) -> None:
+        self.tree = functools.cache(typer.main.get_command)
+        self.robots: dict[str, Robot] = {}
+        self.shipped = functools.cache(schema.read_yaml)
+        self.read, self.build = schema.read_yaml, catalogue.robot_of_data
+
+    def read_yaml(self, path: Path) -> dict[str, Any]:
+        return self.shipped(path) if path.parent == catalogue.config_folder() else self.read(path)
+
+    def robot_of_data(self, data: Any, name: str) -> Robot:
+        key = repr((name, data))
+        if key not in self.robots:
+            self.robots[key] = self.build(data, name)
+        return self.robots[key]
+
+    @contextlib.contextmanager
+    def used(self) -> Iterator[None]:
+        with (
+            mock.patch.object(typer.main, "get_command", self.tree),
+            mock.patch.object(schema, "read_yaml", self.read_yaml),
+            mock.patch.object(catalogue, "robot_of_data", self.robot_of_data),
+        ):
+            yield
 
 
 class Commands(Kind):
@@ -33,6 +67,7 @@ class Commands(Kind):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.turn = 0
+        self.once = Once()
         small_bag(folder / "a.mcap")
         (folder / "cut.mcap").write_bytes((folder / "a.mcap").read_bytes()[:900])
         rows = "".join(f"{n / 100},0.1,{0.1 + n / 1000},0.1\n" for n in range(20))
@@ -61,8 +96,7 @@ class Commands(Kind):
             (["info", "stewart"], [["--json"], ["--platform", "x"]]),
             (["urdf", "five_bar"], [["--platform", "x"]]),
             (["convert", "prru"], [["--platform", "x"]]),
-            (["show", "absent.nc"], [["--html"], ["--out", "."]]),
-            (["show", "a.mcap"], []),
+            (["show", "absent.nc"], [["--html"], ["--out", "."], ["a.mcap"]]),
             (["certify", "absent.yaml"], [["--states", "-1"]]),
             (["info", "delta_cu"], [["--json"]]),
             (["info", "upr_rpu"], [["--json"]]),
@@ -111,7 +145,11 @@ class Commands(Kind):
         before = Path.cwd()
         os.chdir(self.folder)
         try:
-            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            with (
+                self.once.used(),
+                contextlib.redirect_stdout(out),
+                contextlib.redirect_stderr(err),
+            ):
                 try:
                     cli.main(list(words))
                 except SystemExit as end:

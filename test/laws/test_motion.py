@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kinematics of every robot by one engine: placements, closures, derivatives, passive joints."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from support.bodies import bodies
@@ -13,9 +15,12 @@ from support.robots import (
 )
 
 from pkm_twin import load
+from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.kinematics.passive import passive_program
 from pkm_twin.machine.graph import BASE
 
+MACHINES = Path(__file__).parents[1] / "machine" / "machines"
 STEP = 2e-3
 WEIGHTS = np.array([-1, 9, -45, 0, 45, -9, 1]) / (60 * STEP)
 SECOND = np.array([2, -27, 270, -490, 270, -27, 2]) / (180 * STEP * STEP)
@@ -186,6 +191,33 @@ def test_pose_acceleration_is_the_second_derivative(name, rng):
     found = robot.pose_acceleration(q, qd, qdd)
     size = max(1.0, np.abs(found).max())
     np.testing.assert_allclose(found, np.tensordot(SECOND, poses, 1), atol=1e-6 * size)
+
+
+@every_robot
+def test_passive_rates_are_the_derivative_of_passive_positions(name, rng):
+    """A stencil of them along a motion: hinges, balls as three angles, slides, rods."""
+    robot = load(name)
+    q = random_joints(robot, rng, 40)
+    qd = joint_units_of_size(robot) * rng.normal(size=q.shape)
+    times = STEP * np.arange(-3, 4)[:, None, None]
+    found = robot.passive_rates(q, qd)
+    assert found.shape == (len(q), len(robot.passive_joints))
+    expected = np.tensordot(WEIGHTS, robot.passive(q + times * qd), 1)
+    np.testing.assert_allclose(found, expected, atol=1e-8 * max(1.0, np.abs(found).max()))
+    # Linear in the joints' rates.
+    np.testing.assert_allclose(robot.passive_rates(q, -2.0 * qd), -2.0 * found, rtol=1e-12)
+
+
+def test_an_arm_without_loops_has_no_passive_joints():
+    """A program without unknowns or results is one, on both back ends."""
+    robot = load(MACHINES / "arm_2r.yaml")
+    q = np.linspace(0.1, 0.5, 8).reshape(4, 2)
+    assert robot.passive(q).shape == (4, 0) and robot.passive(q[0]).shape == (0,)
+    assert robot.passive_rates(q, q).shape == (4, 0)
+    plain = PlainCode(robot.engine.kernel("passive", passive_program).program)
+    for samples in (q, q[:1]):
+        (found,), status = plain.run(np.zeros(0), [samples], len(samples), 1)
+        assert found.shape == (len(samples), 0) and not status[:, 0].any()
 
 
 @every_robot

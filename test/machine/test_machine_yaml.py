@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
 
 from pkm_twin.machine import schema
+from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.urdf_read import read_urdf
 
@@ -52,6 +55,16 @@ def test_one_list_in_two_places_is_written_twice(tmp_path):
     point = [0.1, 0.2, 0.3]
     data = {"mechanism": "machine", "origin": point, "bodies": {"a": {"com": point}}}
     assert read_back(data, tmp_path) == data
+
+
+@pytest.mark.parametrize("off", [5e-324, 1e-17, 1e-9])
+def test_what_rounding_makes_of_one_point_is_no_length(off):
+    """A spherical machine's joints all meet in a point: its size is not the distance of two."""
+    exact = schema.read_yaml(Path(__file__).parent / "machines" / "rrr3_spherical.yaml")
+    robot = robot_of_data(exact | {"origin": [0.0, 0.0, off]}, "near")
+    expected = robot_of_data(exact | {"origin": [0.0, 0.0, 0.0]}, "exact")
+    assert robot.graph.size == expected.graph.size == 1.0
+    assert robot.engine.mobility == expected.engine.mobility
 
 
 def test_units_and_meanings_are_told():

@@ -72,7 +72,16 @@ class TestState:
             assert (state.position == position).all() and (state.rotation == rotation).all()
             assert (state.joints == [*q, *robot.passive(q)]).all()
             assert len(MachineState(robot).joint_names) == len(state.joints)
-            assert state.twist is None
+            assert state.twist is None and state.rates is None
+
+    def test_rates_of_all_joints(self, robot):
+        q = poses(robot, 1)[0]
+        qd = np.linspace(0.1, 0.3, len(q))
+        state = told(robot, q, qd)
+        h = 1e-5
+        ends = [told(robot, q + s * h * qd).joints for s in (-1.0, 1.0)]
+        assert np.allclose(state.rates, (ends[1] - ends[0]) / (2 * h), atol=1e-7)
+        assert (state.rates[: len(q)] == qd).all()
 
     def test_the_twist_is_the_platforms_motion(self, robot):
         q = poses(robot, 1)[0]

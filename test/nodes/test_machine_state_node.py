@@ -120,6 +120,8 @@ def test_all_joints_by_the_urdfs_names(answers, expected):
     message = answers["joint_states"]
     assert tuple(message.name) == (*ROBOT.joint_names, *ROBOT.passive_joints)
     assert np.allclose(message.position, expected[0].joints, atol=1e-12)
+    assert np.allclose(message.velocity, expected[0].rates, atol=1e-12)
+    assert message.velocity[0] == pytest.approx(QD[0])
     assert stamp_of(message) in answers["stamps"]
 
 
@@ -214,6 +216,7 @@ def test_a_rigid_robot_and_refusals(launch, peer):
     peer.talk(JointState, "/rigid/states")
     peer.hear(MarkerArray, "/rigid/markers")
     peer.hear(TwistStamped, "/rigid/twist")
+    peer.hear(JointState, "/rigid/joint_states")
     received = peer.received("/rigid/markers")
 
     def ask():
@@ -222,8 +225,10 @@ def test_a_rigid_robot_and_refusals(launch, peer):
 
     peer.until(lambda: received, repeat=ask)
     assert {marker.ns for marker in received[-1].markers} == {"bars"}
-    # Without velocities there is no twist, never one of zeros.
+    # Without velocities there are none, never zeros.
     assert not peer.received("/rigid/twist")
+    joints = peer.until(lambda: peer.received("/rigid/joint_states"), repeat=ask)[-1]
+    assert len(joints.position) == len(joints.name) and not joints.velocity
 
 
 def test_the_monitors_numbers_have_stamped_siblings(launch, peer):
