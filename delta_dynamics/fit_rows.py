@@ -16,7 +16,16 @@ from scipy.ndimage import maximum_filter1d  # type: ignore[import-untyped]
 from delta_dynamics.estimation import estimate
 from delta_dynamics.file_parameters import FileParameters
 from delta_dynamics.regressor import parameter_values, regressor
-from delta_dynamics.samples import LEAST, WINDOWS, Filtering, Track, by_blocks, low_pass, tracks
+from delta_dynamics.samples import (
+    LEAST,
+    WINDOWS,
+    Filtering,
+    Track,
+    by_blocks,
+    low_pass,
+    rate_noise,
+    tracks,
+)
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.robot import Robot
 
@@ -27,6 +36,8 @@ OUTLIER: Final = 8.0
 """Robust deviations beyond which a measured effort is no measurement."""
 STILL: Final = 4.0
 """Deviations of a rate's noise below which a joint stands still."""
+LARGEST: Final = 1e9
+"""Effort that no drive has, N m or N."""
 LATE: Final = 2.0
 """Samples by which efforts may well be late."""
 
@@ -84,9 +95,10 @@ def rows_of(
 ) -> tuple[Rows, Filtering]:
     """A recording's filtered rows.
 
-    :raises PkmTwinError: it is too short, or its joints stand still.
+    :raises PkmTwinError: it is too short, its joints stand still, or its efforts are none.
     """
     r = recording
+    _check_efforts(robot, r)
     if len(r.time) < LEAST:
         raise PkmTwinError(
             f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row"
@@ -98,7 +110,8 @@ def rows_of(
     )
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
-    parts = [_piece(robot, parameters, r.carried, track) for track in pieces]
+    slow = STILL * rate_noise(how, pieces[0].period)
+    parts = [_piece(robot, parameters, r.carried, track, slow) for track in pieces]
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
@@ -137,7 +150,23 @@ class _Piece:
         return time[:, 0], table.reshape(len(table), n, -1), target, rest, counts, change
 
 
-def _piece(robot: Robot, parameters: FileParameters, carried: Robot | None, track: Track) -> _Piece:
+def _check_efforts(robot: Robot, r: Recorded) -> None:
+    for joint, effort in zip(robot.joint_names, r.effort.T, strict=True):
+        worst = float(effort[np.argmax(~(np.abs(effort) < LARGEST))])
+        if not abs(worst) < LARGEST:
+            raise PkmTwinError(
+                f"{r.name}: effort of {joint} is {worst:g}; below {LARGEST:g} is what a drive has"
+            )
+        if len(effort) and np.ptp(effort) == 0.0:
+            only = effort[0] + 0.0  # no minus before zero
+            raise PkmTwinError(
+                f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured"
+            )
+
+
+def _piece(
+    robot: Robot, parameters: FileParameters, carried: Robot | None, track: Track, slow: Array
+) -> _Piece:
     pi = parameter_values(robot)
     extra = np.zeros(len(pi)) if carried is None else parameter_values(carried) - pi
     loads = [
@@ -157,8 +186,8 @@ def _piece(robot: Robot, parameters: FileParameters, carried: Robot | None, trac
 
     both = by_blocks(len(track.q), BLOCK, block)
     table, rest = both[..., :-1], both[..., -1]
-    rate_noise = STILL * np.abs(track.qd - np.asarray(_smooth(track.qd))).mean(0)
-    moves = np.abs(track.qd) > np.maximum(rate_noise, 1e-9)
+    rough = STILL * np.abs(track.qd - np.asarray(_smooth(track.qd))).mean(0)
+    moves = np.abs(track.qd) > np.maximum(np.maximum(rough, slow), 1e-9)
     return _Piece(table, track.effort - rest, rest, moves.astype(np.float64))
 
 

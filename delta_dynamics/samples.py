@@ -82,6 +82,12 @@ def position_noise(pieces: list[Array]) -> Array:
     return np.asarray(1.4826 * np.median(np.abs(jumps), axis=0) / size, np.float64)
 
 
+def rate_noise(how: Filtering, period: float) -> Array:
+    """Standard deviation that the positions' noise leaves in the differentiated rates, (n,)."""
+    weights = _derivative(how.window, DEGREE, 1, period)
+    return np.asarray(np.array(how.position_noise) * np.linalg.norm(weights), np.float64)
+
+
 def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
     """The window whose accelerations have the least expected error, all joints together."""
     best, least = WINDOWS[0], np.inf

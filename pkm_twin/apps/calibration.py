@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Geometry from measured platform poses: weighted least squares with the file as prior.
 
-Gauss and Newton's method on the machine itself: every step assembles its graph with the new numbers
-(:mod:`pkm_twin.kinematics.maximal`, nothing is compiled) and takes the exact derivatives of its
-platform (:mod:`pkm_twin.kinematics.sensitivity`). The errors before and after are those of the
-loaded robots.
+Gauss and Newton's method on the machine itself, damped where it has to be: every step assembles its
+graph with the new numbers (:mod:`pkm_twin.kinematics.maximal`, nothing is compiled) and takes the
+exact derivatives of its platform (:mod:`pkm_twin.kinematics.sensitivity`). The errors before and
+after are those of the loaded robots.
 """
 
 from __future__ import annotations
@@ -46,13 +46,20 @@ KNOWN: Final = 0.5
 """A parameter whose deviation stays above this part of its prior one was not observed."""
 HELD_OUT: Final = 4
 """Every so many poses one is held out."""
+SAME: Final = 1e-4
+"""Difference of joints that makes another pose, rad or m."""
 SHOWN: Final = 0.1
 """Part of the greatest weight below which a number is not named in a combination."""
-STEPS: Final = 12
-WHOLE: Final = 0.75
-"""A step that is best at this part of it, or beyond, is gone as a whole."""
-LEAST: Final = 0.1
-"""Least part of a step that is gone."""
+STEPS: Final = 60
+WRONG: Final = 0.02
+"""Part of the machine's size that no fit may leave over: such poses are not its own."""
+FINEST: Final = 1e-9
+"""Noise that no instrument is below, m or rad."""
+POOR: Final = 0.25
+GOOD: Final = 0.75
+"""Parts of what a linear machine would gain: below the one steps are damped more, above less."""
+TRIALS: Final = 8
+"""Dampings of a step that are tried."""
 CONVERGED: Final = 1e-3
 """Part of its deviation by which no parameter moves in the last step."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
@@ -161,7 +168,8 @@ def calibrate(
     :param paths: numbers of the robot's file, of :func:`geometric`.
     :param prior: standard deviation that lengths have without the poses, m; angles have it at the
         platform's radius.
-    :raises ParameterError: too few poses, or a fit that does not settle.
+    :raises ParameterError: too few poses, poses of another machine or unit, poses that tell no
+        number, or a fit that does not settle.
     """
     known = entries(robot)
     angle = prior / robot.size
@@ -188,11 +196,14 @@ def calibrate(
     ]
     held = np.arange(len(poses.joints)) % HELD_OUT == HELD_OUT - 1
     learnt, judged = poses.part(~held), poses.part(held)
-    equations = learnt.position.size * (1 if poses.rotation is None else 2)
+    # A pose that is measured again tells no more numbers.
+    different = len(np.unique(np.round(learnt.joints / SAME), axis=0))
+    equations = different * (3 if poses.rotation is None else 6)
     if equations < len(parameters) + 6 or not held.any():
         raise ParameterError(
-            "poses", len(poses.joints), f"enough for {len(parameters)} numbers to be fitted"
-        )
+            "poses", f"{different} different ones to learn from",
+            f"enough for {len(parameters)} numbers to be fitted",
+        )  # fmt: skip
     instrument = [p for p in parameters if p.name in extra]
     start = start_of(robot, learnt)
     if frame:
@@ -201,6 +212,12 @@ def calibrate(
     after, values, covariance, information, noise, steps = _fit(
         robot, before, learnt, parameters, progress
     )
+    most = max(prior, WRONG * robot.engine.tree.size)
+    if noise[0] > most:
+        raise ParameterError(
+            "poses", f"{noise[0]:.3g} m an axis left over", "poses of this machine, m and rad, its "
+            f"own joints beside them: at most {most:.3g} m",
+        )  # fmt: skip
     built = type(robot).from_data(after.data, robot.name)
     deviations = np.sqrt(np.diag(covariance))
     told = [
@@ -208,6 +225,10 @@ def calibrate(
         for p, v, d in zip(parameters, values, deviations, strict=True)
     ]
     good = np.array([p.observed for p in told])
+    if not good.any():
+        raise ParameterError(
+            "poses", len(poses.joints), "poses apart from each other: these tell no number"
+        )
     singular = np.linalg.svd(information[:, good], compute_uv=False) if good.any() else np.ones(1)
     fitted_errors, held_errors = (
         (before.instrument.errors(robot, part), after.instrument.errors(built, part))
@@ -232,6 +253,7 @@ def _fit(
     def right(state: State, values: Array, noise: Noise) -> Array:
         return np.concatenate([_over(state.residuals(poses), noise), (centre - values) / prior])
 
+    damping = 0.0
     for steps in range(1, STEPS + 1):
         progress(1)
         noise = _noise(state, poses, len(parameters))
@@ -239,34 +261,41 @@ def _fit(
         angular = None if poses.rotation is None else columns[:, 3:]
         table = _over((columns[:, :3], angular), noise).reshape(-1, len(parameters))
         left, before = np.vstack([table, np.diag(1.0 / prior)]), right(state, values, noise)
-        move: Array = np.asarray(np.linalg.lstsq(left, before, rcond=None)[0], np.float64)
-        covariance = np.linalg.inv(left.T @ left)
-        settled = bool(np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))))
-        trial = _stepped(robot, state, poses, parameters, values, move)
-        if not settled:
-            after = right(trial, values + move, noise)
-            share = _share(*(float(row @ row) for row in (before, left @ move, after)))
-            if share < 1.0:
-                move = share * move
-                trial = _stepped(robot, state, poses, parameters, values, move)
+        # In units of the prior no singular value is below one.
+        _, sizes, axes = np.linalg.svd(left * prior, full_matrices=False)
+        spread = prior[:, None] * axes.T / sizes
+        covariance = spread @ spread.T
+        for _ in range(TRIALS):
+            move = _move(left, before, np.sqrt(damping) / prior)
+            trial = _stepped(robot, state, poses, parameters, values, move)
+            settled = bool(np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))))
+            sums = [
+                float(row @ row)
+                for row in (before, before - left @ move, right(trial, values + move, noise))
+            ]
+            gained = (sums[0] - sums[2]) / max(sums[0] - sums[1], 1e-300)
+            if settled or gained > POOR:
+                break
+            damping = max(10.0 * damping, 1.0)
         state, values = trial, values + move
         if settled:
             return state, values, covariance, table * prior, noise, steps
+        if gained > GOOD:
+            damping = 0.1 * damping if damping > 1.0 else 0.0
     raise ParameterError("poses", f"{STEPS} steps", "poses to which a fit settles")
 
 
-def _share(before: float, gain: float, after: float) -> float:
-    """Part of a step at which the sum of squares is least, by the parabola through what is known.
+def _move(left: Array, right: Array, damping: Array) -> Array:
+    """A step of Gauss and Newton's method, damped where that is not zero (Levenberg, Marquardt).
 
-    Along a direction that the poses tell badly the machine may turn away from its tangent: a whole
-    step then goes beyond, and back, for ever.
-
-    :param before: the sum at the beginning; ``after``: at the end of the whole step.
-    :param gain: what a linear machine would lose of it; its slope there is twice that.
+    Along a direction that the poses tell badly the machine may turn away from its tangent: without
+    damping a step then goes beyond, and back, for ever.
     """
-    bend = after - before + 2.0 * gain
-    share = gain / bend if bend > 0.0 else 1.0
-    return 1.0 if share > WHOLE else max(share, LEAST)
+    rows, end = (left, right)
+    if damping.any():
+        rows = np.vstack([left, np.diag(damping)])
+        end = np.concatenate([right, np.zeros(len(damping))])
+    return np.asarray(np.linalg.lstsq(rows, end, rcond=None)[0], np.float64)
 
 
 def _stepped(
@@ -285,7 +314,7 @@ def _noise(state: State, poses: Poses, parameters: int) -> Noise:
     linear, angular = state.residuals(poses)
     count = max(1, linear.size - parameters // (1 if angular is None else 2))
     sizes = [
-        max(float(np.sqrt((part**2).sum() / count)), 1e-12)
+        max(float(np.sqrt((part**2).sum() / count)), FINEST)
         for part in (linear, angular)
         if part is not None
     ]

@@ -262,11 +262,9 @@ def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judg
     r, end = part.recording, slice(part.split, None)
     before, _ = part.response.deflection(r.wrench, np.ones(len(factors)))
     after, slopes = part.response.deflection(r.wrench, factors)
-    spread = np.einsum("kje,ef,kjf->kj", slopes[end], covariance, slopes[end], optimize=True)
-    return Judged(
-        r.name, r.time[end], r.deflection[end] - zero, before[end], after[end],
-        np.sqrt(np.maximum(spread, 0.0)),
-    )  # fmt: skip
+    spread = np.sqrt(np.sum((slopes @ covariance) * slopes, -1).clip(0.0))
+    measured = r.deflection[end] - zero
+    return Judged(r.name, r.time[end], measured, before[end], after[end], spread[end])
 
 
 def groups_of(names: Sequence[str], factors: Array, covariance: Array) -> tuple[Group, ...]:

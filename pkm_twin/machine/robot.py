@@ -307,7 +307,7 @@ class Robot:
         """
         raise ParameterError("members", None, "a section with the elastic members")
 
-    def elastic_entries(self) -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+    def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
         """What its file tells of elasticity at bodies, joints and rods: plain data, kind and name.
 
         Empty where the file has other words for it, which a file of those has not.

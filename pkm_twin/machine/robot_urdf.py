@@ -50,10 +50,11 @@ def robot_description(robot: Robot) -> dict[str, Any]:
     Members and compliances stay where the robot has them as such a description tells them.
     """
     data = graph_description(robot.graph)
-    for kind, entries in robot.elastic_entries().items():
+    elastic = robot.elastic_entries()
+    for kind, entries in elastic.items():
         for name, entry in entries.items():
             data[kind][name] |= entry
-    if robot.elastic_entries() and robot.element_compliance:
+    if elastic and robot.element_compliance:
         data["element_compliance"] = dict(robot.element_compliance)
     data["gravity"] = robot.gravity.tolist()
     pose = [coordinate.name for coordinate in robot.coordinates]

@@ -371,7 +371,7 @@ class Machine(Robot):
         return self.described
 
     def parameter_sections(self) -> dict[str, Any]:
-        """The machine written out, limbs turned."""
+        """The machine written out, limbs turned, with what is elastic."""
         return robot_description(self)
 
     def parameter_units(self) -> dict[str, Any]:
@@ -523,17 +523,15 @@ class Machine(Robot):
                 beams.append(Beam(name, name, limb[name], *ends, (name,), radius))
         return tuple(beams)
 
-    def elastic_entries(self) -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+    def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
         """Members of bodies, sections and radii of rods, compliances of joints."""
-        keys = {"bodies": ("member",), "joints": ("compliance",), "rods": ("section", "radius")}
-        told = {
-            kind: {
-                name: given({key: schema.plain(getattr(spec, key)) for key in keys[kind]})
-                for name, spec in specs.items()
-            }
-            for kind, specs in self.specs.items()
-        }
-        return {kind: {n: e for n, e in all_.items() if e} for kind, all_ in told.items()}
+        told: dict[str, dict[str, dict[str, Any]]] = {kind: {} for kind in KINDS}
+        for kind, word in _ELASTIC:
+            for name, spec in self.specs[kind].items():
+                value = given(schema.plain(getattr(spec, word)))
+                if value is not None:
+                    told[kind].setdefault(name, {})[word] = value
+        return {kind: entries for kind, entries in told.items() if entries}
 
     def structure(self) -> Structure:
         """Bars with sections, and the compliance of joints.

@@ -11,18 +11,25 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from bags.recording.capture import machine_parameters
-from pkm_twin import load
+from pkm_twin import Robot, load
 from pkm_twin.apps.calibrate import read_poses
+from pkm_twin.apps.calibration import calibrate, geometric
+from pkm_twin.apps.calibration_state import Poses
 from pkm_twin.apps.cli import app
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.entries import entries, with_entries
+from test.support.robots import random_joints
 
 Array = NDArray[np.float64]
 
 NOISE = 2e-5
 OFFSETS = np.array([0.01, -0.015, 0.008])
 SHIFTS = {"base_radius": 1.2e-3, "arm_length": 9e-4, "forearm_length": -1.1e-3}
+DELTA_LENGTHS = [f"geometry.{name}" for name in SHIFTS]
 TURNS = (0.004, -0.003, 0.002)
 
 
@@ -87,6 +94,17 @@ def test_a_machine_is_found_that_was_not_built_as_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("scale", "copies", "text"),
+    [(1e3, 1, "m an axis left over"), (1.0, 40, "1 different ones")],
+)
+def test_poses_of_no_use_are_refused(scale: float, copies: int, text: str) -> None:
+    robot = load("delta_cu")
+    q = np.random.default_rng(1).uniform(-0.5, 0.9, (40 // copies, 3)).repeat(copies, 0)
+    with pytest.raises(ParameterError, match=text):
+        calibrate(robot, Poses(q, scale * robot.platform(q)[0]), DELTA_LENGTHS)
+
+
+@pytest.mark.parametrize(
     ("columns", "rows", "text"),
     [
         (["arm_1.position", "x", "y", "z"], [[0, 0, 0, 0]], "a column 'arm_2.position'"),
@@ -121,6 +139,37 @@ def test_what_cannot_work_is_refused_by_name(
     assert result.exit_code != 0
     assert text in str(result.exception) + result.output
     assert not (tmp_path / "mine.yaml").exists()
+
+
+def crooked(seed: int, only: list[str], count: int) -> tuple[Robot, Poses]:
+    """A 3-RPS head some numbers of which are not as drawn, and its poses."""
+    robot, rng = load("rps3"), np.random.default_rng([seed, 77])
+    q = random_joints(robot, rng, count, 0.05)
+    sizes = {"m": 1e-3, "": 3e-3}
+    moved = {p: entries(robot)[p] for p in geometric(robot, q, only) if not p.endswith(".home")}
+    values = {p: v + sizes[unit] * rng.normal() for p, (v, unit) in moved.items()}
+    position, rotation = with_entries(robot, values).platform(q)
+    turn = Rotation.from_rotvec(1e-4 * rng.normal(size=position.shape)).as_matrix()
+    noisy = position + NOISE * rng.normal(size=position.shape)
+    return robot, Poses(q + 1e-3 * rng.normal(size=3), noisy, turn @ rotation)
+
+
+def settles(seed: int, only: list[str], count: int = 60) -> None:
+    robot, poses = crooked(seed, only, count)
+    result = calibrate(robot, poses, geometric(robot, poses.joints, only))
+    assert result.held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0)
+    assert 0.7 * NOISE < result.noise < 1.4 * NOISE
+
+
+def test_directions_in_which_the_machine_turns_away_from_its_tangent_settle() -> None:
+    """Tilts of the legs are told by their squares alone."""
+    settles(1, ["joints.leg_3.", "joints.hinge_3."], 20)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, *range(2, 10)])
+def test_others_settle_too(seed: int) -> None:
+    settles(seed, [])
 
 
 def test_only_numbers_that_there_are_can_be_chosen(tmp_path: Path) -> None:

@@ -188,6 +188,17 @@ def test_refusals_by_name():
     asleep = dataclasses.replace(whole, q=np.tile(whole.q[0], (len(whole.q), 1)))
     with pytest.raises(PkmTwinError, match="no excitation"):
         fit(robot, [asleep], ("friction",))
+    # The noise of an encoder is no motion.
+    rng = np.random.default_rng(7)
+    trembling = dataclasses.replace(asleep, q=asleep.q + 1e-6 * rng.normal(size=asleep.q.shape))
+    with pytest.raises(PkmTwinError, match="no excitation"):
+        fit(robot, [trembling], ("friction",))
+    silent = dataclasses.replace(whole, effort=whole.effort * np.array([1.0, 0.0]))
+    with pytest.raises(PkmTwinError, match="effort of right is 0 throughout"):
+        fit(robot, [silent], ("friction",))
+    huge = dataclasses.replace(whole, effort=1e200 * whole.effort)
+    with pytest.raises(PkmTwinError, match=r"effort of left is .*; below 1e\+09"):
+        fit(robot, [huge], ("friction",))
 
 
 def test_the_nearest_possible_body_takes_an_impossible_one_s_place():

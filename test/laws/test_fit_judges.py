@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits of machines whose friction and payload are drawn at random, by maximal coordinates."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.fit import fit
+from delta_dynamics.fit_rows import Recorded
+from pkm_twin import Robot, load
+from pkm_twin.apps.certificate.maximal import Maximal, State
+from pkm_twin.machine.robot_urdf import robot_description
+from test.laws.recordings import engine_efforts, smooth_motion
+from test.laws.test_fit import truths
+
+Array = NDArray[np.float64]
+
+KINDS: Any = ("friction", "payload")
+ROBOTS = ["delta", "delta_cu", "prru", "upr_rpu", "five_bar", "rps3"]
+
+
+class Walking(Maximal):
+    """The judge, each state assembled from the one before."""
+
+    def assemble(self, q: Array) -> State:
+        here: Any = self.__dict__.get("_here")
+        if here is None:
+            state: State | None = self._follow(q - self.machine.home)
+        else:
+            state, _ = self._close(here, q - self.machine.home, 0.5)
+        assert state is not None
+        self._state = dataclasses.replace(state, velocity=np.zeros_like(state.velocity))
+        self.__dict__["_here"] = self._state
+        return self._state
+
+
+@cache
+def drawn(name: str) -> tuple[Robot, Robot, Recorded, Array]:
+    """The robot as its file has it and in truth, a recording, and the efforts' size by joint."""
+    rng = np.random.default_rng([7, *name.encode()])
+    robot = load(name)
+    time, q, qd, qdd = smooth_motion(robot, rng, 12.0, 100.0)
+    size = np.sqrt(np.mean(inverse_dynamics(robot, q, qd, qdd) ** 2, 0))
+    n, radius = robot.joints_count, robot.size
+    mass = rng.uniform(0.3, 1.2) * robot.graph.bodies[robot.graph.platform].mass
+    moment = mass * (rng.uniform(0.2, 0.4) * radius) ** 2
+    truth = robot.changed(
+        friction={
+            "viscous": (rng.uniform(0.03, 0.15, n) * size / np.sqrt(np.mean(qd**2, 0))).tolist(),
+            "coulomb": (rng.uniform(0.02, 0.1, n) * size).tolist(),
+        },
+        payload={
+            "mass": mass, "com": (radius * rng.uniform(-0.3, 0.3, 3)).tolist(),
+            "inertia": [moment, 1.3 * moment, 1.6 * moment],
+        },
+    )  # fmt: skip
+    efforts = engine_efforts(Walking(robot_description(truth)), q, qd, qdd)
+    return robot, truth, Recorded(name, time, q, efforts), size
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ROBOTS)
+def test_clean_efforts_give_what_was_drawn(name: str) -> None:
+    robot, truth, recorded, _ = drawn(name)
+    true = truths(truth, KINDS)
+    for number in fit(robot, [recorded], KINDS).numbers:
+        error = abs(number.after - true[number.name])
+        if number.status == "not excited":
+            assert number.after == number.before, number.name
+        elif number.name == "payload.mass":
+            assert error < 0.01 * true[number.name]
+        elif number.name.startswith("payload.com"):
+            assert number.status == "fitted" and error < 2e-3, number.name
+        elif true[number.name] > 0.0 and number.status == "fitted":
+            assert error < 0.02 * true[number.name], number.name
+        assert error <= 3.0 * number.deviation, number.name
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_noisy_efforts_keep_every_truth_within_three_deviations(name: str) -> None:
+    """In 95 of 100: 1 % noise of the efforts, an encoder with 1e5 steps a span."""
+    robot, truth, recorded, size = drawn(name)
+    true, good, step = truths(truth, KINDS), 0, 1e-5 * np.ptp(recorded.q, axis=0)
+    for seed in range(100):
+        rng = np.random.default_rng([seed, 5])
+        shape = recorded.q.shape
+        noisy = dataclasses.replace(
+            recorded,
+            q=np.round(recorded.q / step + rng.normal(size=shape)) * step,
+            effort=recorded.effort + 0.01 * size * rng.normal(size=shape),
+        )
+        numbers = fit(robot, [noisy], KINDS).numbers
+        good += all(abs(n.after - true[n.name]) <= 3.0 * n.deviation for n in numbers)
+    assert good >= 95
