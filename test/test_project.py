@@ -23,6 +23,7 @@ MAY_IMPORT_ROS = {
     "delta_dynamics/sim_node.py",
     "stiffness_monitor/correction_node.py",
     "stiffness_monitor/node.py",
+    "pkm_twin/ros/changes.py",
     "pkm_twin/ros/context.py",
     "pkm_twin/ros/listener.py",
     "pkm_twin/ros/node.py",
