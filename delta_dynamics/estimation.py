@@ -64,6 +64,7 @@ def estimate(
     scales: Array,
     cones: Cones = (),
     judged: Array | None = None,
+    begin: Array | None = None,
 ) -> Estimate:
     """Fit target = table parameters.
 
@@ -73,6 +74,8 @@ def estimate(
     :param scales: its deviations, shape (k,), above zero.
     :param cones: matrices that have to stay positive semidefinite.
     :param judged: 1 or 0 for what counts, shape (samples, n).
+    :param begin: the noise to begin with, (n,); default what the prior's values leave, from which
+        a few samples do not find their way.
     """
     samples, n, k = table.shape
     counts = np.ones((samples, n)) if judged is None else judged
@@ -81,7 +84,8 @@ def estimate(
     scaled = table * scales
     size = np.sqrt(_mean(target**2, counts))
     floor = 1e-9 * max(float(size.max()), 1e-300)
-    noise = np.maximum(np.sqrt(_mean(change**2, counts)), floor)
+    guess = np.sqrt(_mean(change**2, counts)) if begin is None else begin
+    noise = np.maximum(guess, floor)
     weights = counts.copy()
     told: Any = None
     z = np.zeros(k)

@@ -63,13 +63,17 @@ class Number:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """Held-out efforts of a recording: ``time`` (k,), s; measured, before and after (k, n)."""
+    """Held-out efforts of a recording: ``time`` (k,), s; measured, before and after (k, n).
+
+    ``deviation``: of those after, by what is not known of the parameters, shape (k, n).
+    """
 
     name: str
     time: Array
     measured: Array
     before: Array
     after: Array
+    deviation: Array
 
     def rms(self, which: Array) -> Array:
         """Of measured less predicted, shape (n,)."""
@@ -135,7 +139,9 @@ def fit(
     for recording, made in zip(recordings, rows, strict=True):
         end = made.part(slice(_split(made), None))
         before, after = (end.rest + end.table @ v for v in (parameters.values, result.values))
-        judged.append(Judged(recording.name, end.time, end.target + end.rest, before, after))
+        spread = np.sqrt(np.sum((end.table @ result.covariance) * end.table, -1).clip(0.0))
+        measured = end.target + end.rest
+        judged.append(Judged(recording.name, end.time, measured, before, after, spread))
     return Fit(
         robot, parameters, result, numbers, tuple(judged), tuple(filtering),
         sum(made.outliers for made in rows), sum(_split(made) for made in rows), delays,
@@ -205,14 +211,24 @@ def _group(group: Shared, result: Estimate, where: slice) -> tuple[Number, ...]:
     for slope, (key, value) in zip(slopes, after.items(), strict=True):
         deviation = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
         usual = float(np.sqrt(np.sum((slope * prior) ** 2)))
-        share = deviation / usual if usual > 0.0 else 1.0
-        status: Status = "combination"
-        if share < SURE:
-            status = "fitted"
-        elif share > UNSURE and abs(value - before[key]) <= STAYS * usual:
-            status, value = "not excited", before[key]
-        numbers.append(Number(key, _unit(group, key), before[key], value, deviation, share, status))
+        numbers.append(known(key, _unit(group, key), before[key], value, deviation, usual))
     return tuple(numbers)
+
+
+def known(
+    key: Key, unit: str, before: float, value: float, deviation: float, usual: float
+) -> Number:
+    """A number with how well it is known.
+
+    :param usual: its deviation before.
+    """
+    share = deviation / usual if usual > 0.0 else 1.0
+    status: Status = "combination"
+    if share < SURE:
+        status = "fitted"
+    elif share > UNSURE and abs(value - before) <= STAYS * usual:
+        status, value = "not excited", before
+    return Number(key, unit, before, value, deviation, share, status)
 
 
 def _unit(group: Shared, key: Key) -> str:

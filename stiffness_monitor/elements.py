@@ -81,6 +81,23 @@ def energy_kernel(robot: Robot) -> Kernel:
     return robot.engine.kernel(f"strain energy {robot.closed_key}", write)
 
 
+def limb_kernel(robot: Robot) -> Kernel:
+    """Pose to one row: of each limb its three unit wrenches (18), then its elements' compliances.
+
+    Four an element, as :class:`~pkm_twin.machine.robot.LimbElements` has them.
+    """
+
+    def write(t: Traced) -> Program:
+        p = t.tape.inputs(PARAMETERS, len(robot.elastic_parameters))
+        row: list[Any] = []
+        for limb in robot.limb_elements(t.tape.inputs("pose", 3), p):
+            row += [entry for wrench in limb.wrenches for entry in wrench]
+            row += [entry for element in limb.elements for entry in element]
+        return Program({"pose": 3}, len(robot.elastic_parameters), {"row": t.lift(row)})
+
+    return robot.engine.kernel(f"limb elements {robot.closed_key}", write)
+
+
 class _Solved:
     """Cholesky factors of every limb's compliance and of the stiffness.
 

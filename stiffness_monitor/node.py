@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node ``stiffness_monitor``: wrenches in, compliance and dominant element out.
 
-Beside them the natural frequencies of the pose, which need joint states alone.
+With measured deflections, the elements that have departed from the file. Beside them the natural
+frequencies of the pose, which need joint states alone.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
 from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench
 from pkm_twin.streams.wrench import PLATFORM
+from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.correction_node import SetpointCorrection
 from stiffness_monitor.modes import has_modes, natural_frequencies
@@ -60,6 +62,10 @@ class StiffnessMonitor(health.TwinNode):
         self._monitor = Monitor(robot, settings, mounts)
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self._correction = SetpointCorrection(self, robot, settings.stamp_rules, self._decode)
+        self._alarm = StiffnessAlarmTopics(
+            self, robot, settings.stamp_rules,
+            (settings.base_frame, self._platform_frame or settings.platform_frame),
+        )  # fmt: skip
         self._compliance = self.create_guarded_publisher(Float64MultiArray, "~/compliance")
         # What has no stamp, or texts for numbers, has a sibling that plots can draw.
         self._compliance_stamped = self.create_guarded_publisher(JointState, "~/compliance_stamped")
@@ -104,6 +110,7 @@ class StiffnessMonitor(health.TwinNode):
         """No pose across the seam."""
         self._monitor.reset()
         self._correction.reset()
+        self._alarm.reset()
         self._known = 0
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
@@ -112,6 +119,8 @@ class StiffnessMonitor(health.TwinNode):
         level, message = health.OK, "running"
         if core.last_reject:
             level, message = health.WARN, f"last reject: {core.last_reject}"
+        if self._alarm.departures:
+            level, message = health.WARN, self._alarm.warning()
         values: dict[str, object] = {
             "robot": core.robot.name,
             "joint states taken": core.states.accepted,
@@ -120,6 +129,7 @@ class StiffnessMonitor(health.TwinNode):
         }
         if self._correction.wanted:
             values["corrections at their bound"] = self._correction.bounded
+        values |= self._alarm.diagnose()
         values |= {f"joint states rejected: {k}": v for k, v in core.states.rejected.items()}
         values |= {f"wrenches rejected: {k}": v for k, v in core.wrenches.rejected.items()}
         return level, message, values
@@ -127,6 +137,7 @@ class StiffnessMonitor(health.TwinNode):
     def activated(self) -> None:
         """No pose from before."""
         self._monitor.reset()
+        self._alarm.reset()
 
     def _declare_settings(self) -> Settings:
         d = Settings()
@@ -179,6 +190,7 @@ class StiffnessMonitor(health.TwinNode):
         deflection.child_frame_id = f"{frame}_deflected"
         self._deflection.publish(deflection)
         self._correction.take(answer)
+        self._alarm.take(answer)
 
     def _publish_frequencies(self) -> None:
         """Of the latest joint state: a pose costs milliseconds, so not of every one."""

@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 import functools
+import os
 import signal
+
+# The cores have tests of their own, and matrices are small. Read when numpy is loaded.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pytest

@@ -31,6 +31,7 @@ NODES = {
     "delta_dynamics.node",
     "delta_dynamics.action_node",
     "delta_dynamics.estimates_node",
+    "stiffness_monitor.alarm_node",
     "stiffness_monitor.correction_node",
     "delta_dynamics.gate_node",
     "delta_dynamics.sim_node",

@@ -21,6 +21,7 @@ MAY_IMPORT_ROS = {
     "delta_dynamics/gate_node.py",
     "delta_dynamics/node.py",
     "delta_dynamics/sim_node.py",
+    "stiffness_monitor/alarm_node.py",
     "stiffness_monitor/correction_node.py",
     "stiffness_monitor/node.py",
     "pkm_twin/ros/changes.py",

@@ -11,11 +11,23 @@ from typing import Final
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from bags.recording import record_collision, record_delta_cu, record_prru, record_upr_rpu
+from bags.recording import (
+    record_collision,
+    record_delta_cu,
+    record_prru,
+    record_soft_joint,
+    record_upr_rpu,
+)
 
 RECORDERS: Final[dict[str, Callable[..., None]]] = {
     module.NAME: module.record
-    for module in (record_delta_cu, record_collision, record_prru, record_upr_rpu)
+    for module in (
+        record_delta_cu,
+        record_collision,
+        record_prru,
+        record_upr_rpu,
+        record_soft_joint,
+    )
 }
 """Recorders by the name of the bag they write."""
 

@@ -88,7 +88,7 @@ class UprRpuFrame:
     """Finite-element frame of the 2UPR-RPU machine.
 
     :param params: the machine's parameters in the YAML schema's shape (geometry, members,
-        joints_compliance), SI units.
+        joints_compliance, element_compliance), SI units.
     """
 
     def __init__(self, params: Mapping[str, Any]) -> None:
@@ -103,6 +103,8 @@ class UprRpuFrame:
             name: np.asarray(values, dtype=float)
             for name, values in params["joints_compliance"].items()
         }
+        given = params.get("element_compliance") or {}
+        self.factors = {name: float(given.get(name, 1.0)) for name in ELEMENTS}
 
     def placement(self, pose: ArrayLike) -> tuple[Array, Array]:
         """Return the platform's origin, shape (3,), and axes as columns, shape (3, 3).
@@ -164,7 +166,6 @@ class UprRpuFrame:
 
         model = FEModel3D()
         poisson = self.youngs_modulus / (2.0 * self.shear_modulus) - 1.0
-        model.add_material("bar", self.youngs_modulus, self.shear_modulus, poisson, 0.0)
         model.add_node("o", *map(float, origin))
         for limb in range(3):
             number = limb + 1
@@ -179,10 +180,13 @@ class UprRpuFrame:
                 model.add_node(name, *map(float, point))
             model.def_support(base, True, True, True, True, True, True)
             model.add_section(f"round {number}", area, second, second, 2.0 * second)
-            model.add_member(f"{number}B", foot, head, "bar", f"round {number}")
+            softer = self.factors[f"{number}B"]
+            moduli = self.youngs_modulus / softer, self.shear_modulus / softer
+            model.add_material(f"bar {number}", *moduli, poisson, 0.0)
+            model.add_member(f"{number}B", foot, head, f"bar {number}", f"round {number}")
             # PyNite's beams do not shear. Under loads at the ends alone the shear force is the
             # same all along, so its displacement can stand in series with the bar's foot.
-            shear = self.shear_factor * length / (self.shear_modulus * area)
+            shear = self.shear_factor * length / (moduli[1] * area)
             sheared = shear * (np.eye(3) - np.outer(along, along))
             if limb < 2:
                 down = -along
@@ -199,8 +203,9 @@ class UprRpuFrame:
                 (head_joint, head, "o", upper[limb], None),
             ):
                 model.springs[name] = _JointSpring(
-                    name, model.nodes[i_node], model.nodes[j_node], point, frame, values, extra
-                )
+                    name, model.nodes[i_node], model.nodes[j_node], point, frame,
+                    self.factors[name] * values, extra,
+                )  # fmt: skip
         return model
 
 

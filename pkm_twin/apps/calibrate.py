@@ -13,20 +13,16 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
-from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.apps.calibration import (
-    FRAME,
     HELD_OUT,
     STEPS,
-    TARGET,
     Calibration,
-    Errors,
     Parameter,
-    Poses,
     calibrate,
     geometric,
 )
+from pkm_twin.apps.calibration_state import FRAME, TARGET, Errors, Poses, rotations
 from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.options import Json, RobotName
 from pkm_twin.console import print_json, progress, refuse_existing, table_console
@@ -71,9 +67,9 @@ def read_poses(path: Path, robot: Robot) -> Poses:
     if quaternion is not None:
         if not (np.linalg.norm(quaternion, axis=1) > 1e-6).all():
             raise ParameterError(f"{path}: qx qy qz qw", 0.0, "quaternions of length one")
-        rotation = Rotation.from_quat(quaternion).as_matrix()
+        rotation = rotations().from_quat(quaternion).as_matrix()
     elif angles is not None:
-        rotation = Rotation.from_euler("xyz", angles).as_matrix()
+        rotation = rotations().from_euler("xyz", angles).as_matrix()
     return Poses(q, position, rotation)
 
 

@@ -1,30 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
 """Geometry from measured platform poses: weighted least squares with the file as prior.
 
-Gauss and Newton's method on the machine itself: every step loads the machine with the new numbers
-and takes the exact derivatives of its platform (:mod:`pkm_twin.kinematics.sensitivity`).
+Gauss and Newton's method on the machine itself: every step assembles its graph with the new numbers
+(:mod:`pkm_twin.kinematics.maximal`, nothing is compiled) and takes the exact derivatives of its
+platform (:mod:`pkm_twin.kinematics.sensitivity`). The errors before and after are those of the
+loaded robots.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
+from pkm_twin.apps.calibration_state import (
+    BESIDE,
+    FRAME,
+    TARGET,
+    Errors,
+    Poses,
+    State,
+    change_of,
+    moved,
+    place_frame,
+    start_of,
+    value_of,
+)
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.sensitivity import GraphChange, platform_change
-from pkm_twin.machine.entries import changed_graph, entries, with_entries
+from pkm_twin.kinematics.maximal import GraphChange, Placement
+from pkm_twin.kinematics.sensitivity import platform_twists
+from pkm_twin.machine.entries import data_of, entries
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import skew
 
 Array = NDArray[np.float64]
+Noise = tuple[float, float | None]
+"""Standard deviations: m an axis, and rad an axis where rotations were measured."""
 
-STEP: Final = 1e-6
-"""Of a difference quotient of the graph at home: what is linear in it is exact to rounding."""
 MOVES: Final = 1e-6
 """A number that moves the platform less than this, per unit, is no number of the geometry."""
 KNOWN: Final = 0.5
@@ -34,27 +49,13 @@ HELD_OUT: Final = 4
 SHOWN: Final = 0.1
 """Part of the greatest weight below which a number is not named in a combination."""
 STEPS: Final = 12
+WHOLE: Final = 0.75
+"""A step that is best at this part of it, or beyond, is gone as a whole."""
+LEAST: Final = 0.1
+"""Least part of a step that is gone."""
 CONVERGED: Final = 1e-3
 """Part of its deviation by which no parameter moves in the last step."""
-FRAME: Final = tuple(f"frame.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
-TARGET: Final = ("target.x", "target.y", "target.z")
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
-
-
-@dataclass(frozen=True)
-class Poses:
-    """Measured poses: joints (k, n) in the controller's numbers; positions (k, 3), m; rotations
-    from home (k, 3, 3), None where only positions were measured.
-    """
-
-    joints: Array
-    position: Array
-    rotation: Array | None = None
-
-    def part(self, rows: NDArray[np.bool_]) -> Poses:
-        """Some of them."""
-        turned = None if self.rotation is None else self.rotation[rows]
-        return Poses(self.joints[rows], self.position[rows], turned)
 
 
 @dataclass(frozen=True)
@@ -72,16 +73,6 @@ class Parameter:
     def observed(self) -> bool:
         """Whether the poses tell it: they, not the prior, make its deviation."""
         return self.deviation < KNOWN * self.prior
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Of poses: root mean square and greatest distance, m, and angle, rad (None: not measured)."""
-
-    rms: float
-    worst: float
-    rms_angle: float | None = None
-    worst_angle: float | None = None
 
 
 @dataclass(frozen=True)
@@ -124,68 +115,34 @@ class Calibration:
         return tuple(found)
 
 
-@dataclass
-class _State:
-    """The machine with numbers as they are now."""
-
-    robot: Robot
-    offsets: Array
-    frame: Rotation = field(default_factory=Rotation.identity)
-    place: Array = field(default_factory=lambda: np.zeros(3))
-    target: Array = field(default_factory=lambda: np.zeros(3))
-
-    def joints(self, poses: Poses) -> Array:
-        return self.robot.controller.positions(poses.joints - self.offsets)
-
-    def predicted(self, poses: Poses) -> tuple[Array, Array]:
-        """What the instrument should see: positions and rotations in its own frame."""
-        position, rotation = self.robot.platform(self.joints(poses))
-        turn = self.frame.as_matrix()
-        return self.place + (position + rotation @ self.target) @ turn.T, turn @ rotation
-
-    def residuals(self, poses: Poses) -> tuple[Array, Array | None]:
-        """Measured less predicted: (k, 3), m, and rotation vectors (k, 3), rad."""
-        position, rotation = self.predicted(poses)
-        if poses.rotation is None:
-            return poses.position - position, None
-        apart = Rotation.from_matrix(poses.rotation @ np.swapaxes(rotation, -1, -2))
-        return poses.position - position, apart.as_rotvec()
-
-    def errors(self, poses: Poses) -> Errors:
-        linear, angular = self.residuals(poses)
-        sizes = [np.linalg.norm(part, axis=1) for part in (linear, angular) if part is not None]
-        pairs = [(float(np.sqrt(np.mean(size**2))), float(size.max())) for size in sizes]
-        values = [value for pair in pairs for value in pair]
-        return Errors(*values)
-
-
 def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ...]:
     """Numbers of the robot's file that move its platform at joint states (k, n).
+
+    A number that cannot change alone, because the machine would not assemble, is none.
 
     :param only: paths, or their beginnings, to choose from.
     :raises ParameterError: a beginning that no number of the geometry has.
     """
-    found = []
-    for path, (value, _) in entries(robot).items():
+    data, changes = data_of(robot), {}
+    for path in entries(robot):
         if path.startswith(NOT_GEOMETRY) or (only and not path.startswith(tuple(only))):
             continue
         try:
-            change = _change(robot, path, value)
+            change = change_of(robot, data, path)
         except ParameterError:
             continue  # a machine that closes only with this very number
-        if change.nothing(1e-9):
-            continue
-        if np.abs(platform_change(robot, q, [change])).max() > MOVES:
-            found.append(path)
+        if not change.nothing(1e-9):
+            changes[path] = change
+    found: list[str] = []
+    if changes:
+        near = Placement.of(robot, q)
+        twists, possible = platform_twists(robot.graph, q, near, list(changes.values()))
+        good = possible & (np.abs(twists).max((0, 1)) > MOVES)
+        found = [path for path, one in zip(changes, good, strict=True) if one]
     for beginning in only:
         if not any(path.startswith(beginning) for path in found):
             raise ParameterError("--only", beginning, "the beginning of a geometric number's path")
     return tuple(found)
-
-
-def _change(robot: Robot, path: str, value: float) -> GraphChange:
-    low, high = (changed_graph(robot, path, value + sign * STEP) for sign in (-1.0, 1.0))
-    return GraphChange.between(low, high, 2.0 * STEP)
 
 
 def calibrate(
@@ -237,13 +194,14 @@ def calibrate(
             "poses", len(poses.joints), f"enough for {len(parameters)} numbers to be fitted"
         )
     instrument = [p for p in parameters if p.name in extra]
-    start = _State(robot, np.zeros(robot.joints_count))
+    start = start_of(robot, learnt)
     if frame:
-        _place_frame(start, learnt)
-    before = _fit(start, learnt, instrument, progress)[0] if instrument else start
+        place_frame(start, learnt)
+    before = _fit(robot, start, learnt, instrument, progress)[0] if instrument else start
     after, values, covariance, information, noise, steps = _fit(
-        before, learnt, parameters, progress
+        robot, before, learnt, parameters, progress
     )
+    built = type(robot).from_data(after.data, robot.name)
     deviations = np.sqrt(np.diag(covariance))
     told = [
         Parameter(p.name, p.unit, p.before, p.prior, float(v), float(d))
@@ -252,84 +210,112 @@ def calibrate(
     good = np.array([p.observed for p in told])
     singular = np.linalg.svd(information[:, good], compute_uv=False) if good.any() else np.ones(1)
     fitted_errors, held_errors = (
-        (before.errors(part), after.errors(part)) for part in (learnt, judged)
+        (before.instrument.errors(robot, part), after.instrument.errors(built, part))
+        for part in (learnt, judged)
     )
     return Calibration(
-        after.robot, tuple(told), covariance, float(singular[0] / singular[-1]), noise[0],
+        built, tuple(told), covariance, float(singular[0] / singular[-1]), noise[0],
         noise[1], fitted_errors, held_errors, steps,
     )  # fmt: skip
 
 
-def _place_frame(state: _State, poses: Poses) -> None:
-    """A first guess of the instrument's frame: the best rigid motion between the point clouds."""
-    model = state.predicted(poses)[0]
-    centres = poses.position.mean(0), model.mean(0)
-    state.frame, _ = Rotation.align_vectors(poses.position - centres[0], model - centres[1])
-    state.place = centres[0] - state.frame.apply(centres[1])
-
-
 def _fit(
-    start: _State, poses: Poses, parameters: Sequence[Parameter], progress: Callable[[int], None]
-) -> tuple[_State, Array, Array, Array, tuple[float, float | None], int]:
+    robot: Robot, start: State, poses: Poses, parameters: Sequence[Parameter],
+    progress: Callable[[int], None],
+) -> tuple[State, Array, Array, Array, Noise, int]:  # fmt: skip
     """Least squares over all parameters, the noise found with them."""
     state = start
-    values = np.array([_value(start, p) for p in parameters])
+    values = np.array([value_of(start, p.name, p.before) for p in parameters])
     centre = np.array([p.before for p in parameters])
     prior = np.array([p.prior for p in parameters])
-    noise: tuple[float, float | None] = (0.0, None)
-    steps = 0
-    while True:
-        steps += 1
+
+    def right(state: State, values: Array, noise: Noise) -> Array:
+        return np.concatenate([_over(state.residuals(poses), noise), (centre - values) / prior])
+
+    for steps in range(1, STEPS + 1):
         progress(1)
-        residual, table, noise = _weighted(state, poses, parameters)
-        left = np.vstack([table, np.diag(1.0 / prior)])
-        right = np.concatenate([residual, (centre - values) / prior])
-        move, *_ = np.linalg.lstsq(left, right, rcond=None)
+        noise = _noise(state, poses, len(parameters))
+        columns = _derivatives(robot, state, parameters)
+        angular = None if poses.rotation is None else columns[:, 3:]
+        table = _over((columns[:, :3], angular), noise).reshape(-1, len(parameters))
+        left, before = np.vstack([table, np.diag(1.0 / prior)]), right(state, values, noise)
+        move: Array = np.asarray(np.linalg.lstsq(left, before, rcond=None)[0], np.float64)
         covariance = np.linalg.inv(left.T @ left)
-        state = _moved(start, state, parameters, values + move, move)
-        values = values + move
-        if np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))):
-            break
-        if steps == STEPS:
-            raise ParameterError("poses", f"{STEPS} steps", "poses to which a fit settles")
-    return state, values, covariance, table * prior, noise, steps
+        settled = bool(np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))))
+        trial = _stepped(robot, state, poses, parameters, values, move)
+        if not settled:
+            after = right(trial, values + move, noise)
+            share = _share(*(float(row @ row) for row in (before, left @ move, after)))
+            if share < 1.0:
+                move = share * move
+                trial = _stepped(robot, state, poses, parameters, values, move)
+        state, values = trial, values + move
+        if settled:
+            return state, values, covariance, table * prior, noise, steps
+    raise ParameterError("poses", f"{STEPS} steps", "poses to which a fit settles")
 
 
-def _weighted(
-    state: _State, poses: Poses, parameters: Sequence[Parameter]
-) -> tuple[Array, Array, tuple[float, float | None]]:
-    """Residuals and derivatives over the noise that the residuals tell."""
+def _share(before: float, gain: float, after: float) -> float:
+    """Part of a step at which the sum of squares is least, by the parabola through what is known.
+
+    Along a direction that the poses tell badly the machine may turn away from its tangent: a whole
+    step then goes beyond, and back, for ever.
+
+    :param before: the sum at the beginning; ``after``: at the end of the whole step.
+    :param gain: what a linear machine would lose of it; its slope there is twice that.
+    """
+    bend = after - before + 2.0 * gain
+    share = gain / bend if bend > 0.0 else 1.0
+    return 1.0 if share > WHOLE else max(share, LEAST)
+
+
+def _stepped(
+    robot: Robot, state: State, poses: Poses, parameters: Sequence[Parameter], values: Array,
+    move: Array,
+) -> State:  # fmt: skip
+    names = [p.name for p in parameters]
+    by = dict(zip(names, move.tolist(), strict=True))
+    turn = np.array([by.get(name, 0.0) for name in FRAME[3:]])
+    new = dict(zip(names, (values + move).tolist(), strict=True))
+    return moved(robot, state, poses, new, turn)
+
+
+def _noise(state: State, poses: Poses, parameters: int) -> Noise:
+    """Standard deviations of positions and rotations that the residuals tell."""
     linear, angular = state.residuals(poses)
-    count = max(1, linear.size - len(parameters) // (1 if angular is None else 2))
-    sigma = max(float(np.sqrt((linear**2).sum() / count)), 1e-12)
-    columns = _derivatives(state, poses, parameters)
-    residual = linear.ravel() / sigma
-    table = columns[:, :3].reshape(-1, len(parameters)) / sigma
-    if angular is None:
-        return residual, table, (sigma, None)
-    turn = max(float(np.sqrt((angular**2).sum() / count)), 1e-12)
-    residual = np.concatenate([residual, angular.ravel() / turn])
-    table = np.vstack([table, columns[:, 3:].reshape(-1, len(parameters)) / turn])
-    return residual, table, (sigma, turn)
+    count = max(1, linear.size - parameters // (1 if angular is None else 2))
+    sizes = [
+        max(float(np.sqrt((part**2).sum() / count)), 1e-12)
+        for part in (linear, angular)
+        if part is not None
+    ]
+    return sizes[0], sizes[1] if len(sizes) > 1 else None
 
 
-def _derivatives(state: _State, poses: Poses, parameters: Sequence[Parameter]) -> Array:
+def _over(parts: tuple[Array, Array | None], noise: Noise) -> Array:
+    """Rows of positions, then of rotations, in units of their noise, the poses' axes flat."""
+    rows = [
+        part.reshape(part.shape[0] * 3, *part.shape[2:]) / size
+        for part, size in zip(parts, noise, strict=True)
+        if part is not None and size is not None
+    ]
+    return np.concatenate(rows)
+
+
+def _derivatives(robot: Robot, state: State, parameters: Sequence[Parameter]) -> Array:
     """Of predicted positions and rotations by the parameters, shape (k, 6, parameters)."""
-    robot, q = state.robot, state.joints(poses)
-    known = entries(robot)
-    position, rotation = robot.platform(q)
-    paths = [p.name for p in parameters if p.name in known and not p.name.startswith("joint_map.")]
-    changes = [_change(robot, path, known[path][0]) for path in paths]
-    moved: dict[str, Array] = {}
-    if paths:
-        found = np.moveaxis(platform_change(robot, q, changes), -1, 0)
-        moved = dict(zip(paths, found, strict=True))
-    twist = robot.platform_jacobian(q) / -robot.controller.factors
-    for k, joint in enumerate(robot.joint_names):
-        moved[f"joint_map.{joint}.offset"] = twist[..., k]
-    turn = state.frame.as_matrix()
-    lever = rotation @ state.target
-    out = np.zeros((len(q), 6, len(parameters)))
+    tool, joints = state.instrument, robot.joint_names
+    position, rotation = state.platform
+    paths = [p.name for p in parameters if not p.name.startswith(BESIDE)]
+    changes = [change_of(robot, state.data, path) for path in paths]
+    changes += [GraphChange.of_joint(state.graph, joint) for joint in joints]
+    twists, _ = platform_twists(state.graph, state.q, state.placement, changes)
+    twists[..., len(paths) :] /= -robot.controller.factors
+    names = [*paths, *(f"joint_map.{joint}.offset" for joint in joints)]
+    by_name = dict(zip(names, np.moveaxis(twists, -1, 0), strict=True))
+    turn = tool.frame.as_matrix()
+    lever = rotation @ tool.target
+    out = np.zeros((len(state.q), 6, len(parameters)))
     for k, p in enumerate(parameters):
         if p.name in FRAME:
             axis = np.eye(3)[FRAME.index(p.name) % 3]
@@ -341,42 +327,7 @@ def _derivatives(state: _State, poses: Poses, parameters: Sequence[Parameter]) -
         elif p.name in TARGET:
             out[:, :3, k] = rotation[..., TARGET.index(p.name)] @ turn.T
         else:
-            linear, angular = moved[p.name][:, :3], moved[p.name][:, 3:]
+            linear, angular = by_name[p.name][:, :3], by_name[p.name][:, 3:]
             shifted = linear - (skew(lever) @ angular[..., None])[..., 0]
             out[:, :3, k], out[:, 3:, k] = shifted @ turn.T, angular @ turn.T
     return out
-
-
-def _value(state: _State, parameter: Parameter) -> float:
-    name = parameter.name
-    if name in FRAME[:3]:
-        return float(state.place[FRAME.index(name)])
-    if name in TARGET:
-        return float(state.target[TARGET.index(name)])
-    return parameter.before
-
-
-def _moved(
-    start: _State, state: _State, parameters: Sequence[Parameter], values: Array, move: Array
-) -> _State:
-    """The machine with the new numbers."""
-    by_name = {p.name: float(v) for p, v in zip(parameters, values, strict=True)}
-    steps = {p.name: float(v) for p, v in zip(parameters, move, strict=True)}
-    joints = start.robot.joint_names
-    paths = {
-        name: value
-        for name, value in by_name.items()
-        if name not in (*FRAME, *TARGET) and not name.startswith("joint_map.")
-    }
-    old = start.robot.controller.offsets
-    offsets = np.array(
-        [by_name.get(f"joint_map.{j}.offset", o) - o for j, o in zip(joints, old, strict=True)]
-    )
-    turn = Rotation.from_rotvec([steps.get(name, 0.0) for name in FRAME[3:]])
-    return _State(
-        with_entries(start.robot, paths) if paths else start.robot,
-        offsets,
-        turn * state.frame,
-        np.array([by_name.get(n, v) for n, v in zip(FRAME[:3], state.place, strict=True)]),
-        np.array([by_name.get(n, v) for n, v in zip(TARGET, state.target, strict=True)]),
-    )

@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics import inverse_dynamics
+from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.apps.limits import ranges
 from pkm_twin.apps.recorded import (
     Load,
@@ -23,11 +23,14 @@ from pkm_twin.apps.recorded import (
 )
 from pkm_twin.apps.verdict import Item, Verdict
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
+from pkm_twin.machine.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 
 Array = NDArray[np.float64]
 # Samples computed at a time, so that memory stays flat.
 _BLOCK = 4096
+DEVIATIONS: Final = (1, 2, 3)
+"""Of the model, inside which residuals are counted."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +48,42 @@ class Bounds:
 
 
 @dataclass(frozen=True)
+class ModelBand:
+    """A joint's residual beside what the file's ``uncertainty`` makes of the model's torque.
+
+    ``deviation_rms``: of the model's standard deviation over the judged samples, ``unit``.
+    ``share_within``: part of the samples whose residual is inside so many of their deviations.
+    """
+
+    deviation_rms: float
+    unit: str
+    share_within: Mapping[int, float]
+
+    def __str__(self) -> str:
+        shares = ", ".join(f"{100 * share:.3g}" for share in self.share_within.values())
+        counts = ", ".join(map(str, self.share_within))
+        return (
+            f"{shares} % inside {counts} deviations of the model (RMS {self.deviation_rms:.3g} "
+            f"{self.unit})"
+        )
+
+
+@dataclass(frozen=True)
 class CheckReport:
-    """All items; the whole is good where none is bad."""
+    """All items; the whole is good where none is bad.
+
+    ``bands``: by joint; empty where the robot's file has no ``uncertainty``, or torques were not
+    judged.
+    """
 
     bag: str
     robot: str
     items: tuple[Item, ...]
     topics: Topics
     load: Load | None
+    unsure: bool
+    """Whether the robot's file has an ``uncertainty``."""
+    bands: Mapping[str, ModelBand]
 
     @property
     def good(self) -> bool:
@@ -71,6 +102,15 @@ class CheckReport:
             "topics": asdict(self.topics),
             "payload": None if self.load is None else self.load.as_json(),
             "items": [asdict(item) for item in self.items],
+            "uncertainty": {
+                joint: {
+                    "effort_deviation_rms": band.deviation_rms,
+                    "effort_unit": band.unit,
+                    "share_within_deviations": {str(k): v for k, v in band.share_within.items()},
+                }
+                for joint, band in self.bands.items()
+            }
+            or None,
             "good": self.good,
         }
 
@@ -94,9 +134,11 @@ def check_bag(
     recording = read_recording(path, robot, progress, topics=topics, carried=carried)
     items = [*_file(recording, bounds), *_timing(recording, bounds), *_limits(recording)]
     items.append(_singularity(recording, bounds))
-    items += _residuals(recording, bounds)
+    judged, bands = _residuals(recording, bounds)
+    items += judged
+    r = recording
     return CheckReport(
-        str(path), recording.robot.name, tuple(items), recording.topics, recording.load
+        str(path), r.robot.name, tuple(items), r.topics, r.load, bool(r.robot.uncertainty), bands
     )
 
 
@@ -175,37 +217,57 @@ def _singularity(r: Recording, bounds: Bounds) -> Item:
     return _item(what, value, bound, bool(measure[worst] >= bounds.singularity))
 
 
-def _residuals(r: Recording, bounds: Bounds) -> list[Item]:
+def _residuals(r: Recording, bounds: Bounds) -> tuple[list[Item], dict[str, ModelBand]]:
+    """Items, and by joint the model's band where the robot's file has an ``uncertainty``."""
     what = "torque residual"
     bound = f"RMS below {100 * bounds.residual:g} % of peak"
     reason = why_no_torques(r.robot) or (
         "" if r.effort is not None else "the bag carries no efforts"
     )
     if reason or r.effort is None:
-        return [Item(what, reason, bound, Verdict.UNKNOWN)]
+        return [Item(what, reason, bound, Verdict.UNKNOWN)], {}
+    models = (inverse_dynamics, torque_deviation)[: 2 if r.robot.uncertainty else 1]
     try:
-        residual, used = residuals(r)
+        (expected, *spread), used = _modelled(r, *models)
     except (UnreachableError, SingularityError):
         raise
     except ValueError as error:  # numbers within bounds whose result is not finite
-        return [Item(what, str(error), bound, Verdict.BAD)]
+        return [Item(what, str(error), bound, Verdict.BAD)], {}
+    used = _judged(r, used)
     if not used.any():
-        return [Item(what, "too few joint states in a row", bound, Verdict.UNKNOWN)]
-    rms = np.sqrt(np.mean(residual[used] ** 2, 0))
+        return [Item(what, "too few joint states in a row", bound, Verdict.UNKNOWN)], {}
+    residual = (r.effort - expected)[used]
+    bands = _bands(r.robot, residual, spread[0][used]) if spread else {}
+    rms = np.sqrt(np.mean(residual**2, 0))
     peak = np.abs(r.effort).max(0)
     units = r.robot.effort_units
     good = rms <= bounds.residual * peak
     hint = "" if r.load or good.all() else "; a payload that nobody told of? --payload"
-    return [
+    items = [
         _item(
             f"{what} of {name}",
             f"RMS {rms[i]:.4g} {units[i]}, {100 * rms[i] / max(peak[i], 1e-12):.2f} % of "
-            f"{peak[i]:.4g}{'' if good[i] else hint}",
+            f"{peak[i]:.4g}{f'; {bands[name]}' if bands else ''}{'' if good[i] else hint}",
             bound,
             bool(good[i]),
         )
         for i, name in enumerate(r.robot.joint_names)
     ]
+    return items, bands
+
+
+def _bands(robot: Robot, residual: Array, spread: Array) -> dict[str, ModelBand]:
+    """By joint, of residuals and the model's deviations, shape (samples, n) each."""
+    rms = np.sqrt(np.mean(spread**2, 0))
+    shares = np.array([np.mean(np.abs(residual) <= k * spread, 0) for k in DEVIATIONS])
+    return {
+        joint: ModelBand(
+            float(rms[i]),
+            robot.effort_units[i],
+            dict(zip(DEVIATIONS, shares[:, i].tolist(), strict=True)),
+        )
+        for i, joint in enumerate(robot.joint_names)
+    }
 
 
 def residuals(r: Recording) -> tuple[Array, NDArray[np.bool_]]:
@@ -217,21 +279,29 @@ def residuals(r: Recording) -> tuple[Array, NDArray[np.bool_]]:
     """
     assert r.effort is not None  # noqa: S101
     expected, used = predicted(r)
-    if r.load is not None:
-        used = used & ~r.load.near_change(r.time, 0.5)
-    return r.effort - expected, used
+    return r.effort - expected, _judged(r, used)
+
+
+def _judged(r: Recording, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return used if r.load is None else used & ~r.load.near_change(r.time, 0.5)
 
 
 def predicted(r: Recording) -> tuple[Array, NDArray[np.bool_]]:
     """Efforts that the twin expects (samples, n), zero where its window is not full; and where."""
+    (efforts,), used = _modelled(r, inverse_dynamics)
+    return efforts, used
+
+
+def _modelled(r: Recording, *models: Callable[..., Array]) -> tuple[list[Array], NDArray[np.bool_]]:
+    """What functions of robot, motion and wrench say, shape (samples, n) each; and where."""
     qd, qdd, used = motion(r)
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
-    efforts = np.zeros_like(r.q)
+    values = [np.zeros_like(r.q) for _ in models]
     for robot, part in by_load(r.robot, r.load, r.time, _BLOCK):
         rows = np.arange(part.start, part.stop)[used[part]]
-        state = (r.q[rows], qd[rows], qdd[rows], wrench[rows])
-        efforts[rows] = inverse_dynamics(robot, *state)
-    return efforts, used
+        for found, model in zip(values, models, strict=True):
+            found[rows] = model(robot, r.q[rows], qd[rows], qdd[rows], wrench[rows])
+    return values, used
 
 
 def motion(r: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -417,6 +417,8 @@ def check(
     else:
         typer.echo(f"{report.topics}")
         typer.echo(f"payload: {report.load or 'the robot file alone'}")
+        if not report.unsure:
+            typer.echo("uncertainty: the robot file gives none, so the model has no band")
         table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
         bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
         text = f"bad: {', '.join(bad)}" if bad else "good"

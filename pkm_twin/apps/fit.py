@@ -24,6 +24,8 @@ RobotFile = Annotated[
 ]
 NEAR: Final = 0.5
 """Around a pick or release the payload is neither held nor gone, s."""
+COMPLIANCE: Final = "compliance"
+"""What is fitted to deflections, not to efforts."""
 
 
 def fit(
@@ -32,7 +34,8 @@ def fit(
         list[Path], typer.Argument(help="bags, or CSV files with a header row", show_default=False)
     ],
     what: Annotated[
-        str, typer.Option(help="of friction, rotor, payload, inertia, commas between")
+        str,
+        typer.Option(help="of friction, rotor, payload, inertia, commas between; or compliance"),
     ] = "friction,rotor,payload,inertia",
     out: Annotated[
         Path, typer.Option(help="YAML to write; the report goes beside it as HTML")
@@ -50,7 +53,7 @@ def fit(
     ] = False,
     json_output: Json = False,
 ) -> None:
-    """Fit friction, rotors, payload and masses of a robot to recorded efforts.
+    """Fit friction, rotors, payload and masses of a robot to recorded efforts, or its compliance.
 
     Positions and efforts are enough: rates are differentiated without delay, and regressor and
     efforts filtered alike. CSV columns: time (s); JOINT.position and JOINT.effort for every
@@ -60,16 +63,24 @@ def fit(
     The YAML is the robot's file with new numbers, each with its standard deviation in a comment.
     What the motion does not show keeps the file's value and is named. --payload and --load-times
     tell of a payload that is known, or, with `payload` among what is fitted, when it is held.
+
+    `--what compliance` fits a factor on the compliance of every elastic element (member or joint)
+    to measured loads and deflections: in a bag the wrench and a TransformStamped; CSV columns
+    JOINT.position, fx fy fz mx my mz, and dx dy dz (m) rx ry rz (rad), as many as are measured, all
+    at the platform's reference point in base axes.
     """
     from pkm_twin.apps.fit_files import fitted_yaml, robot_text, yaml_head
     from pkm_twin.machine.edited import write_edited
 
-    kinds = kinds_of(what)
     page = out.with_suffix(".html")
     if out.suffix not in (".yaml", ".yml"):
         raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
     for target in (out, page) if report else (out,):
         refuse_existing(target, overwrite)
+    if COMPLIANCE in [word.strip() for word in what.split(",")]:
+        _fit_compliance(robot, recordings, what, topic, out, page if report else None, json_output)
+        return
+    kinds = kinds_of(what)
     text, machine = robot_text(robot, per_copy=per_copy)
     carried = load_of(payload, load_times)
     with progress("fit", 2 * len(recordings)) as update:
@@ -88,6 +99,44 @@ def fit(
         return
     _print(result)
     typer.echo(f"{out}" + (f", {page}" if report else ""))
+
+
+def _fit_compliance(
+    robot: str, recordings: Sequence[Path], what: str, topics: Sequence[str], out: Path,
+    page: Path | None, json_output: bool,
+) -> None:  # fmt: skip
+    """The fit of elastic elements, its files and what it says."""
+    from pkm_twin.apps import elastic_report
+    from pkm_twin.apps.elastic_fit import fit_elements
+    from pkm_twin.apps.elastic_recordings import read_deflected
+    from pkm_twin.apps.fit_files import fitted_yaml, robot_text
+    from pkm_twin.machine.edited import write_edited
+
+    if what.strip() != COMPLIANCE:
+        raise ParameterError("what", what, "compliance alone: it is fitted to other recordings")
+    text, machine = robot_text(robot)
+    _ = machine.elastic
+    with progress("fit", 2 * len(recordings)) as update:
+        read = []
+        for path in recordings:
+            read.append(read_deflected(path, machine, topics))
+            update(len(read))
+        result = fit_elements(machine, read, lambda k: update(len(recordings) + k))
+    names = [path.name for path in recordings]
+    try:
+        write_edited(out, elastic_report.yaml_head(result, names), fitted_yaml(text, result, names))
+        if page is not None:
+            page.write_text(elastic_report.elastic_page(result, names), encoding="utf-8")
+    except OSError as error:
+        raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
+    if json_output:
+        print_json(
+            elastic_report.as_json(result)
+            | {"out": str(out), "report": None if page is None else str(page)}
+        )
+        return
+    elastic_report.print_fit(result)
+    typer.echo(f"{out}" + (f", {page}" if page is not None else ""))
 
 
 def fit_recordings(
@@ -150,7 +199,7 @@ def kinds_of(what: str) -> tuple[Any, ...]:
     words = tuple(word.strip() for word in what.split(","))
     for word in words:
         if word not in KINDS:
-            raise UnknownNameError("what", word, KINDS)
+            raise UnknownNameError("what", word, (*KINDS, COMPLIANCE))
     return tuple(kind for kind in KINDS if kind in words)
 
 
@@ -225,6 +274,7 @@ def as_json(result: Any) -> dict[str, Any]:
                 "from_s": float(judged.time[0]), "to_s": float(judged.time[-1]),
                 "residual_rms_before": judged.rms(judged.before).tolist(),
                 "residual_rms_after": judged.rms(judged.after).tolist(),
+                "effort_deviation_rms_after": np.sqrt(np.mean(judged.deviation**2, 0)).tolist(),
                 "peak_effort": np.abs(judged.measured).max(0).tolist(),
             }
             for judged in result.judged

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from delta_dynamics.fit import Fit, Number
 from pkm_twin import Robot, load
+from pkm_twin.errors import ParameterError
 from pkm_twin.machine.catalogue import TREES, robot_of_data, robot_path
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.robot_urdf import robot_description
@@ -16,17 +17,42 @@ from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.machine.yaml_edit import edit_yaml
 
 
+class Fitted(Protocol):
+    """What a fit says of numbers of a file."""
+
+    @property
+    def numbers(self) -> tuple[Number, ...]:
+        """Before and after."""
+
+
 def robot_text(name: str, *, per_copy: bool = False) -> tuple[str, Robot]:
     """A robot and the text of its file; of a URDF, or with ``per_copy``, as a machine's YAML.
 
-    :raises ParameterError: the file is refused.
+    :raises ParameterError: the file is refused; or it is to be written out, and would lose what it
+        says of elasticity.
     """
     robot = load(name)
+    if per_copy and not robot.elastic_entries() and _elastic(robot):
+        raise ParameterError(
+            "--per-copy",
+            robot.name,
+            f"a robot whose elastic members can be written out; a {robot.mechanism}'s cannot: take "
+            "a file without them, or fit without --per-copy",
+        )
     path = robot_path(name)
     if per_copy or path.suffix in TREES:
         data = read_urdf(path) if path.suffix in TREES else robot_description(robot)
         return describe_machine_yaml(data), robot_of_data(data, path.stem)
     return path.read_text(encoding="utf-8"), robot
+
+
+def _elastic(robot: Robot) -> bool:
+    """Whether its file tells of elasticity."""
+    try:
+        robot.structure()
+    except ParameterError:
+        return False
+    return True
 
 
 def yaml_head(result: Fit, recordings: Sequence[str]) -> list[str]:
@@ -45,7 +71,7 @@ def yaml_head(result: Fit, recordings: Sequence[str]) -> list[str]:
     return lines
 
 
-def fitted_yaml(text: str, result: Fit, recordings: Sequence[str]) -> str:
+def fitted_yaml(text: str, result: Fitted, recordings: Sequence[str]) -> str:
     """The robot's file with what was fitted, each number's deviation and source in a comment."""
     groups: dict[Key, list[Number]] = {}
     for number in result.numbers:
@@ -66,9 +92,10 @@ def fitted_yaml(text: str, result: Fit, recordings: Sequence[str]) -> str:
         alone = all(n.status == "fitted" for n in told)
         how = "" if alone else "; known only together with others"
         was = ", ".join(f"{n.before:.6g}" for n in told)
+        unit = f" {told[0].unit}" if told[0].unit else ""
         notes[base] = (
-            f"{'.'.join(str(k) for k in base[-2:])}: fitted from {source}, +- {spread} "
-            f"{told[0].unit} (one standard deviation), was {was}{how}"
+            f"{'.'.join(str(k) for k in base[-2:])}: fitted from {source}, +- {spread}{unit} "
+            f"(one standard deviation), was {was}{how}"
         )
     return edit_yaml(text, values, notes)
 

@@ -14,7 +14,7 @@ import numpy as np
 from delta_dynamics.fit import Fit, Number
 from pkm_twin.atlas.plots import COLOURS, columns
 
-_HEAD: Final = """<!DOCTYPE html>
+HEAD_OF_PAGE: Final = """<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
@@ -39,7 +39,11 @@ def fit_page(result: Fit, recordings: Sequence[str]) -> str:
     """The whole page."""
     title = f"{html.escape(result.robot.name)}: fitted from {html.escape(', '.join(recordings))}"
     e = result.estimate
-    parts = [_HEAD.format(title=title), "<h2>What was fitted</h2>", _numbers(result)]
+    parts = [
+        HEAD_OF_PAGE.format(title=title),
+        "<h2>What was fitted</h2>",
+        numbers_table(_shown(result)),
+    ]
     parts.append(
         f"<p>{e.directions} combinations of numbers are told by {result.samples} filtered samples; "
         f"condition number {e.condition:.3g}. +- is one standard deviation, of the noise, of the "
@@ -54,14 +58,19 @@ def fit_page(result: Fit, recordings: Sequence[str]) -> str:
     if idle:
         names = ", ".join(html.escape(n.name) for n in idle)
         parts.append(f"<p>The motion tells nothing of, and the file's value stays: {names}.</p>")
-    parts += ["<h2>Numbers, before and now</h2>", _picture(_changes(result))]
+    parts += ["<h2>Numbers, before and now</h2>", picture(changes_figure(_shown(result)))]
     parts += ["<h2>Held out: the last third of each recording</h2>", _residuals(result)]
-    parts += [_picture(_efforts(result, k)) for k in range(len(result.judged))]
+    parts.append(
+        "<p>The band is two standard deviations of the model's own torques, by what the fit does "
+        "not know of its numbers; noise of the measured efforts is not in it.</p>"
+    )
+    parts += [picture(_efforts(result, k)) for k in range(len(result.judged))]
     parts += ["<h2>What was done to the signals</h2>", _signals(result, recordings)]
     return "\n".join([*parts, "</body>", "</html>", ""])
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of plain texts."""
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
     body = "".join(
         "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
@@ -69,13 +78,14 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
-def _numbers(result: Fit) -> str:
-    return _table(
+def numbers_table(numbers: Sequence[Number]) -> str:
+    """Numbers of a file, before and now."""
+    return html_table(
         ("number", "before", "now", "+-", "unit", ""),
         [
             (n.name, f"{n.before:.6g}", f"{n.after:.6g}", f"{n.deviation:.2g}", n.unit,
              WORDS[n.status])
-            for n in _shown(result)
+            for n in numbers
         ],
     )  # fmt: skip
 
@@ -94,7 +104,7 @@ def _residuals(result: Fit) -> str:
             rows.append(
                 (judged.name, joint, f"{before[k]:.4g}", f"{after[k]:.4g}", f"{peak[k]:.4g}", unit)
             )
-    return _table(("recording", "joint", "rms before", "rms now", "peak effort", "unit"), rows)
+    return html_table(("recording", "joint", "rms before", "rms now", "peak effort", "unit"), rows)
 
 
 def _signals(result: Fit, recordings: Sequence[str]) -> str:
@@ -109,12 +119,11 @@ def _signals(result: Fit, recordings: Sequence[str]) -> str:
         "recording", "window of the differentiation (samples)", "low-pass (Hz)",
         "every so many samples kept", "efforts late (ms)",
     )  # fmt: skip
-    return _table(header, rows) + f"<p>{result.outliers} efforts were outliers.</p>"
+    return html_table(header, rows) + f"<p>{result.outliers} efforts were outliers.</p>"
 
 
-def _changes(result: Fit) -> Any:
+def changes_figure(shown: Sequence[Number]) -> Any:
     """By how many deviations each number moved, and how sure it is."""
-    shown = _shown(result)
     figure, ((ax,),) = columns(1, 1)
     figure.set_size_inches(9, 1 + 0.25 * len(shown))
     places = np.arange(len(shown))[::-1]
@@ -141,6 +150,10 @@ def _efforts(result: Fit, number: int) -> Any:
             (judged.before, COLOURS[1], "before"), (judged.after, COLOURS[0], "now"),
         ):  # fmt: skip
             ax.plot(time, (judged.measured - values)[::step, k], color=colour, lw=0.8, label=label)
+        band = 2.0 * judged.deviation[::step, k]
+        ax.fill_between(
+            time, -band, band, color=COLOURS[0], alpha=0.25, lw=0, label="now, two deviations"
+        )
         ax.set_title(f"{judged.name}, {joint}: measured less predicted, held out")
         ax.set_xlabel("time (s)")
         ax.set_ylabel(f"effort ({result.robot.effort_units[k]})")
@@ -149,7 +162,8 @@ def _efforts(result: Fit, number: int) -> Any:
     return figure
 
 
-def _picture(figure: Any) -> str:
+def picture(figure: Any) -> str:
+    """A figure as an image in a page; it is closed."""
     from matplotlib import pyplot
 
     data = io.BytesIO()

@@ -422,7 +422,7 @@ def read_recording(
                     raise MessageError("stamp order", f"stamp {sample.stamp} is not after the last")
                 samples.append(sample)
             else:
-                wrenches.append(_wrench(message.message, message.log_time, rules))
+                wrenches.append(recorded_wrench(message.message, message.log_time, rules))
         except MessageError as error:
             rejected[error.reason] += 1
             first = first or one_line(f"{message.topic}: {error}")
@@ -471,7 +471,11 @@ def by_load(
             yield (loaded if held[start] else robot), slice(start, stop)
 
 
-def _wrench(message: Any, now: int, rules: StampRules) -> tuple[int, str, Array]:
+def recorded_wrench(message: Any, now: int, rules: StampRules) -> tuple[int, str, Array]:
+    """Stamp (ns), frame and values (6,) of a geometry_msgs/WrenchStamped.
+
+    :raises MessageError: it is refused.
+    """
     # Any frame that has a name: all but the base frame turn with the platform.
     frame = message.header.frame_id or PLATFORM_FRAME
     sample = read_wrench(message, now, rules, frame, accept_empty=False)

@@ -9,9 +9,7 @@ May import: numpy, scipy, pkm_twin's core; never rclpy.
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import (
     CLEAR,
+    circle_radii,
     reachable,
-    singularity_at,
     try_forward,
 )
 from pkm_twin.machine.pose_grid import PoseGrid
@@ -31,9 +29,6 @@ from pkm_twin.machine.robot import Robot
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-RAYS: Final = 360
-REFINEMENTS: Final = 32
-BLOCK: Final = 16
 JOINT_STATES: Final = 2**14
 """Joint states, evenly spread between the limits, whose poses bound a workspace."""
 CLIMBERS: Final = 32
@@ -196,45 +191,12 @@ def circles(
     :param least_clearance: what the limbs' clearance has to be above, m.
     """
     z = np.atleast_1d(np.asarray(heights, np.float64))
-    grid = cylinder(robot, "circles about it")
-    turn = turns(RAYS)
+    cylinder(robot, "circles about it")
     step = largest_distance(robot) / steps
-
-    def inside(height: float, distance: Array, azimuth: Array) -> Mask:
-        poses = grid.polar_pose(height, distance, azimuth)
-        kept = reachable(robot, poses, least_clearance)
-        kept[kept] = singularity_at(robot, poses[kept]) >= max(least, CLEAR)
-        return kept
-
-    radius = np.zeros(len(z))
-    for k, height in enumerate(z.tolist()):
-        radius[k] = _free(functools.partial(inside, height), turn, step, steps)
+    radius = circle_radii(
+        robot, z, step, steps, least=max(least, CLEAR), least_clearance=least_clearance
+    )
     return Reach(z, radius)
-
-
-def _free(good: Callable[[Array, Array], Mask], turn: Array, step: float, steps: int) -> float:
-    """How far a test holds from the axis on, on all rays.
-
-    :param good: the test, of distances and azimuths.
-    :param step: first search along each ray, ``steps`` of them; a bisection refines it.
-    """
-    # The first rung that any ray leaves bounds the circle; what is beyond does not matter.
-    rung, out = 0, ~good(np.zeros(1), turn)
-    while not out.any() and rung < steps:
-        block = np.arange(rung + 1, min(rung + BLOCK, steps) + 1)
-        outside = ~good(np.multiply(step, block)[:, None], turn)
-        hit = outside.any(-1)
-        first = int(hit.argmax()) if hit.any() else len(block) - 1
-        rung, out = int(block[first]), outside[first]
-    if not out.any() or rung == 0:
-        return step * rung
-    rays = turn[out]
-    low, high = np.full(len(rays), step * (rung - 1)), np.full(len(rays), step * rung)
-    for _ in range(REFINEMENTS):
-        middle = (low + high) / 2
-        kept = good(middle, rays)
-        low, high = np.where(kept, middle, low), np.where(kept, high, middle)
-    return float(low.min())
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 POINTS: Final = 600
+LAYERS: Final = 201
+"""Heights of the circles that the largest cylinder is looked for in."""
 COUNT: Final = 6
 ENLARGED: Final = 0.13
 """Largest displacement of a drawn mode shape over the size of the machine."""
@@ -219,7 +221,7 @@ def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:
     if total < 50:
         raise ParameterError("points", total, "50 or more")
     # A little inside: on the edge rounding decides.
-    best = largest_cylinder(circles(robot, np.linspace(*height_range(robot), 201)))
+    best = largest_cylinder(circles(robot, np.linspace(*height_range(robot), LAYERS)))
     if best.radius == 0.0:
         raise ParameterError("limits", robot.name, "limits that leave a regular workspace")
     side = total ** (1 / 3)

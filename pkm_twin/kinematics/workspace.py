@@ -7,6 +7,7 @@ May import: numpy, pkm_twin's core, the standard library; never rclpy.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -20,6 +21,12 @@ from pkm_twin.machine.robot import Robot
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+RAYS: Final = 360
+"""Rays of a circle about the axis."""
+REFINEMENTS: Final = 32
+BLOCK: Final = 16
+AT_ONCE: Final = 2**16
+"""Poses, about, that are tried at a time."""
 CLEAR: Final = 0.01
 """Singularity measure (0 in one, 1 at best) that regular workspaces stay above."""
 
@@ -181,26 +188,81 @@ def regular_workspace(
             "mechanism", robot.mechanism, "a height and two tilts side by side (as upr_rpu)"
         )
     heights = np.atleast_1d(np.asarray(z, np.float64))
-    turn = np.arange(directions) * (2 * np.pi / directions)
-    ladder = np.arange(0.0, math.pi / 2, step)
-
-    def inside(radius: Array) -> Mask:
-        """Of radii (n, directions, ...), whether those points are reachable."""
-        extra = [1] * (radius.ndim - 2)
-        poses = grid.polar_pose(heights.reshape(-1, 1, *extra), radius, turn.reshape(-1, *extra))
-        kept = reachable(robot, poses)
-        kept[kept] = singularity_at(robot, poses[kept]) >= CLEAR
-        return kept
-
-    rungs = np.broadcast_to(ladder, (len(heights), directions, len(ladder)))
-    outside = ~inside(rungs)
-    first = np.where(outside.any(-1), outside.argmax(-1), len(ladder))
-    low = step * np.maximum(first - 1, 0)
-    high = step * first
-    for _ in range(32):
-        middle = (low + high) / 2
-        good = inside(middle)
-        low, high = np.where(good, middle, low), np.where(good, high, middle)
-    radius = low.min(-1)
+    steps = math.ceil(math.pi / 2 / step) - 1
+    radius = circle_radii(robot, heights, step, steps, directions)
     kept = (radius >= least_radius) & (radius > 0.0)
     return RegularWorkspace(heights[kept], radius[kept])
+
+
+def circle_radii(
+    robot: Robot,
+    heights: Array,
+    step: float,
+    steps: int,
+    rays: int = RAYS,
+    least: float = CLEAR,
+    least_clearance: float = 0.0,
+) -> Array:
+    """Radii of the largest circles about the axis that are reachable with all their inside, (n,).
+
+    0 where the axis itself is out of reach; m or rad.
+
+    :param heights: shape (n,), m.
+    :param step: first search along each ray, ``steps`` of them; a bisection refines it.
+    :param least: singularity measure below which a pose counts as out of reach.
+    :param least_clearance: what the limbs' clearance has to be above, m.
+    :raises ValueError: a robot whose poses lie about no axis.
+    """
+    grid = robot.grid()
+    turn = np.asarray(np.arange(rays) * (2 * np.pi / rays), np.float64)
+
+    def outside(height: Array, distance: Array, azimuth: Array) -> Mask:
+        poses = grid.polar_pose(height, distance, azimuth)
+        kept = reachable(robot, poses, least_clearance)
+        kept[kept] = singularity_at(robot, poses[kept]) >= least
+        return ~kept
+
+    rung, left = np.zeros(len(heights), np.int64), np.zeros((len(heights), rays), bool)
+    at_once = max(1, AT_ONCE // (BLOCK * rays))
+    for start in range(0, len(heights), at_once):
+        part = slice(start, start + at_once)
+        rung[part], left[part] = _first_rungs(outside, heights[part], turn, step, steps)
+    low, high = step * np.maximum(rung - 1, 0), step * rung
+    # The nearest end of all rays of a height: a ray that goes on beyond another's end is dropped.
+    row, ray = np.nonzero(left & (rung > 0)[:, None])
+    ends = np.isin(np.arange(len(heights)), row)
+    for _ in range(REFINEMENTS):
+        middle = (low + high) / 2
+        gone = outside(heights[row], middle[row], turn[ray])
+        nearer = np.isin(np.arange(len(heights)), row[gone])
+        low, high = np.where(nearer, low, middle), np.where(nearer, middle, high)
+        kept = gone | ~nearer[row]
+        row, ray = row[kept], ray[kept]
+    return np.where(ends, low, step * rung)
+
+
+def _first_rungs(
+    outside: Callable[[Array, Array, Array], Mask],
+    heights: Array,
+    turn: Array,
+    step: float,
+    steps: int,
+) -> tuple[NDArray[np.int64], Mask]:
+    """First multiple of a step that any ray leaves, shape (n,), and which rays do, (n, rays).
+
+    What is beyond does not matter. The last multiple, and no ray, where all hold.
+    """
+    rung = np.zeros(len(heights), np.int64)
+    left = outside(heights[:, None], np.zeros(1), turn)
+    inner = np.flatnonzero(~left.any(-1))
+    for start in range(1, steps + 1, BLOCK):
+        if not len(inner):
+            break
+        block = np.arange(start, min(start + BLOCK, steps + 1))
+        gone = outside(heights[inner, None, None], np.multiply(step, block)[:, None], turn)
+        hit = gone.any(-1)
+        ended = hit.any(-1)
+        first = np.where(ended, hit.argmax(-1), len(block) - 1)
+        rung[inner], left[inner] = block[first], gone[np.arange(len(inner)), first]
+        inner = inner[~ended]
+    return rung, left

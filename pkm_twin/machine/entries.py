@@ -50,15 +50,23 @@ def given(data: Any) -> Any:
     return {key: given(value) for key, value in data.items() if value is not None}
 
 
+def data_of(robot: Robot, values: Mapping[str, float] | None = None) -> dict[str, Any]:
+    """What the robot's file gives, as plain data, with other numbers by dotted path.
+
+    :raises ParameterError: a path that there is not.
+    """
+    data: dict[str, Any] = copy.deepcopy(given(robot.parameter_sections()))
+    for path, value in (values or {}).items():
+        put(data, path, value)
+    return data
+
+
 def with_entries(robot: R, values: Mapping[str, float]) -> R:
     """The robot of the same file with other numbers.
 
     :raises ParameterError: a path that there is not, or a value that the file may not have.
     """
-    data = copy.deepcopy(given(robot.parameter_sections()))
-    for path, value in values.items():
-        put(data, path, value)
-    return type(robot).from_data(data, robot.name)
+    return type(robot).from_data(data_of(robot, values), robot.name)
 
 
 def put(data: Any, path: str, value: float) -> None:
@@ -66,14 +74,24 @@ def put(data: Any, path: str, value: float) -> None:
 
     :raises ParameterError: a path that there is not.
     """
+    number_at(data, path)
     *way, last = keys_of(path)
-    try:
-        for key in way:
-            data = data[key]
-        data[last]
-    except (KeyError, IndexError, TypeError):
-        raise ParameterError(path, value, "a number that the robot's file gives") from None
+    for key in way:
+        data = data[key]
     data[last] = value
+
+
+def number_at(data: Any, path: str) -> Any:
+    """The value of plain data at a dotted path.
+
+    :raises ParameterError: a path that there is not.
+    """
+    try:
+        for key in keys_of(path):
+            data = data[key]
+    except (KeyError, IndexError, TypeError):
+        raise ParameterError(path, None, "a number that the robot's file gives") from None
+    return data
 
 
 def has_entry(data: Any, path: str) -> bool:
@@ -91,6 +109,6 @@ def has_entry(data: Any, path: str) -> bool:
 def changed_graph(robot: Robot, path: str, value: float) -> Graph:
     """The graph with one number changed; nothing is compiled.
 
-    :raises ParameterError: no machine has it.
+    :raises ParameterError: no file has it.
     """
-    return with_entries(robot, {path: value}).graph
+    return type(robot).graph_of(data_of(robot, {path: value}))

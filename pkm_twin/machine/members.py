@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -155,6 +155,35 @@ class Structure:
     beams: tuple[Beam, ...]
     sections: Mapping[str, Section]
     compliances: Mapping[str, Sequence[float]]
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Names of what is elastic, as the energy shares have them: bars, then joints."""
+        soft = [
+            name
+            for name, values in self.compliances.items()
+            if any(0.0 < value < math.inf for value in values)
+        ]
+        return tuple(dict.fromkeys([*(beam.element for beam in self.beams), *soft]))
+
+    def scaled(self, factors: Mapping[str, float]) -> Structure:
+        """The same with the compliance of some elements multiplied, by name."""
+        if not factors:
+            return self
+        moduli = {beam.name: 1.0 / factors.get(beam.element, 1.0) for beam in self.beams}
+        sections = {
+            name: replace(
+                section,
+                youngs_modulus=section.youngs_modulus * moduli[name],
+                shear_modulus=section.shear_modulus * moduli[name],
+            )
+            for name, section in self.sections.items()
+        }
+        compliances = {
+            name: [factors.get(name, 1.0) * value for value in values]
+            for name, values in self.compliances.items()
+        }
+        return Structure(self.beams, sections, compliances)
 
 
 def disc(mass: float, radius: float) -> Array:

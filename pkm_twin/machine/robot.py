@@ -198,9 +198,13 @@ class Robot:
     limits: JointLimits = schema.section(limits_of(3), default={})
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
+    element_compliance: Mapping[str, float] = schema.numbers(above=0.0, at_most=1e6, default={})
+    """Factors on the compliance of elastic elements, by name; 1 where left out."""
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
-    changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
+    changeable: ClassVar[tuple[str, ...]] = (
+        "payload", "friction", "gravity", "limits", "element_compliance",
+    )  # fmt: skip
     has_start: ClassVar[bool] = False
     has_inverse: ClassVar[bool] = False
     has_branch: ClassVar[bool] = False
@@ -214,7 +218,16 @@ class Robot:
         robot = dataclasses.replace(schema.build(cls, data), name=name)
         _ = robot.controller
         check_uncertainty(robot)
+        robot.check_elements()
         return robot
+
+    @classmethod
+    def graph_of(cls, data: Mapping[str, Any]) -> Graph:
+        """The graph of a parameter file's data, without the checks of a whole robot.
+
+        :raises ParameterError: by the field.
+        """
+        return schema.build(cls, data).graph
 
     # What a mechanism gives.
 
@@ -294,6 +307,13 @@ class Robot:
         """
         raise ParameterError("members", None, "a section with the elastic members")
 
+    def elastic_entries(self) -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+        """What its file tells of elasticity at bodies, joints and rods: plain data, kind and name.
+
+        Empty where the file has other words for it, which a file of those has not.
+        """
+        return {}
+
     def shared_inertia(self) -> tuple[Shared, ...]:
         """What the file says of masses, as linear parameters.
 
@@ -333,12 +353,12 @@ class Robot:
 
         :raises ParameterError: the robot's file gives no masses.
         """
-        graph, load = self.massive().graph, self.payload
+        # The engine's own graph may be that of a machine with other masses.
+        self.massive()
+        graph, load = self.graph, self.payload
         masses = [body.mass for body in graph.bodies.values()]
         heavy = max(graph.bodies[graph.platform].mass, 0.1 * sum(masses))
-        payload = shared_payload(
-            self.graph, load.mass, load.com, load.inertia, heavy, 0.3 * graph.size
-        )
+        payload = shared_payload(graph, load.mass, load.com, load.inertia, heavy, 0.3 * graph.size)
         return (*self.shared_drives(), payload, *self.shared_inertia())
 
     @cached_property
@@ -463,8 +483,18 @@ class Robot:
 
     @cached_property
     def elastic(self) -> Structure:
-        """Elastic beams and joints; errors as :meth:`structure`."""
-        return self.structure()
+        """Elastic beams and joints with the elements' factors; errors as :meth:`structure`."""
+        return self.structure().scaled(self.element_compliance)
+
+    def check_elements(self) -> None:
+        """Refuse factors of elements that there are not.
+
+        :raises ParameterError: by the name, or nothing is elastic.
+        """
+        for name in self.element_compliance:
+            known = self.element_names or self.structure().elements
+            if name not in known:
+                raise UnknownNameError(f"element_compliance.{name}", name, known)
 
     @cached_property
     def joints_count(self) -> int:
@@ -736,12 +766,14 @@ class Robot:
         for key, value in sections.items():
             if key not in self.changeable:
                 raise UnknownNameError(key, key, self.changeable)
-            if isinstance(value, Mapping):
+            if isinstance(value, Mapping) and not isinstance(getattr(self, key), Mapping):
                 new[key] = schema.replace(getattr(self, key), value, key)
             else:
                 fields = {f.name: f for f in dataclasses.fields(self)}
                 new[key] = fields[key].metadata["check"](key, value)
-        return dataclasses.replace(self, **new)
+        made = dataclasses.replace(self, **new)
+        made.check_elements()
+        return made
 
     def refuse_joints(self, status: Array, q: ArrayLike, inputs: Sequence[ArrayLike] = ()) -> None:
         """Raise the typed error of the first refused sample, if there is one.

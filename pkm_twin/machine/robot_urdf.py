@@ -45,8 +45,14 @@ def robot_urdf(robot: Robot) -> str:
 
 
 def robot_description(robot: Robot) -> dict[str, Any]:
-    """The robot as a description of ``mechanism: machine``, limits and payload included."""
+    """The robot as a description of ``mechanism: machine``, limits and payload included.
+
+    Members and compliances stay where the robot has them as such a description tells them.
+    """
     data = graph_description(robot.graph)
+    for kind, entries in robot.elastic_entries().items():
+        for name, entry in entries.items():
+            data[kind][name] |= entry
     data["gravity"] = robot.gravity.tolist()
     pose = [coordinate.name for coordinate in robot.coordinates]
     # A mechanism may have coordinates of its own.

@@ -22,6 +22,15 @@ def about(axis: Array, angle: ArrayLike) -> Array:
     return rotation
 
 
+def about_vector(turns: Array) -> Array:
+    """Rotations by rotation vectors (..., 3), rad, shape (..., 3, 3)."""
+    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
+    across = skew(turns)
+    sine, rest = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    rotation: Array = np.eye(3) + sine * across + rest * (across @ across)
+    return rotation
+
+
 def skew(vectors: Array) -> Array:
     """Matrices (..., 3, 3) that take the cross product of vectors (..., 3) with what follows."""
     x, y, z = np.moveaxis(vectors, -1, 0)

@@ -197,6 +197,27 @@ def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
     return _field(check, default, "a mapping of names to entries", entries=kind)
 
 
+def numbers(
+    *,
+    above: float = -math.inf,
+    at_most: float = math.inf,
+    unit: str = "",
+    default: Any = dataclasses.MISSING,
+) -> Any:
+    """Field: names to numbers within bounds."""
+
+    def check(field: str, value: Any) -> dict[str, float]:
+        if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
+            raise ParameterError(field, value, "a mapping of names to numbers")
+        return {
+            name: _number(_join(field, name), entry, above, at_most=at_most)
+            for name, entry in value.items()
+        }
+
+    bound = "a mapping of names to numbers" + _bound(above, at_most=at_most)
+    return _field(check, default, bound, unit)
+
+
 def flag(*, default: Any = dataclasses.MISSING) -> Any:
     """Field: true or false."""
 
@@ -391,11 +412,14 @@ def replace(section_value: T, changes: Mapping[str, object], path: str) -> T:
 
 
 def plain(value: Any) -> Any:
-    """Dataclasses, arrays and tuples as mappings and lists, in mappings too."""
+    """Dataclasses, arrays and tuples as mappings and lists, in mappings too; keys as in a file."""
     if isinstance(value, Mapping):
         return {name: plain(entry) for name, entry in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {
+            f.metadata.get("key") or f.name: plain(getattr(value, f.name))
+            for f in dataclasses.fields(value)
+        }
     if isinstance(value, np.ndarray):
         return value.tolist()
     return list(value) if isinstance(value, tuple) else value

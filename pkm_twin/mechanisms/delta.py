@@ -138,20 +138,20 @@ class Delta(Robot):
         lengths = (g.base_radius, g.platform_radius, g.arm_length, g.forearm_length)
         return repr((lengths, g.azimuths.tolist(), g.closures))
 
-    def _directions(self, i: int) -> tuple[Array, Array]:
-        """Outwards, and along the arm's axis, of limb i."""
-        angle = self.geometry.azimuths[i]
-        out = np.array([np.cos(angle), np.sin(angle), 0.0])
-        return out, np.cross(UP, out)
+    @cached_property
+    def _directions(self) -> list[tuple[Array, Array]]:
+        """Outwards, and along the arm's axis, of every limb."""
+        outwards = [np.array([np.cos(a), np.sin(a), 0.0]) for a in self.geometry.azimuths]
+        return [(out, np.cross(UP, out)) for out in outwards]
 
     def _elbow(self, i: int, q: Any) -> Any:
         """Elbow of limb i; of an rcu, where its axis meets the plane of the arm."""
-        g, (out, _) = self.geometry, self._directions(i)
+        g, (out, _) = self.geometry, self._directions[i]
         return g.base_radius * out + g.arm_length * (cos(q) * out - sin(q) * UP)
 
     def _forearm(self, i: int, q: Any, platform: Any) -> Any:
         """Forearm of limb i from elbow to platform joint; of an rcu, without its slide."""
-        g, (out, along) = self.geometry, self._directions(i)
+        g, (out, along) = self.geometry, self._directions[i]
         span = platform + g.platform_radius * out - self._elbow(i, q)
         return span - (span @ along) * along if g.closures[i] == "rcu" else span
 
@@ -169,7 +169,7 @@ class Delta(Robot):
             # How well forearms hold the platform, and how well each arm moves its own.
             measure = float(abs(np.linalg.det(rows)))
             for i in range(3):
-                lever = -np.sin(angle) * self._directions(i)[0] - np.cos(angle) * UP
+                lever = -np.sin(angle) * self._directions[i][0] - np.cos(angle) * UP
                 measure = min(measure, float(abs(rows[i] @ lever)))
             if best is None or measure > best[0]:
                 best = measure, q, platform
@@ -202,7 +202,7 @@ class Delta(Robot):
         """
         g = self.geometry
         centres = [
-            self._elbow(i, q[i]) - g.platform_radius * self._directions(i)[0] for i in range(3)
+            self._elbow(i, q[i]) - g.platform_radius * self._directions[i][0] for i in range(3)
         ]
         u, v = centres[1] - centres[0], centres[2] - centres[0]
         n = cross(u, v)
@@ -221,7 +221,7 @@ class Delta(Robot):
         for i, closure in enumerate(self.geometry.closures):
             if closure != "rcu":
                 continue
-            _, along = self._directions(i)
+            _, along = self._directions[i]
             span = self._forearm(i, q[i], x)
             before = np.asarray(self._forearm(i, home[i], platform), float)
             # The forearm is turned with the arm first.
@@ -236,7 +236,7 @@ class Delta(Robot):
         g = self.geometry
         q, misses = [], []
         for i in range(3):
-            out, along = self._directions(i)
+            out, along = self._directions[i]
             a = pose @ out + (g.platform_radius - g.base_radius)
             aside = pose @ along
             z = pose[2]
@@ -263,7 +263,7 @@ class Delta(Robot):
             _, miss, measure = self.engine.ending(q, reached)
             return (g.closures.index("rcu"), miss) if measure is None else None
         centres = np.array(
-            [self._elbow(i, q[i]) - g.platform_radius * self._directions(i)[0] for i in range(3)],
+            [self._elbow(i, q[i]) - g.platform_radius * self._directions[i][0] for i in range(3)],
             float,
         )
         u, v = centres[1] - centres[0], centres[2] - centres[0]
@@ -302,7 +302,7 @@ class Delta(Robot):
         rods: dict[str, Rod] = {}
         sliding: dict[str, Joint] = {}
         for i, limb in enumerate(LIMBS):
-            out, along = self._directions(i)
+            out, along = self._directions[i]
             arm, forearm = f"arm {limb}", f"forearm {limb}"
             pivot = array(g.base_radius * out)
             lever = np.asarray(self._elbow(i, q[i]), float) - pivot
@@ -410,7 +410,7 @@ class Delta(Robot):
         beams: list[Beam] = []
         q, platform = self._home
         for i, limb in enumerate(LIMBS):
-            out, along = self._directions(i)
+            out, along = self._directions[i]
             arm, forearm = f"arm {limb}", f"forearm {limb}"
             pivot = g.base_radius * out
             tip = np.asarray(self._elbow(i, q[i]), float)

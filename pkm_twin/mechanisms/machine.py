@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from pkm_twin.kinematics.engine import choose_coordinates
 from pkm_twin.kinematics.motion import matrices, numbers
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
+from pkm_twin.machine.entries import given
 from pkm_twin.machine.graph import (
     AXES,
     BASE,
@@ -248,8 +249,12 @@ KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "ro
 """The three mappings of a graph, and the schema of their entries."""
 _KEYS: Final = (
     "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs", "joint_map",
-    "uncertainty",
+    "uncertainty", "element_compliance",
 )  # fmt: skip
+_ELASTIC: Final = (
+    ("bodies", "member"), ("joints", "compliance"), ("rods", "section"), ("rods", "radius"),
+)  # fmt: skip
+"""What a graph has no place for, by the kind of its entry."""
 _TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
 _SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
 _TURNED: Final = ("com", "at", "axis", "axes", "ends")
@@ -264,8 +269,6 @@ class Machine(Robot):
     sources: Mapping[tuple[str, str], Source]
     """Where each entry stands in the file, by kind and name."""
     pose: tuple[str, ...]
-
-    changeable: ClassVar[tuple[str, ...]] = ("payload", "friction", "gravity", "limits")
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], name: str) -> Machine:
@@ -309,6 +312,11 @@ class Machine(Robot):
             "gravity": schema.checked(
                 schema.vector(3), "gravity", data.get("gravity", [0, 0, -9.81])
             ),
+            "element_compliance": schema.checked(
+                cls.__dataclass_fields__["element_compliance"],
+                "element_compliance",
+                data.get("element_compliance") or {},
+            ),
         }
         robot = cls(
             mechanism="machine",
@@ -323,7 +331,15 @@ class Machine(Robot):
         robot.engine.check()
         robot.check_masses()
         check_uncertainty(robot)
+        robot.check_elements()
         return robot
+
+    @classmethod
+    def graph_of(cls, data: Mapping[str, Any]) -> Graph:
+        """Of a file that a robot was made of; what its joints hold is not looked at."""
+        graph = _graph(data, _written_out(data)[0])
+        graph.check()
+        return graph
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:  # type: ignore[override]
@@ -359,8 +375,18 @@ class Machine(Robot):
         return self.described
 
     def parameter_sections(self) -> dict[str, Any]:
-        """The machine written out, limbs turned."""
-        return robot_description(self)
+        """The machine written out, limbs turned, with what is elastic."""
+        data = robot_description(self)
+        for kind, word in _ELASTIC:
+            for name, spec in self.specs[kind].items():
+                value = schema.plain(getattr(spec, word))
+                if word == "member" and value is not None:
+                    value = {"from": value.pop("start"), "to": value.pop("end"), **value}
+                if value is not None:
+                    data[kind][name][word] = value
+        if self.element_compliance:
+            data["element_compliance"] = dict(self.element_compliance)
+        return data
 
     def parameter_units(self) -> dict[str, Any]:
         """Units of the same, of each joint by its own type."""
@@ -510,6 +536,18 @@ class Machine(Robot):
                 ends = (inner, rod.ends[0]), (outer, rod.ends[1])
                 beams.append(Beam(name, name, limb[name], *ends, (name,), radius))
         return tuple(beams)
+
+    def elastic_entries(self) -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+        """Members of bodies, sections and radii of rods, compliances of joints."""
+        keys = {"bodies": ("member",), "joints": ("compliance",), "rods": ("section", "radius")}
+        told = {
+            kind: {
+                name: given({key: schema.plain(getattr(spec, key)) for key in keys[kind]})
+                for name, spec in specs.items()
+            }
+            for kind, specs in self.specs.items()
+        }
+        return {kind: {n: e for n, e in all_.items() if e} for kind, all_ in told.items()}
 
     def structure(self) -> Structure:
         """Bars with sections, and the compliance of joints.

@@ -178,6 +178,7 @@ class UprRpu(Robot):
     )  # fmt: skip
     changeable: ClassVar[tuple[str, ...]] = (
         "members", "joints_compliance", "limits", "payload", "friction", "gravity",
+        "element_compliance",
     )  # fmt: skip
     has_start: ClassVar[bool] = True
     has_inverse: ClassVar[bool] = True
@@ -424,7 +425,9 @@ class UprRpu(Robot):
 
         :raises ParameterError: the robot's file gives no masses.
         """
-        graph, inertia = self.massive().graph, self.inertia
+        # The engine's own graph may be that of a machine with other masses.
+        self.massive()
+        graph, inertia = self.graph, self.inertia
         assert inertia is not None  # noqa: S101
         tubes = {
             name: ten_numbers(body.mass, body.com, body.inertia) / inertia.density
@@ -506,6 +509,7 @@ class UprRpu(Robot):
                     1 / (m.shear_modulus * 2 * second),
                     # Free axes carry no load; their entries are never read.
                     np.where(np.isinf(joints), 0.0, joints),
+                    [self.element_compliance.get(name, 1.0) for name in self.element_names],
                 ]
             )
         )
@@ -522,6 +526,7 @@ class UprRpu(Robot):
         cb, sb, cg, sg = cos(beta), sin(beta), cos(gamma), sin(gamma)
         rho = z / cb
         bars, joints = np.reshape(p[:12], (4, 3)), np.reshape(p[12:36], (4, 6))
+        factors = np.reshape(p[36:45], (3, 3))
         limbs = []
 
         def wrench(fx: Any, fy: Any, ft: Any, mx: Any, my: Any, mt: Any) -> list[Any]:
@@ -571,7 +576,11 @@ class UprRpu(Robot):
                 ),
                 (c1, c2, 0.0, universal[5]),
             ]  # fmt: skip
-            limbs.append(LimbElements(wrenches, elements))
+            scaled = [
+                (factor * c11, factor * c22, factor * c23, factor * c33)
+                for factor, (c11, c22, c23, c33) in zip(factors[i], elements, strict=True)
+            ]
+            limbs.append(LimbElements(wrenches, scaled))
         return limbs
 
 

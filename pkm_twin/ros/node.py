@@ -661,8 +661,10 @@ class TwinNode(LifecycleNode):
             elif now == self._last_clock:
                 found.append((WARN, "use_sim_time is set and /clock stands still"))
             self._last_clock = now
+        # Every node has one; of the list of names, an ended node's last words may bring it back.
         own = (self.get_name(), self.get_namespace())
-        namesakes = self.get_node_names_and_namespaces().count(own)
+        publishers = self.get_publishers_info_by_topic("/parameter_events")
+        namesakes = sum((p.node_name, p.node_namespace) == own for p in publishers)
         if namesakes > 1:
             found.append((WARN, f"{namesakes} nodes have this name"))
         taken, clocks = self._seen["messages"], self._seen["clock messages refused"]

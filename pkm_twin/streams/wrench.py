@@ -188,6 +188,17 @@ class Recent(Generic[V]):
                 return item
         return self.items[0] if self.items else None
 
+    def around(self, stamp: int) -> tuple[tuple[int, V], tuple[int, V]] | None:
+        """The newest one that is not later and the oldest that is not earlier; None outside."""
+        after: tuple[int, V] | None = None
+        for item in reversed(self.items):
+            if item[0] <= stamp:
+                if item[0] == stamp or after is None:
+                    return (item, item) if item[0] == stamp else None
+                return item, after
+            after = item
+        return None
+
     def clear(self) -> None:
         """Forget all."""
         self.items.clear()

@@ -1,4 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
+import fcntl
+import os
+import pickle
+
 import numpy as np
 import pytest
 
@@ -7,6 +11,7 @@ pytest.importorskip("h5netcdf")
 pytest.importorskip("h5py")
 
 from pkm_twin import load
+from pkm_twin.atlas import modes, workspace
 from pkm_twin.atlas.isotropy import isotropy_sweep
 from pkm_twin.atlas.modes import modes_sweep
 from pkm_twin.atlas.run import run
@@ -28,37 +33,62 @@ def same(one, other):
     return True
 
 
-@pytest.fixture(scope="session")
-def strain(tmp_path_factory):
-    """The default strain-energy atlas under P1: its sweep and its file, computed alone."""
-    sweep = strain_energy_sweep(load("upr_rpu"), "P1")
-    path = tmp_path_factory.mktemp("strain") / "strain.nc"
-    return sweep, run(sweep, path, workers=1)
+LAYERS = 25
+"""Heights of the circles of small atlases."""
+WHOLE = "whole"
+"""Of as many heights as a command's atlas, in the name of one."""
+MAKE = {
+    "strain-energy": lambda robot: strain_energy_sweep(robot, "P1"),
+    "isotropy": lambda robot: isotropy_sweep(robot, 8000),
+    "workspace": lambda robot: workspace_sweep(robot, 4000),
+    "modes": lambda robot: modes_sweep(robot, 60),
+}
 
 
-class SmallAtlases:
-    """One small file of every kind and robot, by "kind robot", computed when it is asked for."""
+class Atlases:
+    """One small file of every kind and robot, by "kind robot", computed when it is asked for.
 
-    def __init__(self, folder, strain):
+    Once for all processes of a test run: whoever asks first computes it, the others wait.
+    """
+
+    def __init__(self, folder):
         self.folder = folder
-        self.files = {"strain-energy upr_rpu": strain[1]}
 
     def __getitem__(self, name):
-        if name not in self.files:
-            kind, robot = name.split()
-            make, points = {
-                "isotropy": (isotropy_sweep, 8000),
-                "workspace": (workspace_sweep, 4000),
-                "modes": (modes_sweep, 60),
-            }[kind]
-            path = self.folder / f"{kind}_{robot}.nc"
-            self.files[name] = run(make(load(robot), points), path, workers=1)
-        return self.files[name]
+        return self.get(name)[1]
+
+    def get(self, name):
+        """The sweep and its file."""
+        path = self.folder / f"{name.replace(' ', '_')}.nc"
+        kept = path.with_suffix(".sweep")
+        with open(path.with_suffix(".lock"), "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if path.exists():
+                return pickle.loads(kept.read_bytes()), path
+            kind, robot, *whole = name.split()
+            with pytest.MonkeyPatch.context() as patch:
+                if whole != [WHOLE]:
+                    for module in (workspace, modes):
+                        patch.setattr(module, "LAYERS", LAYERS)
+                sweep = MAKE[kind](load(robot))
+                kept.write_bytes(pickle.dumps(sweep))
+                return sweep, run(sweep, path, workers=1)
 
 
 @pytest.fixture(scope="session")
-def small_atlases(strain, tmp_path_factory):
-    return SmallAtlases(tmp_path_factory.mktemp("small"), strain)
+def small_atlases(tmp_path_factory):
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    folder /= "atlases"
+    folder.mkdir(exist_ok=True)
+    return Atlases(folder)
+
+
+@pytest.fixture(scope="session")
+def strain(small_atlases):
+    """The default strain-energy atlas under P1: its sweep and its file, computed alone."""
+    return small_atlases.get("strain-energy upr_rpu")
 
 
 def finite(values):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,17 +13,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.command import forked
+from support.robots import partly_long
 
-from pkm_twin.atlas.store import open_atlas
+from pkm_twin import load
+from pkm_twin.atlas import kinds
+from pkm_twin.atlas.run import run
+from pkm_twin.atlas.store import Parts, open_atlas
+from pkm_twin.atlas.strain_energy import strain_energy_sweep
 from test.atlas.conftest import same
 
 ROOT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "pkm_twin.apps.cli"]
 SWEEP = ["atlas", "upr_rpu", "strain-energy", "--wrench", "P2", "--points", "20000"]
+SPHERES = ["atlas", "prru", "isotropy", "--points", "2000"]
 
 
 def environment():
+    """Of a process that runs a command."""
     return {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
+
+
+@pytest.fixture(scope="module")
+def sweep():
+    """What the command SWEEP computes."""
+    return strain_energy_sweep(load("upr_rpu"), "P2", 20_000)
 
 
 @pytest.fixture
@@ -31,49 +46,45 @@ def call(twin, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
 
-    def run(*words, code=0):
+    def called(*words, code=0):
         result = twin(*words)
         assert result.code == code, result.err
         return result
 
-    return run
+    return called
 
 
-def show_process(name, folder, stdout=subprocess.PIPE):
-    """Draw a file in a process of its own."""
-    return subprocess.run(
-        [*COMMAND, "show", name],
-        cwd=folder,
-        env=environment(),
-        stdout=stdout,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def test_atlas_to_pictures_and_show(call, tmp_path):
-    pytest.importorskip("plotly")
-    out = call(*SWEEP, "--out", "a.nc", "--workers", "1").out
+def test_an_atlas_says_what_made_it(call, tmp_path):
+    out = call(*SWEEP, "--out", "a.nc", "--no-picture", "--workers", "1").out
     assert "paper, table 2" in out
-    for name in ("plane", "factors", "slices", "global"):
-        picture = tmp_path / f"a_{name}.png"
-        assert picture.read_bytes().startswith(b"\x89PNG")
-        assert str(picture.name) in out
     with open_atlas(tmp_path / "a.nc") as data:
         assert data.attrs["robot"] == "upr_rpu"
         assert "youngs_modulus" in data.attrs["robot_parameters"]
         assert data.attrs["pkm_twin_version"]
         assert data.energy.dims == ("z", "tilt", "azimuth")
         assert data.energy.attrs["units"] == "J"
+
+
+@pytest.mark.parametrize(
+    "words", partly_long([SWEEP, SPHERES], SPHERES), ids=lambda words: words[2]
+)
+def test_atlas_to_pictures_and_show(words, call, tmp_path):
+    pytest.importorskip("plotly")
+    out = call(*words, "--out", "a.nc", "--workers", "1").out
+    figures = kinds.KINDS[words[2]].figures
+    for name in figures:
+        picture = tmp_path / f"a_{name}.png"
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert str(picture.name) in out
     call("show", "a.nc", "--out", "b", "--html")
-    assert (tmp_path / "b_plane.png").exists()
+    for name in figures:
+        assert (tmp_path / f"b_{name}.png").exists()
     assert "Plotly" in (tmp_path / "b.html").read_text()
 
 
-def test_interrupted_and_resumed(call, tmp_path):
+def test_interrupted_and_resumed(call, small_atlases, tmp_path):
     """Ctrl-C leaves finished parts; the same command goes on, with the same file."""
-    words = ["atlas", "upr_rpu", "strain-energy", "--points", "300000", "--no-picture"]
-    call(*words, "--out", "whole.nc", "--workers", "1")
+    words = ["atlas", "prru", "modes", "--points", "60", "--no-picture"]
     process = subprocess.Popen(
         [*COMMAND, *words, "--out", "cut.nc"],
         cwd=tmp_path,
@@ -96,7 +107,7 @@ def test_interrupted_and_resumed(call, tmp_path):
     assert not (tmp_path / "cut.nc").exists()
     call(*words, "--out", "cut.nc", "--workers", "1")
     assert not parts.exists()
-    assert same(tmp_path / "whole.nc", tmp_path / "cut.nc")
+    assert same(small_atlases["modes prru whole"], tmp_path / "cut.nc")
 
 
 @pytest.mark.parametrize(
@@ -140,9 +151,8 @@ def test_each_kind_says_its_own_options(call):
             assert (option in text) == (option in shared | options)
 
 
-def test_damaged_atlases_are_one_line(call, tmp_path):
-    call(*SWEEP, "--out", "a.nc", "--no-picture", "--workers", "1")
-    whole = (tmp_path / "a.nc").read_bytes()
+def test_damaged_atlases_are_one_line(strain, tmp_path):
+    whole = strain[1].read_bytes()
     rng = np.random.default_rng(5)
     for k in (0, 1, 4):
         damaged = bytearray(whole[: len(whole) // 3] if k == 0 else whole)
@@ -151,19 +161,42 @@ def test_damaged_atlases_are_one_line(call, tmp_path):
             damaged[rng.integers(0, 60_000)] ^= 255
         (tmp_path / "b.nc").write_bytes(damaged)
         # HDF5 may end the process.
-        result = show_process("b.nc", tmp_path)
-        assert result.returncode == 1, result
-        assert result.stderr.startswith("pkm-twin: b.nc: ")
-        assert result.stderr.count("\n") == 1
+        result = forked(tmp_path, "show", "b.nc")
+        assert result.code == 1, result
+        assert result.err.startswith("pkm-twin: b.nc: ")
+        assert result.err.count("\n") == 1
 
 
-def test_output_that_cannot_be_written_is_one_line(call, tmp_path):
-    call(*SWEEP, "--out", "a.nc", "--no-picture", "--workers", "1")
+def test_output_that_cannot_be_written_is_one_line(call, small_atlases, tmp_path):
+    shutil.copy(small_atlases["workspace delta_cu"], tmp_path / "a.nc")
     with open("/dev/full", "w") as full:
-        result = show_process("a.nc", tmp_path, stdout=full)
+        result = subprocess.run(
+            [*COMMAND, "show", "a.nc"],
+            cwd=tmp_path,
+            env=environment(),
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
     assert result.returncode == 1
     assert result.stderr.count("\n") == 1
-    (tmp_path / "a_plane.png").mkdir()
+    (tmp_path / "a_sections.png").unlink(missing_ok=True)
+    (tmp_path / "a_sections.png").mkdir()
     result = call("show", "a.nc", code=1)
-    assert "a_plane.png" in result.err
+    assert "a_sections.png" in result.err
     assert result.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("limit", [20_000, 1_000_000])
+def test_a_full_disk_costs_no_finished_chunk(limit, sweep, tmp_path):
+    """While chunks are written, and while HDF5 joins them: one line, and the rest goes on."""
+    out = tmp_path / "a.nc"
+    words = [*SWEEP, "--no-picture", "--workers", "1", "--out", out]
+    ended = forked(tmp_path, *words, limit=limit)
+    assert ended.code == 1, ended
+    assert ended.err.count("\n") == 1
+    assert "File too large" in ended.err
+    assert not out.exists()
+    assert not list(tmp_path.rglob("*.tmp"))
+    run(sweep, out, workers=1)
+    assert not Parts(out, sweep).folder.exists()

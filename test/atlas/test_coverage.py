@@ -18,8 +18,11 @@ from pkm_twin.atlas.workspace import planes, workspace_sweep
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import reachable, singularity_at, try_forward
 
+COUNTS = partly_long([20_000, 100_000], 20_000)
+"""Random joint states."""
 
-def reached(robot, rng, count=100_000):
+
+def reached(robot, rng, count):
     """Reachable poses of random joint states between the limits."""
     low, high = robot.limits.position.T
     poses, good = try_forward(robot, rng.uniform(low, high, (count, len(low))))
@@ -29,10 +32,11 @@ def reached(robot, rng, count=100_000):
     return poses
 
 
+@pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("name", robot_names())
-def test_the_default_atlas_holds_all_that_is_reachable(name, rng):
+def test_the_default_atlas_holds_all_that_is_reachable(name, count, rng):
     robot = load(name)
-    poses = reached(robot, rng)
+    poses = reached(robot, rng, count)
     axes = workspace_sweep(robot).axes
     assert len(axes) == len(robot.pose_names)
     for k, ticks in enumerate(axes):
@@ -50,27 +54,30 @@ VOLUMES = partly_long(
 )
 
 
+@pytest.mark.parametrize("count", partly_long([40_000, 200_000], 40_000))
 @pytest.mark.parametrize("name", VOLUMES)
-def test_the_volume_is_that_of_random_poses(name, rng, monkeypatch, tmp_path):
+def test_the_volume_is_that_of_random_poses(name, count, rng, monkeypatch, tmp_path):
     """By Monte Carlo in the search box, which the atlas's own box has no part in."""
     monkeypatch.setattr(workspace, "LAYERS", 3)
     robot = load(name)
     low, high = robot.search_box().T
-    share = reachable(robot, rng.uniform(low, high, (200_000, len(low)))).mean()
-    with open_atlas(run(workspace_sweep(robot, 60_000), tmp_path / "a.nc", workers=1)) as data:
+    share = reachable(robot, rng.uniform(low, high, (count, len(low)))).mean()
+    sweep = workspace_sweep(robot, 40 ** len(low))
+    with open_atlas(run(sweep, tmp_path / "a.nc", workers=1)) as data:
         expected = share * np.prod(high - low)
         assert float(data.volume) == pytest.approx(expected, rel=0.06)
 
 
+@pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("name", robot_names())
-def test_a_cylinder_of_poses_holds_all_that_is_reachable(name, rng):
+def test_a_cylinder_of_poses_holds_all_that_is_reachable(name, count, rng):
     robot = load(name)
     grid = robot.grid()
     if grid.kind == "box":
         with pytest.raises(ValueError, match="no height"):
             grid.polar_pose(0.0, 0.0, 0.0)
         return
-    poses = dict(zip(robot.pose_names, reached(robot, rng).T, strict=True))
+    poses = dict(zip(robot.pose_names, reached(robot, rng, count).T, strict=True))
     low, high = height_range(robot)
     assert low <= poses[grid.height].min()
     assert poses[grid.height].max() <= high

@@ -9,6 +9,7 @@ import re
 
 import numpy as np
 import pytest
+from support.robots import partly_long
 
 from pkm_twin.atlas.kinds import write_page
 from pkm_twin.atlas.store import open_atlas
@@ -17,7 +18,7 @@ from test.atlas.browser import Browser, find_browser
 pytest.importorskip("plotly")
 pytest.importorskip("tornado")
 
-POINTS = 8
+POINTS = partly_long([4, 8], 4)
 """Places that the mouse is put to for each entry of a page's menu."""
 LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 """Robots whose pages are of the same kind as those of the default run."""
@@ -67,6 +68,11 @@ READ = """(() => {
 })()"""
 
 
+@pytest.fixture(params=POINTS)
+def points(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
 def browser():
     program = find_browser()
@@ -91,13 +97,13 @@ def choose(browser, number):
     )
 
 
-def labels(browser):
+def labels(browser, points):
     """Lines of the labels at known points, or at what stands before them.
 
     The points that labels tell of are under the mouse, but for some pixels between points.
     """
     found = []
-    for x, y in browser.run(f"window.known({POINTS})"):
+    for x, y in browser.run(f"window.known({points})"):
         browser.run(f"window.under = null; window.mouse = [{x}, {y}]")
         # From beside it: a place that the mouse is at already tells nothing new.
         browser.move(x - 3, y)
@@ -105,7 +111,7 @@ def labels(browser):
         label = browser.run(f"window.soon(() => {READ})")
         if label:
             found.append(label)
-    assert len(found) >= POINTS // 2, found
+    assert len(found) >= points // 2, found
     assert np.median([label["off"] for label in found]) < 20, found
     return [label["lines"] for label in found]
 
@@ -118,12 +124,12 @@ def number(line):
     return name, float(text.replace("−", "-")), unit
 
 
-def test_strain_energy(browser, small_atlases, tmp_path):
+def test_strain_energy(browser, points, small_atlases, tmp_path):
     with open_atlas(small_atlases["strain-energy upr_rpu"]) as data:
         show(browser, data, tmp_path)
         for entry in (0, 2):
             choose(browser, entry)
-            for gamma, beta, z, value in labels(browser):
+            for gamma, beta, z, value in labels(browser, points):
                 (a, g, _), (b, t, _), (_, h, _) = map(number, (gamma, beta, z))
                 assert (a, b) == ("gamma", "beta")
                 lean, turn = math.hypot(g, t), math.atan2(g, t) % (2 * math.pi)
@@ -142,13 +148,13 @@ def test_strain_energy(browser, small_atlases, tmp_path):
 
 
 @pytest.mark.parametrize("robot", ["prru", LONG("delta_cu")])
-def test_isotropy(browser, robot, small_atlases, tmp_path):
+def test_isotropy(browser, points, robot, small_atlases, tmp_path):
     """A label names the sphere; which of its points it tells of, its number does."""
     with open_atlas(small_atlases[f"isotropy {robot}"]) as data:
         show(browser, data, tmp_path)
         for entry, (field, said) in enumerate((("eta", "eta_KE"), ("force", "F_max"))):
             choose(browser, entry)
-            for lines in labels(browser):
+            for lines in labels(browser, points):
                 (a, first, unit), (b, second, _) = map(number, lines[0].split(", "))
                 scale = math.pi / 180 if unit == "deg" else 1.0
                 point = data.sel({a: scale * first, b: scale * second}, method="nearest")
@@ -160,13 +166,13 @@ def test_isotropy(browser, robot, small_atlases, tmp_path):
 
 
 @pytest.mark.parametrize("robot", ["delta_cu", LONG("prru"), LONG("upr_rpu")])
-def test_workspace(browser, robot, small_atlases, tmp_path):
+def test_workspace(browser, points, robot, small_atlases, tmp_path):
     with open_atlas(small_atlases[f"workspace {robot}"]) as data:
         show(browser, data, tmp_path)
         fields = [f for f in ("singularity", "clearance", "joint_angle") if f in data]
         for entry, field in enumerate(fields):
             choose(browser, entry)
-            for *place, value in labels(browser):
+            for *place, value in labels(browser, points):
                 where = {}
                 for name, shown, unit in map(number, place):
                     where[name] = math.radians(shown) if unit == "deg" else shown
@@ -180,13 +186,13 @@ def test_workspace(browser, robot, small_atlases, tmp_path):
 
 
 @pytest.mark.parametrize("robot", ["prru", LONG("delta_cu"), LONG("upr_rpu")])
-def test_modes(browser, robot, small_atlases, tmp_path):
+def test_modes(browser, points, robot, small_atlases, tmp_path):
     with open_atlas(small_atlases[f"modes {robot}"]) as data:
         show(browser, data, tmp_path)
         swap = robot == "upr_rpu"
         for mode in (1, 4):
             choose(browser, mode - 1)
-            for lines in labels(browser):
+            for lines in labels(browser, points):
                 if len(lines) == 1:
                     # Of the frame: the name of a node.
                     assert lines[0] in set(data.node.values)

@@ -5,27 +5,33 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.robots import parameters_of
+from support.robots import parameters_of, partly_long
 
 from pkm_twin import load
 from pkm_twin.atlas import workspace
-from pkm_twin.atlas.grids import circles, largest_cylinder, nice
+from pkm_twin.atlas.grids import circles, height_range, largest_cylinder, largest_distance, nice
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace import workspace_sweep
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.clearance import clearance
-from pkm_twin.kinematics.workspace import singularity_at
+from pkm_twin.kinematics.workspace import CLEAR, RAYS, singularity_at
 from stiffness_monitor import reachable, regular_workspace
+from test.atlas.conftest import LAYERS
 
 ROBOTS = ("prru", "delta_cu", "upr_rpu")
 TURN = np.linspace(0, 2 * np.pi, 1001)
 
 
-@pytest.fixture(params=ROBOTS)
+@pytest.fixture(params=partly_long([r + w for w in ("", " whole") for r in ROBOTS], *ROBOTS))
 def reach_atlas(request, small_atlases):
     with open_atlas(small_atlases[f"workspace {request.param}"]) as data:
-        yield load(request.param), data.load()
+        yield load(request.param.split()[0]), data.load()
+
+
+@pytest.fixture
+def few_layers(monkeypatch):
+    monkeypatch.setattr(workspace, "LAYERS", LAYERS)
 
 
 def test_reach_and_singularity_are_those_of_the_library(reach_atlas):
@@ -77,9 +83,33 @@ def test_the_cylinder_is_reachable_and_no_wider_one_is(reach_atlas):
     assert not whole(1.002)
 
 
+@pytest.mark.parametrize("name", ROBOTS)
+def test_circles_end_where_the_first_ray_does(name):
+    """Each height alone, its rays one test at a time: whole inside, not whole a hair beyond."""
+    robot = load(name)
+    low, high = height_range(robot)
+    found = circles(robot, np.linspace(low, high, 41))
+    assert (found.radius > 0.0).sum() > 4
+    turn = np.arange(RAYS) * (2 * np.pi / RAYS)
+    step = largest_distance(robot) / 340
+
+    def clear(z, distance):
+        poses = robot.grid().polar_pose(z, distance, turn)
+        return ((singularity_at(robot, poses) >= CLEAR) & reachable(robot, poses)).all()
+
+    for z, radius in zip(found.z.tolist(), found.radius.tolist(), strict=True):
+        if radius == 0.0:
+            assert not clear(z, step)
+            continue
+        for distance in (*np.arange(0.0, radius, 20 * step), radius):
+            assert clear(z, distance)
+        assert not clear(z, radius + 1e-9)
+
+
 def test_circles_of_the_upr_rpu_are_those_of_the_regular_workspace():
+    """Whatever the steps of the search."""
     robot = load("upr_rpu")
-    regular = regular_workspace(robot, np.arange(-1.0, -0.24, 0.05))
+    regular = regular_workspace(robot, np.arange(-1.0, -0.24, 0.15))
     found = circles(robot, regular.z)
     assert found.radius == pytest.approx(regular.radius, abs=1e-8)
 
@@ -88,7 +118,7 @@ def test_the_largest_cylinder_is_better_than_all_others(reach_atlas):
     _, data = reach_atlas
     z, radius = data.height.values, data.circle.values
     best = float(data.cylinder_radius) ** 2 * float(data.cylinder_high - data.cylinder_low)
-    for i in range(0, len(z), 7):
+    for i in range(0, len(z), max(1, len(z) // 15)):
         for j in range(i + 1, len(z)):
             assert radius[i : j + 1].min() ** 2 * (z[j] - z[i]) <= best * (1 + 1e-12)
 
@@ -100,30 +130,20 @@ def test_no_cylinder_where_nothing_is_reachable():
     assert singularity_at(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
 
 
-def test_a_bound_on_singularity_takes_away(tmp_path, monkeypatch):
-    monkeypatch.setattr(workspace, "LAYERS", 15)
-    robot = load("upr_rpu")
-    files = [
-        run(
-            workspace_sweep(robot, 4000, least_singularity=least),
-            tmp_path / f"{least}.nc",
-            workers=1,
-        )
-        for least in (0.0, 0.2)
-    ]
-    with open_atlas(files[0]) as wide, open_atlas(files[1]) as narrow:
+def test_a_bound_on_singularity_takes_away(small_atlases, tmp_path, few_layers):
+    sweep = workspace_sweep(load("upr_rpu"), 4000, least_singularity=0.2)
+    file = run(sweep, tmp_path / "a.nc", workers=1)
+    with open_atlas(small_atlases["workspace upr_rpu"]) as wide, open_atlas(file) as narrow:
         assert 0 < float(narrow.volume) < float(wide.volume)
         assert float(narrow.cylinder_radius) < float(wide.cylinder_radius)
         assert float(narrow.singularity.min()) >= 0.2
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_a_bound_on_clearance_takes_away(name, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", partly_long(ROBOTS, "delta_cu"))
+def test_a_bound_on_clearance_takes_away(name, small_atlases, tmp_path, few_layers):
     """Volume, circles and cylinder are those of what is left; the rest is in the file."""
-    monkeypatch.setattr(workspace, "LAYERS", 15)
     robot = load(name)
-    wide = run(workspace_sweep(robot, 4000), tmp_path / "wide.nc", workers=1)
-    with open_atlas(wide) as data:
+    with open_atlas(small_atlases[f"workspace {name}"]) as data:
         data.load()
     gaps = data.clearance.values
     bound = float(np.nanquantile(gaps, 0.1))
@@ -158,16 +178,18 @@ def test_the_box_holds_what_interference_takes_away(variant):
         assert (one == other).all()
 
 
-def test_pictures_show_what_interference_takes_away(tmp_path, monkeypatch):
+def test_pictures_show_what_interference_takes_away(small_atlases, tmp_path, few_layers):
     """A name for the hatching, in words that say why."""
     from matplotlib import pyplot
 
     from pkm_twin.atlas import kinds
 
-    monkeypatch.setattr(workspace, "LAYERS", 15)
-    for least, words in ((0.0, "limbs meet nowhere"), (0.03, "limbs are within 30 mm in ")):
-        sweep = workspace_sweep(load("delta"), 30000, least_clearance=least)
-        with open_atlas(run(sweep, tmp_path / f"{least}.nc", workers=1)) as data:
+    sweep = workspace_sweep(load("delta"), 8000, least_clearance=0.03)
+    for file, words, least in (
+        (small_atlases["workspace delta"], "limbs meet nowhere", 0.0),
+        (run(sweep, tmp_path / "a.nc", workers=1), "limbs are within 30 mm in ", 0.03),
+    ):
+        with open_atlas(file) as data:
             figure = kinds.draw(data)["sections"]
         assert words in figure.get_suptitle()
         legends = [ax.get_legend() for ax in figure.axes if ax.get_legend()]
@@ -177,12 +199,11 @@ def test_pictures_show_what_interference_takes_away(tmp_path, monkeypatch):
         pyplot.close(figure)
 
 
-def test_all_taken_away_is_still_an_atlas(tmp_path, monkeypatch):
+def test_all_taken_away_is_still_an_atlas(tmp_path, few_layers):
     from matplotlib import pyplot
 
     from pkm_twin.atlas import kinds
 
-    monkeypatch.setattr(workspace, "LAYERS", 15)
     sweep = workspace_sweep(load("delta"), 4000, least_clearance=0.05)
     with open_atlas(run(sweep, tmp_path / "none.nc", workers=1)) as data:
         assert float(data.volume) == 0.0
@@ -191,14 +212,13 @@ def test_all_taken_away_is_still_an_atlas(tmp_path, monkeypatch):
         pyplot.close(kinds.draw(data)["sections"])
 
 
-def test_without_members_there_is_no_clearance(tmp_path, monkeypatch):
+def test_without_members_there_is_no_clearance(small_atlases, tmp_path, few_layers, monkeypatch):
     from matplotlib import pyplot
 
     from pkm_twin.atlas import kinds
 
-    monkeypatch.setattr(workspace, "LAYERS", 15)
     robot = load("delta")
-    whole = run(workspace_sweep(robot, 4000), tmp_path / "whole.nc", workers=1)
+    whole = small_atlases["workspace delta"]
     monkeypatch.setattr(type(robot), "beams", ())
     bare = run(workspace_sweep(load("delta"), 4000), tmp_path / "bare.nc", workers=1)
     with open_atlas(whole) as one, open_atlas(bare) as other:

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
+from support.robots import often
 
 from pkm_twin.bags import format as mcap_format
 from pkm_twin.bags.reader import (
@@ -99,14 +100,17 @@ def test_topics_are_filtered_and_unknown_ones_named(bag: Path) -> None:
     assert caught.value.reason == "no_topic"
 
 
-def test_every_byte_is_covered_by_a_check(bag: Path, tmp_path: Path, rows: Rows) -> None:
+@pytest.mark.parametrize("flips", often(FLIPS // 4, FLIPS))
+def test_every_byte_is_covered_by_a_check(
+    bag: Path, tmp_path: Path, rows: Rows, flips: int
+) -> None:
     """Flip one bit at a time: nothing may be handed out that differs from what was recorded."""
     sound = bag.read_bytes()
     expected = rows(read_messages(bag))
     target = tmp_path / "flipped.mcap"
     chance = random.Random(20240501)
     unseen = []
-    for _ in range(FLIPS):
+    for _ in range(flips):
         bit = chance.randrange(8 * len(sound))
         damaged = bytearray(sound)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -120,13 +124,14 @@ def test_every_byte_is_covered_by_a_check(bag: Path, tmp_path: Path, rows: Rows)
     assert rows(read_messages(bag)) == expected
 
 
+@pytest.mark.parametrize("step", often(37, 7))
 @pytest.mark.parametrize("length", [1, 4, 8, 64])
-def test_zeroed_bytes(bag: Path, tmp_path: Path, rows: Rows, length: int) -> None:
+def test_zeroed_bytes(bag: Path, tmp_path: Path, rows: Rows, length: int, step: int) -> None:
     """Zeroed CRC fields are harmless, everything else is found."""
     sound = bag.read_bytes()
     expected = rows(read_messages(bag))
     target = tmp_path / "zeroed.mcap"
-    for start in range(0, len(sound) - length, 7):
+    for start in range(0, len(sound) - length, step):
         damaged = sound[:start] + bytes(length) + sound[start + length :]
         target.write_bytes(damaged)
         try:
@@ -159,11 +164,12 @@ def test_foreign_bag_without_crcs_gives_no_wrong_times_or_counts(
         assert found == times
 
 
-def test_cut_at_every_byte(tmp_path: Path, make_bag: Callable[..., Path]) -> None:
+@pytest.mark.parametrize("step", often(7, 1))
+def test_cut_at_every_byte(tmp_path: Path, make_bag: Callable[..., Path], step: int) -> None:
     sound = make_bag(tmp_path / "sound.mcap", 20, chunk_size=600).read_bytes()
     target = tmp_path / "cut.mcap"
     last = 0
-    for length in range(len(sound)):
+    for length in sorted({*range(0, len(sound), step), len(sound) - 1}):
         target.write_bytes(sound[:length])
         with pytest.raises(BagError) as caught:
             inspect(target)

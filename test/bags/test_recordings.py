@@ -42,6 +42,11 @@ EXPECTED = {
         WRENCH: ("geometry_msgs/msg/WrenchStamped", 10000, 0.3),
         TRAJECTORY: ("trajectory_msgs/msg/JointTrajectory", 4, -50.0),
     },
+    "upr_rpu_soft_joint": {
+        STATES: ("sensor_msgs/msg/JointState", 2000, 0.2),
+        WRENCH: ("geometry_msgs/msg/WrenchStamped", 2000, 0.3),
+        "/measured_deflection": ("geometry_msgs/msg/TransformStamped", 400, 0.4),
+    },
     "upr_rpu_milling": {
         STATES: ("sensor_msgs/msg/JointState", 10000, 0.2),
         WRENCH: ("geometry_msgs/msg/WrenchStamped", 10000, 0.3),

@@ -134,7 +134,7 @@ def deflections(bars: float = 1.0, joints: float = 1.0, base: Robot | None = Non
         },
     }
     changed = robot.changed(**changes)
-    return 1e6 * np.array([compliance(changed, pose) @ LOAD for pose, *_ in TABLE_1])
+    return 1e6 * compliance(changed, [pose for pose, *_ in TABLE_1]) @ LOAD
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,13 +154,14 @@ class PaperRows:
     joints: tuple[float, float]
 
 
-def paper_rows() -> PaperRows:
+def paper_rows(factors: np.ndarray = FACTORS) -> PaperRows:
+    """Of the paper's configurations; ``factors`` are those that are tried."""
     twin = deflections()
     robot = load("upr_rpu")
     best = []
     for name in ("bars", "joints"):
         left = [
-            (error(deflections(base=robot, **{name: factor})), float(factor)) for factor in FACTORS
+            (error(deflections(base=robot, **{name: factor})), float(factor)) for factor in factors
         ]
         best.append(min(left)[::-1])
     held = with_rigid_joints()

@@ -5,13 +5,18 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 from support.command import command
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
+from pkm_twin.apps.fit_files import robot_text
 from pkm_twin.bags.reader import open_bag
+from pkm_twin.machine.entries import entries, with_entries
+from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
+from test.support.robots import parameters_of
 
 HEAD = ("five_bar", "friction,payload")
 
@@ -122,3 +127,48 @@ def test_excite_writes_a_trajectory_within_the_limits_that_rests_at_both_ends(ca
     assert (robot.singularity(q) > 0.1 * 0.99).all()
     columns = np.genfromtxt(out.with_suffix(".csv"), delimiter=",", names=True)
     assert len(columns) == len(points)
+
+
+def elastic_machine(path):
+    """A 3-RPS head with elastic parts in its limbs, and a controller that counts otherwise."""
+    data = parameters_of("rps3")
+    (section,) = data["limbs"] if isinstance(data["limbs"], list) else [data["limbs"]]
+    names = load("rps3").joint_names
+    for k, (name, joint) in enumerate(section["joints"].items()):
+        joint["compliance"] = [1e-8, 1e-8, 1e-8, 1e-6, 2e-6 * (k + 1), 1e-6]
+        assert name
+    data["joint_map"] = {names[0]: {"sign": -1, "offset": 0.02}}
+    path.write_text(yaml.safe_dump(data))
+    return load(str(path))
+
+
+def test_copies_of_a_limb_keep_elastic_parts_and_the_joint_map(tmp_path):
+    source = tmp_path / "elastic.yaml"
+    robot = elastic_machine(source)
+    text, written = robot_text(str(source), per_copy=True)
+    out = tmp_path / "written.yaml"
+    out.write_text(text)
+    for other in (written, load(str(out))):
+        assert other.controller.offsets == pytest.approx(robot.controller.offsets)
+        assert other.controller.factors == pytest.approx(robot.controller.factors)
+        assert len(other.shared_parameters()) > len(robot.shared_parameters())
+        expected = compliance(robot, robot.home())
+        assert compliance(other, other.home()) == pytest.approx(expected, rel=1e-9)
+    again = with_entries(robot, {"origin[2]": entries(robot)["origin[2]"][0]})
+    assert again.structure().compliances == robot.structure().compliances
+    assert [beam.radius for beam in again.beams] == [beam.radius for beam in robot.beams]
+
+
+def test_copies_that_would_lose_elastic_members_are_refused_by_name(capsys, tmp_path):
+    data = parameters_of("delta")
+    assert data.pop("members")
+    data["joint_map"] = {load("delta").joint_names[0]: {"offset": 0.1}}
+    rigid = tmp_path / "rigid.yaml"
+    rigid.write_text(yaml.safe_dump(data))
+    assert robot_text(str(rigid), per_copy=True)[1].controller.offsets[0] == pytest.approx(0.1)
+    done = command(
+        capsys, "fit", "delta_cu", DELTA, "--per-copy", "--out", tmp_path / "fitted.yaml"
+    )
+    assert done.code == 1
+    assert "members" in done.one_line_error()
+    assert not (tmp_path / "fitted.yaml").exists()

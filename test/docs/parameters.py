@@ -45,6 +45,7 @@ example in [new_machine.md](new_machine.md). `friction` and `limits` stand at th
 | `bodies`, `joints`, `rods` |  | mappings of names to entries | none |
 | `joint_map` |  | a mapping of names to entries | none |
 | `uncertainty` |  | a mapping of paths to entries | none |
+| `element_compliance` |  | a mapping of names to numbers above 0, at most 1e+06 | none |
 | `limbs` |  | one section or a list: `azimuths` (rad), `bodies`, `joints`, `rods` | none |
 
 What stands in `limbs` is given for azimuth 0, copied and turned about base z by each azimuth, its
@@ -60,6 +61,11 @@ the number's own unit, or `relative`, that of a common factor."""
 
 JOINT_MAP = """Between a controller's numbers and the model's: its name for the joint, and
 controller = offset + sign * ratio * model."""
+ELEMENTS = """### `element_compliance`
+
+Factors on the compliance of elastic elements by their names (those of `strain_energy`: members
+and joints), 1 where left out: `{3U: 3.0}` makes a joint three times softer than the other
+sections say. Above 0, at most 1e6. `pkm-twin fit --what compliance` writes it."""
 GRAVITY = """### `gravity`
 
 Acceleration of free fall in base axes, m/s2; default [0, 0, -9.81]."""
@@ -74,7 +80,7 @@ def default(field):
     if value is None:
         return "none"
     if value == {}:
-        return "none" if field.metadata["entries"] else "its own defaults"
+        return "its own defaults" if field.metadata["section"] else "none"
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(plain(value)).replace("'", "")
@@ -136,6 +142,7 @@ def page():
     parts.append(table("`limits`, by actuated joint (here three)", limits_of(3), LIMITS))
     parts.append(table("`joint_map.NAME`, by actuated joint", JointMapEntry, JOINT_MAP))
     parts.append(table("`uncertainty.PATH`", UncertaintyEntry, UNCERTAINTY))
+    parts.append(ELEMENTS)
     parts.append(table("Tube", Tube))
     parts.append(GRAVITY)
     return "\n\n".join(parts) + "\n"

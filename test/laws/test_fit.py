@@ -18,6 +18,7 @@ from delta_dynamics.fit import Fit, Recorded, fit
 from pkm_twin import Robot, load
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.entries import entries, with_entries
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.shared import pseudo_inertia
 from test.laws.recordings import smooth_motion
@@ -81,6 +82,18 @@ def test_columns_of_the_file_are_the_efforts(name):
     for group in parameters.groups:
         for key, value in group.keys(group.values).items():
             assert np.isfinite(value), key
+
+
+@pytest.mark.parametrize("name", ["delta", "prru", "upr_rpu", "five_bar"])
+def test_numbers_are_those_of_the_robot_and_not_of_another_with_its_geometry(name):
+    robot = load(name)
+    keys = [path for path, (_, unit) in entries(robot).items() if unit in ("kg", "kg/m3")]
+    own = [path for path in keys if not path.startswith(("payload", "members", "limits"))]
+    heavier = with_entries(robot, {path: 1.5 * entries(robot)[path][0] for path in own})
+    before, after = (file_parameters(r, ("payload", "inertia")) for r in (robot, heavier))
+    masses = [k for k, n in enumerate(after.names) if n.endswith((".mass", "density"))]
+    np.testing.assert_allclose(after.values[masses], 1.5 * before.values[masses], rtol=1e-9)
+    np.testing.assert_allclose(after.scales[masses], 1.5 * before.scales[masses], rtol=1e-9)
 
 
 def test_clean_efforts_of_pinocchio_give_friction_and_payload():

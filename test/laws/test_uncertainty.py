@@ -25,6 +25,8 @@ DELTA = {
     "friction": {"relative": 0.1},
     "gravity[2]": {"deviation": 0.05},
 }
+FULL = ((120, 0.25), (10_000, 0.03))
+"""Draws, and by how much the spread may differ from what is said."""
 HEAD = {"members.youngs_modulus": {"relative": 0.02}, "joints_compliance": {"relative": 0.04}}
 
 
@@ -77,13 +79,13 @@ def check(count: int, tolerance: float) -> None:
     np.testing.assert_allclose(found, expected, rtol=tolerance, atol=1e-3 * expected.max())
 
 
-def test_random_machines_spread_as_is_said() -> None:
-    check(120, 0.25)
-
-
-@pytest.mark.long
-def test_ten_thousand_random_machines_spread_as_is_said() -> None:
-    check(10_000, 0.03)
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize(
+    ("count", "tolerance"),
+    [(24, 0.5), *(pytest.param(*case, marks=pytest.mark.long) for case in FULL)],
+)
+def test_random_machines_spread_as_is_said(count: int, tolerance: float) -> None:
+    check(count, tolerance)
 
 
 def test_a_file_that_names_none_is_sure() -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A maker of messages of both kinds, and per module a domain, a peer and processes."""
 
+import functools
 import os
 
 import numpy as np
@@ -11,7 +12,7 @@ from support.robots import parameters_of
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from stiffness_monitor import compliance, strain_energy
-from test.nodes.harness import Domain, Maker, NodeProcess, Peer, Plain, Ros
+from test.nodes.harness import Domain, ForkedNode, Maker, NodeProcess, Peer, Plain, Ros
 
 
 @pytest.fixture(scope="session", params=["plain", "ros"])
@@ -73,6 +74,12 @@ def launch(domain):
 def launch_alone(domain):
     """The same for one test: what it leaves is no other test's peer."""
     yield from started(domain)
+
+
+@pytest.fixture
+def refused(domain, tmp_path):
+    """Start a node that ends by itself: refused(module, *parameters)."""
+    return functools.partial(ForkedNode, domain, tmp_path / "output")
 
 
 def started(domain):

@@ -7,6 +7,8 @@ Nothing here sleeps to synchronise: every wait is for a condition, with a deadli
 import contextlib
 import ctypes
 import fcntl
+import importlib
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -207,6 +209,55 @@ class NodeProcess(Process):
         super().__init__(domain, [sys.executable, *run, "--ros-args", *flags, *arguments])
 
 
+NODES = (
+    "delta_dynamics.node",
+    "delta_dynamics.gate_node",
+    "delta_dynamics.sim_node",
+    "pkm_twin.state.node",
+    "stiffness_monitor.node",
+)
+
+
+def fork_of(module, flags, environment, output):
+    """Run a node in this process, which is a fork of one that has imported all."""
+    with open(output, "wb") as file:
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(file.fileno(), stream.fileno())
+    os.environ.update(environment)
+    sys.argv = [module, *flags]
+    importlib.import_module(module).main()
+
+
+class ForkedNode:
+    """A node that ends by itself, in a process that need not import anything: a third of the cost.
+
+    What it says is in ``output`` once it has ended.
+    """
+
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(NODES))
+
+    def __init__(self, domain, output, module, *parameters, arguments=()):
+        self._path = output
+        flags = [flag for parameter in parameters for flag in ("-p", parameter)]
+        words = ["--ros-args", *flags, *arguments]
+        self._process = self.context.Process(
+            target=fork_of, args=(module, words, domain.environment(), str(output)), daemon=True
+        )
+        self._process.start()
+
+    @property
+    def output(self):
+        return self._path.read_text()
+
+    def wait(self, timeout=DEADLINE):
+        """The exit code."""
+        self._process.join(timeout)
+        if self._process.exitcode is None:
+            self._process.kill()
+        return self._process.exitcode
+
+
 class Peer:
     """The other side of the topics: a node of this process that sends and collects."""
 
@@ -269,7 +320,7 @@ class Peer:
             if repeat is not None and now >= due:
                 repeat()
                 due = now + 0.05
-            self._executor.spin_once(timeout_sec=0.01)
+            self._executor.spin_once(timeout_sec=0.05)
 
         return wait_until(condition, spin, timeout, "what this test waits for")
 

@@ -203,8 +203,8 @@ def test_a_publisher_that_promises_no_deadline_is_told_of(heard, launch):
         (["deadlin:=0.2"], "did you mean 'deadline'"),
     ],
 )
-def test_a_bad_configuration_is_refused_in_one_line(launch, parameters, named):
-    line = one_line_refusal(launch(GATE, *parameters))
+def test_a_bad_configuration_is_refused_in_one_line(refused, parameters, named):
+    line = one_line_refusal(refused(GATE, *parameters))
     assert line.startswith("refused to start: ")
     assert named in line
 

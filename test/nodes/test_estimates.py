@@ -17,7 +17,9 @@ from pkm_twin import load
 
 ROBOT = load("delta_cu")
 PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=600.0")
+TORQUES = "/delta_dynamics/joint_torques"
 OUTPUTS = {
+    TORQUES: JointState,
     "/delta_dynamics/payload": InertiaStamped,
     "/delta_dynamics/payload_deviation": InertiaStamped,
     "/delta_dynamics/external_wrench": WrenchStamped,
@@ -40,14 +42,19 @@ def states(count, mass, push, begin):
 
 
 def stream(peer, samples, beginning):
-    """Send samples stamped a millisecond apart; the stamp after the last."""
+    """Send samples stamped a millisecond apart, no more at once than can wait; the stamp after."""
+    answers = peer.received(TORQUES)
     for k, (q, qd, effort) in enumerate(zip(*samples, strict=True)):
+        if k % 50 == 0:
+            seen = len(answers)
         message = JointState(name=list(ROBOT.joint_names))
         message.position, message.velocity = q.tolist(), qd.tolist()
         message.effort = effort.tolist()
         stamp = beginning + 1_000_000 * k
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
         peer.send("/joint_states", message)
+        if k % 50 == 49:
+            peer.until(lambda seen=seen: len(answers) > seen + 20)
     return beginning + 1_000_000 * len(samples[0])
 
 

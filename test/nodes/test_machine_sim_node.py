@@ -136,5 +136,5 @@ def test_it_ends_on_a_signal(peer, machine):
         (("payload.masses:=[1.0, 2.0]",), "payload.masses"),
     ],
 )
-def test_a_bad_parameter_is_refused_in_one_line(launch, parameters, word):
-    assert word in one_line_refusal(launch(MODULE, *parameters))
+def test_a_bad_parameter_is_refused_in_one_line(refused, parameters, word):
+    assert word in one_line_refusal(refused(MODULE, *parameters))

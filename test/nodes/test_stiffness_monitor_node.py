@@ -288,8 +288,8 @@ class TestRejects:
             (["accept_empty_frame:=1"], "accept_empty_frame: 1"),
         ],
     )
-    def test_a_bad_configuration_is_refused_in_one_line(self, launch, parameters, named):
-        line = one_line_refusal(launch(MODULE, *parameters))
+    def test_a_bad_configuration_is_refused_in_one_line(self, refused, parameters, named):
+        line = one_line_refusal(refused(MODULE, *parameters))
         assert line.startswith("refused to start: ")
         assert named in line
 

@@ -9,7 +9,7 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from pkm_twin import load
-from test.nodes.harness import SECOND, Maker, Ros, stamp_of
+from test.nodes.harness import SECOND, Maker, Ros, stamp_of, values_of
 
 MODULE = "delta_dynamics.node"
 ROBOT = load("delta_cu")
@@ -126,6 +126,41 @@ class Twin:
 
     def diagnostics(self, condition=lambda array: True):
         return self.peer.diagnostics(f"/{self.name}", condition)
+
+    def at_rest(self):
+        """Diagnostics after which nothing more waits: two in a row with the same count."""
+        last = self.diagnostics()
+        while count_of(last) != count_of(array := self.diagnostics()):
+            last = array
+        return array
+
+    def balance(self, total):
+        """The diagnostics up to where every one of ``total`` samples is taken or counted as lost.
+
+        More are sent until it is so: what is lost last is seen by what comes after it.
+        """
+        told = self.peer.received("/diagnostics")
+        told.clear()
+        sent = total
+
+        def again():
+            nonlocal sent
+            sent += 1
+            self.send_state(state(self.stamp()))
+
+        def own():
+            return [a for a in told if a.status[0].name == f"/{self.name}"]
+
+        self.peer.until(lambda: any(count_of(a) >= total for a in own()), repeat=again)
+        self.peer.until(lambda: any(count_of(a) >= sent for a in own()))
+        assert count_of(own()[-1]) == sent
+        return own()
+
+
+def count_of(array):
+    """Joint states that the node took and that it says were lost."""
+    values = values_of(array)
+    return sum(int(values[key]) for key in ("messages", "lost: joint_states"))
 
 
 def trajectory(count=5, order=(0, 1, 2), stamp=0, **changes):

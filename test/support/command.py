@@ -3,12 +3,19 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import resource
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pkm_twin.apps import cli
+
+_FORK = multiprocessing.get_context("fork")
 
 
 @dataclass(frozen=True)
@@ -34,3 +41,30 @@ def command(capture: Any, *arguments: Any) -> Result:
         cli.main([str(argument) for argument in arguments])
     captured = capture.readouterr()
     return Result(int(end.value.code or 0), captured.out, captured.err)
+
+
+def forked(folder: Path, *arguments: Any, limit: int = resource.RLIM_INFINITY) -> Result:
+    """What a command gives in a fork of this process: it may be ended, and need not import.
+
+    :param folder: where it runs.
+    :param limit: bytes at which its files end.
+    """
+    outputs = [folder / "stdout.txt", folder / "stderr.txt"]
+    process = _FORK.Process(target=_run, args=(folder, arguments, outputs, limit))
+    process.start()
+    process.join()
+    out, err = (path.read_text() for path in outputs)
+    for path in outputs:
+        path.unlink()
+    assert process.exitcode is not None
+    return Result(process.exitcode, out, err)
+
+
+def _run(folder: Path, arguments: tuple[Any, ...], outputs: list[Path], limit: int) -> None:
+    os.chdir(folder)
+    sys.stdout, sys.stderr = (path.open("w", buffering=1) for path in outputs)
+    # What a library writes past Python.
+    for number, stream in enumerate((sys.stdout, sys.stderr), 1):
+        os.dup2(stream.fileno(), number)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    cli.main([str(argument) for argument in arguments])

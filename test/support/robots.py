@@ -39,6 +39,11 @@ def partly_long(names: Iterable[Any], *kept: Any) -> list[Any]:
     return [name if name in kept else pytest.param(name, marks=marks) for name in names]
 
 
+def often(some: int, all_of_them: int) -> list[Any]:
+    """How many, or how far apart: what is run by default, and what `make long` runs."""
+    return [some, pytest.param(all_of_them, marks=pytest.mark.long)]
+
+
 def has(robot: Robot, ask: str) -> bool:
     """Whether a robot's file gives what a method needs: ``massive`` or ``structure``."""
     try:

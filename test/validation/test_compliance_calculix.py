@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.robots import partly_long
 
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.members import Section
@@ -25,6 +26,7 @@ from stiffness_monitor.beams import local_axes
 from stiffness_monitor.structure import Member, StructuralModel, Support, structural_model
 from test.certificate.links import (
     BOUND,
+    FACTORS,
     FINITE_ELEMENTS,
     MESH,
     PAPER_BOUND,
@@ -48,22 +50,26 @@ def rigid(variant):
     return variant("upr_rpu", joints_compliance=rigid_joints())[0]
 
 
-@pytest.fixture(scope="module")
-def solids(tmp_path_factory):
+SHORT = Mesh(MESH.square, MESH.rings, 2)
+"""The certificate's section in longer bricks, which bars of even section are as well with."""
+
+
+@pytest.fixture(scope="module", params=partly_long([SHORT, MESH], SHORT), ids=str)
+def solids(request, tmp_path_factory):
     """Compliance of a robot's solid bars in a pose, each computed once."""
     known = {}
 
     def make(robot, name):
         if name not in known:
             frame = structural_model(robot, np.array(POSES[name]))
-            known[name] = solid_compliance(frame, tmp_path_factory.mktemp("solids"), MESH)
+            known[name] = solid_compliance(frame, tmp_path_factory.mktemp("solids"), request.param)
         return known[name]
 
     return make
 
 
 @needs_calculix
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", partly_long(POSES, "configuration 2"))
 def test_compliance_of_the_bars(name, rigid, solids):
     theirs = solids(rigid, name)
     found = difference(compliance(rigid, POSES[name]), theirs)
@@ -76,7 +82,7 @@ def test_compliance_of_the_bars(name, rigid, solids):
 
 
 @needs_calculix
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", partly_long(POSES, "configuration 2"))
 def test_the_rest_is_the_shear_factor(name, rigid, solids):
     better = rigid.changed(members={"shear_factor": round_bar(rigid)})
     assert difference(compliance(better, POSES[name]), solids(rigid, name)).worst < 0.0005
@@ -118,12 +124,17 @@ def test_the_comparison_tells_a_held_joint_apart(end, entry, rigid, tmp_path):
     assert held[entry] == np.inf
     held[entry] = 0.0
     first = replace(first, **{end: replace(support, compliance=tuple(held))})
-    theirs = solid_compliance(replace(frame, parts=(first, *others)), tmp_path, Mesh(2, 1, 4))
+    theirs = solid_compliance(replace(frame, parts=(first, *others)), tmp_path, Mesh(1, 1, 2))
     assert difference(compliance(rigid, pose), theirs).worst > 10 * BOUND
 
 
 @needs_calculix
-def test_cantilever_and_a_finer_mesh(rigid, tmp_path):
+@pytest.mark.parametrize(
+    "meshes",
+    partly_long([(SHORT, MESH), (MESH, Mesh(4, 1, 8))], (SHORT, MESH)),
+    ids=lambda meshes: f"{meshes[0]} and {meshes[1]}",
+)
+def test_cantilever_and_a_finer_mesh(meshes, rigid, tmp_path):
     """One clamped bar, askew, against Timoshenko's beam; and two meshes against each other."""
     modulus, shear, diameter, length = 210e9, 80e9, 0.1, 0.6
     axes = local_axes(np.array([0.36, 0.48, -0.8]))
@@ -144,7 +155,7 @@ def test_cantilever_and_a_finer_mesh(rigid, tmp_path):
         closed[move, turn] = closed[turn, move] = sign * length**2 / (2 * modulus * second)
     world = np.kron(np.eye(2), axes)
     closed = world @ closed @ world.T
-    coarse, fine = (solid_compliance(frame, tmp_path, mesh) for mesh in (MESH, Mesh(4, 1, 8)))
+    coarse, fine = (solid_compliance(frame, tmp_path, mesh) for mesh in meshes)
     # Seen: 0.03 % on the circle of the coarse mesh, 0.05 % from ends that shear evenly.
     assert difference(closed, coarse).worst < 0.001
     assert difference(closed, fine).worst < 0.001
@@ -170,9 +181,9 @@ EXCESS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def rows():
-    return paper_rows()
+@pytest.fixture(scope="module", params=partly_long([4, 1], 4), ids="of {} factors one".format)
+def rows(request):
+    return paper_rows(FACTORS[:: request.param])
 
 
 def test_the_papers_finite_elements_are_softer(rows):

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import SingularityError, UnreachableError
@@ -10,7 +11,7 @@ from pkm_twin.errors import SingularityError, UnreachableError
 pytest.importorskip("pinocchio")
 from bags.recording.pinocchio_models import AssemblyError, DeltaEngine
 
-STATES = 200
+MACHINES, STATES = partly_long([2, 10], 2), 20
 
 
 def reachable(robot, engine, rng):
@@ -26,10 +27,11 @@ def reachable(robot, engine, rng):
     raise AssertionError("no reachable state found")
 
 
+@pytest.mark.parametrize("machines", MACHINES)
 @pytest.mark.parametrize("closure", ["rod", "rcu"])
-def test_torques_of_random_machines_and_states(closure, variant, rng):
+def test_torques_of_random_machines_and_states(closure, machines, variant, rng):
     worst = 0.0
-    for machine in range(10):
+    for machine in range(machines):
         arm = rng.uniform(0.12, 0.4)
         robot, data = variant(
             "delta",
@@ -62,7 +64,7 @@ def test_torques_of_random_machines_and_states(closure, variant, rng):
         # The PyYAML reader of the engine knows full matrices only.
         data["payload"]["inertia"] = np.diag(data["payload"]["inertia"]).tolist()
         engine = DeltaEngine(data)
-        for _ in range(STATES // 10):
+        for _ in range(STATES):
             q, qd, qdd = reachable(robot, engine, rng), rng.normal(0, 4, 3), rng.normal(0, 60, 3)
             wrench = rng.normal(0, 20, 6)
             expected = engine.inverse_dynamics(q, qd, qdd, wrench)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.robots import parameters_of
+from support.robots import parameters_of, partly_long
 
 from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.structure import structural_model
@@ -23,6 +23,8 @@ CLOSE, CONTRACTED = numbers(
     "README.md",
     r"\(isotropic\) material: within (\S+) %, (\S+) % with a Poisson's ratio of 0.3",
 )
+
+ANGLES = [(0.22, 0.22, 0.22), (0.5, -0.2, 0.1), (0.0, 0.6, 0.3)]
 
 pytestmark = pytest.mark.skipif(CCX is None, reason=ABSENT)
 
@@ -41,7 +43,7 @@ def isotropic(variant):
     return make
 
 
-@pytest.mark.parametrize("angles", [(0.22, 0.22, 0.22), (0.5, -0.2, 0.1), (0.0, 0.6, 0.3)])
+@pytest.mark.parametrize("angles", partly_long(ANGLES, ANGLES[1]))
 @pytest.mark.parametrize("name", ["delta", "delta_cu"])
 def test_first_six_frequencies_of_the_robot(name, angles, isotropic, tmp_path):
     robot = isotropic(name, 0.0)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.bodies import bodies
+from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
@@ -231,13 +232,14 @@ def test_velocity_maps(branch: str) -> None:
 
 
 @pytest.mark.parametrize("branch", ["below", "above"])
-def test_driving_forces_with_the_links_at_the_sliders(branch: str) -> None:
+@pytest.mark.parametrize("count", partly_long([5, 25], 5))
+def test_driving_forces_with_the_links_at_the_sliders(branch: str, count: int) -> None:
     """Equation 41: F_d = -J^-T (J_M' Q_M + sum J_Hij' Q_Hij) - Q_S, every term as printed."""
     robot = machine(branch, link_com=0.0)
     gravity = robot.gravity
     m = robot.inertia
     rng = np.random.default_rng(3)
-    for pose, rate, twice in states(25, 3):
+    for pose, rate, twice in states(count, 3):
         q, qd, qdd = sliders(robot, pose, rate, twice)
         wrench = rng.normal(size=6) * 200
         here, j = paper(robot, pose), maps(robot, pose)
@@ -302,12 +304,13 @@ def energies(robot: Prru, pose: Array) -> tuple[Array, Any]:
 
 @pytest.mark.parametrize("branch", ["below", "above"])
 @pytest.mark.parametrize("link_com", [0.0, 0.4, 1.0])
-def test_lagrange(branch: str, link_com: float) -> None:
+@pytest.mark.parametrize("count", partly_long([1, 6], 1))
+def test_lagrange(branch: str, link_com: float, count: int) -> None:
     """d/dt dT/dXd - dT/dX + dV/dX = J' F, with exact centres of mass, an own payload included."""
     robot = machine(branch, link_com, (0.02, -0.03, 0.05)).changed(
         payload={"mass": 3.0, "com": [0.05, 0.02, 0.1], "inertia": [0.02, 0.03, 0.04]}
     )
-    for pose, rate, twice in states(6, 4):
+    for pose, rate, twice in states(count, 4):
         q, qd, qdd = sliders(robot, pose, rate, twice)
         matrix, gradient = energies(robot, pose)
 

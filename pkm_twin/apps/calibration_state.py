@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine that is being calibrated: its numbers as they are now, and what an instrument sees.
+
+May import: numpy, scipy, pkm_twin's kinematics and machine, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.kinematics.maximal import GraphChange, Placement, assembled
+from pkm_twin.machine.entries import data_of, number_at, put
+from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.robot import Robot
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
+
+Array = NDArray[np.float64]
+
+STEP: Final = 1e-6
+"""Of a difference quotient of the graph at home: what is linear in it is exact to rounding."""
+FRAME: Final = tuple(f"frame.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
+TARGET: Final = ("target.x", "target.y", "target.z")
+BESIDE: Final = (*FRAME, *TARGET, "joint_map.")
+"""Names, or their beginnings, of what is fitted beside the machine's own numbers."""
+
+
+def rotations() -> Any:
+    """Scipy's class of rotations."""
+    # Not above: every command would load it, which takes as long as all else at its start.
+    from scipy.spatial.transform import Rotation
+
+    return Rotation
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Measured poses: joints (k, n) in the controller's numbers; positions (k, 3), m; rotations
+    from home (k, 3, 3), None where only positions were measured.
+    """
+
+    joints: Array
+    position: Array
+    rotation: Array | None = None
+
+    def part(self, rows: NDArray[np.bool_]) -> Poses:
+        """Some of them."""
+        turned = None if self.rotation is None else self.rotation[rows]
+        return Poses(self.joints[rows], self.position[rows], turned)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of poses: root mean square and greatest distance, m, and angle, rad (None: not measured)."""
+
+    rms: float
+    worst: float
+    rms_angle: float | None = None
+    worst_angle: float | None = None
+
+
+@dataclass
+class Instrument:
+    """What is fitted beside the machine: its joints' sensors, where the instrument stands."""
+
+    offsets: Array
+    frame: Rotation = field(default_factory=lambda: rotations().identity())
+    place: Array = field(default_factory=lambda: np.zeros(3))
+    target: Array = field(default_factory=lambda: np.zeros(3))
+
+    def joints(self, robot: Robot, poses: Poses) -> Array:
+        """The model's joint positions (k, n) at measured poses."""
+        return robot.controller.positions(poses.joints - self.offsets)
+
+    def seen(self, position: Array, rotation: Array) -> tuple[Array, Array]:
+        """What it should see of the platform: positions and rotations in its own frame."""
+        turn = self.frame.as_matrix()
+        return self.place + (position + rotation @ self.target) @ turn.T, turn @ rotation
+
+    def residuals(
+        self, poses: Poses, position: Array, rotation: Array
+    ) -> tuple[Array, Array | None]:
+        """Measured less seen: (k, 3), m, and rotation vectors (k, 3), rad."""
+        position, rotation = self.seen(position, rotation)
+        if poses.rotation is None:
+            return poses.position - position, None
+        apart = rotations().from_matrix(poses.rotation @ np.swapaxes(rotation, -1, -2))
+        return poses.position - position, apart.as_rotvec()
+
+    def errors(self, robot: Robot, poses: Poses) -> Errors:
+        """Of a loaded robot."""
+        linear, angular = self.residuals(poses, *robot.platform(self.joints(robot, poses)))
+        sizes = [np.linalg.norm(part, axis=1) for part in (linear, angular) if part is not None]
+        pairs = [(float(np.sqrt(np.mean(size**2))), float(size.max())) for size in sizes]
+        values = [value for pair in pairs for value in pair]
+        return Errors(*values)
+
+
+@dataclass
+class State:
+    """The machine with numbers as they are now, at the poses that are learnt from."""
+
+    data: dict[str, Any]
+    graph: Graph
+    q: Array
+    placement: Placement
+    instrument: Instrument
+
+    @property
+    def platform(self) -> tuple[Array, Array]:
+        """Positions (k, 3) and rotations (k, 3, 3) of the reference point."""
+        name = self.graph.platform
+        return self.placement.point(name, self.graph.origin), self.placement.rotation[name]
+
+    def residuals(self, poses: Poses) -> tuple[Array, Array | None]:
+        """As the instrument's, of the poses that are learnt from."""
+        return self.instrument.residuals(poses, *self.platform)
+
+
+def change_of(robot: Robot, data: dict[str, Any], path: str) -> GraphChange:
+    """By one number, from its value in the data, which stay as they are.
+
+    :raises ParameterError: no file has a number next to it.
+    """
+    value = number_at(data, path)
+
+    def graph(shift: float) -> Graph:
+        put(data, path, value + shift)
+        try:
+            return type(robot).graph_of(data)
+        finally:
+            put(data, path, value)
+
+    return GraphChange.between(graph(-STEP), graph(STEP), 2.0 * STEP)
+
+
+def start_of(robot: Robot, poses: Poses) -> State:
+    """The robot as it is, an instrument at its base.
+
+    :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
+    """
+    instrument = Instrument(np.zeros(robot.joints_count))
+    q = instrument.joints(robot, poses)
+    return State(data_of(robot), robot.graph, q, Placement.of(robot, q), instrument)
+
+
+def place_frame(state: State, poses: Poses) -> None:
+    """A first guess of the instrument's frame: the best rigid motion between the point clouds."""
+    tool, model = state.instrument, state.platform[0]
+    centres = poses.position.mean(0), model.mean(0)
+    tool.frame, _ = rotations().align_vectors(poses.position - centres[0], model - centres[1])
+    tool.place = centres[0] - tool.frame.apply(centres[1])
+
+
+def value_of(state: State, name: str, otherwise: float) -> float:
+    """A number of the instrument's as it is now, of any other name the given one."""
+    tool = state.instrument
+    if name in FRAME[:3]:
+        return float(tool.place[FRAME.index(name)])
+    if name in TARGET:
+        return float(tool.target[TARGET.index(name)])
+    return otherwise
+
+
+def moved(
+    robot: Robot, state: State, poses: Poses, values: Mapping[str, float], turn: Array
+) -> State:
+    """The machine with new numbers.
+
+    :param values: of all that is fitted, by name.
+    :param turn: of the instrument's frame since ``state``, a rotation vector, shape (3,), rad.
+    :raises ParameterError: numbers that no file may have, or no machine can be assembled with.
+    """
+    old, tool = robot.controller.offsets, state.instrument
+    offsets = [
+        values.get(f"joint_map.{j}.offset", o) - o
+        for j, o in zip(robot.joint_names, old, strict=True)
+    ]
+    new = Instrument(
+        np.array(offsets),
+        rotations().from_rotvec(turn) * tool.frame,
+        np.array([values.get(n, v) for n, v in zip(FRAME[:3], tool.place, strict=True)]),
+        np.array([values.get(n, v) for n, v in zip(TARGET, tool.target, strict=True)]),
+    )
+    numbers = {n: v for n, v in values.items() if not n.startswith(BESIDE)}
+    data = data_of(robot, numbers)
+    graph = type(robot).graph_of(data) if numbers else state.graph
+    q = new.joints(robot, poses)
+    return State(data, graph, q, assembled(graph, q, state.placement), new)

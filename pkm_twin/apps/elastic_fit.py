@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The compliance of a robot's elastic elements from measured loads and deflections.
+
+delta = C(s) w + z: s multiplies each element's compliance of the file, z is a zero of the
+instrument, one a recording and direction. C is not linear in s where limbs share a load: the fit
+goes by Gauss and Newton, with exact derivatives. The last third of every recording is held out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.estimation import Estimate, estimate
+from delta_dynamics.fit import HELD_OUT, SURE, Judged, Number, known
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.shared import above_zero
+from stiffness_monitor.response import ElementResponse, element_response
+
+Array = NDArray[np.float64]
+
+AXES: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
+"""Directions of a deflection, as the columns of a table call them: m, then rad."""
+LEAST_SAMPLES: Final = 12
+MOST_SAMPLES: Final = 2000
+"""Of a recording: of more, every so many are taken."""
+PRIOR: Final = 1.0
+"""An element's compliance may be off by all of its value."""
+STIFFEST: Final = 0.02
+"""Least factor at which the model is made linear."""
+STEPS: Final = 20
+CONVERGED: Final = 1e-2
+"""Part of its deviation by which no factor moves in the last step."""
+ALIKE: Final = 1e-3
+"""Loads whose directions, and poses whose places, differ by no more of their size are one."""
+SHOWN: Final = 0.1
+"""Part of the greatest weight below which an element is no part of a combination."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deflected:
+    """A recording: ``time`` (k,), s; joints ``q`` (k, n); what was on the platform, and its answer.
+
+    ``wrench`` and ``deflection``: at the platform's reference point, base axes, (k, 6), N and N m,
+    m and rad; NaN in a column of the deflection: not measured.
+    """
+
+    name: str
+    time: Array
+    q: Array
+    wrench: Array
+    deflection: Array
+
+    def thinned(self) -> Deflected:
+        """With so many samples at most."""
+        step = -(-len(self.time) // MOST_SAMPLES)
+        cut = {k: getattr(self, k)[::step] for k in ("time", "q", "wrench", "deflection")}
+        return replace(self, **cut)
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A weighted sum of elements' factors, of weights with squares that sum to 1."""
+
+    weights: dict[str, float]
+    value: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Group:
+    """Elements that the loads do not tell apart, and what is known of them together."""
+
+    elements: tuple[str, ...]
+    known: tuple[Combination, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ElasticFit:
+    """What recordings say of a robot's elastic elements.
+
+    ``numbers``: the factors of the file's ``element_compliance``. ``zeros``: of the instrument by
+    recording, (recordings, 6). ``measured``: which directions are, (recordings, 6).
+    """
+
+    robot: Robot
+    estimate: Estimate
+    numbers: tuple[Number, ...]
+    groups: tuple[Group, ...]
+    judged: tuple[Judged, ...]
+    zeros: Array
+    measured: NDArray[np.bool_]
+    samples: int
+
+    @property
+    def told(self) -> int:
+        """How many combinations of factors are known."""
+        count = len(self.numbers)
+        own = self.estimate.covariance[:count, :count] / PRIOR**2
+        return int(np.sum(np.linalg.eigvalsh(own) < SURE**2))
+
+    def of(self, status: str) -> tuple[Number, ...]:
+        """The numbers of a status."""
+        return tuple(number for number in self.numbers if number.status == status)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One recording with the model in its poses; what is fitted comes first."""
+
+    recording: Deflected
+    response: ElementResponse
+    measured: NDArray[np.bool_]
+
+    @property
+    def split(self) -> int:
+        return round((1.0 - HELD_OUT) * len(self.recording.time))
+
+    def rows(self, factors: Array) -> tuple[Array, Array, Array]:
+        """Of what is fitted: derivatives (k, 6, e), target and what counts, (k, 6) each."""
+        r, end = self.recording, self.split
+        moved, slopes = self.response.deflection(r.wrench, factors)
+        target = r.deflection - moved + slopes @ factors
+        counts = np.isfinite(target)
+        keep = counts[:end, :, None]
+        return (
+            np.where(keep, slopes[:end], 0.0), np.where(counts, target, 0.0)[:end],
+            counts[:end].astype(float),
+        )  # fmt: skip
+
+
+def fit_elements(
+    robot: Robot, recordings: Sequence[Deflected], update: Callable[[int], None] | None = None
+) -> ElasticFit:
+    """Fit a factor on the compliance of every elastic element.
+
+    :param update: called with the number of recordings whose poses are solved.
+    :raises ParameterError: a robot without elastic members.
+    :raises PkmTwinError: recordings that are too short, or whose loads tell nothing.
+    """
+    parts = []
+    for i, recording in enumerate(recordings):
+        _check(recording)
+        thin = recording.thinned()
+        response = element_response(robot, robot.forward(thin.q))
+        measured = np.asarray(np.isfinite(thin.deflection).any(0))
+        parts.append(_Part(thin, response, measured))
+        if update is not None:
+            update(i + 1)
+    _check_loads(recordings, robot)
+    names = parts[0].response.names
+    found = _solve(parts, len(names))
+    factors = found.values[: len(names)]
+    before = np.array([robot.element_compliance.get(name, 1.0) for name in names])
+    deviations = np.sqrt(np.diag(found.covariance)[: len(names)])
+    numbers = tuple(
+        known(
+            ("element_compliance", name), "", float(b), float(b * f), float(b * d), float(PRIOR * b)
+        )
+        for name, b, f, d in zip(names, before, factors, deviations, strict=True)
+    )
+    if all(number.status == "not excited" for number in numbers):
+        raise PkmTwinError("no excitation: the loads tell nothing of any element's compliance")
+    zeros = found.values[len(names) :].reshape(len(parts), 6)
+    judged = tuple(_judged(part, factors, zero) for part, zero in zip(parts, zeros, strict=True))
+    return ElasticFit(
+        robot, found, numbers, groups_of(names, factors, found.covariance), judged, zeros,
+        np.array([part.measured for part in parts]), sum(part.split for part in parts),
+    )  # fmt: skip
+
+
+def _check(recording: Deflected) -> None:
+    """Refuse what no fit can begin with."""
+    count = int(np.isfinite(recording.deflection).any(1).sum())
+    if count < LEAST_SAMPLES:
+        raise PkmTwinError(
+            f"{recording.name}: too short to fit, {count} deflections; {LEAST_SAMPLES} or more"
+        )
+    if not recording.wrench.any():
+        raise PkmTwinError(f"{recording.name}: no load, every wrench is zero")
+
+
+def _check_loads(recordings: Sequence[Deflected], robot: Robot) -> None:
+    """One load in one pose tells one deflection, whatever its size.
+
+    :raises PkmTwinError: that is all there is.
+    """
+    loads = np.concatenate([r.wrench for r in recordings]) / np.repeat([1.0, robot.size], 3)
+    sizes = np.linalg.norm(loads, axis=1)
+    loads = loads[sizes > 0.1 * sizes.max()]
+    singular = np.linalg.svd(loads, compute_uv=False)
+    q = np.concatenate([r.q for r in recordings]) * robot.joint_scales
+    apart = float(np.ptp(q, axis=0).max())
+    if singular[1:].max(initial=0.0) < ALIKE * singular[0] and apart < ALIKE * robot.size:
+        raise PkmTwinError(
+            "no excitation: one load direction in one pose; other directions or other poses tell "
+            "elements apart"
+        )
+
+
+def _solve(parts: Sequence[_Part], count: int) -> Estimate:
+    """Of the factors and the zeros, by steps of linear least squares."""
+    factors = np.ones(count)
+    sizes = [np.nan_to_num(np.sqrt(np.nanmean(_measured(part) ** 2, 0))) for part in parts]
+    scales = np.concatenate([np.full(count, PRIOR), *(np.maximum(s, 1e-12) for s in sizes)])
+    start = np.concatenate([factors, np.zeros(6 * len(parts))])
+    cones = [(slice(k, k + 1), above_zero(0, 1)) for k in range(count)]
+    for _ in range(STEPS):
+        rows = [part.rows(factors) for part in parts]
+        tables = []
+        for i, (slopes, _, counts) in enumerate(rows):
+            zeros = np.zeros((*slopes.shape[:2], 6 * len(parts)))
+            zeros[..., 6 * i : 6 * i + 6] = counts[..., None] * np.eye(6)
+            tables.append(np.concatenate([slopes, zeros], -1))
+        target, judged = (np.concatenate([one[k] for one in rows]) for k in (1, 2))
+        table = np.concatenate(tables)
+        begin = _noise(table * scales, target - table @ start, judged)
+        found = estimate(table, target, start, scales, cones, judged, begin)
+        new = np.maximum(found.values[:count], STIFFEST)
+        moved = np.abs(new - factors) / np.sqrt(np.diag(found.covariance)[:count])
+        factors = new
+        if moved.max() < CONVERGED:
+            return found
+    raise PkmTwinError(f"the compliances do not settle in {STEPS} steps: loads that tell more")
+
+
+def _noise(table: Array, change: Array, judged: Array) -> Array | None:
+    """What all factors and zeros together leave of a change, by direction (6,).
+
+    None where there are hardly more equations than those.
+    """
+    size = np.sqrt(np.sum(change**2 * judged, 0) / np.maximum(np.sum(judged, 0), 1.0))
+    weights = judged / np.maximum(size, 1e-300)
+    rows = (table * weights[..., None]).reshape(-1, table.shape[-1])
+    equations, unknowns = int(judged.sum()), int((np.abs(rows).max(0) > 0.0).sum())
+    if equations < 1.5 * unknowns:
+        return None
+    found = np.linalg.lstsq(rows, (change * weights).ravel(), rcond=1e-9)[0]
+    left = (change - table @ found) * judged
+    free = 1.0 - unknowns / equations
+    return np.asarray(
+        np.sqrt(np.sum(left**2, 0) / np.maximum(free * np.sum(judged, 0), 1.0)), np.float64
+    )
+
+
+def _measured(part: _Part) -> Array:
+    """The fitted part's deflections; a direction that is not measured is zero."""
+    values = part.recording.deflection[: part.split]
+    return np.where(part.measured, values, 0.0)
+
+
+def _judged(part: _Part, factors: Array, zero: Array) -> Judged:
+    """What is held out, without the instrument's zero."""
+    r, end = part.recording, slice(part.split, None)
+    before, after = (
+        part.response.deflection(r.wrench, f)[0][end] for f in (np.ones(len(factors)), factors)
+    )
+    return Judged(r.name, r.time[end], r.deflection[end] - zero, before, after)
+
+
+def groups_of(names: Sequence[str], factors: Array, covariance: Array) -> tuple[Group, ...]:
+    """Elements that share a direction that is not known, and the directions that are.
+
+    :param factors: shape (elements,). ``covariance``: of them, and of more behind them.
+    """
+    count = len(names)
+    own = covariance[:count, :count] / PRIOR**2
+    values, vectors = np.linalg.eigh(own)
+    unknown = vectors[:, values > SURE**2]
+    shared = np.abs(unknown @ unknown.T)
+    left, groups = set(np.flatnonzero(np.diag(shared) > SHOWN**2).tolist()), []
+    while left:
+        group, edge = set(), {min(left)}
+        while edge:
+            group |= edge
+            edge = {j for i in edge for j in left - group if shared[i, j] > SHOWN}
+        left -= group
+        if len(group) > 1:
+            groups.append(_group(sorted(group), names, factors, own))
+    return tuple(groups)
+
+
+def _group(members: list[int], names: Sequence[str], factors: Array, own: Array) -> Group:
+    values, vectors = np.linalg.eigh(own[np.ix_(members, members)])
+    told = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value > SURE**2:
+            continue
+        weights = vector * np.sign(vector[np.argmax(np.abs(vector))])
+        weights[np.abs(weights) < SHOWN * np.abs(weights).max()] = 0.0
+        weights /= np.linalg.norm(weights)
+        deviation = float(np.sqrt(weights @ own[np.ix_(members, members)] @ weights)) * PRIOR
+        told.append(
+            Combination(
+                {names[k]: float(w) for k, w in zip(members, weights, strict=True) if w},
+                float(weights @ factors[members]), deviation,
+            )
+        )  # fmt: skip
+    return Group(tuple(names[k] for k in members), tuple(told))

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loads and deflections of bags and tables, on one time axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.elastic_fit import AXES, Deflected
+from pkm_twin.apps.recorded import BASE_FRAME, Recording, read_recording, recorded_wrench
+from pkm_twin.apps.torques import WRENCH_AXES
+from pkm_twin.bags.reader import Bag, open_bag
+from pkm_twin.bags.storage import is_bag
+from pkm_twin.errors import BagError, MessageError, ParameterError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import SECOND, StampRules
+from pkm_twin.streams.deflection import in_base_axes, read_deflection
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
+OWN: Final = ["stiffness_monitor", "deflection"]
+"""The end of the topic that the twin's own, computed, deflections come on."""
+MEASURED: Final = "measured_deflection"
+"""The usual name of the measured ones."""
+APART: Final = 0.02
+"""Farthest that a wrench or a joint state may be from a deflection, s."""
+
+
+def read_deflected(path: Path, robot: Robot, topics: Sequence[str] = ()) -> Deflected:
+    """A recording with joint positions, a wrench and a deflection: a bag, or a table.
+
+    Columns of a table: ``JOINT.position``; of the wrench at the platform's reference point, base
+    axes, any of fx fy fz mx my mz (others are zero); of the deflection there any of dx dy dz (m)
+    and rx ry rz (rad) (others are not measured); optionally ``time`` (s).
+
+    :raises PkmTwinError: something of this is missing.
+    """
+    return _of_bag(path, robot, topics) if is_bag(path) else _of_table(path, robot)
+
+
+def _of_table(path: Path, robot: Robot) -> Deflected:
+    columns = read_columns(path)
+    names = [f"{joint}.position" for joint in robot.joint_names]
+    for name in names:
+        if name not in columns:
+            raise ParameterError(str(path), ", ".join(columns), f"a column {name}")
+    for what, axes in (("wrench", WRENCH_AXES), ("deflection", AXES)):
+        if not any(axis in columns for axis in axes):
+            raise ParameterError(
+                str(path), f"no {what}", f"a column {axes[0]} or more of {', '.join(axes)}"
+            )
+    q = np.stack([columns[name] for name in names], -1)
+    count = len(q)
+    time = columns.get("time", np.arange(count, dtype=np.float64))
+    if not (np.diff(time) > 0.0).all():
+        raise ParameterError(f"{path}: time", "not rising", "strictly rising times")
+    wrench = [columns.get(axis, np.zeros(count)) for axis in WRENCH_AXES]
+    deflection = [columns.get(axis, np.full(count, np.nan)) for axis in AXES]
+    return Deflected(path.name, time - time[0], q, np.stack(wrench, -1), np.stack(deflection, -1))
+
+
+def _of_bag(path: Path, robot: Robot, topics: Sequence[str]) -> Deflected:
+    bag = open_bag(path)
+    kinds = {name: info.type for name, info in bag.report.topics.items()}
+    chosen = _deflection_topic(bag, [name for name in topics if kinds.get(name) == TRANSFORM])
+    others = [name for name in topics if kinds.get(name) != TRANSFORM]
+    r = read_recording(path, robot=robot, topics=others, limited=False)
+    if r.topics.wrench is None:
+        raise BagError(
+            "no wrench in the bag: stiffness needs what pushes", path=path, reason="no wrench"
+        )
+    wrenches, deflections = _messages(bag, r.topics.wrench, chosen)
+    for what, found in ((r.topics.wrench, wrenches), (chosen, deflections)):
+        if not found:
+            raise BagError(f"no usable message on {what}", path=path, reason="no messages")
+    stamps = np.array([stamp for stamp, _, _ in deflections], np.int64)
+    times = np.array([stamp for stamp, _, _ in wrenches], np.int64)
+    near = (_apart(stamps, times) <= APART) & (_apart(stamps, r.stamps) <= APART)
+    if not near.any():
+        raise BagError(
+            f"no deflection on {chosen} has a wrench and a joint state within {APART:g} s",
+            path=path, reason="no pairs",
+        )  # fmt: skip
+    values = np.array([value for _, _, value in deflections])[near]
+    frames = np.array([frame for _, frame, _ in deflections])[near]
+    return _paired(path.name, r, stamps[near], (times, wrenches), (frames, values))
+
+
+def _paired(
+    name: str, r: Recording, stamps: Stamps, wrenches: tuple[Stamps, Any], deflections: Any
+) -> Deflected:
+    """Joints and wrench at the deflections' stamps, all in base axes."""
+    times, messages = wrenches
+    frames, values = deflections
+    q = _between(stamps, r.stamps, r.q)
+    rotation = r.robot.platform(q)[1]
+    loads = _between(stamps, times, np.array([value for _, _, value in messages]))
+    # A wrench's frame is one in a recording; all but the base's turn with the platform.
+    if messages[0][1] != BASE_FRAME:
+        loads = in_base_axes(loads, rotation)
+    turned = in_base_axes(values, rotation)
+    deflection = np.where((frames == BASE_FRAME)[:, None], values, turned)
+    return Deflected(name, (stamps - stamps[0]) / SECOND, q, loads, deflection)
+
+
+def _deflection_topic(bag: Bag, wanted: Sequence[str]) -> str:
+    """The topic of measured deflections.
+
+    :raises BagError: there is none, or several fit.
+    """
+    topics = bag.report.topics
+    fit = list(wanted) or [
+        name
+        for name, info in topics.items()
+        if info.type == TRANSFORM and info.count and name.split("/")[-2:] != OWN
+    ]
+    usual = [name for name in fit if name.split("/")[-1] == MEASURED]
+    if not fit:
+        raise BagError(
+            f"no deflection in the bag: a topic of {TRANSFORM} from the platform to the deflected "
+            "platform",
+            path=bag.report.path, reason="no deflection",
+        )  # fmt: skip
+    if len(fit) > 1 and len(usual) != 1:
+        raise BagError(
+            f"deflections on {', '.join(fit)}; choose one with --topic", path=bag.report.path,
+            reason="topic",
+        )  # fmt: skip
+    return usual[0] if usual else fit[0]
+
+
+def _messages(bag: Bag, wrench: str, deflection: str) -> tuple[list[Any], list[Any]]:
+    """Stamps (ns), frames and values of both, in the order of their stamps; bad ones left out."""
+    rules = StampRules(future_tolerance=2**62)
+    wrenches: dict[int, Any] = {}
+    deflections: dict[int, Any] = {}
+    for message in bag.messages([wrench, deflection]):
+        try:
+            if message.topic == wrench:
+                one = recorded_wrench(message.message, message.log_time, rules)
+                wrenches[one[0]] = one
+            else:
+                sample = read_deflection(message.message, message.log_time, rules)
+                deflections[sample.stamp] = sample
+        except MessageError:
+            continue
+    return [wrenches[k] for k in sorted(wrenches)], [deflections[k] for k in sorted(deflections)]
+
+
+def _apart(stamps: Stamps, others: Stamps) -> Array:
+    """From each stamp to the nearest of the others, s."""
+    right = np.minimum(np.searchsorted(others, stamps), len(others) - 1)
+    left = np.maximum(right - 1, 0)
+    nearest = np.minimum(np.abs(others[right] - stamps), np.abs(others[left] - stamps))
+    return np.asarray(nearest / SECOND, np.float64)
+
+
+def _between(stamps: Stamps, others: Stamps, values: Array) -> Array:
+    """Values (k, n) at the stamps, linear between two."""
+    at = (stamps - others[0]) / SECOND
+    known = (others - others[0]) / SECOND
+    return np.stack([np.interp(at, known, column) for column in values.T], -1)

@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which elastic element has departed from the file, by measured deflections under measured loads.
+
+A measured deflection is C(s) w + F u + z and noise: s multiplies the elements' compliances
+(:mod:`stiffness_monitor.response`), F u is what the causes of the file's ``uncertainty`` make of
+C w, u of deviation 1, and z a zero of the instrument. The fewest elements are looked for whose
+factors explain a window of samples: always one more, the one that leaves the least sum of squares.
+It has departed where its factor is farther from 1 than a number of deviations, of the measured
+noise and of what the file's uncertainty says of that element. Elements that would explain the same
+nearly as well are named with it.
+
+May import: numpy, pkm_twin's core, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.uncertainty import STEP, Factor
+from stiffness_monitor.compliance import compliance, strain_energy
+from stiffness_monitor.response import element_response
+
+Array = NDArray[np.float64]
+
+LEAST_SAMPLES: Final = 20
+"""Fewer loaded ones tell nothing."""
+MOST_SAMPLES: Final = 1000
+LOADED: Final = 0.05
+"""A sample is loaded whose predicted deflection is above this part of the window's greatest."""
+LOUD: Final = 10.0
+"""Least change of the measured deflections over their noise: less is no load, but the noise of
+wrenches."""
+APART: Final = 4.0
+"""Deviations by which an element explains the samples worse than the best, to be ruled out."""
+SHARE: Final = 1e-3
+"""Least noise of a direction, as a share of the deflections' deviation there."""
+RANGE: Final = (0.05, 100.0)
+"""Factors that are looked for."""
+STRIDE: Final = 3.0
+"""By how much a step may multiply a factor."""
+STEPS: Final = 20
+SETTLED: Final = 1e-4
+NEAR: Final = 0.5
+"""Part of its bound that some element alone has to miss 1 by, to first order, to be looked at."""
+MOST_ALIKE: Final = 0.95
+"""Greatest correlation of one residual with the next that is taken for one."""
+
+
+@dataclass(frozen=True)
+class AlarmSettings:
+    """When an element has departed.
+
+    ``sigmas``: deviations of model and noise. ``least``: of a factor from 1, however sure.
+    ``window``: stamps that are judged together, s. ``directions``: which of x y z rx ry rz are
+    measured.
+    """
+
+    sigmas: float = 6.0
+    least: float = 0.1
+    window: float = 20.0
+    directions: tuple[bool, ...] = (True,) * 6
+
+
+@dataclass(frozen=True)
+class Departure:
+    """An element whose compliance is ``factor`` times the file's, with its standard deviation.
+
+    ``bound``: how far from 1 is no departure. ``others``: elements that would explain the samples
+    as well in its place, with their factors.
+    """
+
+    element: str
+    factor: float
+    deviation: float
+    bound: float
+    others: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def candidates(self) -> str:
+        """All elements that it may be, in words."""
+        return " or ".join((self.element, *(name for name, _ in self.others)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sample:
+    """A load in a pose, and what the model says of it; shapes as in :class:`_Window` without k."""
+
+    time: float
+    moved: Array
+    reach: Array
+    rest: Array
+    carried: Array
+    effects: Array
+    measured: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Explained:
+    """Factors of some elements, their variances by the noise alone, and the squares left."""
+
+    factors: Array
+    variances: Array
+    squares: float
+
+    def deviations(self, alike: float) -> Array:
+        return np.asarray(np.sqrt(alike * self.variances), np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """k samples in d measured directions, each over its noise.
+
+    ``owner``: (r,). ``reach``: (k, d, r), ``rest``: (k, r, r), ``carried``: (k, r) as in
+    :mod:`stiffness_monitor.response`. ``common``: effects of the causes, then of the zeros,
+    (k, d, c + d). ``residual``: measured less predicted, (k, d). ``prior``: (c + d,), of both.
+    """
+
+    owner: NDArray[np.intp]
+    reach: Array
+    rest: Array
+    carried: Array
+    common: Array
+    residual: Array
+    prior: Array
+
+    def added(self, chosen: Sequence[int], factors: Array) -> tuple[Array, Array]:
+        """What chosen elements with factors add, (k, d), and its derivatives, (k, d, chosen)."""
+        own = np.isin(self.owner, chosen)
+        mine = np.equal.outer(self.owner[own], np.asarray(chosen)).astype(float)
+        change = mine @ (factors - 1.0)
+        reach = self.reach[..., own]
+        matrix = np.eye(len(change)) + self.rest[:, own][..., own] * change
+        right = np.concatenate([np.swapaxes(reach, -1, -2), self.carried[:, own, None]], -1)
+        solved = np.linalg.solve(matrix, right)
+        columns, amounts = np.swapaxes(solved[..., :-1], -1, -2), solved[..., -1]
+        added = reach @ (change * amounts)[..., None]
+        return added[..., 0], (columns * amounts[:, None]) @ mine
+
+    def alone(self, count: int) -> tuple[Array, Array]:
+        """Each element's factor by itself, to first order, and its deviation, (elements,)."""
+        _, slopes = self.added(range(count), np.ones(count))
+        rows, columns = slopes.reshape(-1, count), self.common.reshape(-1, len(self.prior))
+        columns = np.concatenate([columns, np.diag(np.sqrt(self.prior))])
+        basis = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
+        basis = basis[: len(rows)]
+        rows = rows - basis @ (basis.T @ rows)
+        information = np.maximum(np.sum(rows**2, 0), 1e-300)
+        return 1.0 + rows.T @ self.residual.ravel() / information, 1.0 / np.sqrt(information)
+
+    def explained(self, chosen: Sequence[int], start: Array) -> _Explained:
+        """The window by chosen elements, from factors to begin with."""
+        factors, e = start, len(chosen)
+        held = np.concatenate([np.zeros(e), self.prior])
+        for _ in range(STEPS):
+            added, slopes = self.added(chosen, factors)
+            table = np.concatenate([slopes, self.common], -1).reshape(-1, len(held))
+            target = (self.residual - added).ravel()
+            information = table.T @ table + np.diag(held)
+            # Zeros and factors are of sizes that differ by the noise's.
+            scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+            inverse = np.linalg.pinv(scale[:, None] * information * scale, 1e-12, hermitian=True)
+            found = scale * (inverse @ (scale * (table.T @ target)))
+            bounds = np.maximum(factors / STRIDE, RANGE[0]), np.minimum(factors * STRIDE, RANGE[1])
+            new = np.clip(factors + found[:e], *bounds)
+            step, factors = np.abs(new - factors).max(initial=0.0), new
+            if step < SETTLED:
+                break
+        left = target - table[:, e:] @ found[e:]
+        squares = float(left @ left + held[e:] @ found[e:] ** 2)
+        variances = (scale**2 * np.diag(inverse))[:e]
+        return _Explained(factors, variances, squares)
+
+
+@dataclass
+class StiffnessAlarm:
+    """Samples of load and deflection in, departures out; times are arguments, s."""
+
+    robot: Robot
+    settings: AlarmSettings = field(default_factory=AlarmSettings)
+
+    def __post_init__(self) -> None:
+        self._samples: deque[_Sample] = deque(maxlen=MOST_SAMPLES)
+        self.names: tuple[str, ...] = ()
+        # A machine may be singular at home; then the first sample's pose tells.
+        with suppress(PkmTwinError, ValueError):
+            self._prepare(self.robot.home())
+
+    def _prepare(self, pose: Array) -> None:
+        """What the elements are, and how sure the file is of each."""
+        response = element_response(self.robot, pose)
+        self._causes = _elastic_causes(self.robot, pose)
+        self._doubts = _doubts(self.robot, self._causes, pose, response.names)
+        self.names, self._owner = response.names, response.owner
+
+    @property
+    def count(self) -> int:
+        """Samples in the window."""
+        return len(self._samples)
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self._samples.clear()
+
+    def push(self, time: float, pose: Array, wrench: Array, deflection: Array) -> None:
+        """Take a sample: pose (m,), wrench and deflection (6,) in base axes."""
+        if not self.names:
+            self._prepare(pose)
+        response = element_response(self.robot, pose)
+        effects = [factor.effect(lambda r: compliance(r, pose)) @ wrench for factor in self._causes]
+        self._samples.append(
+            _Sample(
+                time, response.compliance @ wrench, response.reach, response.rest,
+                response.reach.T @ wrench, np.array(effects).reshape(-1, 6).T, deflection,
+            )
+        )  # fmt: skip
+        while time - self._samples[0].time > self.settings.window:
+            self._samples.popleft()
+
+    def judge(self) -> tuple[Departure, ...] | None:
+        """The elements that have departed, the surest first; None where too little is loaded."""
+        if not self._samples:
+            return None
+        sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])
+        if int((sizes > LOADED * sizes.max()).sum()) < LEAST_SAMPLES or not sizes.max() > 0.0:
+            return None
+        window, alike, loudest = self._window()
+        if loudest < LOUD:
+            return None
+        values, deviations = window.alone(len(self.names))
+        bounds = self._bounds(np.sqrt(alike) * deviations, range(len(self.names)))
+        if not (np.abs(values - 1.0) > NEAR * bounds).any():
+            return ()
+        return self._departures(window, alike, self._chosen(window, alike))
+
+    def _bounds(self, deviations: Array, elements: Sequence[int]) -> Array:
+        """How far from 1 a factor is no departure."""
+        s = self.settings
+        doubts = self._doubts[list(elements)]
+        return np.asarray(np.maximum(s.least, s.sigmas * np.hypot(deviations, doubts)), np.float64)
+
+    def _beyond(self, fit: _Explained, alike: float, elements: Sequence[int]) -> Array:
+        """Departures from 1 over their bounds, (elements,)."""
+        bounds = self._bounds(fit.deviations(alike), elements)
+        return np.asarray(np.abs(fit.factors - 1.0) / bounds, np.float64)
+
+    def _chosen(self, window: _Window, alike: float) -> list[int]:
+        """The fewest elements that explain the window: added one by one, then left out again."""
+        chosen: list[int] = []
+        factors = np.zeros(0)
+        while len(chosen) < len(self.names):
+            left = [k for k in range(len(self.names)) if k not in chosen]
+            tried = {k: window.explained([*chosen, k], np.append(factors, 1.0)) for k in left}
+            best = min(left, key=lambda k: tried[k].squares)
+            if not self._beyond(tried[best], alike, [*chosen, best])[-1] > 1.0:
+                break
+            chosen.append(best)
+            factors = tried[best].factors
+        while chosen:
+            fit = window.explained(chosen, factors)
+            beyond = self._beyond(fit, alike, chosen)
+            least = int(beyond.argmin())
+            if beyond[least] > 1.0:
+                break
+            del chosen[least]
+            factors = np.delete(fit.factors, least)
+        return chosen
+
+    def _departures(
+        self, window: _Window, alike: float, chosen: Sequence[int]
+    ) -> tuple[Departure, ...]:
+        """What is told of the chosen elements, the surest first."""
+        if not chosen:
+            return ()
+        fit = window.explained(chosen, np.ones(len(chosen)))
+        deviations, beyond = fit.deviations(alike), self._beyond(fit, alike, chosen)
+        bounds = self._bounds(deviations, chosen)
+        found = []
+        for at in np.argsort(-beyond).tolist():
+            others = []
+            for k in range(len(self.names)):
+                if k in chosen:
+                    continue
+                swapped, start = list(chosen), fit.factors.copy()
+                swapped[at], start[at] = k, 1.0
+                other = window.explained(swapped, start)
+                if other.squares - fit.squares < APART**2 * alike:
+                    others.append((other.squares, self.names[k], float(other.factors[at])))
+            found.append(
+                Departure(
+                    self.names[chosen[at]], float(fit.factors[at]), float(deviations[at]),
+                    float(bounds[at]), tuple((name, value) for _, name, value in sorted(others)),
+                )
+            )  # fmt: skip
+        return tuple(found)
+
+    def _window(self) -> tuple[_Window, float, float]:
+        """The samples over their noise.
+
+        :returns: and how many of them are one by their correlation, and by how much the
+            deflections' changes are above the noise in the clearest direction.
+        """
+        kept = np.flatnonzero(self.settings.directions)
+        moved, reach, rest, carried, effects, measured = (
+            np.array([getattr(sample, name) for sample in self._samples])
+            for name in ("moved", "reach", "rest", "carried", "effects", "measured")
+        )
+        residual, reach, effects = (a[:, kept] for a in (measured - moved, reach, effects))
+        zeros = np.broadcast_to(np.eye(len(kept)), (len(moved), len(kept), len(kept)))
+        common = np.concatenate([effects, zeros], -1)
+        prior = np.repeat([1.0, 0.0], [effects.shape[-1], len(kept)])
+        plain = _Window(self._owner, reach, rest, carried, common, residual, prior)
+        _, slopes = plain.added(range(len(self.names)), np.ones(len(self.names)))
+        size = np.std(measured[:, kept], 0)
+        noise, alike = _noise(residual, np.concatenate([slopes, common], -1), SHARE * size)
+        loudest = float((size / noise).max())
+        over = noise[:, None]
+        scaled = _Window(
+            self._owner, reach / over, rest, carried, common / over, residual / noise, prior
+        )
+        return scaled, alike, loudest
+
+
+def _noise(residual: Array, table: Array, least: Array) -> tuple[Array, float]:
+    """Deviation by direction (d,) that no element explains, and the samples' correlation.
+
+    :param table: all that may explain it, (k, d, p).
+    :returns: and by how much the residual's correlation in time widens variances.
+    """
+    size = np.maximum(least, 1e-30)
+    left = residual
+    for _ in range(2):
+        rows = (table / size[:, None]).reshape(-1, table.shape[-1])
+        scale = 1.0 / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+        found = scale * np.linalg.lstsq(rows * scale, (residual / size).ravel(), rcond=1e-12)[0]
+        left = residual - table @ found
+        spread = 1.4826 * np.median(np.abs(left - np.median(left, 0)), 0)
+        size = np.maximum(np.maximum(spread, least), 1e-30)
+    scaled = left / size
+    whole = float(np.sum(scaled**2))
+    alike = float(np.sum(scaled[1:] * scaled[:-1])) / whole if whole > 0.0 else 0.0
+    alike = min(max(alike, 0.0), MOST_ALIKE)
+    return size, (1.0 + alike) / (1.0 - alike)
+
+
+def _elastic_causes(robot: Robot, pose: Array) -> tuple[Factor, ...]:
+    """The causes of doubt that change the compliance."""
+    size = np.abs(compliance(robot, pose)).max()
+    return tuple(
+        factor
+        for factor in robot.factors
+        if np.abs(factor.effect(lambda r: compliance(r, pose))).max() > 1e-9 * size
+    )
+
+
+def _doubts(robot: Robot, causes: Sequence[Factor], pose: Array, names: Sequence[str]) -> Array:
+    """Relative deviation of each element's compliance by the causes, (elements,).
+
+    Of its energy under six unit loads at one pose.
+    """
+    loads = np.diag(np.repeat([1.0, 1.0 / robot.size], 3))
+
+    def energies(one: Robot) -> Array:
+        return np.asarray(strain_energy(one, pose, loads).energies.sum(0), np.float64)
+
+    own = energies(robot)
+    changes = [(energies(f.high) - energies(f.low)) / (2.0 * STEP) for f in causes]
+    squares = np.sum(np.square(changes), 0) if changes else np.zeros(len(names))
+    return np.asarray(np.sqrt(squares) / np.maximum(own, 1e-300), np.float64)

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measured deflections in, ``~/stiffness_alarm`` out.
+
+Only the node ``stiffness_monitor`` imports this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TransformStamped
+from rclpy.time import Time
+from std_srvs.srv import Trigger
+
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros import node as health
+from pkm_twin.ros.messages import StampRules
+from stiffness_monitor.alarm import AlarmSettings, Departure
+from stiffness_monitor.monitor import Answer
+from stiffness_monitor.watch import StiffnessWatch
+
+DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class StiffnessAlarmTopics:
+    """``measured_deflection`` beside the wrenches; ``~/stiffness_alarm`` says what has departed."""
+
+    def __init__(
+        self, node: health.TwinNode, robot: Robot, rules: StampRules, frames: tuple[str, str]
+    ) -> None:
+        """Declare the parameters and create the topics that they ask for.
+
+        :param rules: what the stamps of deflections have to keep to.
+        :param frames: of the base, and of the platform as ``~/deflection`` names it.
+        """
+        self._node, self._robot, self._base = node, robot, frames[0]
+        self._told: tuple[str, ...] | None = None
+        self._core: StiffnessWatch | None = None
+        wanted = node.declare(
+            "watch_stiffness",
+            True,
+            "take measured_deflection and publish ~/stiffness_alarm: elements that have departed "
+            "from the file",
+            read_only=True,
+        )
+        settings = self._declare_settings()
+        seconds: dict[str, Any] = {"unit": "s", "high": 3600.0, "read_only": True}
+        age = node.declare(
+            "alarm.wrench_age", 0.02, "from a deflection to the wrench on either side of it",
+            low=0.0, **seconds,
+        )  # fmt: skip
+        period = node.declare(
+            "alarm.period", 0.1, "least time between two deflections that count", low=0.0, **seconds
+        )
+        if not wanted:
+            return
+        self._core = StiffnessWatch(robot, rules, frames, settings, age, period)
+        self._alarm = node.create_guarded_publisher(
+            DiagnosticArray, "~/stiffness_alarm", latched=True
+        )
+        node.create_guarded_subscription(
+            TransformStamped, "measured_deflection", self._on_deflection
+        )
+        node.create_service(Trigger, "~/reset_stiffness", self._on_reset)
+
+    def _declare_settings(self) -> AlarmSettings:
+        node, d = self._node, AlarmSettings()
+        sigmas = node.declare(
+            "alarm.sigmas", d.sigmas, "deviations of model and noise that are a departure",
+            low=1.0, high=1e3, read_only=True,
+        )  # fmt: skip
+        least = node.declare(
+            "alarm.least", d.least, "least departure of a factor on an element's compliance",
+            low=0.0, high=10.0, read_only=True,
+        )  # fmt: skip
+        window = node.declare(
+            "alarm.window", d.window, "stamps that are judged together", unit="s", low=1.0,
+            high=3600.0, read_only=True,
+        )  # fmt: skip
+        words = node.declare(
+            "alarm.directions", list(DIRECTIONS), "which of x y z rx ry rz are measured",
+            read_only=True,
+        )  # fmt: skip
+        for word in words:
+            if word not in DIRECTIONS:
+                raise UnknownNameError("alarm.directions", word, DIRECTIONS)
+        if not words:
+            raise ParameterError("alarm.directions", [], "one of x y z rx ry rz or more")
+        measured = tuple(word in words for word in DIRECTIONS)
+        return AlarmSettings(sigmas, least, window, measured)
+
+    @property
+    def departures(self) -> tuple[Departure, ...]:
+        """What the last judgement found."""
+        return (self._core.departures or ()) if self._core is not None else ()
+
+    def reset(self) -> None:
+        """Forget all deflections, as when the clock jumps."""
+        if self._core is not None:
+            self._core.reset()
+
+    def take(self, answer: Answer) -> None:
+        """What a wrench did by the model."""
+        if self._core is not None and self._core.answer(answer):
+            self._publish(self._core)
+
+    def warning(self) -> str:
+        """What the diagnostics warn of; empty where nothing has departed."""
+        told = (
+            f"{d.candidates} is {d.factor:.3g} +- {d.deviation:.2g} times as soft as the file says"
+            for d in self.departures
+        )
+        return "; ".join(told)
+
+    def diagnose(self) -> dict[str, object]:
+        """Values of the node's diagnostic status."""
+        core = self._core
+        if core is None or not (core.taken.accepted or core.taken.rejected):
+            return {}
+        values: dict[str, object] = {
+            "deflections taken": core.taken.accepted,
+            "deflections in the window": core.count,
+        }
+        return values | {f"deflections rejected: {k}": v for k, v in core.taken.rejected.items()}
+
+    def _on_deflection(self, message: TransformStamped) -> None:
+        core = self._core
+        if core is not None and core.deflection(message, self._node.now()):
+            self._publish(core)
+
+    def _publish(self, core: StiffnessWatch) -> None:
+        """Each judgement while something has departed; the first, and the first after, too."""
+        found = core.departures
+        if found is None:
+            return
+        told = tuple(departure.candidates for departure in found)
+        if not told and self._told == ():
+            return
+        self._told = told
+        message = DiagnosticArray(status=self._statuses(found))
+        message.header.stamp = Time(nanoseconds=core.stamp).to_msg()
+        message.header.frame_id = self._base
+        self._alarm.publish(message)
+
+    def _statuses(self, found: Sequence[Departure]) -> list[DiagnosticStatus]:
+        """One an element that has departed; where none has, one that says so."""
+        name, hardware = f"{self._node.get_name()}: stiffness", self._robot.name
+        if not found:
+            return [
+                DiagnosticStatus(
+                    level=health.OK, name=name, message="none", hardware_id=hardware, values=[]
+                )
+            ]
+        statuses = []
+        for departure in found:
+            pairs = {
+                "element": departure.element,
+                "factor": repr(departure.factor),
+                "deviation": repr(departure.deviation),
+                "bound": repr(departure.bound),
+            }
+            # What the loads do not tell apart from it.
+            pairs |= {f"or {other}": repr(factor) for other, factor in departure.others}
+            statuses.append(
+                DiagnosticStatus(
+                    level=health.WARN,
+                    name=name,
+                    message=departure.candidates,
+                    hardware_id=hardware,
+                    values=[KeyValue(key=key, value=value) for key, value in pairs.items()],
+                )
+            )
+        return statuses
+
+    def _on_reset(self, _request: Any, response: Any) -> Any:
+        self.reset()
+        response.success, response.message = True, "the deflections are forgotten"
+        return response

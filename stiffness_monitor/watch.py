@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measured deflections beside the wrenches that made them: messages in, departures out. Pure.
+
+May import: numpy, pkm_twin's core, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import MessageError, SingularityError, UnreachableError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import SECOND, StampRules, shown
+from pkm_twin.streams.deflection import DeflectionSample, in_base_axes, read_deflection
+from pkm_twin.streams.wrench import Recent, counting
+from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
+from stiffness_monitor.monitor import Answer
+
+Array = NDArray[np.float64]
+
+WAITING: Final = 64
+"""Deflections that wait for the wrench after them."""
+JUDGED: Final = 1.0
+"""Between two judgements, s of stamps."""
+
+
+@dataclass
+class StiffnessWatch:
+    """Pairs each measured deflection with the wrenches around it, and judges a window of pairs.
+
+    ``frames``: of the base and of the platform: a deflection is along the axes of either.
+    ``max_age``: from a deflection to the wrench on either side, s. ``period``: least time between
+    two pairs that count, s.
+    """
+
+    robot: Robot
+    rules: StampRules
+    frames: tuple[str, str]
+    settings: AlarmSettings = field(default_factory=AlarmSettings)
+    max_age: float = 0.02
+    period: float = 0.1
+
+    def __post_init__(self) -> None:
+        self.taken = counting()
+        self.last_reject = ""
+        self.departures: tuple[Departure, ...] | None = None
+        """What the last judgement found; None before there was one."""
+        self._alarm = StiffnessAlarm(self.robot, self.settings)
+        self._answers: Recent[Answer] = Recent(1024)
+        self._waiting: deque[DeflectionSample] = deque()
+        self._last = self._due = self._judged = 0
+
+    @property
+    def count(self) -> int:
+        """Pairs in the window."""
+        return self._alarm.count
+
+    @property
+    def stamp(self) -> int:
+        """Of the newest pair, ns."""
+        return self._due
+
+    def reset(self) -> None:
+        """Forget all pairs, as when the clock jumps or the machine was repaired."""
+        self._alarm.reset()
+        self._answers.clear()
+        self._waiting.clear()
+        self._last = self._due = self._judged = 0
+        self.departures = None
+
+    def answer(self, answer: Answer) -> bool:
+        """Take what the monitor made of a wrench.
+
+        :returns: whether there is a new judgement.
+        """
+        latest = self._answers.latest
+        if latest is None or answer.stamp >= latest[0]:
+            self._answers.push(answer.stamp, answer)
+        return self._pair()
+
+    def deflection(self, message: Any, now: int) -> bool:
+        """Take a geometry_msgs/TransformStamped, of the deflected platform.
+
+        :returns: whether there is a new judgement.
+        :raises MessageError: the message is rejected, and counted.
+        """
+        try:
+            sample = read_deflection(message, now, self.rules)
+            if sample.frame not in self.frames:
+                told = " or ".join(map(repr, dict.fromkeys(self.frames)))
+                raise MessageError("frame", f"frame is {shown(sample.frame)}, expected {told}")
+            if sample.stamp < self._last:
+                late = (self._last - sample.stamp) / SECOND
+                raise MessageError("stamp order", f"the stamp is {late:.6f} s before the last")
+        except MessageError as error:
+            self._refuse(error)
+            raise
+        self._last = sample.stamp
+        self._waiting.append(sample)
+        return self._pair()
+
+    def _refuse(self, error: MessageError) -> None:
+        self.taken.reject(error.reason, str(error))
+        self.last_reject = str(error)
+
+    def _pair(self) -> bool:
+        """Pair what waits and has a wrench behind it; judge where it is time."""
+        latest = self._answers.latest
+        while self._waiting:
+            late = len(self._waiting) > WAITING
+            if not late and (latest is None or latest[0] < self._waiting[0].stamp):
+                break
+            try:
+                self._take(self._waiting.popleft())
+            except MessageError as error:
+                self._refuse(error)
+        newest = self._due
+        if newest - self._judged < JUDGED * SECOND:
+            return False
+        self._judged = newest
+        self.departures = self._alarm.judge()
+        return True
+
+    def _take(self, sample: DeflectionSample) -> None:
+        before, after = self._around(sample.stamp)
+        if sample.stamp - self._due < self.period * SECOND:
+            self.taken.accept()
+            return
+        span = after.stamp - before.stamp
+        part = (sample.stamp - before.stamp) / span if span else 0.0
+        wrench = before.wrench + part * (after.wrench - before.wrench)
+        near = before if part < 0.5 else after
+        values = sample.values
+        if sample.frame != self.frames[0]:
+            values = in_base_axes(values, near.rotation)
+        try:
+            self._alarm.push(sample.stamp / SECOND, near.pose, wrench, values)
+        except (UnreachableError, SingularityError, ValueError) as error:
+            raise MessageError("pose", str(error)) from error
+        self._due = sample.stamp
+        self.taken.accept()
+
+    def _around(self, stamp: int) -> tuple[Answer, Answer]:
+        """The wrenches on either side.
+
+        :raises MessageError: there are none near.
+        """
+        found = self._answers.around(stamp)
+        if found is None:
+            raise MessageError("no wrench", "no wrench around the deflection's stamp")
+        age = max(stamp - found[0][0], found[1][0] - stamp) / SECOND
+        if age > self.max_age:
+            raise MessageError(
+                "no wrench",
+                f"the wrench beside the deflection is {age:.3f} s away, allowed {self.max_age:g} s",
+            )
+        return found[0][1], found[1][1]

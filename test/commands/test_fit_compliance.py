@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`pkm-twin fit --what compliance` as a user runs it."""
+
+import json
+
+import numpy as np
+import pytest
+from support.command import command
+
+from pkm_twin import load
+from pkm_twin.bags.reader import BagWriter, open_bag
+from stiffness_monitor import compliance
+from test.bags.test_recordings import FOLDER
+from test.laws.deflections import SENSORS, noisy, twin_recording
+
+SOFT = FOLDER / "upr_rpu_soft_joint.mcap"
+COLLISION = FOLDER / "delta_cu_collision.mcap"
+WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
+DEFLECTION = ("dx", "dy", "dz", "rx", "ry", "rz")
+
+
+def table(path, *, wrench=WRENCH, deflection=DEFLECTION, rows=slice(None)):
+    """A CSV of loads and deflections of a machine whose joint 3U is three times softer."""
+    recording = noisy(twin_recording({"3U": 3.0}), np.random.default_rng(1), SENSORS)
+    columns = {"time": recording.time}
+    joints = load("upr_rpu").joint_names
+    columns |= {f"{name}.position": recording.q[:, k] for k, name in enumerate(joints)}
+    columns |= {name: recording.wrench[:, WRENCH.index(name)] for name in wrench}
+    columns |= {name: recording.deflection[:, DEFLECTION.index(name)] for name in deflection}
+    np.savetxt(
+        path, np.stack(list(columns.values()), -1)[rows], "%.17g", ",", header=",".join(columns),
+        comments="",
+    )  # fmt: skip
+    return path
+
+
+def test_fit_of_the_recorded_bag_writes_a_robot_with_a_softer_joint_and_a_report(capsys, tmp_path):
+    out = tmp_path / "fitted.yaml"
+    done = command(capsys, "fit", "upr_rpu", SOFT, "--what", "compliance", "--out", out, "--json")
+    assert done.code == 0, done.err
+    data = json.loads(done.out)
+    found = {p["element"]: p for p in data["parameters"]}
+    for element, number in found.items():
+        true = {"3U": 3.0}.get(element, 1.0)
+        assert abs(number["value"] - true) <= 3.0 * number["standard_deviation"]
+    assert found["3B"]["status"] == "fitted"
+    assert found["3R"]["status"] == "combination"
+    apart = {tuple(group["elements"]): group["known"] for group in data["not_told_apart"]}
+    (known,) = apart["3R", "3U"]
+    weights = known["weights"]
+    assert abs(known["value"] - weights["3R"] - 3.0 * weights["3U"]) < (
+        3.0 * known["standard_deviation"]
+    )
+    (held,) = data["held_out"]
+    before, after = (held[f"residual_rms_{k}_m_m_m_rad_rad_rad"] for k in ("before", "after"))
+    assert before[3] > 2.0 * after[3]
+    assert data["deflection_noise_m_m_m_rad_rad_rad"][0] == pytest.approx(1e-7, rel=0.3)
+    fitted, pose = load(str(out)), [-0.6, 0.0, 0.0]
+    expected = load("upr_rpu").changed(element_compliance={"3U": 3.0})
+    assert fitted.element_compliance["3U"] == pytest.approx(3.0, abs=0.7)
+    np.testing.assert_allclose(
+        np.diag(compliance(fitted, pose)), np.diag(compliance(expected, pose)), rtol=0.03
+    )
+    text = out.read_text()
+    assert "element_compliance.3U: fitted from upr_rpu_soft_joint.mcap, +- " in text
+    assert "# Loads do not tell 3R and 3U apart" in text
+    page = (tmp_path / "fitted.html").read_text()
+    assert page.count("data:image/png;base64,") == 2
+    assert "Loads do not tell 3R and 3U apart" in page
+    again = command(capsys, "fit", "upr_rpu", SOFT, "--what", "compliance", "--out", out)
+    assert again.code == 1
+    assert "exists" in again.err
+
+
+def test_fit_of_a_table_with_three_gauges_says_what_it_found(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = table(tmp_path / "static.csv", deflection=("dx", "dy", "dz"))
+    done = command(capsys, "fit", "upr_rpu", path, "--what", "compliance", "--no-report")
+    assert done.code == 0, done.err
+    assert "apart; known is" in done.out
+    assert "static.csv, held out, dz: residual" in done.out
+    assert "held out, rx" not in done.out
+    assert load(str(tmp_path / "fitted.yaml")).element_compliance["1B"] == pytest.approx(
+        1.0, abs=0.36
+    )
+
+
+@pytest.fixture
+def without_wrench(tmp_path):
+    path = tmp_path / "no_wrench.mcap"
+    with BagWriter(path) as bag:
+        bag.add_topic("/joint_states", "sensor_msgs/msg/JointState")
+        bag.add_topic("/measured_deflection", "geometry_msgs/msg/TransformStamped")
+        for message in open_bag(SOFT).messages(["/joint_states", "/measured_deflection"]):
+            bag.write(message.topic, message.message, message.log_time)
+            if message.log_time > 1_700_000_001 * 10**9:
+                break
+    return path
+
+
+def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
+    monkeypatch.chdir(tmp_path)
+    plain = table(tmp_path / "with.csv", rows=slice(0, 60))
+    for arguments, text in (
+        (("upr_rpu", without_wrench), "no wrench in the bag"),
+        (("upr_rpu", SOFT, "--topic", "/wrnch"), "is not in the bag"),
+        (("delta_cu", COLLISION), "no deflection in the bag"),
+        (("stewart", plain), "nothing is elastic"),
+        (("upr_rpu", table(tmp_path / "a.csv", wrench=(), rows=slice(60))), "no wrench"),
+        (("upr_rpu", table(tmp_path / "b.csv", deflection=(), rows=slice(60))), "no deflection"),
+        (("upr_rpu", table(tmp_path / "c.csv", rows=slice(0, 9))), "too short to fit"),
+    ):
+        done = command(capsys, "fit", *arguments, "--what", "compliance")
+        assert done.code == 1, text
+        assert text in done.one_line_error()
+    done = command(capsys, "fit", "upr_rpu", plain, "--what", "compliance,friction")
+    assert "compliance alone" in done.one_line_error()
+    done = command(capsys, "fit", "upr_rpu", plain, "--what", "complience")
+    assert "did you mean 'compliance'" in done.one_line_error()
+    assert not list(tmp_path.glob("*.yaml"))

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands show how sure the model is, where the robot's file says it."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from support.command import command
+
+from delta_dynamics import inverse_dynamics, torque_deviation
+from pkm_twin import load
+from pkm_twin.apps.check import DEVIATIONS, motion, read_recording, residuals
+from test.commands.conftest import DELTA, rewrite
+from test.support.robots import parameters_of
+
+UNCERTAINTY = {
+    "inertia.platform_mass": {"deviation": 0.004},
+    "inertia.forearm_mass": {"relative": 0.05},
+}
+
+
+@pytest.fixture
+def unsure(tmp_path):
+    path = tmp_path / "unsure.yaml"
+    path.write_text(yaml.safe_dump({**parameters_of("delta_cu"), "uncertainty": UNCERTAINTY}))
+    return path
+
+
+@pytest.fixture
+def part(tmp_path):
+    return rewrite(DELTA, tmp_path / "part.mcap", seconds=0.4)
+
+
+def test_check_counts_the_residuals_inside_the_model_s_band(capsys, unsure, part):
+    done = command(capsys, "check", part, "--robot", unsure, "--json")
+    assert done.code == 0, done.err
+    data = json.loads(done.out)
+    recording = read_recording(part, str(unsure))
+    residual, used = residuals(recording)
+    qd, qdd, _ = motion(recording)
+    spread = torque_deviation(recording.robot, recording.q[used], qd[used], qdd[used])
+    share = {k: np.mean(np.abs(residual[used]) <= k * spread, 0) for k in DEVIATIONS}
+    assert 0.0 < share[1].min() < share[3].max() <= 1.0
+    for i, joint in enumerate(recording.robot.joint_names):
+        band = data["uncertainty"][joint]
+        assert band["effort_unit"] == "N m"
+        assert band["effort_deviation_rms"] == pytest.approx(np.sqrt(np.mean(spread[:, i] ** 2)))
+        told = [band["share_within_deviations"][str(k)] for k in DEVIATIONS]
+        assert told == pytest.approx([share[k][i] for k in DEVIATIONS])
+        item = {item["what"]: item for item in data["items"]}[f"torque residual of {joint}"]
+        size = f"(RMS {np.sqrt(np.mean(spread[:, i] ** 2)):.3g} N m)"
+        assert f"% inside 1, 2, 3 deviations of the model {size}" in item["value"]
+    shown = command(capsys, "check", part, "--robot", unsure).out
+    assert "deviations" in shown
+    assert "gives none" not in shown
+
+
+def test_check_says_that_a_file_tells_of_no_uncertainty(capsys, part):
+    data = json.loads(command(capsys, "check", part, "--json").out)
+    assert data["uncertainty"] is None
+    assert not any("deviation" in item["value"] for item in data["items"])
+    (line,) = [x for x in command(capsys, "check", part).out.splitlines() if "uncertainty" in x]
+    assert line == "uncertainty: the robot file gives none, so the model has no band"
+
+
+def test_torques_have_a_column_of_deviations(capsys, unsure, tmp_path):
+    robot = load(str(unsure))
+    rows = np.array([[0.0, 0.1, 0.2, 0.15], [0.1, 0.12, 0.2, 0.1], [0.2, 0.16, 0.2, 0.06]])
+    head = ",".join(["time", *(f"{joint}.position" for joint in robot.joint_names)])
+    np.savetxt(tmp_path / "motion.csv", rows, "%.17g", ",", header=head, comments="")
+    out = tmp_path / "table.csv"
+    done = command(
+        capsys, "torques", unsure, tmp_path / "motion.csv", "--out", out,
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    assert out.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
+    table = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
+    q, qd, qdd = (
+        np.stack([table[f"{joint}.{what}"] for joint in robot.joint_names], -1)
+        for what in ("position", "velocity", "acceleration")
+    )
+    told = np.stack([table[f"{joint}.effort_deviation"] for joint in robot.joint_names], -1)
+    np.testing.assert_allclose(told, torque_deviation(robot, q, qd, qdd), rtol=1e-9)
+    assert (np.abs(told) < np.abs(inverse_dynamics(robot, q, qd, qdd))).all()
+
+
+def test_info_and_compliance_tell_it(capsys, unsure):
+    shown = " ".join(command(capsys, "info", unsure).out.split())
+    assert "uncertainty: inertia.platform_mass: deviation │ 0.004" in shown
+    assert "uncertainty: inertia.forearm_mass: relative │ 0.05" in shown
+    stiff = (
+        "compliance",
+        "upr_rpu",
+        "--wrench",
+        "0,0,100,0,0,0",
+        "--json",
+        "--",
+        "-0.6",
+        "0.1",
+        "0",
+    )
+    data = json.loads(command(capsys, *stiff).out)
+    matrix, spread = (np.array(data[k]) for k in ("compliance", "compliance_deviation"))
+    part = np.diag(spread) / np.diag(matrix)
+    # Three independent causes of 5 % each, and each a part of the compliance.
+    assert (part > 0.05 / np.sqrt(3) * 0.999).all()
+    assert (part < 0.05).all()

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stiffness alarm of stiffness_monitor over the real middleware, fed with the recorded bag."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy", exc_type=ImportError)
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import TransformStamped, WrenchStamped
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from pkm_twin.bags.reader import open_bag
+from test.bags.test_recordings import FOLDER
+from test.nodes.harness import counts_of, values_of
+
+TOPICS = {
+    "/joint_states": JointState,
+    "/wrench": WrenchStamped,
+    "/measured_deflection": TransformStamped,
+}
+ALARM = "/stiffness_monitor/stiffness_alarm"
+PERIOD = 100_000_000
+"""Of what is sent, ns of stamps."""
+
+
+def recorded():
+    """The bag's messages of every tenth of a second, as live ones: topic and message."""
+    for m in open_bag(FOLDER / "upr_rpu_soft_joint.mcap").messages(TOPICS):
+        stamp = m.message.header.stamp
+        if stamp.nanosec % PERIOD:
+            continue
+        message = TOPICS[m.topic]()
+        message.header.stamp.sec, message.header.stamp.nanosec = stamp.sec, stamp.nanosec
+        message.header.frame_id = m.message.header.frame_id
+        if m.topic == "/joint_states":
+            message.name, message.position = list(m.message.name), list(m.message.position)
+        elif m.topic == "/wrench":
+            copy(message.wrench.force, m.message.wrench.force, "xyz")
+            copy(message.wrench.torque, m.message.wrench.torque, "xyz")
+        else:
+            copy(message.transform.translation, m.message.transform.translation, "xyz")
+            copy(message.transform.rotation, m.message.transform.rotation, "xyzw")
+        yield m.topic, message
+
+
+def copy(target, source, names):
+    for name in names:
+        setattr(target, name, getattr(source, name))
+
+
+def test_a_joint_three_times_softer_is_found_by_name_live(peer, launch):
+    process = launch("stiffness_monitor.node", "max_state_age:=600.0")
+    for topic, kind in TOPICS.items():
+        peer.talk(kind, topic, 1000)
+    peer.hear(DiagnosticArray, ALARM)
+    peer.hear(DiagnosticArray, "/diagnostics")
+    peer.until(peer.matched)
+    for topic, message in recorded():
+        peer.send(topic, message)
+        peer.spin()
+        assert process.alive(), process.output
+
+    def settled():
+        """The alarm of nearly all of the bag."""
+        heard = peer.received(ALARM)
+        return heard[-1] if heard and heard[-1].header.stamp.sec >= 1_700_000_018 else None
+
+    alarm = peer.until(settled)
+    (status,) = alarm.status
+    assert status.level == DiagnosticStatus.WARN
+    assert (status.message, status.hardware_id) == ("3U", "upr_rpu")
+    values = values_of(alarm)
+    assert set(values) == {"element", "factor", "deviation", "bound"}
+    assert values["element"] == "3U"
+    assert abs(float(values["factor"]) - 3.0) < 4.0 * float(values["deviation"]) < 1.0
+    named = {status.message for array in peer.received(ALARM) for status in array.status}
+    assert named <= {"3U", "3U or 3R"}
+    told = peer.diagnostics("/stiffness_monitor", lambda a: "as soft as" in a.status[0].message)
+    assert told.status[0].level == DiagnosticStatus.WARN
+    assert told.status[0].message.startswith("3U is ")
+    assert int(values_of(told)["deflections taken"]) > 150
+
+    bad = TransformStamped()
+    bad.header.frame_id = "tool"
+    bad.header.stamp.sec = 1_700_000_021
+    peer.send("/measured_deflection", bad)
+    peer.diagnostics(
+        "/stiffness_monitor", lambda a: counts_of(a, "deflections rejected").get("frame") == 1
+    )
+    answer = peer.call(Trigger, "/stiffness_monitor/reset_stiffness", Trigger.Request())
+    assert answer.success
+    peer.diagnostics("/stiffness_monitor", lambda a: "as soft as" not in a.status[0].message)
