@@ -167,7 +167,10 @@ def fit_elements(
     if all(number.status == "not excited" for number in numbers):
         raise PkmTwinError("no excitation: the loads tell nothing of any element's compliance")
     zeros = found.values[len(names) :].reshape(len(parts), 6)
-    judged = tuple(_judged(part, factors, zero) for part, zero in zip(parts, zeros, strict=True))
+    own = found.covariance[: len(names), : len(names)]
+    judged = tuple(
+        _judged(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True)
+    )
     return ElasticFit(
         robot, found, numbers, groups_of(names, factors, found.covariance), judged, zeros,
         np.array([part.measured for part in parts]), sum(part.split for part in parts),
@@ -254,13 +257,16 @@ def _measured(part: _Part) -> Array:
     return np.where(part.measured, values, 0.0)
 
 
-def _judged(part: _Part, factors: Array, zero: Array) -> Judged:
+def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judged:
     """What is held out, without the instrument's zero."""
     r, end = part.recording, slice(part.split, None)
-    before, after = (
-        part.response.deflection(r.wrench, f)[0][end] for f in (np.ones(len(factors)), factors)
-    )
-    return Judged(r.name, r.time[end], r.deflection[end] - zero, before, after)
+    before, _ = part.response.deflection(r.wrench, np.ones(len(factors)))
+    after, slopes = part.response.deflection(r.wrench, factors)
+    spread = np.einsum("kje,ef,kjf->kj", slopes[end], covariance, slopes[end], optimize=True)
+    return Judged(
+        r.name, r.time[end], r.deflection[end] - zero, before[end], after[end],
+        np.sqrt(np.maximum(spread, 0.0)),
+    )  # fmt: skip
 
 
 def groups_of(names: Sequence[str], factors: Array, covariance: Array) -> tuple[Group, ...]:
