@@ -18,7 +18,7 @@ from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import SECOND, StampRules, shown
 from pkm_twin.streams.deflection import DeflectionSample, in_base_axes, read_deflection
-from pkm_twin.streams.wrench import Recent, counting
+from pkm_twin.streams.wrench import Recent, check_order, counting
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
 from stiffness_monitor.monitor import Answer
 
@@ -93,9 +93,7 @@ class StiffnessWatch:
             if sample.frame not in self.frames:
                 told = " or ".join(map(repr, dict.fromkeys(self.frames)))
                 raise MessageError("frame", f"frame is {shown(sample.frame)}, expected {told}")
-            if sample.stamp < self._last:
-                late = (self._last - sample.stamp) / SECOND
-                raise MessageError("stamp order", f"the stamp is {late:.6f} s before the last")
+            check_order(sample.stamp, self._last)
         except MessageError as error:
             self._refuse(error)
             raise
