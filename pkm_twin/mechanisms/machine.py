@@ -251,6 +251,10 @@ _KEYS: Final = (
     "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs", "joint_map",
     "uncertainty", "element_compliance",
 )  # fmt: skip
+_ELASTIC: Final = (
+    ("bodies", "member"), ("joints", "compliance"), ("rods", "section"), ("rods", "radius"),
+)  # fmt: skip
+"""What a graph has no place for, by the kind of its entry."""
 _TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
 _SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
 _TURNED: Final = ("com", "at", "axis", "axes", "ends")
