@@ -78,6 +78,10 @@ def fit(
     for target in (out, page) if report else (out,):
         refuse_existing(target, overwrite)
     if COMPLIANCE in [word.strip() for word in what.split(",")]:
+        if per_copy or payload is not None or load_times is not None:
+            raise ParameterError(
+                "what", what, "without --per-copy, --payload and --load-times: of efforts they tell"
+            )
         _fit_compliance(robot, recordings, what, topic, out, page if report else None, json_output)
         return
     kinds = kinds_of(what)

@@ -115,6 +115,8 @@ def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
         assert text in done.one_line_error()
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "compliance,friction")
     assert "compliance alone" in done.one_line_error()
+    done = command(capsys, "fit", "upr_rpu", plain, "--what", "compliance", "--payload", "1")
+    assert "without --per-copy, --payload" in done.one_line_error()
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "complience")
     assert "did you mean 'compliance'" in done.one_line_error()
     assert not list(tmp_path.glob("*.yaml"))

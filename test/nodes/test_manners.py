@@ -233,8 +233,8 @@ class TestReset:
 
 
 class TestLongTrajectories:
-    @pytest.mark.parametrize("points", [20_000, pytest.param(100_000, marks=pytest.mark.long)])
-    def test_the_stream_is_answered_while_a_long_trajectory_is_worked_on(self, twin, points):
+    def test_the_stream_is_answered_while_a_long_trajectory_is_worked_on(self, twin):
+        points = 100_000
         times = np.arange(points) * 0.001
         waves = np.outer(times, [3.0, -4.0, 5.0])
         rows = [
