@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from delta_dynamics.noise import Noise
 from delta_dynamics.observer import MomentumObserver, platform_wrench
 from delta_dynamics.uncertainty import torque_deviation
 from pkm_twin.machine.robot import Robot
@@ -22,8 +23,6 @@ SIGMAS: Final = 6.0
 """Deviations of model and noise together that are a contact."""
 LEARNING: Final = 0.2
 """Time after a beginning in which only the noise is learnt, s."""
-AVERAGED: Final = 1.0
-"""Time over which the noise is averaged, s."""
 CLIPPED: Final = 9.0
 """A square counts as noise up to so many times the average: a push is none."""
 SHARE: Final = 1e-3
@@ -65,8 +64,8 @@ class ContactMonitor:
         """Forget the stream, as after a gap."""
         n = self.robot.joints_count
         self.observer.reset()
-        self._noise, self._greatest = np.zeros(n), np.zeros(n)
-        self._since, self._last = 0.0, 0.0
+        self._noise = Noise(np.zeros(n), LEARNING, CLIPPED)
+        self._greatest, self._last = np.zeros(n), 0.0
 
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity or friction."""
@@ -89,19 +88,14 @@ class ContactMonitor:
         self._greatest = np.maximum(self._greatest, np.abs(effort))
         if external is None:
             return None
-        self._since += step
-        if self._since <= LEARNING:
-            self._learn(external**2, step)
+        self._noise.advance(step)
+        least = (SHARE * self._greatest) ** 2
+        if not self._noise.settled:
+            self._noise.learn(external, least)
             return None
         model = torque_deviation(self.robot, q, qd, qdd, wrench)
-        bound = self.sigmas * np.sqrt(model**2 + self._noise)
+        bound = self.sigmas * np.sqrt(model**2 + self._noise.variance)
         touching = bool((np.abs(external) > bound).any())
         if not touching:
-            # A lasting push must not become noise.
-            self._learn(np.minimum(external**2, CLIPPED * self._noise), step)
+            self._noise.learn(external, least)
         return Contact(external, bound, platform_wrench(self.robot, q, external), touching)
-
-    def _learn(self, square: Array, step: float) -> None:
-        part = min(1.0, step / min(self._since, AVERAGED))
-        least = (SHARE * self._greatest) ** 2
-        self._noise = np.maximum(self._noise + part * (square - self._noise), least)

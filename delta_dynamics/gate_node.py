@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.duration import Duration
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -19,6 +18,7 @@ from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
+from pkm_twin.ros.changes import follow_changes
 
 PAYLOAD = {
     "payload.mass": ("mass", "kg"),
@@ -45,7 +45,6 @@ class CommandGate(health.TwinNode):
         # The same with names and a stamp, for recordings and plots.
         self._stamped = self.create_guarded_publisher(JointState, "~/commands_stamped")
         self._declare_robot(settings)
-        self._pending: Robot | None = None
         self.create_guarded_subscription(
             JointState,
             "delta_dynamics/joint_torques",
@@ -58,8 +57,9 @@ class CommandGate(health.TwinNode):
             self.create_guarded_subscription(
                 JointState, "joint_states", self._on_joint_state, awaited=True
             )
-        self.add_on_set_parameters_callback(self._on_set)
-        self.add_post_set_parameters_callback(self._after_set)
+        follow_changes(
+            self, lambda values: _changed(self._gate.robot, values), self._gate.change_robot
+        )
         self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._watch)
         self.start(leap=settings.deadline + settings.future_tolerance)
 
@@ -206,19 +206,6 @@ class CommandGate(health.TwinNode):
         told = JointState(name=list(self._gate.robot.controller.names), effort=values)
         told.header.stamp = self.get_clock().now().to_msg()
         self._stamped.publish(told)
-
-    def _on_set(self, changes: list[Parameter]) -> Any:
-        values = health.values_of(changes)
-
-        def check() -> None:
-            self._pending = _changed(self._gate.robot, values)
-
-        return health.verdict(check)
-
-    def _after_set(self, changes: list[Parameter]) -> None:
-        if self._pending is not None:
-            self._gate.change_robot(self._pending)
-            self._pending = None
 
 
 def _changed(robot: Robot, values: dict[str, Any]) -> Robot:

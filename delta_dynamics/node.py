@@ -12,7 +12,6 @@ from typing import Any, Final
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
-from rclpy.parameter import Parameter
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -26,6 +25,7 @@ from pkm_twin.bags.cdr import message_definition
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import MAX_MASS, Robot
 from pkm_twin.ros import node as health
+from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
 from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.wrench import SECONDS, declare_mounts, declare_wrench
@@ -119,7 +119,6 @@ class DeltaDynamics(health.TwinNode):
         self._numbers_message = DoublesTemplate(
             NUMBERS, message_definition(NUMBERS), {"data": numbers}, stamped=False
         )
-        self._pending: tuple[Robot, Settings] | None = None
         # Long messages must not lose their parts.
         self.create_guarded_subscription(
             JointTrajectory, "~/joint_trajectory", self._on_trajectory, raw=True, best_effort=False
@@ -133,8 +132,7 @@ class DeltaDynamics(health.TwinNode):
             expires=lambda: self._feedforward.settings.stale_after,
         )
         self._action = self._create_action()
-        self.add_on_set_parameters_callback(self._on_set)
-        self.add_post_set_parameters_callback(self._after_set)
+        follow_changes(self, self._prepare, self._take)
         self._last_heard = 0
         self._watchdog: Any = None
         self._watch_every(stale_after)
@@ -491,29 +489,19 @@ class DeltaDynamics(health.TwinNode):
         if self._commands is not None:
             self._commands.publish(self._numbers_message.fill(effort))
 
-    def _on_set(self, changes: list[Parameter]) -> Any:
-        values = health.values_of(changes)
+    def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
         core = self._feedforward
+        robot = {k: v for k, v in values.items() if k in CHANGES}
+        settings = {SETTINGS[k]: v for k, v in values.items() if k in SETTINGS}
+        if "differentiate" in settings:
+            settings["differentiate"] = settings["differentiate"] == "differentiate"
+        return (
+            _changed(core.robot, robot) if robot else core.robot,
+            dataclasses.replace(core.settings, **settings),
+        )
 
-        def check() -> None:
-            for name, value in values.items():
-                if self.has_parameter(name):
-                    self.check_parameter(name, value)
-            robot = {k: v for k, v in values.items() if k in CHANGES}
-            settings = {SETTINGS[k]: v for k, v in values.items() if k in SETTINGS}
-            if "differentiate" in settings:
-                settings["differentiate"] = settings["differentiate"] == "differentiate"
-            self._pending = (
-                _changed(core.robot, robot) if robot else core.robot,
-                dataclasses.replace(core.settings, **settings),
-            )
-
-        return health.verdict(check)
-
-    def _after_set(self, changes: list[Parameter]) -> None:
-        if self._pending is None:
-            return
-        (robot, settings), self._pending = self._pending, None
+    def _take(self, prepared: tuple[Robot, Settings]) -> None:
+        robot, settings = prepared
         core = self._feedforward
         before = core.settings
         if robot is not core.robot:

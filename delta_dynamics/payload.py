@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from delta_dynamics.noise import Noise
 from delta_dynamics.regressor import PAYLOAD, parameter_names, regressor
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.machine.robot import Robot
@@ -27,8 +28,6 @@ MEMORY: Final = 20.0
 """Time after which what was learnt weighs 1/e, s."""
 STEADY: Final = 0.4
 """Time after a beginning in which no jump is looked for, s."""
-AVERAGED: Final = 1.0
-"""Time over which the noise is averaged, s."""
 CLIPPED: Final = 4.0
 """A square counts as noise up to so many times the average: a jump is none."""
 JUMP: Final = 0.06
@@ -79,8 +78,7 @@ class PayloadEstimator:
         # A machine that hangs in balance has no effort at rest.
         self._least = SHARE * max(float(np.abs(rest).max()), 1e-3 * self._scale())
         self.resets = 0
-        self._noise = np.full(robot.joints_count, 4.0 * self._least**2)
-        self._learning = 0.0
+        self._noise = Noise(np.full(robot.joints_count, 4.0 * self._least**2), STEADY, CLIPPED)
         self.reset()
         self.resets = 0
 
@@ -121,23 +119,16 @@ class PayloadEstimator:
             return self.estimate()
         fade = math.exp(-step / MEMORY)
         share = min(1.0, step / CORRELATION)
-        rows = columns / self._noise[:, None]
+        rows = columns / self._noise.variance[:, None]
         prior = np.diag(self._prior**-2.0)
         # What fades away gives place to what is known of any load.
         self._information = fade * self._information + (1 - fade) * prior + share * rows.T @ columns
         self._weighted = (
             fade * self._weighted + (1 - fade) * prior @ self._own + share * rows.T @ target
         )
-        self._learn_noise(target - columns @ self._solution(), step)
+        self._noise.advance(step)
+        self._noise.learn(target - columns @ self._solution(), self._least**2)
         return self.estimate()
-
-    def _learn_noise(self, after: Array, step: float) -> None:
-        self._learning += step
-        square = after**2
-        if self._learning > STEADY:
-            square = np.minimum(square, CLIPPED * self._noise)
-        part = min(1.0, step / min(self._learning, AVERAGED))
-        self._noise = np.maximum(self._noise + part * (square - self._noise), self._least**2)
 
     def _solution(self) -> Array:
         return np.asarray(np.linalg.solve(self._information, self._weighted), np.float64)
@@ -149,7 +140,7 @@ class PayloadEstimator:
         if self._since < STEADY:
             return False
         # The average of errors that last for their correlation time.
-        spread = np.sqrt(self._noise * CORRELATION / (CORRELATION + JUMP))
+        spread = np.sqrt(self._noise.variance * CORRELATION / (CORRELATION + JUMP))
         return bool((np.abs(self._average) > THRESHOLD * spread).any())
 
     def estimate(self) -> PayloadEstimate:

@@ -25,6 +25,7 @@ ARGUMENTS = {
     ),
     "joint_states": ("joint_states", "topic of the measured joint states"),
     "wrench": ("wrench", "topic of the measured wrench"),
+    "measured_deflection": ("measured_deflection", "topic of the platform's measured deflection"),
     "joint_trajectory_ff": ("~/joint_trajectory_ff", "topic of the trajectories with effort"),
     "controller_action": ("", "of delta_dynamics: the controller's action that goals go on to"),
     "commands": ("~/commands", "topic that command_gate sends to, an effort controller's"),
@@ -46,7 +47,7 @@ PARAMETERS = {
 
 TOPICS = {
     "delta_dynamics": ("joint_states", "wrench", "~/joint_trajectory_ff"),
-    "stiffness_monitor": ("joint_states", "wrench"),
+    "stiffness_monitor": ("joint_states", "wrench", "measured_deflection"),
     "command_gate": ("joint_states", "~/commands"),
     "machine_state": ("joint_states", "wrench"),
 }

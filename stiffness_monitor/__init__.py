@@ -7,17 +7,24 @@ from pkm_twin.kinematics.workspace import (
     reachable,
     regular_workspace,
 )
+from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
 from stiffness_monitor.compliance import StrainEnergy, compliance, stiffness, strain_energy
 from stiffness_monitor.correction import Correction, setpoint_correction
+from stiffness_monitor.response import ElementResponse, element_response
 from stiffness_monitor.uncertainty import compliance_deviation
 
 __all__ = [
+    "AlarmSettings",
     "Correction",
+    "Departure",
+    "ElementResponse",
     "RegularWorkspace",
+    "StiffnessAlarm",
     "StrainEnergy",
     "clearance",
     "compliance",
     "compliance_deviation",
+    "element_response",
     "reachable",
     "regular_workspace",
     "setpoint_correction",

@@ -15,7 +15,7 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
@@ -227,6 +227,16 @@ class StiffnessAlarm:
 
     def judge(self) -> tuple[Departure, ...] | None:
         """The elements that have departed, the surest first; None where too little is loaded."""
+        work = self.judging()
+        while True:
+            try:
+                next(work)
+            except StopIteration as done:
+                found: tuple[Departure, ...] | None = done.value
+                return found
+
+    def judging(self) -> Generator[None, None, tuple[Departure, ...] | None]:
+        """The same in slices of a few milliseconds, of the samples that there are at the first."""
         if not self._samples:
             return None
         sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])
@@ -235,11 +245,14 @@ class StiffnessAlarm:
         window, alike, loudest = self._window()
         if loudest < LOUD:
             return None
+        yield
         values, deviations = window.alone(len(self.names))
         bounds = self._bounds(np.sqrt(alike) * deviations, range(len(self.names)))
         if not (np.abs(values - 1.0) > NEAR * bounds).any():
             return ()
-        return self._departures(window, alike, self._chosen(window, alike))
+        yield
+        chosen = yield from self._chosen(window, alike)
+        return (yield from self._departures(window, alike, chosen))
 
     def _bounds(self, deviations: Array, elements: Sequence[int]) -> Array:
         """How far from 1 a factor is no departure."""
@@ -252,13 +265,16 @@ class StiffnessAlarm:
         bounds = self._bounds(fit.deviations(alike), elements)
         return np.asarray(np.abs(fit.factors - 1.0) / bounds, np.float64)
 
-    def _chosen(self, window: _Window, alike: float) -> list[int]:
+    def _chosen(self, window: _Window, alike: float) -> Generator[None, None, list[int]]:
         """The fewest elements that explain the window: added one by one, then left out again."""
         chosen: list[int] = []
         factors = np.zeros(0)
         while len(chosen) < len(self.names):
             left = [k for k in range(len(self.names)) if k not in chosen]
-            tried = {k: window.explained([*chosen, k], np.append(factors, 1.0)) for k in left}
+            tried = {}
+            for k in left:
+                tried[k] = window.explained([*chosen, k], np.append(factors, 1.0))
+                yield
             best = min(left, key=lambda k: tried[k].squares)
             if not self._beyond(tried[best], alike, [*chosen, best])[-1] > 1.0:
                 break
@@ -266,6 +282,7 @@ class StiffnessAlarm:
             factors = tried[best].factors
         while chosen:
             fit = window.explained(chosen, factors)
+            yield
             beyond = self._beyond(fit, alike, chosen)
             least = int(beyond.argmin())
             if beyond[least] > 1.0:
@@ -276,7 +293,7 @@ class StiffnessAlarm:
 
     def _departures(
         self, window: _Window, alike: float, chosen: Sequence[int]
-    ) -> tuple[Departure, ...]:
+    ) -> Generator[None, None, tuple[Departure, ...]]:
         """What is told of the chosen elements, the surest first."""
         if not chosen:
             return ()
@@ -292,6 +309,7 @@ class StiffnessAlarm:
                 swapped, start = list(chosen), fit.factors.copy()
                 swapped[at], start[at] = k, 1.0
                 other = window.explained(swapped, start)
+                yield
                 if other.squares - fit.squares < APART**2 * alike:
                     others.append((other.squares, self.names[k], float(other.factors[at])))
             found.append(

@@ -22,6 +22,8 @@ from stiffness_monitor.alarm import AlarmSettings, Departure
 from stiffness_monitor.monitor import Answer
 from stiffness_monitor.watch import StiffnessWatch
 
+SLICE = 0.02
+"""Between two slices of a judgement, s."""
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -65,6 +67,7 @@ class StiffnessAlarmTopics:
             TransformStamped, "measured_deflection", self._on_deflection
         )
         node.create_service(Trigger, "~/reset_stiffness", self._on_reset)
+        node.create_guarded_timer(SLICE, self._on_slice)
 
     def _declare_settings(self) -> AlarmSettings:
         node, d = self._node, AlarmSettings()
@@ -104,8 +107,8 @@ class StiffnessAlarmTopics:
 
     def take(self, answer: Answer) -> None:
         """What a wrench did by the model."""
-        if self._core is not None and self._core.answer(answer):
-            self._publish(self._core)
+        if self._core is not None:
+            self._core.answer(answer)
 
     def warning(self) -> str:
         """What the diagnostics warn of; empty where nothing has departed."""
@@ -127,9 +130,13 @@ class StiffnessAlarmTopics:
         return values | {f"deflections rejected: {k}": v for k, v in core.taken.rejected.items()}
 
     def _on_deflection(self, message: TransformStamped) -> None:
-        core = self._core
-        if core is not None and core.deflection(message, self._node.now()):
-            self._publish(core)
+        if self._core is not None:
+            self._core.deflection(message, self._node.now())
+
+    def _on_slice(self) -> None:
+        """A judgement takes tens of milliseconds: no wrench shall wait so long."""
+        if self._core is not None and self._core.work():
+            self._publish(self._core)
 
     def _publish(self, core: StiffnessWatch) -> None:
         """Each judgement while something has departed; the first, and the first after, too."""

@@ -6,16 +6,16 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, JointReader, WrenchSample, as_message_error
-from pkm_twin.streams.wrench import Mount, Mounts, Recent, WrenchReader, WrenchSettings, counting
+from pkm_twin.ros.messages import SECOND, WrenchSample, as_message_error
+from pkm_twin.streams.pairing import PairingCore
+from pkm_twin.streams.wrench import Mount, Recent, WrenchSettings
 from stiffness_monitor.compliance import StrainEnergy, compliance, strain_energy
 
 Array = NDArray[np.float64]
@@ -41,24 +41,12 @@ class Answer:
 
 
 @dataclass
-class Monitor:
-    """Pairs each wrench with the joint state nearest to it in time.
-
-    ``mounts``: tells where a wrench's frame stands; None is the settings' fixed mount.
-    """
-
-    robot: Robot
-    settings: Settings = field(default_factory=Settings)
-    mounts: Mounts | None = None
+class Monitor(PairingCore):
+    """Pairs each wrench with the joint state nearest to it in time."""
 
     def __post_init__(self) -> None:
-        self.states = counting()
-        self.wrenches = counting()
-        self.dropped = 0
-        self.last_reject = ""
+        super().__post_init__()
         self._recent: Recent[Array] = Recent()
-        self._reader = JointReader(self.robot)
-        self.change_settings(self.settings)
 
     @property
     def latest(self) -> tuple[int, Array] | None:
@@ -69,30 +57,14 @@ class Monitor:
         """Forget all joint states, as when the clock jumps."""
         self._recent.clear()
 
-    def change_settings(self, settings: Settings) -> None:
-        """Answer by other settings from the next message on."""
-        self.settings = settings
-        self._rules = settings.stamp_rules
-        self._wrenches = WrenchReader(settings, self.mounts)
-
-    def refuse_joint_state(self, error: MessageError) -> None:
-        """Count a joint state that is refused."""
-        self.states.reject(error.reason, str(error))
-        self.last_reject = str(error)
-
     def joint_state(self, message: Any, now: int) -> None:
         """Take a joint state's positions; an older one than the last is dropped and counted.
 
         :raises MessageError: the message is rejected, and counted.
         """
-        try:
+        with self._judging(self.states):
             sample = self._reader.positions(message, now, self._rules)
             self._recent.push(sample.stamp, sample.q)
-        except MessageError as error:
-            self.dropped += error.reason == "stamp order"
-            self.refuse_joint_state(error)
-            raise
-        self.states.accept()
 
     def wrench(self, message: Any, now: int) -> Answer:
         """Answer a wrench.
@@ -103,17 +75,11 @@ class Monitor:
 
         :raises MessageError: the message is rejected, and counted.
         """
-        try:
-            answer = self._wrench(message, now)
-        except MessageError as error:
-            self.wrenches.reject(error.reason, str(error))
-            self.last_reject = str(error)
-            raise
-        self.wrenches.accept()
-        return answer
+        with self._judging(self.wrenches):
+            return self._wrench(message, now)
 
     def _wrench(self, message: Any, now: int) -> Answer:
-        sample, mount = self._wrenches.read(message, now)
+        sample, mount = self._wrench_reader.read(message, now)
         q = self._nearest(sample.stamp)
         answer: Answer = as_message_error(self._answer, sample, mount, q)
         deflection = answer.energy.deflection
@@ -124,7 +90,7 @@ class Monitor:
     def _answer(self, sample: WrenchSample, mount: Mount, q: Array) -> Answer:
         pose = self.robot.forward(q)
         _, rotation = self.robot.platform(q)
-        fixed = self._wrenches.at_reference(sample, mount, rotation)
+        fixed = self._wrench_reader.at_reference(sample, mount, rotation)
         energy = strain_energy(self.robot, pose, fixed)
         matrix = compliance(self.robot, pose)
         return Answer(sample.stamp, q, pose, fixed, matrix, energy, rotation)

@@ -17,7 +17,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TransformStamped, WrenchStamped
 from numpy.typing import NDArray
-from rclpy.parameter import Parameter
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
@@ -26,6 +25,7 @@ from pkm_twin import load
 from pkm_twin.bags.cdr import message_definition
 from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.ros import node as health
+from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
 from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench
 from pkm_twin.streams.wrench import PLATFORM
@@ -91,9 +91,11 @@ class StiffnessMonitor(health.TwinNode):
             JointState, "joint_states", self._on_joint_state, raw=True, awaited=True
         )
         self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
-        self._pending: Settings | None = None
-        self.add_on_set_parameters_callback(self._on_set)
-        self.add_post_set_parameters_callback(self._after_set)
+        follow_changes(
+            self,
+            lambda values: changed(self._monitor.settings, values),
+            self._monitor.change_settings,
+        )
         self.start()
 
     def summary(self) -> str:
@@ -156,22 +158,6 @@ class StiffnessMonitor(health.TwinNode):
                 "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
             ),
         )  # fmt: skip
-
-    def _on_set(self, changes: list[Parameter]) -> Any:
-        values = health.values_of(changes)
-
-        def check() -> None:
-            for name, value in values.items():
-                if self.has_parameter(name):
-                    self.check_parameter(name, value)
-            self._pending = changed(self._monitor.settings, values)
-
-        return health.verdict(check)
-
-    def _after_set(self, changes: list[Parameter]) -> None:
-        if self._pending is not None:
-            self._monitor.change_settings(self._pending)
-            self._pending = None
 
     def _on_joint_state(self, data: bytes) -> None:
         try:

@@ -7,6 +7,7 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -17,7 +18,7 @@ from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import SECOND, StampRules, shown
 from pkm_twin.streams.deflection import DeflectionSample, in_base_axes, read_deflection
-from pkm_twin.streams.wrench import Recent, counting
+from pkm_twin.streams.wrench import Recent, check_order, counting
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
 from stiffness_monitor.monitor import Answer
 
@@ -54,6 +55,7 @@ class StiffnessWatch:
         self._answers: Recent[Answer] = Recent(1024)
         self._waiting: deque[DeflectionSample] = deque()
         self._last = self._due = self._judged = 0
+        self._work: Generator[None, None, tuple[Departure, ...] | None] | None = None
 
     @property
     def count(self) -> int:
@@ -62,8 +64,8 @@ class StiffnessWatch:
 
     @property
     def stamp(self) -> int:
-        """Of the newest pair, ns."""
-        return self._due
+        """Of the newest pair that was judged, ns."""
+        return self._judged
 
     def reset(self) -> None:
         """Forget all pairs, as when the clock jumps or the machine was repaired."""
@@ -71,22 +73,19 @@ class StiffnessWatch:
         self._answers.clear()
         self._waiting.clear()
         self._last = self._due = self._judged = 0
+        self._work = None
         self.departures = None
 
-    def answer(self, answer: Answer) -> bool:
-        """Take what the monitor made of a wrench.
-
-        :returns: whether there is a new judgement.
-        """
+    def answer(self, answer: Answer) -> None:
+        """Take what the monitor made of a wrench."""
         latest = self._answers.latest
         if latest is None or answer.stamp >= latest[0]:
             self._answers.push(answer.stamp, answer)
-        return self._pair()
+        self._pair()
 
-    def deflection(self, message: Any, now: int) -> bool:
+    def deflection(self, message: Any, now: int) -> None:
         """Take a geometry_msgs/TransformStamped, of the deflected platform.
 
-        :returns: whether there is a new judgement.
         :raises MessageError: the message is rejected, and counted.
         """
         try:
@@ -94,22 +93,39 @@ class StiffnessWatch:
             if sample.frame not in self.frames:
                 told = " or ".join(map(repr, dict.fromkeys(self.frames)))
                 raise MessageError("frame", f"frame is {shown(sample.frame)}, expected {told}")
-            if sample.stamp < self._last:
-                late = (self._last - sample.stamp) / SECOND
-                raise MessageError("stamp order", f"the stamp is {late:.6f} s before the last")
+            check_order(sample.stamp, self._last)
         except MessageError as error:
             self._refuse(error)
             raise
         self._last = sample.stamp
         self._waiting.append(sample)
-        return self._pair()
+        self._pair()
+
+    def work(self) -> bool:
+        """Go on with a judgement for a few milliseconds; whether one has come to its end."""
+        self._begin()
+        if self._work is None:
+            return False
+        work, self._work = self._work, None
+        try:
+            next(work)
+        except StopIteration as done:
+            self.departures = done.value
+            return True
+        self._work = work
+        return False
+
+    @property
+    def busy(self) -> bool:
+        """Whether a judgement is on its way."""
+        return self._work is not None
 
     def _refuse(self, error: MessageError) -> None:
         self.taken.reject(error.reason, str(error))
         self.last_reject = str(error)
 
-    def _pair(self) -> bool:
-        """Pair what waits and has a wrench behind it; judge where it is time."""
+    def _pair(self) -> None:
+        """Pair what waits and has a wrench behind it."""
         latest = self._answers.latest
         while self._waiting:
             late = len(self._waiting) > WAITING
@@ -119,12 +135,13 @@ class StiffnessWatch:
                 self._take(self._waiting.popleft())
             except MessageError as error:
                 self._refuse(error)
-        newest = self._due
-        if newest - self._judged < JUDGED * SECOND:
-            return False
-        self._judged = newest
-        self.departures = self._alarm.judge()
-        return True
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin a judgement where it is time and none is on its way."""
+        if self._work is None and self._due - self._judged >= JUDGED * SECOND:
+            self._judged = self._due
+            self._work = self._alarm.judging()
 
     def _take(self, sample: DeflectionSample) -> None:
         before, after = self._around(sample.stamp)

@@ -24,6 +24,7 @@ MAY_IMPORT_ROS = {
     "stiffness_monitor/alarm_node.py",
     "stiffness_monitor/correction_node.py",
     "stiffness_monitor/node.py",
+    "pkm_twin/ros/changes.py",
     "pkm_twin/ros/context.py",
     "pkm_twin/ros/listener.py",
     "pkm_twin/ros/node.py",

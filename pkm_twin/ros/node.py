@@ -739,20 +739,6 @@ def _as_float(given: Parameter, like: Any) -> Parameter:
     return given
 
 
-def values_of(changes: Sequence[Parameter]) -> dict[str, Any]:
-    """Parameter changes as a mapping of names to values."""
-    return {change.name: change.value for change in changes}
-
-
-def verdict(check: Callable[[], object]) -> SetParametersResult:
-    """A set of parameters is taken or refused whole, with the reason."""
-    try:
-        check()
-    except PkmTwinError as error:
-        return SetParametersResult(successful=False, reason=str(error))
-    return SetParametersResult(successful=True)
-
-
 class _Executor(SingleThreadedExecutor):
     """One whose making a signal may interrupt: rclpy's own end asks for what is not there then."""
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from rclpy.duration import Duration
-from rclpy.parameter import Parameter
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -23,6 +22,7 @@ from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.robot_urdf import robot_urdf
 from pkm_twin.ros import node as health
 from pkm_twin.ros import outputs
+from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
 from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench, triple
@@ -71,9 +71,11 @@ class MachineStateNode(health.TwinNode):
             JointState, "joint_states", self._on_joint_state, raw=True, awaited=True
         )
         self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
-        self._pending: WrenchSettings | None = None
-        self.add_on_set_parameters_callback(self._on_set)
-        self.add_post_set_parameters_callback(self._after_set)
+        follow_changes(
+            self,
+            lambda values: changed(self._core.settings, values),
+            self._core.change_settings,
+        )
         self.start()
 
     def summary(self) -> str:
@@ -187,22 +189,6 @@ class MachineStateNode(health.TwinNode):
         if rate > 0.0:
             self._markers = self.create_guarded_publisher(MarkerArray, "~/markers")
             self.create_guarded_timer(1.0 / rate, self._publish_markers)
-
-    def _on_set(self, changes: list[Parameter]) -> Any:
-        values = health.values_of(changes)
-
-        def check() -> None:
-            for name, value in values.items():
-                if self.has_parameter(name):
-                    self.check_parameter(name, value)
-            self._pending = changed(self._core.settings, values)
-
-        return health.verdict(check)
-
-    def _after_set(self, changes: list[Parameter]) -> None:
-        if self._pending is not None:
-            self._core.change_settings(self._pending)
-            self._pending = None
 
     def _on_joint_state(self, data: bytes) -> None:
         try:

@@ -6,16 +6,16 @@ May import: numpy, pkm_twin's core, messages, streams; never rclpy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, JointReader, JointSample, WrenchSample, as_message_error
-from pkm_twin.streams.wrench import Mount, Mounts, Recent, WrenchReader, WrenchSettings, counting
+from pkm_twin.ros.messages import SECOND, JointSample, WrenchSample, as_message_error
+from pkm_twin.streams.pairing import PairingCore
+from pkm_twin.streams.wrench import Mount, Recent, check_order
 
 Array = NDArray[np.float64]
 
@@ -40,56 +40,30 @@ class State:
 
 
 @dataclass
-class MachineState:
+class MachineState(PairingCore):
     """Answers joint states with the machine's state, and keeps wrenches to pair with it."""
 
-    robot: Robot
-    settings: WrenchSettings = field(default_factory=WrenchSettings)
-    mounts: Mounts | None = None
-
     def __post_init__(self) -> None:
-        self.states = counting()
-        self.wrenches = counting()
-        self.dropped = 0
-        self.last_reject = ""
+        super().__post_init__()
         self.joint_names = (*self.robot.joint_names, *self.robot.passive_joints)
         self.latest: State | None = None
-        self._reader = JointReader(self.robot)
         self._recent: Recent[tuple[WrenchSample, Mount]] = Recent()
-        self.change_settings(self.settings)
-
-    def change_settings(self, settings: WrenchSettings) -> None:
-        """Answer by other settings from the next message on."""
-        self.settings = settings
-        self._rules = settings.stamp_rules
-        self._wrench_reader = WrenchReader(settings, self.mounts)
 
     def reset(self) -> None:
         """Forget the past, as when the clock jumps."""
         self.latest = None
         self._recent.clear()
 
-    def refuse_joint_state(self, error: MessageError) -> None:
-        """Count a joint state that is refused."""
-        self.states.reject(error.reason, str(error))
-        self.last_reject = str(error)
-
     def joint_state(self, message: Any, now: int) -> State:
         """The machine's state at a sensor_msgs/JointState.
 
         :raises MessageError: the message is rejected, and counted.
         """
-        try:
+        with self._judging(self.states):
             sample = self._reader.joint_state(message, now, self._rules)
-            if self.latest is not None and sample.stamp < self.latest.stamp:
-                self.dropped += 1
-                late = (self.latest.stamp - sample.stamp) / SECOND
-                raise MessageError("stamp order", f"the stamp is {late:.6f} s before the last")
+            if self.latest is not None:
+                check_order(sample.stamp, self.latest.stamp)
             state: State = as_message_error(self._state, sample)
-        except MessageError as error:
-            self.refuse_joint_state(error)
-            raise
-        self.states.accept()
         self.latest = state
         return state
 
@@ -98,14 +72,9 @@ class MachineState:
 
         :raises MessageError: the message is rejected, and counted.
         """
-        try:
+        with self._judging(self.wrenches):
             sample, mount = self._wrench_reader.read(message, now)
             self._recent.push(sample.stamp, (sample, mount))
-        except MessageError as error:
-            self.wrenches.reject(error.reason, str(error))
-            self.last_reject = str(error)
-            raise
-        self.wrenches.accept()
 
     def load(self, state: State) -> Array | None:
         """The wrench nearest to a state, base axes at the reference point, shape (6,).

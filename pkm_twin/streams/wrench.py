@@ -27,6 +27,8 @@ V = TypeVar("V")
 PLATFORM: Final = "platform"
 """The platform's link in an exported URDF."""
 ZERO: Final = (0.0, 0.0, 0.0)
+STAMP_ORDER: Final = "stamp order"
+"""Why a message is refused that is older than the one before."""
 MAX_OFFSET: Final = 100.0
 """Farthest that a sensor may stand from the reference point, m."""
 
@@ -136,6 +138,16 @@ class WrenchReader:
         return np.concatenate((force, moment))
 
 
+def check_order(stamp: int, last: int) -> None:
+    """Refuse a stamp that is older than the one before, ns.
+
+    :raises MessageError: it is.
+    """
+    if stamp < last:
+        late = (last - stamp) / SECOND
+        raise MessageError(STAMP_ORDER, f"the stamp is {late:.6f} s before the last")
+
+
 @dataclass
 class Recent(Generic[V]):
     """The newest values of a stream whose stamps do not fall, by stamp, ns."""
@@ -156,9 +168,8 @@ class Recent(Generic[V]):
 
         :raises MessageError: it is older.
         """
-        if self.items and stamp < self.items[-1][0]:
-            late = (self.items[-1][0] - stamp) / SECOND
-            raise MessageError("stamp order", f"the stamp is {late:.6f} s before the last")
+        if self.items:
+            check_order(stamp, self.items[-1][0])
         self.items.append((stamp, value))
 
     def nearest(self, stamp: int) -> tuple[int, V] | None:

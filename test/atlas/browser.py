@@ -14,6 +14,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from test.support.waiting import wait_until
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
     "--headless=new",
@@ -29,6 +31,10 @@ FLAGS = (
 )
 PATIENCE = 120.0
 """Seconds that a page may take, on a machine that does other things as well."""
+
+
+def _pause() -> None:
+    time.sleep(0.05)
 
 
 def find_browser() -> str | None:
@@ -77,17 +83,21 @@ class Browser:
         self._loop.close()
         self._folder.cleanup()
 
+    def _port(self) -> str:
+        """The port that the browser opens."""
+        told = Path(self._folder.name) / "DevToolsActivePort"
+
+        def words() -> list[str]:
+            assert self._process.poll() is None, "the browser ended"
+            return told.read_text().split() if told.exists() else []
+
+        return wait_until(words, _pause, PATIENCE, "the browser's port")[0]
+
     async def _connect(self) -> Any:
         from tornado.httpclient import AsyncHTTPClient
         from tornado.websocket import websocket_connect
 
-        port = Path(self._folder.name) / "DevToolsActivePort"
-        end = time.monotonic() + PATIENCE
-        while not port.exists() or not port.read_text().strip():
-            assert self._process.poll() is None, "the browser ended"
-            assert time.monotonic() < end, "the browser does not open its port"
-            await asyncio.sleep(0.05)
-        address = f"127.0.0.1:{port.read_text().split()[0]}"
+        address = f"127.0.0.1:{self._port()}"
         answer = await AsyncHTTPClient().fetch(f"http://{address}/json/list")
         page = next(p for p in json.loads(answer.body) if p["type"] == "page")
         return await websocket_connect(page["webSocketDebuggerUrl"], max_message_size=2**28)
@@ -122,13 +132,7 @@ class Browser:
 
     def until(self, script: str) -> Any:
         """Value of a script, as soon as it is true."""
-        end = time.monotonic() + PATIENCE
-        while True:
-            value = self.run(script)
-            if value:
-                return value
-            assert time.monotonic() < end, f"never true: {script}"
-            time.sleep(0.05)
+        return wait_until(lambda: self.run(script), _pause, PATIENCE, script)
 
     def slow_down(self, seconds: float) -> None:
         """From the next page on, let so much time pass between frames.

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pkm_twin import load
 from test.nodes.harness import end_with_parent
+from test.support.waiting import wait_until
 
 PERIOD = 1e-3
 PATIENCE = 0.02
@@ -97,10 +98,9 @@ class Client:
         )
 
     def wait_for(self, name):
-        deadline = time.monotonic() + 60
-        while not self.matched(name):
-            assert time.monotonic() < deadline, f"{name} did not come up"
-            self.executor.spin_once(timeout_sec=0.1)
+        wait_until(
+            lambda: self.matched(name), lambda: self.executor.spin_once(timeout_sec=0.1), 60.0, name
+        )
 
     def send(self, name):
         """The next joint state of an even motion, now; its stamp."""
@@ -148,8 +148,10 @@ class Client:
 
     def first_answer(self, name, begin):
         """Seconds from ``begin`` (perf_counter) to the first answer of a stream that runs."""
-        while self.answered[name] is None:
-            assert time.perf_counter() - begin < 120, f"{name} does not answer"
+
+        def ask():
             self.send(name)
             self.executor.spin_once(timeout_sec=PERIOD)
+
+        wait_until(lambda: self.answered[name], ask, 120.0, f"an answer of {name}")
         return time.perf_counter() - begin

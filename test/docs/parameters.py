@@ -65,7 +65,7 @@ ELEMENTS = """### `element_compliance`
 
 Factors on the compliance of elastic elements by their names (those of `strain_energy`: members
 and joints), 1 where left out: `{3U: 3.0}` makes a joint three times softer than the other
-sections say. Above 0, at most 1e6. `pkm-twin fit --what compliance` writes it."""
+sections say. Above 0, at most 1e6. `fit --what compliance` writes it."""
 GRAVITY = """### `gravity`
 
 Acceleration of free fall in base axes, m/s2; default [0, 0, -9.81]."""

@@ -28,7 +28,8 @@ def drawn(name, count=2):
     robot, rng = load(name), np.random.default_rng(7)
     poses = near_home(robot, rng, count)
     names = element_response(robot, poses[0]).names
-    return robot, poses, rng.normal(size=(count, 6)) * 50.0, rng.uniform(0.5, 3.0, len(names))
+    wrenches = rng.normal(size=(count, 6)) * np.repeat([50.0, 50.0 * robot.size], 3)
+    return robot, poses, wrenches, rng.uniform(0.5, 3.0, len(names))
 
 
 @pytest.mark.parametrize("name", ELASTIC)

@@ -9,6 +9,7 @@ from pkm_twin import load
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.clearance import clearance
 from pkm_twin.machine.catalogue import config_folder
+from pkm_twin.machine.entries import with_entries
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.modes import natural_frequencies
 
@@ -128,3 +129,15 @@ def test_a_rigid_machine_says_what_is_missing():
     with pytest.raises(ParameterError, match="nothing is elastic") as caught:
         compliance(load("stewart"), load("stewart").home())
     assert caught.value.field == "bodies"
+
+
+def test_factors_of_elements_stand_in_what_is_written_out(delta_in_the_graph_form):
+    machine, _ = delta_in_the_graph_form
+    softer = machine.changed(element_compliance={"arm I": 2.0})
+    again = with_entries(softer, {"element_compliance.arm I": 3.0})
+    assert again.element_compliance == {"arm I": 3.0}
+    expected = machine.changed(element_compliance={"arm I": 3.0})
+    size = np.abs(compliance(expected, POSES[0])).max()
+    np.testing.assert_allclose(
+        compliance(again, POSES[0]), compliance(expected, POSES[0]), atol=1e-9 * size
+    )

@@ -18,6 +18,8 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+from test.support.waiting import wait_until
+
 try:
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
@@ -310,18 +312,17 @@ class Peer:
 
         :returns: what the condition gave.
         """
-        deadline = time.monotonic() + timeout
         due = 0.0
-        while True:
-            result = condition()
-            if result:
-                return result
+
+        def spin():
+            nonlocal due
             now = time.monotonic()
-            assert now < deadline, f"not so within {timeout:g} s"
             if repeat is not None and now >= due:
                 repeat()
                 due = now + 0.05
             self._executor.spin_once(timeout_sec=0.05)
+
+        return wait_until(condition, spin, timeout, "what this test waits for")
 
     def spin(self):
         """Take one message, if one comes within a millisecond."""

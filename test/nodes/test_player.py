@@ -29,6 +29,7 @@ from pkm_twin.bags.reader import BagWriter
 from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.ros.player import play
 from test.nodes.harness import DEADLINE, Domain, end_with_parent
+from test.support.waiting import wait_until
 
 # Held as long as this process runs.
 OWN = Domain()
@@ -78,10 +79,12 @@ class Listener:
 
     def spin(self, done: Callable[[], bool], seconds: float = DEADLINE) -> None:
         """Take in messages until ``done``; then a little longer, for what should not come."""
-        give_up = time.monotonic() + seconds
-        while not done():
-            assert time.monotonic() < give_up, f"only {len(self.heard)} messages came"
-            self.executor.spin_once(timeout_sec=0.05)
+        wait_until(
+            done,
+            lambda: self.executor.spin_once(timeout_sec=0.05),
+            seconds,
+            "the player's messages",
+        )
         give_up = time.monotonic() + 0.1
         while time.monotonic() < give_up:
             self.executor.spin_once(timeout_sec=0.01)
