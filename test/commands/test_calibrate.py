@@ -163,7 +163,7 @@ def settles(seed: int, only: list[str], count: int = 60) -> None:
 
 def test_directions_in_which_the_machine_turns_away_from_its_tangent_settle() -> None:
     """Tilts of the legs are told by their squares alone."""
-    settles(1, ["joints.leg_3.", "joints.hinge_3."], 20)
+    settles(1, ["joints.leg_3.", "joints.hinge_3."], 16)
 
 
 @pytest.mark.long

@@ -29,7 +29,7 @@ def unsure(tmp_path):
 
 @pytest.fixture
 def part(tmp_path):
-    return rewrite(DELTA, tmp_path / "part.mcap", seconds=0.4)
+    return rewrite(DELTA, tmp_path / "part.mcap", seconds=0.2)
 
 
 def test_check_counts_the_residuals_inside_the_model_s_band(capsys, unsure, part):
@@ -71,10 +71,9 @@ def test_torques_have_a_column_of_deviations(capsys, unsure, tmp_path):
     np.savetxt(tmp_path / "motion.csv", rows, "%.17g", ",", header=head, comments="")
     out = tmp_path / "table.csv"
     done = command(
-        capsys, "torques", unsure, tmp_path / "motion.csv", "--out", out,
+        capsys, "torques", unsure, tmp_path / "motion.csv", "--out", out, "--no-picture",
     )  # fmt: skip
     assert done.code == 0, done.err
-    assert out.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
     table = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
     q, qd, qdd = (
         np.stack([table[f"{joint}.{what}"] for joint in robot.joint_names], -1)
