@@ -172,6 +172,7 @@ class TwinNode(LifecycleNode):
         self._incompatible = 0
         self._last_clock = 0
         self.active = False
+        self._active_since = 0
         self.seldom = SeldomGroup()
         super().__init__(name)
         self._autostart = self.declare(
@@ -258,6 +259,8 @@ class TwinNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to answer."""
         self.activated()
+        # What came before and waits is not for a node that is active.
+        self._active_since = time.time_ns()
         self.active = True
         return super().on_activate(state)
 
@@ -397,10 +400,12 @@ class TwinNode(LifecycleNode):
                 # Two publishers number their messages each: then nothing can be said.
                 if statistics.received(number, sent) and self.count_publishers(name) == 1:
                     statistics.count_missed()
-                if not self.active:
+                # Not every middleware tells when it came; 0 then.
+                came = info["received_timestamp"]
+                if not self.active or 0 < came < self._active_since:
                     return
-                if expires is not None:
-                    waited = time.time_ns() - info["received_timestamp"]
+                if expires is not None and came:
+                    waited = time.time_ns() - came
                     if waited > expires() * SECOND:
                         # More comes than can be answered: the newest are.
                         statistics.missed += 1

@@ -363,6 +363,11 @@ def values_of(array):
     return {pair.key: pair.value for pair in status.values}
 
 
+def text_of(array):
+    """The status message and what else is told: a busy machine's own lines may come first."""
+    return f"{array.status[0].message}; {values_of(array)['also']}"
+
+
 def counts_of(array, what):
     """The counters of a DiagnosticArray whose keys are ``what: reason``, by reason."""
     pairs = values_of(array).items()

@@ -9,7 +9,14 @@ from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
-from test.nodes.harness import SECOND, counts_of, one_line_refusal, stamp_of, values_of
+from test.nodes.harness import (
+    SECOND,
+    counts_of,
+    one_line_refusal,
+    stamp_of,
+    text_of,
+    values_of,
+)
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -144,7 +151,7 @@ def test_an_inactive_gate_has_said_zeros_and_is_silent(gated):
     gated.until_last(ZEROS)
     gated.peer.received("/gate/commands").clear()
     gated.send(effort)
-    assert gated.diagnostics().status[0].message == "inactive"
+    assert "inactive" in text_of(gated.diagnostics())
     assert gated.commands == []
     gated.change(Transition.TRANSITION_ACTIVATE)
     gated.until_last(ZEROS)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from test.nodes.harness import SECOND, Domain, Peer, counts_of, stamp_of, values_of
+from test.nodes.harness import SECOND, Domain, Peer, counts_of, stamp_of, text_of, values_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -143,11 +143,6 @@ def running(twin):
 
     twin.peer.until(lambda: any(not is_zeros(m) for m in torques), repeat=send)
     return twin
-
-
-def text_of(array):
-    """The status message and what else is told."""
-    return f"{array.status[0].message}; {values_of(array)['also']}"
 
 
 def lost_of(array):
