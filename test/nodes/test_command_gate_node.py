@@ -228,6 +228,11 @@ def test_every_robot_has_a_gate(heard, launch, name):
 
 
 def test_without_a_name_it_waits_for_the_node_of_the_default_name(heard, launch):
+    def listeners():
+        return heard.node.count_subscribers("/delta_dynamics/joint_torques")
+
+    # Those of ended gates are known for a while.
+    heard.until(lambda: listeners() == 0)
     process = launch(GATE)
-    heard.until(lambda: heard.node.count_subscribers("/delta_dynamics/joint_torques") == 1)
+    heard.until(lambda: listeners() == 1)
     assert process.stop() == 0

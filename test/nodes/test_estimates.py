@@ -14,12 +14,12 @@ from std_msgs.msg import Bool
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
+from test.nodes.harness import Maker, Ros
 
 ROBOT = load("delta_cu")
 PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=600.0")
-TORQUES = "/delta_dynamics/joint_torques"
+MAKE = Maker(Ros())
 OUTPUTS = {
-    TORQUES: JointState,
     "/delta_dynamics/payload": InertiaStamped,
     "/delta_dynamics/payload_deviation": InertiaStamped,
     "/delta_dynamics/external_wrench": WrenchStamped,
@@ -28,34 +28,34 @@ OUTPUTS = {
 }
 
 
-def states(count, mass, push, begin):
-    """A slow swing at 1 kHz of a machine that carries a load and is pushed."""
-    middle = ROBOT.inverse(ROBOT.home())
-    time = begin + 1e-3 * np.arange(count)
-    q = middle + 0.05 * np.sin(3.0 * time)[:, None]
-    qd = np.broadcast_to(0.15 * np.cos(3.0 * time)[:, None], q.shape)
-    qdd = np.broadcast_to(-0.45 * np.sin(3.0 * time)[:, None], q.shape)
-    laden = ROBOT.changed(payload={"mass": mass})
-    wrench = np.array([push, 0.0, 0.0, 0.0, 0.0, 0.0])
-    noise = 1e-3 * np.random.default_rng(1).normal(size=q.shape)
-    return q, qd, inverse_dynamics(laden, q, qd, qdd, wrench) + noise
+class Swing:
+    """A slow swing at 1 kHz of a machine that carries a load and may be pushed, sent in parts."""
 
+    def __init__(self, peer, mass):
+        self.push = 0.0
+        self._peer, self._sent = peer, 0
+        # No later than the clock, as no more is sent than time goes by.
+        self._begin = peer.now() - 10**9
+        self._laden = ROBOT.changed(payload={"mass": mass})
+        self._middle = ROBOT.inverse(ROBOT.home())
+        self._noise = np.random.default_rng(1)
 
-def stream(peer, samples, beginning):
-    """Send samples stamped a millisecond apart, no more at once than can wait; the stamp after."""
-    answers = peer.received(TORQUES)
-    for k, (q, qd, effort) in enumerate(zip(*samples, strict=True)):
-        if k % 50 == 0:
-            seen = len(answers)
-        message = JointState(name=list(ROBOT.joint_names))
-        message.position, message.velocity = q.tolist(), qd.tolist()
-        message.effort = effort.tolist()
-        stamp = beginning + 1_000_000 * k
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-        peer.send("/joint_states", message)
-        if k % 50 == 49:
-            peer.until(lambda seen=seen: len(answers) > seen + 20)
-    return beginning + 1_000_000 * len(samples[0])
+    def send(self):
+        """The next 50 ms."""
+        ticks = self._sent + np.arange(50)
+        time = 1e-3 * ticks
+        q = self._middle + 0.05 * np.sin(3.0 * time)[:, None]
+        qd = np.broadcast_to(0.15 * np.cos(3.0 * time)[:, None], q.shape)
+        qdd = np.broadcast_to(-0.45 * np.sin(3.0 * time)[:, None], q.shape)
+        wrench = np.array([self.push, 0.0, 0.0, 0.0, 0.0, 0.0])
+        effort = inverse_dynamics(self._laden, q, qd, qdd, wrench)
+        effort += 1e-3 * self._noise.normal(size=q.shape)
+        for tick, *sample in zip(ticks.tolist(), q, qd, effort, strict=True):
+            position, velocity, measured = (values.tolist() for values in sample)
+            stamp = self._begin + 1_000_000 * tick
+            message = MAKE.joint_state(ROBOT.joint_names, position, velocity, measured, stamp)
+            self._peer.send("/joint_states", message)
+        self._sent += len(ticks)
 
 
 def test_a_load_and_a_push_are_told(peer, launch):
@@ -64,21 +64,17 @@ def test_a_load_and_a_push_are_told(peer, launch):
     for topic, kind in OUTPUTS.items():
         peer.hear(kind, topic)
     peer.until(peer.matched)
-    beginning = peer.now() - 10**9
-    for part, push in enumerate((0.0, 60.0)):
-        samples = states(700, 0.4, push, 0.7 * part)
-        beginning = stream(peer, samples, beginning)
-        wanted = 150 * (part + 1)
-        peer.until(lambda wanted=wanted: len(peer.received("/delta_dynamics/payload")) >= wanted)
-        found = peer.received("/delta_dynamics/payload")[-1]
-        if part == 0:
-            assert found.inertia.m == pytest.approx(0.4, rel=0.03)
-            assert found.header.frame_id == "platform"
-            deviation = peer.received("/delta_dynamics/payload_deviation")[-1]
-            assert 0.0 < deviation.inertia.m < 0.02
-            assert np.isinf(deviation.inertia.com.x)
-    pushed = peer.received("/delta_dynamics/external_wrench")
-    peer.until(lambda: pushed[-1].wrench.force.x > 50.0)
+    swing = Swing(peer, 0.4)
+    loads, deviations, pushed, events = (
+        peer.received(f"/delta_dynamics/{name}")
+        for name in ("payload", "payload_deviation", "external_wrench", "contact")
+    )
+    peer.until(lambda: len(loads) >= 150 and deviations, repeat=swing.send)
+    assert loads[-1].inertia.m == pytest.approx(0.4, rel=0.03)
+    assert loads[-1].header.frame_id == "platform"
+    assert 0.0 < deviations[-1].inertia.m < 0.02
+    assert np.isinf(deviations[-1].inertia.com.x)
+    swing.push = 60.0
+    peer.until(lambda: pushed and pushed[-1].wrench.force.x > 50.0, repeat=swing.send)
     assert pushed[-1].header.frame_id == "base_link"
-    events = [message.data for message in peer.received("/delta_dynamics/contact")]
-    assert events[-1] is True
+    peer.until(lambda: events and events[-1].data, repeat=swing.send)

@@ -71,9 +71,9 @@ def test_torque_residual_and_stop(peer, launch):
     assert counts_of(array, "stopped")["no wrench"] >= 1
     assert int(values_of(array)["wrenches taken"]) > 3
     # What is refused is counted, and no wrench.
-    peer.send("/bearing/wrench", MAKE.wrench(WRENCH, peer.now() + 600 * SECOND))
     peer.until(
-        lambda: counts_of(peer.diagnostics("/bearing"), "wrenches rejected").get("future stamp")
+        lambda: counts_of(peer.diagnostics("/bearing"), "wrenches rejected").get("future stamp"),
+        repeat=lambda: peer.send("/bearing/wrench", MAKE.wrench(WRENCH, peer.now() + 600 * SECOND)),
     )
     torques.clear()
     peer.until(lambda: torques, repeat=send)
