@@ -83,7 +83,6 @@ def main():
             reach, ways = blend()
             rows = [np.outer(way, q[0] - here) for way in ways]
             client.go(trajectory(robot.joint_names, reach, here + rows[0], *rows[1:]))
-            client.answers.clear()
         states, _ = client.go(trajectory(robot.joint_names, times, q, qd, qdd))
     except (TimeoutError, RuntimeError) as error:
         print(f"failed: {error}", file=sys.stderr)

@@ -10,6 +10,7 @@ delta_dynamics' ~/joint_trajectory_ff to its topic.
 """
 
 import argparse
+import functools
 import sys
 import time
 
@@ -62,9 +63,10 @@ class Client(Node):
         ends = (self._to_twin, self._to_controller)
         self.until(lambda: all(p.get_subscription_count() for p in ends), patience, "both nodes")
         self.until(lambda: self.states, patience, "joint_states")
-        self._to_twin.publish(message)
-        self.until(lambda: self.answers, patience, "the efforts")
-        filled = self.answers[-1]
+        # Again until it is heard: a node may find a publisher later than that finds the node.
+        ask = functools.partial(self._to_twin.publish, message)
+        self.until(lambda: self.filled(message), patience, "the efforts", again=ask)
+        filled = self.filled(message)[-1]
         efforts = np.array([point.effort for point in filled.points])
         if efforts.shape != (len(message.points), len(message.joint_names)):
             raise RuntimeError(f"the answer has efforts of shape {efforts.shape}")
@@ -76,6 +78,11 @@ class Client(Node):
         self.until(lambda: self.at_rest(goal, filled.joint_names), patience, "the end")
         return list(self.states), efforts
 
+    def filled(self, message):
+        """Answers to this trajectory, not to one before it."""
+        wanted = [list(point.positions) for point in message.points]
+        return [a for a in self.answers if [list(p.positions) for p in a.points] == wanted]
+
     def at_rest(self, goal, names):
         """Whether the newest joint state stands at the goal, but for a percent of the way."""
         if not self.states:
@@ -86,10 +93,13 @@ class Client(Node):
             and abs(q - positions(self.states[-20], names)).max() < 1e-4 * abs(goal - first).max()
         )
 
-    def until(self, condition, patience, what):
-        """Spin until it is so."""
-        end = time.monotonic() + patience
+    def until(self, condition, patience, what, again=None):
+        """Spin until it is so; ``again`` is called at once and every second."""
+        end, due = time.monotonic() + patience, 0.0
         while not condition():
+            if again is not None and time.monotonic() >= due:
+                again()
+                due = time.monotonic() + 1.0
             rclpy.spin_once(self, timeout_sec=0.1)
             if time.monotonic() > end:
                 raise TimeoutError(f"{what}: nothing within {patience:g} s")

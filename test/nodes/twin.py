@@ -128,11 +128,17 @@ class Twin:
         return self.peer.diagnostics(f"/{self.name}", condition)
 
     def at_rest(self):
-        """Diagnostics after which nothing more waits: two in a row with the same count."""
-        last = self.diagnostics()
-        while count_of(last) != count_of(array := self.diagnostics()):
-            last = array
-        return array
+        """Diagnostics after which nothing more waits: two seconds of them with the same count.
+
+        A process that stood still sends several at once, before it takes what waits.
+        """
+        first = self.diagnostics()
+        while True:
+            array = self.diagnostics()
+            if count_of(array) != count_of(first):
+                first = array
+            elif stamp_of(array) - stamp_of(first) > 1.5 * SECOND:
+                return array
 
     def balance(self, total):
         """The diagnostics up to where every one of ``total`` samples is taken or counted as lost.
