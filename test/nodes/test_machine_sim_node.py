@@ -47,7 +47,17 @@ def machine(peer, launch):
     resolution = "encoder_resolution:=[1.0e-5]"
     process = launch(MODULE, "clock:=lockstep", wrench, resolution, "deadline:=10.0", *SPREAD)
     peer.until(lambda: peer.received("/joint_states") and peer.matched())
+    # It may find a publisher later than that finds it: greeted with what it refuses.
+    told = peer.received("/diagnostics")
+    peer.until(
+        lambda: told and refused(told[-1]).get("length"),
+        repeat=lambda: peer.send(COMMANDS, Float64MultiArray(data=[0.0])),
+    )
     return process
+
+
+def refused(array):
+    return counts_of(array, "effort commands rejected")
 
 
 def answer(peer, data):
@@ -101,13 +111,12 @@ def test_lockstep_gives_the_core_s_numbers(peer, machine):
 
 
 def test_a_bad_command_is_refused_and_time_stands(peer, machine):
+    greeted = refused(peer.diagnostics("/machine_sim"))["length"]
     before = stamp_of(answer(peer, [0.0, 0.0, 0.0]))
     for bad in ([float("nan"), 0.0, 0.0], [0.0, 0.0]):
         peer.send(COMMANDS, Float64MultiArray(data=bad))
-    array = peer.diagnostics(
-        "/machine_sim", lambda a: len(counts_of(a, "effort commands rejected")) == 2
-    )
-    assert counts_of(array, "effort commands rejected") == {"not finite": 1, "length": 1}
+    array = peer.diagnostics("/machine_sim", lambda a: refused(a).get("length", 0) > greeted)
+    assert refused(array) == {"not finite": 1, "length": greeted + 1}
     # One period alone a second and nothing else.
     assert stamp_of(peer.received("/joint_states")[-1]) - before < SECOND // 10
 
