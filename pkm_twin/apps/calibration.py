@@ -229,7 +229,7 @@ def calibrate(
         raise ParameterError(
             "poses", len(poses.joints), "poses apart from each other: these tell no number"
         )
-    singular = np.linalg.svd(information[:, good], compute_uv=False) if good.any() else np.ones(1)
+    singular = np.linalg.svd(information[:, good], compute_uv=False)
     fitted_errors, held_errors = (
         (before.instrument.errors(robot, part), after.instrument.errors(built, part))
         for part in (learnt, judged)

@@ -261,7 +261,7 @@ class TestLongTrajectories:
 
     def test_more_than_can_wait_is_refused_by_name(self, twin):
         before = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0)
-        count = 16
+        count = 40
         for _ in range(count):
             message = trajectory(count=2000, stamp=twin.begin())
             for point, time in zip(message.points, range(2000), strict=True):
@@ -356,7 +356,7 @@ def test_a_full_stream_of_states_leaves_nothing_behind(twin):
     """States come and go in thousands: what is counted is what was sent."""
 
     before = count_of(twin.at_rest())
-    sent = 1500
+    sent = 3000
     for _ in range(sent):
         twin.send_state(state(twin.stamp()))
         twin.peer.spin()
