@@ -6,7 +6,7 @@ Only the node ``stiffness_monitor`` imports this module.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -22,8 +22,6 @@ from stiffness_monitor.alarm import AlarmSettings, Departure
 from stiffness_monitor.monitor import Answer
 from stiffness_monitor.watch import StiffnessWatch
 
-SLICE = 0.02
-"""Between two slices of a judgement, s."""
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -67,7 +65,6 @@ class StiffnessAlarmTopics:
             TransformStamped, "measured_deflection", self._on_deflection
         )
         node.create_service(Trigger, "~/reset_stiffness", self._on_reset)
-        node.create_guarded_timer(SLICE, self._on_slice)
 
     def _declare_settings(self) -> AlarmSettings:
         node, d = self._node, AlarmSettings()
@@ -109,6 +106,7 @@ class StiffnessAlarmTopics:
         """What a wrench did by the model."""
         if self._core is not None:
             self._core.answer(answer)
+            self._judge(self._core)
 
     def warning(self) -> str:
         """What the diagnostics warn of; empty where nothing has departed."""
@@ -132,11 +130,17 @@ class StiffnessAlarmTopics:
     def _on_deflection(self, message: TransformStamped) -> None:
         if self._core is not None:
             self._core.deflection(message, self._node.now())
+            self._judge(self._core)
 
-    def _on_slice(self) -> None:
+    def _judge(self, core: StiffnessWatch) -> None:
         """A judgement takes tens of milliseconds: no wrench shall wait so long."""
-        if self._core is not None and self._core.work():
-            self._publish(self._core)
+        work = core.judgement()
+        if work is not None:
+            self._node.defer("measured_deflection", self._answer(core, work))
+
+    def _answer(self, core: StiffnessWatch, work: Generator[None, None, bool]) -> health.Task:
+        if (yield from work):
+            self._publish(core)
 
     def _publish(self, core: StiffnessWatch) -> None:
         """Each judgement while something has departed; the first, and the first after, too."""

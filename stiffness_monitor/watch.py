@@ -55,7 +55,7 @@ class StiffnessWatch:
         self._answers: Recent[Answer] = Recent(1024)
         self._waiting: deque[DeflectionSample] = deque()
         self._last = self._due = self._judged = 0
-        self._work: Generator[None, None, tuple[Departure, ...] | None] | None = None
+        self._judging: object | None = None
 
     @property
     def count(self) -> int:
@@ -73,7 +73,7 @@ class StiffnessWatch:
         self._answers.clear()
         self._waiting.clear()
         self._last = self._due = self._judged = 0
-        self._work = None
+        self._judging = None
         self.departures = None
 
     def answer(self, answer: Answer) -> None:
@@ -101,24 +101,28 @@ class StiffnessWatch:
         self._waiting.append(sample)
         self._pair()
 
-    def work(self) -> bool:
-        """Go on with a judgement for a few milliseconds; whether one has come to its end."""
-        self._begin()
-        if self._work is None:
-            return False
-        work, self._work = self._work, None
-        try:
-            next(work)
-        except StopIteration as done:
-            self.departures = done.value
-            return True
-        self._work = work
-        return False
+    def judgement(self) -> Generator[None, None, bool] | None:
+        """A judgement in slices of a few milliseconds, where it is time for one; else None.
 
-    @property
-    def busy(self) -> bool:
-        """Whether a judgement is on its way."""
-        return self._work is not None
+        One at a time. It ends with whether ``departures`` are new: not where all was forgotten
+        meanwhile.
+        """
+        if self._judging is not None or self._due - self._judged < JUDGED * SECOND:
+            return None
+        self._judged = self._due
+        self._judging = object()
+        return self._judge(self._judging)
+
+    def _judge(self, mine: object) -> Generator[None, None, bool]:
+        try:
+            found = yield from self._alarm.judging()
+            if self._judging is not mine:
+                return False
+            self.departures = found
+            return True
+        finally:
+            if self._judging is mine:
+                self._judging = None
 
     def _refuse(self, error: MessageError) -> None:
         self.taken.reject(error.reason, str(error))
@@ -135,13 +139,6 @@ class StiffnessWatch:
                 self._take(self._waiting.popleft())
             except MessageError as error:
                 self._refuse(error)
-        self._begin()
-
-    def _begin(self) -> None:
-        """Begin a judgement where it is time and none is on its way."""
-        if self._work is None and self._due - self._judged >= JUDGED * SECOND:
-            self._judged = self._due
-            self._work = self._alarm.judging()
 
     def _take(self, sample: DeflectionSample) -> None:
         before, after = self._around(sample.stamp)

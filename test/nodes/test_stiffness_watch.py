@@ -44,8 +44,10 @@ def watched(name, topic, **settings):
             watch.answer(monitor.wrench(m.message, m.log_time))
         else:
             monitor.joint_state(m.message, m.log_time)
-        while watch.busy:
-            if watch.work() and watch.departures is not None:
+        while (work := watch.judgement()) is not None:
+            for _ in work:
+                pass
+            if watch.departures is not None:
                 judged.append((watch.stamp, watch.departures))
     return watch, judged
 
