@@ -50,9 +50,10 @@ types: $(VENV)/test.stamp
 	$(BIN)/mypy
 
 # Three at a time, as most wait for processes: a test that needs quiet waits for conditions, none for a clock.
-# A file is one worker's: what its tests share is made once.
+# A file is one worker's: what its tests share is made once. Bytecode is kept, as hundreds of
+# processes start.
 unit: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -n 3 --dist loadfile
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n 3 --dist loadfile
 
 long: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -n 3 --dist loadfile -m long $(ENDLESS:%=--ignore=%)

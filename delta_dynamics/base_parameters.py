@@ -16,7 +16,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import qr  # type: ignore[import-untyped]
 
 from delta_dynamics.regressor import (
     DRIVE,
@@ -139,6 +138,8 @@ def independent(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, .
     seen = np.flatnonzero(norms > ABSENT * norms.max())
     weights = np.broadcast_to(np.asarray(preference, np.float64), norms.shape)
     norms = norms / weights
+    from scipy.linalg import qr  # type: ignore[import-untyped]  # dear, and a stream needs none
+
     r, pivots = qr(table[:, seen] / norms[seen], mode="r", pivoting=True)
     diagonal = np.abs(np.diag(r))
     rank = int((diagonal > RANK * weights.max()).sum())

@@ -511,22 +511,11 @@ def emit(program: Program) -> str:
 
 def compile_object(text: str) -> bytes:
     """Machine code for this processor."""
-    machine = _machine()
     module = binding.parse_assembly(text)
     module.verify()
-    if hasattr(binding, "create_pass_builder"):
-        options = binding.create_pipeline_tuning_options(speed_level=OPTIMISATION)
-        options.slp_vectorization = options.loop_vectorization = False
-        builder = binding.create_pass_builder(machine, options)
-        builder.getModulePassManager().run(module, builder)
-    else:
-        # llvmlite before 0.44.
-        builder = binding.create_pass_manager_builder()
-        builder.opt_level = OPTIMISATION
-        passes = binding.create_module_pass_manager()
-        builder.populate(passes)
-        passes.run(module)
-    code: bytes = machine.emit_object(module)
+    # No passes before: of straight lines without repetition they make nothing faster, and take
+    # as long as all the rest.
+    code: bytes = _machine().emit_object(module)
     return code
 
 

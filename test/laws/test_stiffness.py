@@ -62,6 +62,7 @@ CASES = [(ROBOT, random_poses(np.random.default_rng(1), 20))] + [
     (random_machine(np.random.default_rng(seed)), random_poses(np.random.default_rng(seed), 20))
     for seed in range(2, 22)
 ]
+EACH = [*CASES[:7], *(pytest.param(*case, marks=pytest.mark.long) for case in CASES[7:])]
 
 
 def loads(count, seed):
@@ -165,7 +166,7 @@ def second_route(robot, pose):
     return c, np.array(parts)
 
 
-@pytest.mark.parametrize(("robot", "poses"), CASES)
+@pytest.mark.parametrize(("robot", "poses"), EACH)
 def test_second_route(robot, poses):
     wrench = loads(len(poses), 3)
     c = compliance(robot, poses)
@@ -183,7 +184,7 @@ def test_second_route(robot, poses):
 # --- Laws of the matrices.
 
 
-@pytest.mark.parametrize(("robot", "poses"), CASES)
+@pytest.mark.parametrize(("robot", "poses"), EACH)
 def test_symmetric_positive_definite_and_inverse(robot, poses):
     c, k = compliance(robot, poses), stiffness(robot, poses)
     assert (c == c.swapaxes(-1, -2)).all()
@@ -196,7 +197,7 @@ def test_symmetric_positive_definite_and_inverse(robot, poses):
     assert np.abs(product - np.eye(6)).max() < 1e-9
 
 
-@pytest.mark.parametrize(("robot", "poses"), CASES)
+@pytest.mark.parametrize(("robot", "poses"), EACH)
 def test_energies_and_factors(robot, poses):
     wrench = loads(len(poses), 4)
     e = strain_energy(robot, poses, wrench)

@@ -16,6 +16,7 @@ from pkm_twin.apps.certify import effort_differences, relative
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.catalogue import CATALOGUE
 from test.machine.random_machines import NAMES, plain, variant
+from test.support.robots import partly_long
 
 if "machine" not in CATALOGUE:
     pytest.skip("load knows no mechanism machine", allow_module_level=True)
@@ -43,8 +44,13 @@ class Case:
         self.states = random_states(self.judge, rng, STATES)
 
 
+CASES = [(n, k) for n in NAMES for k in range(VARIANTS + 1)]
+
+
 @pytest.fixture(
-    scope="module", params=[(n, k) for n in NAMES for k in range(VARIANTS + 1)], ids=str
+    scope="module",
+    params=partly_long(CASES, *((n, 0) for n in NAMES), *((n, 1) for n in NAMES[::3])),
+    ids=str,
 )
 def case(request, tmp_path_factory):
     return Case(*request.param, tmp_path_factory.mktemp("machine"))
