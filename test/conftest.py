@@ -9,8 +9,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pytest
 import yaml
-from support.command import command
-from support.robots import (  # noqa: F401
+
+from pkm_twin import load
+from test.support.command import command
+from test.support.robots import (  # noqa: F401
     LIMITED,
     both_ways,
     finite_difference,
@@ -18,8 +20,6 @@ from support.robots import (  # noqa: F401
     random_joints,
     random_poses,
 )
-
-from pkm_twin import load
 
 # A background job of a shell ignores SIGINT, and so would every process started from here.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

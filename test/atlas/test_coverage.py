@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 
 from pkm_twin import load, robot_names
 from pkm_twin.atlas import kinds, workspace
@@ -17,6 +16,7 @@ from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace import planes, workspace_sweep
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import reachable, singularity_at, try_forward
+from test.support.robots import partly_long
 
 COUNTS = partly_long([20_000, 100_000], 20_000)
 """Random joint states."""

@@ -7,12 +7,12 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 from typer.testing import CliRunner
 
 from pkm_twin.atlas import isotropy, kinds, modes, strain_energy, workspace
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.errors import UnknownNameError
+from test.support.robots import partly_long
 
 MODES = partly_long(["modes prru", "modes delta_cu", "modes upr_rpu"], "modes upr_rpu")
 KINDS = partly_long(

@@ -9,11 +9,11 @@ import re
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 
 from pkm_twin.atlas.kinds import write_page
 from pkm_twin.atlas.store import open_atlas
 from test.atlas.browser import Browser, find_browser
+from test.support.robots import partly_long
 
 pytest.importorskip("plotly")
 pytest.importorskip("tornado")

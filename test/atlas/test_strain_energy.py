@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 
 from pkm_twin import load
 from pkm_twin.atlas.run import run
@@ -21,6 +20,7 @@ from pkm_twin.atlas.strain_energy import (
 )
 from pkm_twin.errors import ParameterError
 from stiffness_monitor import regular_workspace, strain_energy
+from test.support.robots import partly_long
 
 ROBOT = load("upr_rpu")
 

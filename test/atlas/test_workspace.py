@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.robots import parameters_of, partly_long
 
 from pkm_twin import load
 from pkm_twin.atlas import workspace
@@ -18,6 +17,7 @@ from pkm_twin.kinematics.clearance import clearance
 from pkm_twin.kinematics.workspace import CLEAR, RAYS, singularity_at
 from stiffness_monitor import reachable, regular_workspace
 from test.atlas.conftest import LAYERS
+from test.support.robots import parameters_of, partly_long
 
 ROBOTS = ("prru", "delta_cu", "upr_rpu")
 TURN = np.linspace(0, 2 * np.pi, 1001)

@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
-from support.robots import often
 
 from pkm_twin.bags import format as mcap_format
 from pkm_twin.bags.reader import (
@@ -29,6 +28,7 @@ from pkm_twin.bags.reader import (
     read_messages,
 )
 from pkm_twin.errors import BagError
+from test.support.robots import often
 
 FLIPS = 3000
 MAGIC = b"\x89MCAP0\r\n"

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 from mcap.writer import CompressionType, Writer
-from support.robots import often
 
 from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.bags.recover import recover
 from pkm_twin.errors import BagError
+from test.support.robots import often
 
 Rows = Callable[[Any], list[tuple[Any, ...]]]
 

@@ -9,13 +9,13 @@ import time
 
 import numpy as np
 import pytest
-from support.robots import parameters_of, random_joints
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from stiffness_monitor import strain_energy
 from test.benchmarks.round_trip import TWIN, Client, start, stop
 from test.nodes.harness import Domain
+from test.support.robots import parameters_of, random_joints
 
 pytestmark = pytest.mark.benchmark_run
 

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.command import Result
 
 from pkm_twin.bags.reader import BagWriter, open_bag
+from test.support.command import Result
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DELTA = REPOSITORY / "bags/delta_cu_pick_and_place.mcap"

@@ -7,12 +7,12 @@ import random
 
 import pytest
 from mcap.writer import CompressionType, Writer
-from support.robots import massless, often
 
 from pkm_twin.apps.recorded import JOINT_STATE, WRENCH
 from pkm_twin.bags.reader import BagWriter, inspect, open_bag, read_messages
 from test.bags.folders import make_folder
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
+from test.support.robots import massless, often
 
 JOINTS = "/joint_states"
 

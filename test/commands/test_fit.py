@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 import yaml
-from support.command import command
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
@@ -16,6 +15,7 @@ from pkm_twin.machine.entries import entries, with_entries
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
+from test.support.command import command
 from test.support.robots import parameters_of
 
 HEAD = ("five_bar", "friction,payload")

@@ -5,13 +5,13 @@ import json
 
 import numpy as np
 import pytest
-from support.command import command
 
 from pkm_twin import load
 from pkm_twin.bags.reader import BagWriter, open_bag
 from stiffness_monitor import compliance
 from test.bags.test_recordings import FOLDER
 from test.laws.deflections import SENSORS, noisy, twin_recording
+from test.support.command import command
 
 SOFT = FOLDER / "upr_rpu_soft_joint.mcap"
 COLLISION = FOLDER / "delta_cu_collision.mcap"

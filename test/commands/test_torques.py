@@ -7,11 +7,11 @@ import os
 
 import numpy as np
 import pytest
-from support.robots import massless
 
 from delta_dynamics import inverse_dynamics, reactions
 from pkm_twin import load
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
+from test.support.robots import massless
 
 TERMS = ("gravity", "inertia", "velocity", "payload", "friction", "external")
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")

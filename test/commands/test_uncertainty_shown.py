@@ -6,12 +6,12 @@ import json
 import numpy as np
 import pytest
 import yaml
-from support.command import command
 
 from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin import load
 from pkm_twin.apps.check import DEVIATIONS, motion, read_recording, residuals
 from test.commands.conftest import DELTA, rewrite
+from test.support.command import command
 from test.support.robots import parameters_of
 
 UNCERTAINTY = {

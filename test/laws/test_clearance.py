@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 from scipy.optimize import lsq_linear
-from support.robots import both_ways, parameters_of, random_poses
 
 from delta_dynamics.isotropy import tilted_pose
 from pkm_twin import load, robot_names
@@ -20,6 +19,7 @@ from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.clearance import clearance, distance, has_clearance
 from pkm_twin.kinematics.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import Member, structural_model
+from test.support.robots import both_ways, parameters_of, random_poses
 
 ROBOTS = [name for name in robot_names() if has_clearance(load(name))]
 

@@ -7,7 +7,6 @@ import sys
 
 import numpy as np
 import pytest
-from support.robots import every_robot, random_joints
 
 from pkm_twin import load
 from pkm_twin.codegen import expressions as ex
@@ -17,6 +16,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU, independent_rows
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
+from test.support.robots import every_robot, random_joints
 
 NONE = np.zeros(0)
 compiled = pytest.mark.skipif(not kernels.compiled(), reason="no compiler here")

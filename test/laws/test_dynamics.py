@@ -5,9 +5,14 @@ import json
 
 import numpy as np
 import pytest
-from support.bodies import bodies, rubs
-from support.robots import (
+
+from delta_dynamics import energy, forward_dynamics, inverse_dynamics, mass_matrix
+from pkm_twin import load
+from pkm_twin.errors import SingularityError, UnreachableError
+from test.support.bodies import bodies, rubs
+from test.support.robots import (
     FREE,
+    MASSIVE,
     both_ways,
     loaded,
     massive,
@@ -15,10 +20,6 @@ from support.robots import (
     random_joints,
     random_motion,
 )
-
-from delta_dynamics import energy, forward_dynamics, inverse_dynamics, mass_matrix
-from pkm_twin import load
-from pkm_twin.errors import SingularityError, UnreachableError
 
 pytestmark = massive
 
@@ -206,22 +207,33 @@ def test_wrong_last_axis_is_refused(name, robot):
         inverse_dynamics(robot, np.zeros((2, n)), np.zeros(n), np.zeros(n - 1))
 
 
-def test_without_a_compiler_the_numbers_are_the_same(name, rng):
-    """The same formulas as plain Python, in a process of its own."""
-    code = f"""
+PLAIN = """
 import json, sys
 import numpy as np
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.codegen import kernels
-robot = load({name!r})
-q = np.array(json.loads(sys.stdin.read()))
-tau = inverse_dynamics(robot, q, 2 * q, 3 * q, np.ones(6))
-one = inverse_dynamics(robot, q[0], 2 * q[0], 3 * q[0], np.ones(6))
-print(json.dumps({{"compiled": kernels.compiled(), "tau": tau.tolist(), "one": one.tolist()}}))
+found = {"compiled": kernels.compiled()}
+for name, given in json.loads(sys.stdin.read()).items():
+    robot, q = load(name), np.array(given)
+    tau = inverse_dynamics(robot, q, 2 * q, 3 * q, np.ones(6))
+    one = inverse_dynamics(robot, q[0], 2 * q[0], 3 * q[0], np.ones(6))
+    found[name] = {"tau": tau.tolist(), "one": one.tolist()}
+print(json.dumps(found))
 """
-    q = random_joints(load(name), rng, 20)
-    fast, slow = both_ways(code, json.dumps(q.tolist()))
+
+
+@pytest.fixture(scope="module")
+def both():
+    """Efforts of all robots, compiled and as plain Python, in two processes."""
+    rng = np.random.default_rng(20240229)
+    given = {name: random_joints(load(name), rng, 20).tolist() for name in MASSIVE}
+    return both_ways(PLAIN, json.dumps(given))
+
+
+def test_without_a_compiler_the_numbers_are_the_same(name, both):
+    """The same formulas as plain Python, in a process of its own."""
+    fast, slow = (way[name] for way in both)
     scale = np.abs(fast["tau"]).max()
     for word in fast:
         np.testing.assert_allclose(slow[word], fast[word], rtol=1e-12, atol=1e-12 * max(1, scale))

@@ -4,7 +4,6 @@
 import numpy as np
 import pytest
 from support import robots
-from support.robots import loaded, loaded_like, random_joints
 
 from delta_dynamics import (
     cones,
@@ -26,6 +25,7 @@ from delta_dynamics.cones import largest
 from delta_dynamics.least_form import _descended, least_direction
 from pkm_twin import load
 from pkm_twin.errors import ParameterError, SearchError, SingularityError
+from test.support.robots import loaded, loaded_like, random_joints
 
 MASSIVE = [name for name in robots.MASSIVE if len(load(name).joint_names) == 3]
 """Directions are on a sphere: machines of three freedoms."""
@@ -204,7 +204,7 @@ def test_the_least_direction_of_any_number_of_forms_and_coordinates(count, size)
     forms = forms + forms.swapaxes(-1, -2)
     y = least_direction(forms)
     assert np.linalg.norm(y) == pytest.approx(1, abs=1e-14)
-    dense = rng.normal(size=(20_000, size))
+    dense = rng.normal(size=(6_000, size))
     dense /= np.linalg.norm(dense, axis=-1, keepdims=True)
     assert largest(forms, y) <= largest(forms, dense).min() * (1 + 1e-12)
 

@@ -9,7 +9,6 @@ import math
 import numpy as np
 import pytest
 import yaml
-from support.robots import ELASTIC, elastic, parameters_of, random_joints
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
@@ -19,6 +18,7 @@ from stiffness_monitor.beams import assemble
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
 from stiffness_monitor.statics import frame_compliance
 from stiffness_monitor.structure import Carried, Member, structural_model
+from test.support.robots import ELASTIC, elastic, parameters_of, random_joints
 
 DELTAS = ("delta", "delta_cu")
 

@@ -5,20 +5,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.bodies import bodies
-from support.robots import (
-    every_robot,
-    finite_difference,
-    joint_units_of_size,
-    loaded,
-    random_joints,
-)
 
 from pkm_twin import load
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.passive import passive_program
 from pkm_twin.machine.graph import BASE
+from test.support.bodies import bodies
+from test.support.robots import (
+    every_robot,
+    finite_difference,
+    joint_units_of_size,
+    loaded,
+    random_joints,
+)
 
 MACHINES = Path(__file__).parents[1] / "machine" / "machines"
 STEP = 2e-3

@@ -10,11 +10,11 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.robots import parameters_of
 
 from pkm_twin import load, robot_names
 from pkm_twin.errors import ParameterError, UnknownNameError, one_line
 from pkm_twin.machine.schema import MAX_FILE_SIZE
+from test.support.robots import parameters_of
 
 ROBOTS = robot_names()
 DELTA = parameters_of("delta_cu")

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.robots import FREE, massive, random_joints
 
 from delta_dynamics import energy, inverse_dynamics, mass_matrix
 from delta_dynamics.plant import Plant, _least
 from pkm_twin import load
+from test.support.robots import FREE, massive, random_joints
 
 STEP = 1e-3
 NO_WRENCH = np.zeros(6)

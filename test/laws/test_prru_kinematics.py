@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.bodies import bodies
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import energy
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
+from test.support.bodies import bodies
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from support.bodies import bodies, rubs
-from support.robots import (
+
+from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
+from delta_dynamics.reactions import _joints, _loads
+from pkm_twin import load
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
+from test.support.bodies import bodies, rubs
+from test.support.robots import (
     FREE,
     MASSIVE,
     loaded,
@@ -15,11 +20,6 @@ from support.robots import (
     massless,
     random_motion,
 )
-
-from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
-from delta_dynamics.reactions import _joints, _loads
-from pkm_twin import load
-from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 
 states = random_motion
 

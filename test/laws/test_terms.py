@@ -5,12 +5,12 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from support.bodies import bodies, rubs
-from support.robots import FREE, loaded, massive, massless, random_motion
 
 from delta_dynamics import Terms, dynamics_terms, inverse_dynamics, mass_matrix
 from pkm_twin import load
 from pkm_twin.errors import ParameterError, UnreachableError
+from test.support.bodies import bodies, rubs
+from test.support.robots import FREE, loaded, massive, massless, random_motion
 
 NAMES = tuple(field.name for field in fields(Terms))
 

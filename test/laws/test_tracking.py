@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
-from support.robots import every_robot, random_poses
 
 from pkm_twin import load
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.tracking import boundary_distance, follow, track
+from test.support.robots import every_robot, random_poses
 
 
 def stream(robot, rng, count):

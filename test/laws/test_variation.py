@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
-from support.robots import every_robot
 
 from pkm_twin import load
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.variation import KINDS, varied
+from test.support.robots import every_robot
 
 RIGID = dict.fromkeys(("masses", "inertias", "friction"), 0.05)
 

@@ -7,12 +7,12 @@ import os
 import numpy as np
 import pytest
 import yaml
-from support.robots import parameters_of
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from stiffness_monitor import compliance, strain_energy
 from test.nodes.harness import Domain, ForkedNode, Maker, NodeProcess, Peer, Plain, Ros
+from test.support.robots import parameters_of
 
 
 @pytest.fixture(scope="session", params=["plain", "ros"])

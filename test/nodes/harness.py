@@ -113,7 +113,10 @@ class Domain:
     def __init__(self):
         folder = Path(tempfile.gettempdir())
         for number in range(20, 102):
-            lock = (folder / f"ros_domain_{number}.lock").open("w")
+            try:
+                lock = (folder / f"ros_domain_{number}.lock").open("w")
+            except OSError:  # another user's
+                continue
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:

@@ -5,7 +5,6 @@ import signal
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
@@ -17,6 +16,7 @@ from test.nodes.harness import (
     text_of,
     values_of,
 )
+from test.support.robots import partly_long
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 

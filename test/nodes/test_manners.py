@@ -232,24 +232,35 @@ class TestReset:
         assert call(twin, Trigger, "reset").success
 
 
+POINTS = 100_000
+
+
+@pytest.fixture(scope="module")
+def rows():
+    """Positions, velocities and accelerations, each of shape (points, 3)."""
+    waves = np.outer(np.arange(POINTS) * 0.001, [3.0, -4.0, 5.0])
+    return (
+        0.2 + 0.3 * np.sin(waves),
+        0.3 * np.cos(waves) * [3.0, -4.0, 5.0],
+        -0.3 * np.sin(waves) * [9.0, 16.0, 25.0],
+    )
+
+
+@pytest.fixture(scope="module")
+def long(rows):
+    """Their message, whose making takes longer than its answer."""
+    return MAKE.trajectory(NAMES, [i * STEP for i in range(POINTS)], *rows)
+
+
 class TestLongTrajectories:
-    def test_the_stream_is_answered_while_a_long_trajectory_is_worked_on(self, twin):
-        points = 100_000
-        times = np.arange(points) * 0.001
-        waves = np.outer(times, [3.0, -4.0, 5.0])
-        rows = [
-            0.2 + 0.3 * np.sin(waves),
-            0.3 * np.cos(waves) * [3.0, -4.0, 5.0],
-            -0.3 * np.sin(waves) * [9.0, 16.0, 25.0],
-        ]
-        stamp = twin.begin()
-        message = MAKE.trajectory(NAMES, [i * STEP for i in range(points)], *rows, stamp=stamp)
+    def test_the_stream_is_answered_while_a_long_trajectory_is_worked_on(self, twin, rows, long):
         answered(twin)
         answers = twin.received("joint_trajectory_ff")
         torques = twin.received("joint_torques")
         answers.clear()
         torques.clear()
-        twin.peer.send(f"/{twin.name}/joint_trajectory", message)
+        long.header = MAKE.header(twin.begin())
+        twin.peer.send(f"/{twin.name}/joint_trajectory", long)
         twin.peer.until(lambda: answers, repeat=lambda: twin.stream(1))
         # Of the states that were sent meanwhile.
         assert len(torques) > 3
@@ -257,12 +268,13 @@ class TestLongTrajectories:
         efforts = np.array([p.effort for p in answers[0].points[picked]])
         exact = inverse_dynamics(ROBOT, *(values[picked] for values in rows))
         assert np.abs(efforts - exact).max() < 1e-9
-        assert len(answers[0].points) == points
+        assert len(answers[0].points) == POINTS
 
     def test_more_than_can_wait_is_refused_by_name(self, twin):
         before = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0)
         count = 40
         for _ in range(count):
+            # Made anew each time: faster than that, the middleware loses some.
             message = trajectory(count=2000, stamp=twin.begin())
             for point, time in zip(message.points, range(2000), strict=True):
                 point.time_from_start.sec, point.time_from_start.nanosec = divmod(

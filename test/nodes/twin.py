@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A running delta_dynamics and its topics, seen from the other side; needs rclpy."""
 
+import time
+
 import numpy as np
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
@@ -63,6 +65,25 @@ class Twin:
     def send_state(self, message):
         self.peer.send(f"/{self.name}/states", message)
 
+    def ask_anew(self):
+        """Wait for the answer to a trajectory; after each second without one a new one is sent.
+
+        Where many wait already, as at a node's start, one is refused as busy.
+        """
+        received = self.received("joint_trajectory_ff")
+        sent, due = [], 0.0
+
+        def repeat():
+            nonlocal due
+            if time.monotonic() >= due:
+                message = trajectory(stamp=self.begin())
+                sent.append(stamp_of(message))
+                self.peer.send(f"/{self.name}/joint_trajectory", message)
+                due = time.monotonic() + 1.0
+
+        self.peer.until(lambda: any(stamp_of(m) in sent[-1:] for m in received), repeat=repeat)
+        received.clear()
+
     def ready(self):
         """Wait until all topics are connected both ways."""
 
@@ -81,7 +102,7 @@ class Twin:
 
         A stream that has stopped in a long pause runs again.
         """
-        self.ask(trajectory(stamp=self.begin()))
+        self.ask_anew()
         sent = set()
 
         def repeat():
@@ -90,7 +111,7 @@ class Twin:
 
         received = self.received("joint_torques")
         self.peer.until(lambda: any(stamp_of(m) in sent for m in received), repeat=repeat)
-        self.ask(trajectory(stamp=self.begin()))
+        self.ask_anew()
         for topic in ("joint_torques", "torque_residual", "commands"):
             self.received(topic).clear()
 

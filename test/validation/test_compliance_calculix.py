@@ -17,7 +17,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.members import Section
@@ -39,6 +38,7 @@ from test.certificate.links import (
     rigid_joints,
     round_bar,
 )
+from test.support.robots import partly_long
 from test.validation.calculix import ABSENT, CCX, Mesh, disc_mesh, section_motion, solid_compliance
 
 needs_calculix = pytest.mark.skipif(CCX is None, reason=ABSENT)

@@ -3,10 +3,10 @@
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import SingularityError, UnreachableError
+from test.support.robots import partly_long
 
 pytest.importorskip("pinocchio")
 from bags.recording.pinocchio_models import AssemblyError, DeltaEngine

@@ -6,10 +6,10 @@
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import energy
+from test.support.robots import partly_long
 
 pytest.importorskip("mpmath")
 from test.certificate.lagrange import energies

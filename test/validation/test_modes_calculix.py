@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.robots import parameters_of, partly_long
 
 from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.structure import structural_model
 from test.support.pages import numbers
+from test.support.robots import parameters_of, partly_long
 from test.validation.calculix import ABSENT, CCX, frequencies
 
 CLOSE, CONTRACTED = numbers(

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.bodies import bodies
-from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
+from test.support.bodies import bodies
+from test.support.robots import partly_long
 
 Array = NDArray[Any]
 

@@ -3,9 +3,9 @@
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 
 from delta_dynamics import inverse_dynamics
+from test.support.robots import partly_long
 
 pytest.importorskip("pinocchio")
 from bags.recording.pinocchio_models import PrruEngine

@@ -12,11 +12,11 @@ import math
 
 import numpy as np
 import pytest
-from support.robots import partly_long
 
 from delta_dynamics import reactions
 from test.certificate.machines import random_case
 from test.support.pages import numbers
+from test.support.robots import partly_long
 
 pytest.importorskip("pinocchio")
 
