@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -27,6 +26,7 @@ from pkm_twin.errors import (
     UnknownNameError,
     UnreachableError,
 )
+from pkm_twin.files import replacing
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -233,12 +233,8 @@ def write_table(columns: dict[str, Array], path: Path) -> None:
     :raises ParameterError: another ending, or pyarrow is missing.
     """
     check_target(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        (_write_csv if path.suffix == ".csv" else _write_parquet)(columns, part)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing(path) as hidden:
+        (_write_csv if path.suffix == ".csv" else _write_parquet)(columns, hidden)
 
 
 def _write_csv(columns: dict[str, Array], path: Path) -> None:
