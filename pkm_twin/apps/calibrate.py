@@ -35,6 +35,8 @@ from pkm_twin.machine.robot import Robot
 Array = NDArray[np.float64]
 
 ANGLES = ("roll", "pitch", "yaw")
+FARTHEST = 1e4
+"""No instrument stands farther from what it measures, m."""
 QUATERNION = ("qx", "qy", "qz", "qw")
 
 
@@ -64,6 +66,16 @@ def read_poses(path: Path, robot: Robot) -> Poses:
         return stack(names) if any(name in columns for name in names) else None
 
     q, position = stack(joints), stack("xyz")
+    for names, bound, unit in ((("x", "y", "z"), FARTHEST, "m"), (ANGLES, 2.0 * np.pi, "rad")):
+        for name in names:
+            values = columns.get(name, np.zeros(1))
+            if np.abs(values).max() > bound:
+                worst = int(np.abs(values).argmax())
+                raise ParameterError(
+                    f"{path}: line {worst + 2}: {name}",
+                    float(values[worst]),
+                    f"{unit}, up to {bound:.3g} in size",
+                )
     angles, quaternion = stack_some(ANGLES), stack_some(QUATERNION)
     rotation = None
     if quaternion is not None:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.columns import read_columns, times_of
 from pkm_twin.apps.elastic_fit import AXES, Deflected
 from pkm_twin.apps.recorded import BASE_FRAME, Recording, read_recording, recorded_wrench
 from pkm_twin.apps.torques import WRENCH_AXES
@@ -68,9 +68,7 @@ def _of_table(path: Path, robot: Robot) -> Deflected:
             )
     q = np.stack([columns[name] for name in names], -1)
     count = len(q)
-    time = columns.get("time", np.arange(count, dtype=np.float64))
-    if not (np.diff(time) > 0.0).all():
-        raise ParameterError(f"{path}: time", "not rising", "strictly rising times")
+    time = times_of(path, columns.get("time", np.arange(count, dtype=np.float64)))
     for name in columns:
         _, dot, kind = name.rpartition(".")
         if name not in KNOWN and name not in names and (not dot or kind == "position"):
@@ -80,7 +78,7 @@ def _of_table(path: Path, robot: Robot) -> Deflected:
     wrench = [columns.get(axis, np.zeros(count)) for axis in WRENCH_AXES]
     deflection = [columns.get(axis, np.full(count, np.nan)) for axis in AXES]
     return Deflected(
-        one_line(path.name, 100), time - time[0], q, np.stack(wrench, -1), np.stack(deflection, -1)
+        one_line(path.name, 100), time, q, np.stack(wrench, -1), np.stack(deflection, -1)
     )
 
 

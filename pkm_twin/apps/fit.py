@@ -284,7 +284,7 @@ def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tu
 
 def _of_csv(path: Path, machine: Any) -> Any:
     from delta_dynamics.fit_rows import Recorded
-    from pkm_twin.apps.columns import read_columns
+    from pkm_twin.apps.columns import read_columns, times_of
     from pkm_twin.apps.torques import WRENCH_AXES
 
     columns = read_columns(path)
@@ -298,9 +298,7 @@ def _of_csv(path: Path, machine: Any) -> Any:
             raise ParameterError(str(path), ", ".join(columns), f"a column {missing[0]}.{what}")
     if "time" not in columns:
         raise ParameterError(str(path), ", ".join(columns), "a column time")
-    time = columns["time"] - columns["time"][0]
-    if not (np.diff(time) > 0).all():
-        raise ParameterError(f"{path}: time", "not rising", "strictly rising times")
+    time = times_of(path, columns["time"])
     q, effort = (
         np.stack([columns[f"{joint}.{what}"] for joint in machine.joint_names], -1)
         for what in ("position", "effort")
