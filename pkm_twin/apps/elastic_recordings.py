@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from pkm_twin.apps.columns import read_columns, times_of
 from pkm_twin.apps.elastic_fit import AXES, Deflected
-from pkm_twin.apps.recorded import BASE_FRAME, Recording, read_recording, recorded_wrench
+from pkm_twin.apps.recorded import (
+    BASE_FRAME,
+    TRANSFORM,
+    Recording,
+    read_recording,
+    recorded_wrench,
+    require_definition,
+)
 from pkm_twin.apps.torques import WRENCH_AXES
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
@@ -24,7 +31,6 @@ from pkm_twin.streams.deflection import MAX_SHIFT, MAX_TURN, in_base_axes, read_
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
-TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
 OWN: Final = ["stiffness_monitor", "deflection"]
 """The end of the topic that the twin's own, computed, deflections come on."""
 MEASURED: Final = "measured_deflection"
@@ -166,7 +172,9 @@ def _deflection_topic(bag: Bag, wanted: Sequence[str]) -> str:
             f"deflections on {', '.join(fit)}; choose one with --topic", path=bag.report.path,
             reason="topic",
         )  # fmt: skip
-    return usual[0] if usual else fit[0]
+    chosen = usual[0] if usual else fit[0]
+    require_definition(bag, chosen)
+    return chosen
 
 
 def _messages(bag: Bag, wrench: str, deflection: str) -> tuple[list[Any], list[Any]]:

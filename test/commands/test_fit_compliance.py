@@ -218,3 +218,42 @@ def test_an_element_that_a_bound_holds_stays_a_compliance(capsys, tmp_path, monk
     done = command(capsys, "fit", "upr_rpu", "stiff.csv", "--what", "compliance")
     assert done.code == 0, done.err
     assert min(load("fitted.yaml").element_compliance.values()) > 0.0
+
+
+def test_a_deflection_type_without_its_fields(capsys, tmp_path, monkeypatch):
+    """A definition of one's own below the right type's name, its messages sound."""
+    monkeypatch.chdir(tmp_path)
+    topics = {"/joint_states": "JointState", "/wrench": "WrenchStamped"}
+    with BagWriter("bag.mcap") as bag:
+        for topic, kind in topics.items():
+            package = "sensor_msgs" if kind == "JointState" else "geometry_msgs"
+            bag.add_topic(topic, f"{package}/msg/{kind}")
+        bag.add_topic(
+            "/measured_deflection", "geometry_msgs/msg/TransformStamped", definition="float64 x"
+        )
+        for k, message in enumerate(open_bag(SOFT).messages(list(topics))):
+            if k == 100:
+                break
+            bag.write(message.topic, message.message, message.log_time)
+            bag.write("/measured_deflection", {"x": 1.0}, message.log_time)
+    done = command(capsys, "fit", "upr_rpu", "bag.mcap", "--what", "compliance")
+    assert done.code == 1
+    assert "/measured_deflection: the bag's definition" in done.one_line_error()
+    assert "differs at the field 'header'" in done.err
+
+
+def test_wrenches_in_two_frames_have_no_middle(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with BagWriter("bag.mcap") as bag:
+        bag.add_topic("/joint_states", "sensor_msgs/msg/JointState")
+        bag.add_topic("/wrench", "geometry_msgs/msg/WrenchStamped")
+        bag.add_topic("/measured_deflection", "geometry_msgs/msg/TransformStamped")
+        topics = ["/joint_states", "/wrench", "/measured_deflection"]
+        for k, message in enumerate(open_bag(SOFT).messages(topics)):
+            if k == 300:
+                break
+            if message.topic == "/wrench" and k > 150:
+                message.message.header.frame_id = "base_link"
+            bag.write(message.topic, message.message, message.log_time)
+    done = command(capsys, "fit", "upr_rpu", "bag.mcap", "--what", "compliance")
+    assert "wrenches in several frames, base_link, platform" in done.one_line_error()
