@@ -10,7 +10,6 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
-import yaml
 from numpy.typing import NDArray
 from rich.table import Table
 
@@ -21,6 +20,7 @@ from pkm_twin.console import print_json, progress, refuse_existing, table_consol
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.schema import parse_yaml
 
 Array = NDArray[np.float64]
 
@@ -137,7 +137,7 @@ def _check_loads(text: str, out: Path) -> None:
     :raises PkmTwinError: numbers that no file may have.
     """
     try:
-        robot_of_data(yaml.safe_load(text), out.stem)
+        robot_of_data(parse_yaml(text, str(out)), out.stem)
     except ValueError as error:
         raise PkmTwinError(
             f"the recordings make no robot, and {out} is not written: {error}"

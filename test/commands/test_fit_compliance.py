@@ -257,3 +257,18 @@ def test_wrenches_in_two_frames_have_no_middle(capsys, tmp_path, monkeypatch):
             bag.write(message.topic, message.message, message.log_time)
     done = command(capsys, "fit", "upr_rpu", "bag.mcap", "--what", "compliance")
     assert "wrenches in several frames, base_link, platform" in done.one_line_error()
+
+
+def test_a_robots_own_numbers_are_read_as_the_twin_reads_them(capsys, tmp_path, monkeypatch):
+    """1e-01 is a word for other readers of YAML; below a millionth no element is elastic."""
+    monkeypatch.chdir(tmp_path)
+    source = (FOLDER.parent / "config" / "upr_rpu.yaml").read_text()
+    plain = table(tmp_path / "plain.csv", rows=slice(0, 90))
+    for value, code in (("9e-1", 0), ("1e-300", 1), ("1e7", 1)):
+        (tmp_path / "mine.yaml").write_text(f"{source}element_compliance: {{3R: {value}}}\n")
+        done = command(
+            capsys, "fit", "mine.yaml", plain, "--what", "compliance", "--overwrite", "--no-report"
+        )
+        assert done.code == code, done.err
+        if code:
+            assert "element_compliance.3R" in done.one_line_error()
