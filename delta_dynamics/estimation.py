@@ -11,6 +11,7 @@ May import: numpy, scipy, cvxpy where semidefinite constraints bind, pkm_twin's 
 from __future__ import annotations
 
 import importlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -230,7 +231,10 @@ def _nearest(
         )
         limits.append((block + block.T) / 2 >> 0)
     problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(unknown)), limits)
-    problem.solve(solver=cvxpy.CLARABEL)
+    with warnings.catch_warnings():
+        # An inaccurate solution is put inside the bounds below, and told as held by them.
+        warnings.simplefilter("ignore", UserWarning)
+        problem.solve(solver=cvxpy.CLARABEL)
     if unknown.value is None:
         raise PkmTwinError(f"no possible masses and inertias near the data: {problem.status}")
     result = start + scales * z + moved @ np.asarray(unknown.value, np.float64)

@@ -33,6 +33,10 @@ HELD_OUT: Final = 1 / 3
 """Part of each recording, its end, that is judged and not fitted."""
 SURE: Final = 0.2
 """A number that is known this much better than before is fitted."""
+SCALE: Final = 200.0
+"""How many times heavier or lighter than its file a machine may be as a whole."""
+LIKE: Final = 0.7
+"""Correlation of efforts, measured and by the file, from which the one tells the other's unit."""
 STAYS: Final = 1e-3
 """Change over the deviation before that says nothing."""
 UNSURE: Final = 0.98
@@ -115,12 +119,15 @@ def fit(
     """
     parameters = file_parameters(robot, what)
     rows, filtering = [], []
+    start = parameters.values
     for i, recording in enumerate(recordings):
         made, how = rows_of(robot, parameters, recording, None)
         rows.append(made)
         filtering.append(how)
         if progress is not None:
             progress(2 * i + 1)
+    for recording, made in zip(recordings, rows, strict=True):
+        _check_scale(recording.name, made.target + made.rest, made.rest + made.table @ start)
     result, delays = _estimate(parameters, rows)
     other = []
     for i, (recording, how) in enumerate(zip(recordings, filtering, strict=True)):
@@ -146,6 +153,20 @@ def fit(
         robot, parameters, result, numbers, tuple(judged), tuple(filtering),
         sum(made.outliers for made in rows), sum(_split(made) for made in rows), delays,
     )  # fmt: skip
+
+
+def _check_scale(name: str, measured: Array, predicted: Array) -> None:
+    """Refuse efforts in another unit: alike but for a factor that no machine is off by.
+
+    :raises PkmTwinError: by recording.
+    """
+    both, own = float(np.sum(measured * predicted)), float(np.sum(predicted**2))
+    size = np.sqrt(own * float(np.sum(measured**2)))
+    if both > LIKE * size > 0.0 and not 1.0 / SCALE <= both / own <= SCALE:
+        raise PkmTwinError(
+            f"{name}: efforts are {both / own:.3g} times what the robot's file makes of the "
+            "motion: units? N m and N"
+        )
 
 
 def _split(rows: Rows) -> int:

@@ -36,6 +36,8 @@ OUTLIER: Final = 8.0
 """Robust deviations beyond which a measured effort is no measurement."""
 STILL: Final = 4.0
 """Deviations of a rate's noise below which a joint stands still."""
+LEAST_EFFORT: Final = 1e-9
+"""Efforts that change by less are no measurement, N m or N."""
 LARGEST: Final = 1e9
 """Effort that no drive has, N m or N."""
 LATE: Final = 2.0
@@ -157,7 +159,7 @@ def _check_efforts(robot: Robot, r: Recorded) -> None:
             raise PkmTwinError(
                 f"{r.name}: effort of {joint} is {worst:g}; below {LARGEST:g} is what a drive has"
             )
-        if len(effort) and np.ptp(effort) == 0.0:
+        if len(effort) and np.ptp(effort) < LEAST_EFFORT:
             only = effort[0] + 0.0  # no minus before zero
             raise PkmTwinError(
                 f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured"

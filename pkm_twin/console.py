@@ -25,6 +25,7 @@ from rich.progress import (
 )
 
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.files import require_replaceable
 
 
 @contextmanager
@@ -92,12 +93,18 @@ def print_json(data: Any) -> None:
 def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:
     """Refuse a target that is there, a dangling link too, unless it may be replaced.
 
-    What is read from is never replaced.
+    What is read from is never replaced, nor is a FIFO, a device or a folder.
+
+    :raises PkmTwinError: such a target.
     """
     if source is not None and path.exists() and source.exists() and path.samefile(source):
         raise PkmTwinError(f"{path}: the target is the source itself")
     if os.path.lexists(path) and not overwrite:
         raise PkmTwinError(f"{path} exists; give --overwrite to replace it")
+    try:
+        require_replaceable(path)
+    except OSError as error:
+        raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def system_error(error: OSError) -> str:

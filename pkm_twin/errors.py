@@ -56,7 +56,9 @@ class UnreachableError(PkmTwinError, ValueError):
     ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
         way = "" if reached is None else f", beyond {100 * reached:.3g} % of the way from home"
-        super().__init__(f"{what}{where} is unreachable: {limb} misses by {miss:.6g} m{way}")
+        # A limb of no length at all misses nothing, and points nowhere.
+        how = f"misses by {miss:.6g} m" if miss else "has no direction there"
+        super().__init__(f"{what}{where} is unreachable: {limb} {how}{way}")
         self.reached = reached
         self.limb = limb
         self.index = index

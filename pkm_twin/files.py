@@ -1,11 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening files that a user names: regular ones only. Imports the standard library only."""
+"""Files that a user names: regular ones only, and written whole or not at all.
+
+May import: the standard library.
+"""
 
 from __future__ import annotations
 
 import errno
+import io
 import os
 import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -16,6 +24,7 @@ _KINDS: Final = (
     (stat.S_ISBLK, "a block device"),
     (stat.S_ISSOCK, "a socket"),
 )
+_numbers: Final = count()
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -40,3 +49,64 @@ def _require_regular(mode: int, path: Path) -> None:
     if not stat.S_ISREG(mode):
         kind = next((name for test, name in _KINDS if test(mode)), "something else")
         raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", str(path))
+
+
+def require_replaceable(path: Path) -> None:
+    """Refuse a target that is there and no regular file, nor a link to one.
+
+    Opening a FIFO would wait for a reader, and a device is nobody's to replace.
+
+    :raises OSError: such a target; ``strerror`` says what it is.
+    """
+    with suppress(FileNotFoundError):
+        _require_regular(os.stat(path).st_mode, path)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A name of this process's own beside ``path``, which takes its place at a good end.
+
+    The name is short, whatever the target's is: one that the file system takes is not refused.
+
+    :raises OSError: the target is no regular file, or cannot be written.
+    """
+    require_replaceable(path)
+    hidden = path.with_name(f".{os.getpid()}.{next(_numbers)}.tmp")
+    try:
+        yield hidden
+        os.replace(hidden, path)
+    except OSError as error:
+        # A write that fails names no file, and of the hidden name nobody knows.
+        if error.filename is None or os.fspath(error.filename) == str(hidden):
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        raise
+    finally:
+        with suppress(OSError):
+            hidden.unlink(missing_ok=True)
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a small file whole or not at all.
+
+    :raises OSError: the target is no regular file, or cannot be written.
+    """
+    with replacing(path) as hidden:
+        hidden.write_bytes(data)
+
+
+def open_standard_streams() -> None:
+    """Let stdin, stdout and stderr lead nowhere where the parent closed them.
+
+    Else the next file or socket gets one of their numbers, and what is printed goes into it. What a
+    terminal's encoding cannot show, such as a file's name that is no text, is escaped.
+    """
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    while nowhere <= 2:
+        nowhere = os.dup(nowhere)
+    os.close(nowhere)
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w", encoding="utf-8", closefd=False))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")

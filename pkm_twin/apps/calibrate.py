@@ -24,15 +24,19 @@ from pkm_twin.apps.calibration import (
 )
 from pkm_twin.apps.calibration_state import FRAME, TARGET, Errors, Poses, rotations
 from pkm_twin.apps.columns import read_columns
-from pkm_twin.apps.options import Json, RobotName
+from pkm_twin.apps.limits import beyond_limits as find_beyond
+from pkm_twin.apps.limits import refuse_beyond
+from pkm_twin.apps.options import BeyondLimits, Json, RobotName
 from pkm_twin.console import print_json, progress, refuse_existing, table_console
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError, one_line
 from pkm_twin.machine.edited import Fitted, edited_yaml, write_edited
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
 ANGLES = ("roll", "pitch", "yaw")
+FARTHEST = 1e4
+"""No instrument stands farther from what it measures, m."""
 QUATERNION = ("qx", "qy", "qz", "qw")
 
 
@@ -62,6 +66,16 @@ def read_poses(path: Path, robot: Robot) -> Poses:
         return stack(names) if any(name in columns for name in names) else None
 
     q, position = stack(joints), stack("xyz")
+    for names, bound, unit in ((("x", "y", "z"), FARTHEST, "m"), (ANGLES, 2.0 * np.pi, "rad")):
+        for name in names:
+            values = columns.get(name, np.zeros(1))
+            if np.abs(values).max() > bound:
+                worst = int(np.abs(values).argmax())
+                raise ParameterError(
+                    f"{path}: line {worst + 2}: {name}",
+                    float(values[worst]),
+                    f"{unit}, up to {bound:.3g} in size",
+                )
     angles, quaternion = stack_some(ANGLES), stack_some(QUATERNION)
     rotation = None
     if quaternion is not None:
@@ -105,6 +119,7 @@ def calibrate_command(
             min=1e-6, max=1.0, help="how well lengths are known before, m (standard deviation)"
         ),
     ] = 0.01,
+    beyond_limits: BeyondLimits = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
     as_json: Json = False,
 ) -> None:
@@ -116,10 +131,16 @@ def calibrate_command(
     """
     from pkm_twin import load
 
-    refuse_existing(out, overwrite)
+    if out.suffix not in (".yaml", ".yml"):
+        raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
+    refuse_existing(out, overwrite, poses)
     machine = load(robot)
     measured = read_poses(poses, machine)
     q = machine.controller.positions(measured.joints)
+    _, beyond = find_beyond(machine, q)
+    if not beyond_limits:
+        refuse_beyond(beyond)
+    notes = [f"beyond limits: {item}" for item in beyond]
     paths = geometric(machine, q, only)
     with progress("steps", 2 * STEPS) as update:
         done = 0
@@ -133,18 +154,21 @@ def calibrate_command(
             machine, measured, paths, offsets=offsets, frame=frame, target=target, prior=prior,
             progress=step,
         )  # fmt: skip
-    source = f"calibrated with {poses.name}"
+    source = f"calibrated with {one_line(poses.name, 100)}"
     values = {
         p.name: Fitted(p.value, p.deviation, p.unit, source)
         for p in result.parameters
         if p.name not in (*FRAME, *TARGET)
     }
     head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
-    write_edited(out, head, edited_yaml(machine, robot, values))
+    write_edited(out, [*head, *notes], edited_yaml(machine, robot, values))
     if as_json:
-        print_json({"robot": machine.name, "out": str(out), **as_data(result)})
+        named = {"robot": machine.name, "out": str(out), "beyond_limits": notes}
+        print_json({**named, **as_data(result)})
         return
     _print(result)
+    for line in notes:
+        typer.echo(line)
     typer.echo(f"{out}: {len(values)} numbers")
 
 

@@ -53,6 +53,8 @@ SHOWN: Final = 0.1
 STEPS: Final = 60
 WRONG: Final = 0.02
 """Part of the machine's size that no fit may leave over: such poses are not its own."""
+TWISTED: Final = 0.05
+"""Angle an axis that no fit may leave over, rad: those are other angles, or other units."""
 FINEST: Final = 1e-9
 """Noise that no instrument is below, m or rad."""
 POOR: Final = 0.25
@@ -217,6 +219,12 @@ def calibrate(
         raise ParameterError(
             "poses", f"{noise[0]:.3g} m an axis left over", "poses of this machine, m and rad, its "
             f"own joints beside them: at most {most:.3g} m",
+        )  # fmt: skip
+    steepest = max(prior / robot.engine.tree.size, TWISTED)
+    if noise[1] is not None and noise[1] > steepest:
+        raise ParameterError(
+            "poses", f"{noise[1]:.3g} rad an axis left over", "rotations of this machine from its "
+            f"home, rad, in the order and axes of the columns: at most {steepest:.3g} rad",
         )  # fmt: skip
     built = type(robot).from_data(after.data, robot.name)
     deviations = np.sqrt(np.diag(covariance))

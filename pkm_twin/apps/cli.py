@@ -42,6 +42,7 @@ from pkm_twin.console import (
     table_console,
 )
 from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
 app = typer.Typer(
@@ -143,6 +144,7 @@ def info(
         Optional[Path],  # noqa: UP045  typer reads it
         typer.Option(help="draw the robot at home into this file, .png or .svg"),
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the picture")] = False,
 ) -> None:
     """Print all of a robot, with units.
 
@@ -152,6 +154,8 @@ def info(
     from pkm_twin import load
     from pkm_twin.apps.describe import describe, lines
 
+    if picture is not None:
+        refuse_existing(picture, overwrite)
     loaded = load(robot, platform=platform)
     data = describe(loaded)
     if picture is not None:
@@ -533,6 +537,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point: errors are one line on stderr and exit code 1, Ctrl-C is code 130."""
+    open_standard_streams()
     try:
         with first_signal(lambda: SystemExit(INTERRUPTED)):
             app(arguments, prog_name="pkm-twin")

@@ -21,6 +21,10 @@ from pkm_twin.files import open_regular
 Array = NDArray[np.float64]
 MAX_CSV_BYTES = 1024**3
 """Largest CSV that is read: some millions of samples."""
+SHORTEST_STEP = 1e-9
+"""Between two times, s: what a bag's stamps resolve."""
+LONGEST = 1e6
+"""From the first time to the last, s; of a trajectory it is the same."""
 MAX_CSV_LINE = 1024**2
 """Longest line of it, characters."""
 
@@ -41,6 +45,24 @@ def read_columns(path: Path) -> dict[str, Array]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         what = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise ParameterError(str(path), what, "a readable CSV file") from None
+
+
+def times_of(path: Path, values: Array) -> Array:
+    """A column of times from its first on, s.
+
+    :raises ParameterError: they do not rise, or farther than a recording lasts.
+    """
+    # Between the greatest numbers there is none.
+    with np.errstate(over="ignore"):
+        time: Array = np.asarray(values - values[0], np.float64)
+        rising = bool((np.diff(values) >= SHORTEST_STEP).all())
+    if not rising or not time[-1] <= LONGEST:
+        raise ParameterError(
+            f"{path}: time",
+            f"{values[0]:g} to {values[-1]:g}" if rising else "not rising",
+            f"rising times, {SHORTEST_STEP:g} s or more apart, up to {LONGEST:g} s in all",
+        )
+    return time
 
 
 def _lines(text: TextIO, path: Path) -> Iterator[str]:

@@ -36,6 +36,7 @@ from pkm_twin.apps.demo_report import REPORTS, Finding, draw, print_findings
 from pkm_twin.apps.tracking_report import report_tracking
 from pkm_twin.bags.reader import BagWriter, inspect
 from pkm_twin.errors import BagError, PkmTwinError
+from pkm_twin.ros.context import middleware_arguments
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
 
 
@@ -172,7 +173,7 @@ def run(bags: Path, out: Path, console: Console) -> list[Finding]:
     """Bags through their nodes, a machine by the twin; print and draw what came back."""
     recording = out / "demo.mcap"
     context = Context()
-    rclpy.init(context=context)
+    rclpy.init(args=middleware_arguments([]), context=context)
     try:
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(rclpy.create_node("demo_recorder", context=context))

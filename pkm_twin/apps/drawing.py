@@ -9,7 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.atlas.plots import rendered
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.files import replace_file
 from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.outline import body_points, crosspieces, platform_face
 from pkm_twin.machine.robot import Robot
@@ -76,10 +78,11 @@ def picture(robot: Robot, path: Path) -> None:
         # Another one would get an ending that nobody has asked for.
         raise ParameterError("picture", str(path), f"a name that ends in {' or '.join(PICTURES)}")
     figure = draw(robot).figure
+    data = rendered(figure, 90, path.suffix[1:])
     try:
-        figure.savefig(path, dpi=90)
-    except (OSError, ValueError) as error:
-        raise PkmTwinError(f"{path} cannot be written: {error}") from None
+        replace_file(path, data)
+    except OSError as error:
+        raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def _only_com(graph: Graph, name: str, places: list[Array]) -> list[Array]:

@@ -38,6 +38,12 @@ CONVERGED: Final = 1e-2
 """Part of its deviation by which no factor moves in the last step."""
 ALIKE: Final = 1e-3
 """Loads whose directions, and poses whose places, differ by no more of their size are one."""
+SCALE: Final = 50.0
+"""How many times softer or stiffer than the file says a machine may be as a whole."""
+LIKE: Final = 0.5
+"""Correlation of deflections and loads from which the one speaks of the other's scale."""
+UNEXPLAINED: Final = 0.9
+"""Part of the deflections' rms. A fit that a bound holds and that leaves more explains nothing."""
 SHOWN: Final = 0.1
 """Part of the greatest weight below which an element is no part of a combination."""
 
@@ -153,9 +159,11 @@ def fit_elements(
         if update is not None:
             update(i + 1)
     _check_loads(recordings, robot)
+    _check_scale(parts)
     names = parts[0].response.names
     found = _solve(parts, len(names))
-    factors = found.values[: len(names)]
+    # What a bound holds at zero would be no compliance, and no file's.
+    factors = np.maximum(found.values[: len(names)], STIFFEST)
     before = np.array([robot.element_compliance.get(name, 1.0) for name in names])
     deviations = np.sqrt(np.diag(found.covariance)[: len(names)])
     numbers = tuple(
@@ -167,6 +175,7 @@ def fit_elements(
     if all(number.status == "not excited" for number in numbers):
         raise PkmTwinError("no excitation: the loads tell nothing of any element's compliance")
     zeros = found.values[len(names) :].reshape(len(parts), 6)
+    _check_explained(parts, factors, zeros, found.bound)
     own = found.covariance[: len(names), : len(names)]
     judged = tuple(
         _judged(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True)
@@ -186,6 +195,9 @@ def _check(recording: Deflected) -> None:
         )
     if not recording.wrench.any():
         raise PkmTwinError(f"{recording.name}: no load, every wrench is zero")
+    values = recording.deflection[:, np.isfinite(recording.deflection).any(0)]
+    if not (np.nanmax(values, 0) > np.nanmin(values, 0)).any():
+        raise PkmTwinError(f"{recording.name}: no deflection, every one is the same")
 
 
 def _check_loads(recordings: Sequence[Deflected], robot: Robot) -> None:
@@ -194,6 +206,8 @@ def _check_loads(recordings: Sequence[Deflected], robot: Robot) -> None:
     :raises PkmTwinError: that is all there is.
     """
     loads = np.concatenate([r.wrench for r in recordings]) / np.repeat([1.0, robot.size], 3)
+    # Squares of the smallest numbers are zero.
+    loads /= np.abs(loads).max()
     sizes = np.linalg.norm(loads, axis=1)
     loads = loads[sizes > 0.1 * sizes.max()]
     singular = np.linalg.svd(loads, compute_uv=False)
@@ -203,6 +217,55 @@ def _check_loads(recordings: Sequence[Deflected], robot: Robot) -> None:
         raise PkmTwinError(
             "no excitation: one load direction in one pose; other directions or other poses tell "
             "elements apart"
+        )
+
+
+def _check_scale(parts: Sequence[_Part]) -> None:
+    """Deflections and the file's own, without the instrument's zero, over all directions at once.
+
+    :raises PkmTwinError: they are alike but for a factor that no machine is off by.
+    """
+    for part in parts:
+        r = part.recording
+        moved, _ = part.response.deflection(r.wrench, np.ones(len(part.response.names)))
+        seen = np.where(np.isfinite(r.deflection), moved, np.nan)[:, part.measured]
+        told = r.deflection[:, part.measured]
+        seen, told = (v - np.nanmean(v, 0) for v in (seen, told))
+        size = np.sqrt(np.nanmean(seen**2, 0))
+        seen, told = (v / np.where(size > 0.0, size, np.inf) for v in (seen, told))
+        both, own, other = (float(np.nansum(v)) for v in (seen * told, seen**2, told**2))
+        like = both / max(np.sqrt(own * other), 1e-300)
+        if abs(like) < LIKE:
+            continue
+        if both < 0.0:
+            raise PkmTwinError(
+                f"{r.name}: the platform moves against its loads: signs, or the axes of either"
+            )
+        if not 1.0 / SCALE <= both / own <= SCALE:
+            raise PkmTwinError(
+                f"{r.name}: deflections are {both / own:.3g} times what the robot's file makes of "
+                "the loads: units? m and rad, N and N m"
+            )
+
+
+def _check_explained(parts: Sequence[_Part], factors: Array, zeros: Array, bound: bool) -> None:
+    """Refuse what is no fit: against all loads, and nothing left out of it.
+
+    :raises PkmTwinError: the same would be left of deflections of another machine.
+    """
+    if not bound:
+        return
+    explained = False
+    for part, zero in zip(parts, zeros, strict=True):
+        moved, _ = part.response.deflection(part.recording.wrench, factors)
+        told = (part.recording.deflection - zero)[: part.split, part.measured]
+        left = told - moved[: part.split, part.measured]
+        size = np.nanmean((told - np.nanmean(told, 0)) ** 2, 0)
+        explained |= bool((np.nanmean(left**2, 0) < UNEXPLAINED**2 * size).any())
+    if not explained:
+        raise PkmTwinError(
+            "no compliance of this robot explains the deflections: other loads, poses or axes than "
+            "the recording's?"
         )
 
 
@@ -229,7 +292,10 @@ def _solve(parts: Sequence[_Part], count: int) -> Estimate:
         factors = new
         if moved.max() < CONVERGED:
             return found
-    raise PkmTwinError(f"the compliances do not settle in {STEPS} steps: loads that tell more")
+    raise PkmTwinError(
+        f"the compliances do not settle in {STEPS} steps: no compliance of this robot explains the "
+        "deflections, or loads in more directions are needed"
+    )
 
 
 def _noise(table: Array, change: Array, judged: Array) -> Array | None:

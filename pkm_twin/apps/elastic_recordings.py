@@ -10,25 +10,41 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.columns import read_columns, times_of
 from pkm_twin.apps.elastic_fit import AXES, Deflected
-from pkm_twin.apps.recorded import BASE_FRAME, Recording, read_recording, recorded_wrench
+from pkm_twin.apps.recorded import (
+    BASE_FRAME,
+    TRANSFORM,
+    Recording,
+    read_recording,
+    recorded_wrench,
+    require_definition,
+)
 from pkm_twin.apps.torques import WRENCH_AXES
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
-from pkm_twin.errors import BagError, MessageError, ParameterError
+from pkm_twin.errors import BagError, MessageError, ParameterError, UnknownNameError, one_line
 from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, StampRules
-from pkm_twin.streams.deflection import in_base_axes, read_deflection
+from pkm_twin.ros.messages import MAX_FORCE, MAX_MOMENT, SECOND, TINY, StampRules
+from pkm_twin.streams.deflection import MAX_SHIFT, MAX_TURN, in_base_axes, read_deflection
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
-TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
 OWN: Final = ["stiffness_monitor", "deflection"]
 """The end of the topic that the twin's own, computed, deflections come on."""
 MEASURED: Final = "measured_deflection"
 """The usual name of the measured ones."""
+BOUNDS: Final = dict(
+    zip(
+        (*WRENCH_AXES, *AXES),
+        np.repeat([MAX_FORCE, MAX_MOMENT, MAX_SHIFT, MAX_TURN], 3).tolist(),
+        strict=True,
+    )
+)
+"""Greatest values of a table's columns, as of messages: N, N m, m, rad."""
+KNOWN: Final = ("time", *BOUNDS)
+"""Columns of a table beside the joints'."""
 APART: Final = 0.02
 """Farthest that a wrench or a joint state may be from a deflection, s."""
 
@@ -58,12 +74,30 @@ def _of_table(path: Path, robot: Robot) -> Deflected:
             )
     q = np.stack([columns[name] for name in names], -1)
     count = len(q)
-    time = columns.get("time", np.arange(count, dtype=np.float64))
-    if not (np.diff(time) > 0.0).all():
-        raise ParameterError(f"{path}: time", "not rising", "strictly rising times")
+    time = times_of(path, columns.get("time", np.arange(count, dtype=np.float64)))
+    for name in columns:
+        _, dot, kind = name.rpartition(".")
+        if name not in KNOWN and name not in names and (not dot or kind == "position"):
+            raise UnknownNameError(f"{path}: column", name, (*names, *KNOWN))
+    for axis, bound in BOUNDS.items():
+        _check_size(path, axis, columns.get(axis, np.zeros(1)), bound)
     wrench = [columns.get(axis, np.zeros(count)) for axis in WRENCH_AXES]
     deflection = [columns.get(axis, np.full(count, np.nan)) for axis in AXES]
-    return Deflected(path.name, time - time[0], q, np.stack(wrench, -1), np.stack(deflection, -1))
+    return Deflected(
+        one_line(path.name, 100), time, q, np.stack(wrench, -1), np.stack(deflection, -1)
+    )
+
+
+def _check_size(path: Path, name: str, values: Array, bound: float) -> None:
+    """As of a message: no number that no machine has, and none below every measurement."""
+    sizes = np.abs(values)
+    bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
+    if len(bad):
+        raise ParameterError(
+            f"{path}: line {bad[0] + 2}: {name}",
+            float(values[bad[0]]),
+            f"0, or {TINY:g} to {bound:g} in size",
+        )
 
 
 def _of_bag(path: Path, robot: Robot, topics: Sequence[str]) -> Deflected:
@@ -90,7 +124,7 @@ def _of_bag(path: Path, robot: Robot, topics: Sequence[str]) -> Deflected:
         )  # fmt: skip
     values = np.array([value for _, _, value in deflections])[near]
     frames = np.array([frame for _, frame, _ in deflections])[near]
-    return _paired(path.name, r, stamps[near], (times, wrenches), (frames, values))
+    return _paired(one_line(path.name, 100), r, stamps[near], (times, wrenches), (frames, values))
 
 
 def _paired(
@@ -102,8 +136,13 @@ def _paired(
     q = _between(stamps, r.stamps, r.q)
     rotation = r.robot.platform(q)[1]
     loads = _between(stamps, times, np.array([value for _, _, value in messages]))
-    # A wrench's frame is one in a recording; all but the base's turn with the platform.
-    if messages[0][1] != BASE_FRAME:
+    # All frames but the base's turn with the platform; between two frames there is no middle.
+    found = sorted({frame for _, frame, _ in messages})
+    if len(found) > 1:
+        raise BagError(
+            f"wrenches in several frames, {', '.join(found[:3])}", path=name, reason="frames"
+        )
+    if found != [BASE_FRAME]:
         loads = in_base_axes(loads, rotation)
     turned = in_base_axes(values, rotation)
     deflection = np.where((frames == BASE_FRAME)[:, None], values, turned)
@@ -133,7 +172,9 @@ def _deflection_topic(bag: Bag, wanted: Sequence[str]) -> str:
             f"deflections on {', '.join(fit)}; choose one with --topic", path=bag.report.path,
             reason="topic",
         )  # fmt: skip
-    return usual[0] if usual else fit[0]
+    chosen = usual[0] if usual else fit[0]
+    require_definition(bag, chosen)
+    return chosen
 
 
 def _messages(bag: Bag, wrench: str, deflection: str) -> tuple[list[Any], list[Any]]:

@@ -155,13 +155,17 @@ def _residual_rows(result: ElasticFit) -> list[tuple[str, ...]]:
     return rows
 
 
-def elastic_page(result: ElasticFit, recordings: Sequence[str]) -> str:
-    """The whole page."""
+def elastic_page(result: ElasticFit, recordings: Sequence[str], notes: Sequence[str] = ()) -> str:
+    """The whole page.
+
+    :param notes: lines of warning, which come first.
+    """
     title = f"{html.escape(result.robot.name)}: fitted from {html.escape(', '.join(recordings))}"
     e = result.estimate
     shown = _shown(result)
-    parts = [HEAD_OF_PAGE.format(title=title), "<h2>Compliance of the elements</h2>"]
-    parts += [numbers_table(shown)]
+    parts = [HEAD_OF_PAGE.format(title=title)]
+    parts += [f"<p>{html.escape(line)}</p>" for line in notes]
+    parts += ["<h2>Compliance of the elements</h2>", numbers_table(shown)]
     parts.append(
         "<p>Each number multiplies what the file says of an element's compliance. "
         f"{result.told} combinations are told by {result.samples} deflections; condition number "

@@ -13,9 +13,14 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 
-from pkm_twin.apps.options import BagTopics, Json, LoadTimes, Payload, load_of
+from pkm_twin.apps.limits import beyond_limits as find_beyond
+from pkm_twin.apps.limits import refuse_beyond
+from pkm_twin.apps.options import BagTopics, BeyondLimits, Json, LoadTimes, Payload, load_of
 from pkm_twin.console import print_json, progress, refuse_existing, table_console
-from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError, one_line
+from pkm_twin.files import replace_file
+from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.schema import parse_yaml
 
 Array = NDArray[np.float64]
 
@@ -48,6 +53,7 @@ def fit(
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
     load_times: LoadTimes = None,
+    beyond_limits: BeyondLimits = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="replace the YAML and the report")
     ] = False,
@@ -77,37 +83,84 @@ def fit(
         raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
     for target in (out, page) if report else (out,):
         refuse_existing(target, overwrite)
+    _check_topics(topic, recordings)
     if COMPLIANCE in [word.strip() for word in what.split(",")]:
         if per_copy or payload is not None or load_times is not None:
             raise ParameterError(
                 "what", what, "without --per-copy, --payload and --load-times: of efforts they tell"
             )
-        _fit_compliance(robot, recordings, what, topic, out, page if report else None, json_output)
+        _fit_compliance(
+            robot, recordings, what, topic, out, page if report else None, json_output,
+            beyond_limits,
+        )  # fmt: skip
         return
     kinds = kinds_of(what)
     text, machine = robot_text(robot, per_copy=per_copy)
     carried = load_of(payload, load_times)
     with progress("fit", 2 * len(recordings)) as update:
-        result = fit_recordings(machine, recordings, kinds, topic, carried, update)
-    names = [path.name for path in recordings]
+        result, beyond = fit_recordings(
+            machine, recordings, kinds, topic, carried, update, limited=not beyond_limits
+        )
+    names = [one_line(path.name, 100) for path in recordings]
+    fitted = fitted_yaml(text, result, names)
+    _check_loads(fitted, out)
     try:
-        write_edited(out, yaml_head(result, names), fitted_yaml(text, result, names))
+        write_edited(out, [*yaml_head(result, names), *beyond], fitted)
         if report:
             from pkm_twin.apps.fit_report import fit_page
 
-            page.write_text(fit_page(result, names), encoding="utf-8")
+            replace_file(page, fit_page(result, names, beyond).encode())
     except OSError as error:
         raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
     if json_output:
-        print_json(as_json(result) | {"out": str(out), "report": str(page) if report else None})
+        files = {"out": str(out), "report": str(page) if report else None}
+        print_json(as_json(result) | files | {"beyond_limits": beyond})
         return
     _print(result)
+    for line in beyond:
+        typer.echo(line)
     typer.echo(f"{out}" + (f", {page}" if report else ""))
+
+
+def _check_topics(topics: Sequence[str], recordings: Sequence[Path]) -> None:
+    """A topic is a bag's."""
+    from pkm_twin.bags.storage import is_bag
+
+    tables = [path for path in recordings if not is_bag(path)] if topics else []
+    if tables:
+        raise typer.BadParameter(f"--topic is for bags; {tables[0]} is read as CSV")
+
+
+def _check_loads(text: str, out: Path) -> None:
+    """Refuse to write what could not be read again.
+
+    :raises PkmTwinError: numbers that no file may have.
+    """
+    try:
+        robot_of_data(parse_yaml(text, str(out)), out.stem)
+    except ValueError as error:
+        raise PkmTwinError(
+            f"the recordings make no robot, and {out} is not written: {error}"
+        ) from None
+
+
+def _beyond(machine: Any, recordings: Sequence[tuple[str, Array]], limited: bool) -> list[str]:
+    """What recordings, by name with joints (k, n), have beyond the robot's limits.
+
+    :raises ParameterError: something, where that is refused.
+    """
+    lines = []
+    for name, q in recordings:
+        _, found = find_beyond(machine, q)
+        if limited:
+            refuse_beyond(found, name)
+        lines += [f"beyond limits: {one_line(name, 100)}: {item}" for item in found]
+    return lines
 
 
 def _fit_compliance(
     robot: str, recordings: Sequence[Path], what: str, topics: Sequence[str], out: Path,
-    page: Path | None, json_output: bool,
+    page: Path | None, json_output: bool, beyond_limits: bool,
 ) -> None:  # fmt: skip
     """The fit of elastic elements, its files and what it says."""
     from pkm_twin.apps import elastic_report
@@ -125,21 +178,27 @@ def _fit_compliance(
         for path in recordings:
             read.append(read_deflected(path, machine, topics))
             update(len(read))
+        beyond = _beyond(machine, [(r.name, r.q) for r in read], not beyond_limits)
         result = fit_elements(machine, read, lambda k: update(len(recordings) + k))
-    names = [path.name for path in recordings]
+    names = [one_line(path.name, 100) for path in recordings]
+    fitted = fitted_yaml(text, result, names)
+    _check_loads(fitted, out)
     try:
-        write_edited(out, elastic_report.yaml_head(result, names), fitted_yaml(text, result, names))
+        write_edited(out, [*elastic_report.yaml_head(result, names), *beyond], fitted)
         if page is not None:
-            page.write_text(elastic_report.elastic_page(result, names), encoding="utf-8")
+            replace_file(page, elastic_report.elastic_page(result, names, beyond).encode())
     except OSError as error:
         raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
     if json_output:
         print_json(
             elastic_report.as_json(result)
             | {"out": str(out), "report": None if page is None else str(page)}
+            | {"beyond_limits": beyond}
         )
         return
     elastic_report.print_fit(result)
+    for line in beyond:
+        typer.echo(line)
     typer.echo(f"{out}" + (f", {page}" if page is not None else ""))
 
 
@@ -150,10 +209,12 @@ def fit_recordings(
     topics: Sequence[str] = (),
     carried: Any = None,
     update: Callable[[int], None] | None = None,
-) -> Any:
+    limited: bool = True,
+) -> tuple[Any, list[str]]:
     """The fit of recordings, read as ``pkm-twin fit`` reads them.
 
-    :returns: a :class:`delta_dynamics.fit.Fit`.
+    :param limited: refuse what is beyond the robot's limits.
+    :returns: a :class:`delta_dynamics.fit.Fit`, and a line on each joint beyond its limits.
     :raises PkmTwinError: a recording without efforts, too short, or that shows nothing.
     """
     from delta_dynamics.fit import fit as fit_robot
@@ -165,6 +226,7 @@ def fit_recordings(
         else (_of_csv(path, machine), carried)
         for path in recordings
     ]
+    beyond = _beyond(machine, [(r.name, r.q) for r, _ in pairs], limited)
     base = machine
     if "payload" in kinds:
         loads = [load for _, load in pairs if load is not None]
@@ -181,7 +243,7 @@ def fit_recordings(
             recorded = _away_from_changes(recorded, load)
             held = load.held(recorded.time).astype(np.float64)
         made.append(dataclasses.replace(recorded, held=held, carried=known))
-    return fit_robot(base, made, kinds, progress=update)
+    return fit_robot(base, made, kinds, progress=update), beyond
 
 
 def _away_from_changes(recorded: Any, load: Any) -> Any:
@@ -217,12 +279,12 @@ def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tu
             f"no efforts on {r.topics.joint_states}: a fit needs what the drives gave",
             path=path, reason="no efforts",
         )  # fmt: skip
-    return Recorded(path.name, r.time, r.q, r.effort, r.wrench), r.load
+    return Recorded(one_line(path.name, 100), r.time, r.q, r.effort, r.wrench), r.load
 
 
 def _of_csv(path: Path, machine: Any) -> Any:
     from delta_dynamics.fit_rows import Recorded
-    from pkm_twin.apps.columns import read_columns
+    from pkm_twin.apps.columns import read_columns, times_of
     from pkm_twin.apps.torques import WRENCH_AXES
 
     columns = read_columns(path)
@@ -236,9 +298,7 @@ def _of_csv(path: Path, machine: Any) -> Any:
             raise ParameterError(str(path), ", ".join(columns), f"a column {missing[0]}.{what}")
     if "time" not in columns:
         raise ParameterError(str(path), ", ".join(columns), "a column time")
-    time = columns["time"] - columns["time"][0]
-    if not (np.diff(time) > 0).all():
-        raise ParameterError(f"{path}: time", "not rising", "strictly rising times")
+    time = times_of(path, columns["time"])
     q, effort = (
         np.stack([columns[f"{joint}.{what}"] for joint in machine.joint_names], -1)
         for what in ("position", "effort")
@@ -246,7 +306,7 @@ def _of_csv(path: Path, machine: Any) -> Any:
     wrench = None
     if any(axis in columns for axis in WRENCH_AXES):
         wrench = np.stack([columns.get(a, np.zeros(len(time))) for a in WRENCH_AXES], -1)
-    return Recorded(path.name, time, q, effort, wrench)
+    return Recorded(one_line(path.name, 100), time, q, effort, wrench)
 
 
 def as_json(result: Any) -> dict[str, Any]:

@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from delta_dynamics.fit import Fit, Number
-from pkm_twin.atlas.plots import COLOURS, columns
+from pkm_twin.atlas.plots import COLOURS, columns, rendered
 
 HEAD_OF_PAGE: Final = """<!DOCTYPE html>
 <html lang="en">
@@ -35,12 +34,16 @@ MOST_SAMPLES: Final = 4000
 WORDS: Final = {"fitted": "", "combination": "only together with others", "not excited": ""}
 
 
-def fit_page(result: Fit, recordings: Sequence[str]) -> str:
-    """The whole page."""
+def fit_page(result: Fit, recordings: Sequence[str], notes: Sequence[str] = ()) -> str:
+    """The whole page.
+
+    :param notes: lines of warning, which come first.
+    """
     title = f"{html.escape(result.robot.name)}: fitted from {html.escape(', '.join(recordings))}"
     e = result.estimate
     parts = [
         HEAD_OF_PAGE.format(title=title),
+        *(f"<p>{html.escape(line)}</p>" for line in notes),
         "<h2>What was fitted</h2>",
         numbers_table(_shown(result)),
     ]
@@ -164,9 +167,5 @@ def _efforts(result: Fit, number: int) -> Any:
 
 def picture(figure: Any) -> str:
     """A figure as an image in a page; it is closed."""
-    from matplotlib import pyplot
-
-    data = io.BytesIO()
-    figure.savefig(data, dpi=90, format="png")
-    pyplot.close(figure)
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+    data = base64.b64encode(rendered(figure, 90)).decode()
+    return f'<img alt="" src="data:image/png;base64,{data}">'

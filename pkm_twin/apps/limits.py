@@ -80,9 +80,10 @@ def beyond_limits(
     return outside, found
 
 
-def refuse_beyond(found: list[Beyond]) -> None:
+def refuse_beyond(found: list[Beyond], where: str = "") -> None:
     """Refuse what :func:`beyond_limits` found, if anything.
 
+    :param where: the recording, where there may be several.
     :raises ParameterError: naming the first joint, its value and its range.
     """
     if not found:
@@ -91,7 +92,7 @@ def refuse_beyond(found: list[Beyond]) -> None:
     at = "" if first.index is None else f" at sample {first.index}"
     others = f" ({len(found) - 1} more)" if len(found) > 1 else ""
     raise ParameterError(
-        f"{first.joint}.{first.quantity}{at}",
+        f"{where}{': ' if where else ''}{first.joint}.{first.quantity}{at}",
         round(first.value, 9),
         f"{first.low:g} to {first.high:g} {first.unit}{others}; {OPTION} computes it all the same",
     )

@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 import sys
 
+from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.arguments import answer
 
 MODULES = {
@@ -50,6 +51,7 @@ def machine_sim() -> None:
 
 
 def _run(name: str) -> None:
+    open_standard_streams()
     answer(name, SUMMARIES[name], sys.argv[1:])
     try:
         importlib.import_module("rclpy")

@@ -25,6 +25,7 @@ from pkm_twin.ros.messages import JointReader, JointSample, StampRules, read_wre
 Array = NDArray[np.float64]
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 BASE_FRAME: Final = "base_link"
 PLATFORM_FRAME: Final = "platform"
@@ -64,6 +65,26 @@ MSG: geometry_msgs/Vector3
 float64 x
 float64 y
 float64 z
+""",
+    TRANSFORM: _STAMPED
+    + "string child_frame_id\nTransform transform"
+    + _HEADER
+    + """
+================================================================================
+MSG: geometry_msgs/Transform
+Vector3 translation
+Quaternion rotation
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
 """,
 }
 # How many messages of a topic are looked at for the robot's joints.
@@ -270,7 +291,7 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = ()) -> Topics:
     joints = _choose_joints(bag, robot, kinds[JOINT_STATE], left_out)
     wrench = _choose_wrench(bag, kinds[WRENCH], bool(wanted), left_out)
     for name in filter(None, (joints, wrench)):
-        _require_definition(bag, name)
+        require_definition(bag, name)
     return Topics(joints, wrench, left_out)
 
 
@@ -281,7 +302,7 @@ def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str
         aside = "".join(f"; {name}: {why}" for name, why in left_out.items())
         raise _choice_error(bag, f"no joint states in the bag{aside}", "no joint states")
     for name in filled:
-        _require_definition(bag, name)
+        require_definition(bag, name)
     # As the controller calls them, which recorded them.
     joints = robot.controller.names
     seen = _names_on(bag, filled, set(joints))
@@ -355,7 +376,7 @@ def _names_on(bag: Bag, topics: list[str], joints: set[str]) -> dict[str, set[st
     return seen
 
 
-def _require_definition(bag: Bag, topic: str) -> None:
+def require_definition(bag: Bag, topic: str) -> None:
     """Refuse a type whose recorded fields are not the ones that are read.
 
     :raises BagError: naming the field.

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
 from pkm_twin import load
 from pkm_twin.apps.check import motion
-from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.columns import read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.apps.recorded import Load, by_load, read_recording
 from pkm_twin.errors import (
@@ -27,6 +26,7 @@ from pkm_twin.errors import (
     UnknownNameError,
     UnreachableError,
 )
+from pkm_twin.files import replacing
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -36,8 +36,6 @@ ENDINGS = (".csv", ".parquet")
 WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
-SHORTEST_STEP = 1e-9
-"""Between two of its times, s: what a bag's stamps resolve."""
 
 
 @dataclass(frozen=True)
@@ -129,10 +127,7 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
         needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
         raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
     time = columns["time"]
-    if not (np.diff(time) >= SHORTEST_STEP).all():
-        raise ParameterError(
-            f"{path}: time", "not rising", f"rising times, {SHORTEST_STEP:g} s or more apart"
-        )
+    times_of(path, time)
     qd, qdd = stack("velocity"), stack("acceleration")
     if (qd is None or qdd is None) and len(time) < 3:
         raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
@@ -233,12 +228,8 @@ def write_table(columns: dict[str, Array], path: Path) -> None:
     :raises ParameterError: another ending, or pyarrow is missing.
     """
     check_target(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        (_write_csv if path.suffix == ".csv" else _write_parquet)(columns, part)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing(path) as hidden:
+        (_write_csv if path.suffix == ".csv" else _write_parquet)(columns, hidden)
 
 
 def _write_csv(columns: dict[str, Array], path: Path) -> None:

@@ -10,9 +10,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from pkm_twin.atlas import isotropy, modes, pages, plots, strain_energy, workspace
-from pkm_twin.atlas.store import reading, replace_file, writing
+from pkm_twin.atlas.store import reading, writing
 from pkm_twin.atlas.sweep import Kind
 from pkm_twin.errors import UnknownNameError
+from pkm_twin.files import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

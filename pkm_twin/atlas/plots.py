@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkm_twin.atlas.store import replace_file, writing
+from pkm_twin.atlas.store import writing
+from pkm_twin.files import replace_file
 
 if TYPE_CHECKING:
     from pkm_twin.apps.demo_report import DynamicsSeries, StiffnessSeries
@@ -33,18 +34,34 @@ def columns(count: int, rows: int) -> tuple[Any, list[Any]]:
     return figure, list(axes.T)
 
 
+def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
+    """A figure as an image; it is closed.
+
+    Names of files and joints may have a dollar in them: no text that is set here is a formula.
+    """
+    from matplotlib import pyplot
+
+    texts = [] if figure._suptitle is None else [figure._suptitle]
+    for ax in figure.axes:
+        legend = ax.get_legend()
+        texts += [ax.title, ax.xaxis.label, ax.yaxis.label, *ax.texts]
+        texts += [] if legend is None else legend.get_texts()
+    for text in texts:
+        text.set_parse_math(False)
+    data = io.BytesIO()
+    figure.savefig(data, dpi=dpi, format=form)
+    pyplot.close(figure)
+    return data.getvalue()
+
+
 def save(figure: Any, path: Path) -> Path:
     """Write a figure as PNG, whole or not at all, and close it.
 
     :raises AtlasError: the file cannot be written.
     """
-    from matplotlib import pyplot
-
-    data = io.BytesIO()
-    figure.savefig(data, dpi=110, format="png")
-    pyplot.close(figure)
+    data = rendered(figure, 110)
     with writing(path):
-        replace_file(path, data.getvalue())
+        replace_file(path, data)
     return path
 
 

@@ -27,6 +27,7 @@ import numpy as np
 from pkm_twin.atlas.extras import require
 from pkm_twin.atlas.sweep import Chunk, Sweep, Values
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.files import replace_file
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -369,15 +370,3 @@ def open_atlas(path: Path) -> Dataset:
 
 
 _ATTRIBUTES: Final = ("title", "kind", "robot", "settings", "pose", "layout", "lateral")
-
-
-def replace_file(path: Path, data: bytes) -> None:
-    """Write a small file whole or not at all."""
-    hidden = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        hidden.write_bytes(data)
-        os.replace(hidden, path)
-    except BaseException:
-        with suppress(OSError):
-            hidden.unlink(missing_ok=True)
-        raise

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import zlib
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -52,6 +53,7 @@ from pkm_twin.bags.storage import BagFile, files_by_name, find_storage
 from pkm_twin.bags.strict import Check
 from pkm_twin.bags.writer import LIBRARY, Sink, mcap_writer, refuse_existing, write_error
 from pkm_twin.errors import BagError
+from pkm_twin.files import replacing
 
 
 @dataclass(frozen=True)
@@ -332,14 +334,15 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
     for file in files:
         if target.exists() and file.path.exists() and target.samefile(file.path):
             raise BagError("the target is the source itself", path=target, reason="exists")
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    with _creating(partial, target):
-        result = _write_salvage(files, partial)
-        if not result.messages:
-            text = f"no message can be recovered: {reason or 'there are none in it'}"
-            raise BagError(text, path=source, reason="nothing")
-        refuse_existing(target, overwrite)
-        partial.replace(target)
+    try:
+        with replacing(target) as hidden:
+            result = _write_salvage(files, hidden, target)
+            if not result.messages:
+                text = f"no message can be recovered: {reason or 'there are none in it'}"
+                raise BagError(text, path=source, reason="nothing")
+            refuse_existing(target, overwrite)
+    except OSError as error:
+        raise write_error(error, target) from error
     return replace(result, reason=reason or result.reason)
 
 
@@ -387,9 +390,23 @@ def _first_error(file: BagFile) -> str:
     return ""
 
 
-def _write_salvage(files: Sequence[BagFile], path: Path) -> RecoverResult:
+class _TargetSink(Sink):
+    """What the system refuses here is the target's: a source is being read around it."""
+
+    def __init__(self, file: io.FileIO, target: Path) -> None:
+        super().__init__(file)
+        self._target = target
+
+    def write(self, data: bytes) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            raise write_error(error, self._target) from error
+
+
+def _write_salvage(files: Sequence[BagFile], path: Path, named: Path) -> RecoverResult:
     with path.open("xb", buffering=0) as output:
-        target = _Target(Sink(output))
+        target = _Target(_TargetSink(output, named))
         found = []
         for file in files:
             target.begin()
@@ -404,13 +421,3 @@ def _write_salvage(files: Sequence[BagFile], path: Path) -> RecoverResult:
         sum(salvage.chunks_lost for salvage in found),
         sum(salvage.unverified for salvage in found),
     )
-
-
-@contextmanager
-def _creating(partial: Path, target: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise write_error(error, target) from error
-    finally:
-        partial.unlink(missing_ok=True)

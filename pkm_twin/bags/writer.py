@@ -21,6 +21,7 @@ from mcap.writer import CompressionType, Writer
 from pkm_twin.bags.cdr import MessageCodec, live_type_name, message_definition
 from pkm_twin.bags.format import FREE_BYTES, MAX_CHUNK_BYTES, METADATA_CRC, metadata_crc
 from pkm_twin.errors import BagError
+from pkm_twin.files import require_replaceable
 
 LIBRARY = "pkm_twin"
 """What the header of our own bags says wrote them."""
@@ -157,7 +158,12 @@ class BagWriter:
         self._channel_numbers: dict[str, int] = {}
         refuse_existing(self._path, overwrite)
         try:
-            self._file = self._path.open("wb" if overwrite else "xb", buffering=0)
+            if overwrite:
+                # Another process that writes there now keeps its own, nameless file: never two in
+                # one.
+                require_replaceable(self._path)
+                self._path.unlink(missing_ok=True)
+            self._file = self._path.open("xb", buffering=0)
         except OSError as error:
             raise write_error(error, self._path) from error
         try:

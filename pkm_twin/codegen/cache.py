@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import os
+import stat
 import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
@@ -66,7 +67,10 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
     if place is None:
         return None
     try:
-        with (place / name).open("rb") as file:
+        # A FIFO in its place would wait for a writer, a device never end.
+        with open(os.open(place / name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                return None
             data = file.read(_LARGEST)
     except OSError:
         return None

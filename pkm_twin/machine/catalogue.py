@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError, one_line
 from pkm_twin.machine import schema
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.urdf_read import read_urdf
@@ -79,4 +79,5 @@ def robot_of_data(data: Mapping[str, Any], name: str) -> Robot:
         raise UnknownNameError("mechanism", mechanism, CATALOGUE)
     module, kind = CATALOGUE[mechanism].split(":")
     made: type[Robot] = getattr(importlib.import_module(module), kind)
-    return made.from_data(data, name)
+    # A file's name may be of anything, and ends in titles, XML and JSON.
+    return made.from_data(data, one_line(name, 200))

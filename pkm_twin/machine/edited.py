@@ -13,7 +13,8 @@ from typing import Any
 
 import yaml
 
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.files import replace_file
 from pkm_twin.machine.catalogue import TREES, robot_path
 from pkm_twin.machine.entries import given, has_entry, keys_of
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
@@ -67,11 +68,11 @@ def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted]) -> str:
 def write_edited(path: Path, head: Sequence[str], text: str) -> None:
     """Write a file with lines of comment at its head, whole or not at all.
 
-    :raises ParameterError: not writable.
+    :raises PkmTwinError: not writable.
     """
-    part = path.with_name(path.name + ".part")
+    # A name in it may have anything in it, a new line too.
+    whole = "".join(f"# {one_line(line, 2000)}\n" for line in head) + text
     try:
-        part.write_text("".join(f"# {line}\n" for line in head) + text, encoding="utf-8")
-        part.replace(path)
+        replace_file(path, whole.encode())
     except OSError as error:
-        raise ParameterError(str(path), error.strerror, "a file that can be written") from None
+        raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None

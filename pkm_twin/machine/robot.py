@@ -198,7 +198,7 @@ class Robot:
     limits: JointLimits = schema.section(limits_of(3), default={})
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
-    element_compliance: Mapping[str, float] = schema.numbers(above=0.0, at_most=1e6, default={})
+    element_compliance: Mapping[str, float] = schema.numbers(at_least=1e-6, at_most=1e6, default={})
     """Factors on the compliance of elastic elements, by name; 1 where left out."""
 
     coordinates: ClassVar[tuple[Coordinate, ...]]

@@ -87,15 +87,34 @@ def read_yaml(path: Path) -> dict[str, Any]:
             raise ParameterError(
                 str(path), f"{path.stat().st_size} bytes", f"at most {MAX_FILE_SIZE} bytes"
             )
-        data = yaml.load(content.decode("utf-8"), Loader=_StrictLoader)  # noqa: S506
-    except (yaml.YAMLError, OSError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        text = content.decode("utf-8")
+    except ParameterError:
+        raise
+    except (OSError, ValueError) as error:
+        raise _unreadable(str(path), error) from None
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, name: str) -> dict[str, Any]:
+    """What a parameter file of this text says.
+
+    :param name: the file's.
+    :raises ParameterError: not plain YAML, or not a mapping.
+    """
+    try:
+        data = yaml.load(text, Loader=_StrictLoader)  # noqa: S506
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
         if isinstance(error, ParameterError):
             raise
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise ParameterError(str(path), text, "a readable file of plain YAML") from None
+        raise _unreadable(name, error) from None
     if not isinstance(data, dict):
-        raise ParameterError(str(path), type(data).__name__, "a mapping of keys to values")
+        raise ParameterError(name, type(data).__name__, "a mapping of keys to values")
     return data
+
+
+def _unreadable(name: str, error: Exception) -> ParameterError:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return ParameterError(name, text, "a readable file of plain YAML")
 
 
 def number(
@@ -199,7 +218,7 @@ def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
 
 def numbers(
     *,
-    above: float = -math.inf,
+    at_least: float = -math.inf,
     at_most: float = math.inf,
     unit: str = "",
     default: Any = dataclasses.MISSING,
@@ -210,11 +229,11 @@ def numbers(
         if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
             raise ParameterError(field, value, "a mapping of names to numbers")
         return {
-            name: _number(_join(field, name), entry, above, at_most=at_most)
+            name: _number(_join(field, name), entry, at_least=at_least, at_most=at_most)
             for name, entry in value.items()
         }
 
-    bound = "a mapping of names to numbers" + _bound(above, at_most=at_most)
+    bound = "a mapping of names to numbers" + _bound(at_least=at_least, at_most=at_most)
     return _field(check, default, bound, unit)
 
 

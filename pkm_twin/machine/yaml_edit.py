@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """New numbers in a YAML file that stays otherwise as its author wrote it, comments and all.
 
-May import: yaml, this package's schema, the standard library.
+May import: yaml, this package's schema and errors, the standard library.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, one_line
 
 Path = tuple[str | int, ...]
 
@@ -32,7 +32,7 @@ def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) 
     for number in sorted(above, reverse=True):
         line = lines[number]
         indent = line[: len(line) - len(line.lstrip())]
-        lines[number:number] = [f"{indent}# {note}\n" for note in above[number]]
+        lines[number:number] = [f"{indent}# {one_line(note, 2000)}\n" for note in above[number]]
     return "".join(lines)
 
 

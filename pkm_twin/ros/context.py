@@ -6,11 +6,32 @@ May import: pkm_twin's errors, the standard library; rclpy only when it is asked
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from pkm_twin.errors import PkmTwinError
+
+
+def middleware_arguments(arguments: Sequence[str]) -> list[str]:
+    """Arguments for rclpy: without log files, said once, where there can be no folder for them.
+
+    The middleware would refuse to start. What it logs goes to the terminal and /rosout as ever.
+    """
+    given = list(arguments)
+    try:
+        home = os.environ.get("ROS_HOME") or Path.home() / ".ros"
+        folder = Path(os.environ.get("ROS_LOG_DIR") or Path(home) / "log").expanduser()
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(f"{folder} is read-only")
+    except (OSError, RuntimeError) as error:
+        print(f"no log files: {error}; set ROS_LOG_DIR to a folder", file=sys.stderr)
+        given += ["--ros-args", "--disable-external-lib-logs"]
+    return given
 
 
 @contextmanager
@@ -36,7 +57,11 @@ def own_node(
             f"{needs} needs ROS 2: source its setup, or pip install pkm_twin[jazzy] ({error})"
         ) from error
     context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(
+        args=middleware_arguments([]),
+        context=context,
+        signal_handler_options=SignalHandlerOptions.NO,
+    )
     node = None
     try:
         clock = Parameter("use_sim_time", value=sim_time)

@@ -56,6 +56,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.ros.context import middleware_arguments
 from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.signals import SIGNALS, first_signal, ignore_signals, noted_signals
 from pkm_twin.streams.monitor import TopicStatistics
@@ -790,7 +791,7 @@ def run(
         # The middleware's handler for SIGINT calls this one; SIGTERM is the middleware's alone.
         with first_signal(KeyboardInterrupt, SIGNALS if farewell else (signal.SIGINT,)):
             rclpy.init(
-                args=None if arguments is None else list(arguments),
+                args=middleware_arguments(sys.argv if arguments is None else arguments),
                 signal_handler_options=SignalHandlerOptions.NO if farewell else None,
             )
             begun = True

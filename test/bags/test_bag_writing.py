@@ -131,11 +131,22 @@ def test_full_disk(tmp_path: Path) -> None:
     assert saved == list(range(1, result.messages + 1))
 
 
-def test_full_disk_is_told_by_close() -> None:
-    writer = None
-    with pytest.raises(BagError) as caught:
-        writer = BagWriter("/dev/full", overwrite=True)
-    assert caught.value.reason == "disk_full" and writer is None
+def test_full_disk_is_told_by_close(tmp_path: Path) -> None:
+    """A disk that is full from the first byte on: nothing that is written says so before."""
+    program = (
+        "import resource, sys\nfrom pkm_twin.bags.reader import BagWriter, BagError\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)\n"
+        "try:\n    BagWriter(sys.argv[1], overwrite=True).close()\n"
+        "except BagError as error:\n    print(error.reason)\n"
+    )
+    for size in ("0", "100"):
+        done = subprocess.run(
+            [sys.executable, "-c", program, str(tmp_path / "full.mcap"), size],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert (done.returncode, done.stdout, done.stderr) == (0, "disk_full\n", "")
 
 
 def test_equal_input_gives_equal_bytes(tmp_path: Path, make_bag: Callable[..., Path]) -> None:

@@ -177,3 +177,39 @@ def test_only_numbers_that_there_are_can_be_chosen(tmp_path: Path) -> None:
     measured(path, count=12)
     result = run("delta_cu", str(path), "--only", "inertia", "--out", str(tmp_path / "mine.yaml"))
     assert "the beginning of a geometric number's path" in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("names", "how", "text"),
+    [
+        ("x y z", lambda v: 1e300 * v, "up to 1e+04 in size"),
+        ("roll pitch yaw", lambda v: 1e300 * v, "up to 6.28 in size"),
+        ("roll pitch yaw", np.degrees, "up to 6.28 in size"),
+        ("roll pitch yaw", lambda v: v + 3.1, "rad an axis left over"),
+        ("x y z", lambda v: -v, "left over"),
+        ("limb_1 limb_2 limb_3", lambda v: v - 0.12, "--beyond-limits"),
+    ],
+)
+@pytest.mark.parametrize("frame", [(), ("--frame",)])
+def test_numbers_that_are_no_poses_of_this_machine(
+    tmp_path: Path, names: str, how: Any, text: str, frame: tuple[str, ...]
+) -> None:
+    """With the instrument's frame free too, which may take up much, but no angles of another."""
+    robot = load("upr_rpu")
+    rng = np.random.default_rng(11)
+    q = random_joints(robot, rng, 40)
+    place, rotation = robot.platform(q)
+    angles = Rotation.from_matrix(rotation).as_euler("xyz")
+    columns = dict(zip([f"{n}.position" for n in robot.joint_names], q.T, strict=True))
+    columns |= dict(zip("xyz", place.T + 2e-5 * rng.normal(size=place.T.shape), strict=True))
+    columns |= dict(zip(("roll", "pitch", "yaw"), angles.T, strict=True))
+    for name in columns:
+        if name.removesuffix(".position") in names.split():
+            columns[name] = how(columns[name])
+    path, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
+    table = np.stack(list(columns.values()), -1)
+    np.savetxt(path, table, "%.17g", ",", header=",".join(columns), comments="")
+    result = CliRunner().invoke(app, ["calibrate", "upr_rpu", str(path), "--out", str(out), *frame])
+    assert result.exit_code == 1
+    assert text in str(result.exception)
+    assert not out.exists()

@@ -172,3 +172,37 @@ def test_copies_that_would_lose_elastic_members_are_refused_by_name(capsys, tmp_
     assert done.code == 1
     assert "members" in done.one_line_error()
     assert not (tmp_path / "fitted.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("column", "how", "text"),
+    [
+        ("time", lambda v: v * 1e-300, "time: 'not rising'"),
+        ("time", lambda v: v * 1e300, "1e+06 s in all"),
+        ("effort", lambda v: v * 1e3, "times what the robot's file makes of the motion: units?"),
+        ("effort", lambda v: v * 1e-3, "times what the robot's file makes of the motion: units?"),
+        ("effort", lambda v: v * 1e-300, "nothing was measured"),
+        ("position", lambda v: v + 3.0, "--beyond-limits"),
+    ],
+)
+def test_numbers_that_are_no_recording_of_this_machine(
+    capsys, tmp_path, monkeypatch, column, how, text
+):
+    monkeypatch.chdir(tmp_path)
+    plain = table(tmp_path / "plain.csv", load("five_bar"))
+    names = plain.read_text().splitlines()[0].split(",")
+    data = np.loadtxt(plain, delimiter=",", skiprows=1)
+    for k, name in enumerate(names):
+        if name.rpartition(".")[2] == column:
+            data[:, k] = how(data[:, k])
+    np.savetxt("m.csv", data, "%.17g", ",", header=",".join(names), comments="")
+    done = command(capsys, "fit", "five_bar", "m.csv", "--what", "friction")
+    assert done.code == 1
+    assert text in done.one_line_error()
+    assert not list(tmp_path.glob("fitted*"))
+    if column == "position":
+        done = command(
+            capsys, "fit", "five_bar", "m.csv", "--what", "friction", "--beyond-limits", "--json"
+        )
+        # Marked, or not reachable there at all.
+        assert "beyond limits" in done.out or "unreachable" in done.err

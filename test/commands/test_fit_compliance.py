@@ -120,3 +120,155 @@ def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "complience")
     assert "did you mean 'compliance'" in done.one_line_error()
     assert not list(tmp_path.glob("*.yaml"))
+
+
+def changed(path, source, **columns):
+    """A table with columns put through functions."""
+    names = source.read_text().splitlines()[0].split(",")
+    data = np.loadtxt(source, delimiter=",", skiprows=1)
+    for name, how in columns.items():
+        name = name.replace("__", ".")
+        data[:, names.index(name)] = how(data[:, names.index(name)])
+    np.savetxt(path, data, "%.17g", ",", header=",".join(names), comments="")
+    return path
+
+
+def everywhere(names, how):
+    return dict.fromkeys(names, how)
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        (everywhere(WRENCH, lambda v: v * 1e250), "line 2: fx"),
+        (everywhere(WRENCH, lambda v: v * 1e-311), "line 2: fx"),
+        (everywhere(DEFLECTION, lambda v: v * 1e300), "line 2: dx"),
+        (everywhere(DEFLECTION, lambda v: 1e3 * v), "units? m and rad"),
+        (everywhere(WRENCH, lambda v: 1e-3 * v), "units? m and rad"),
+        (everywhere(DEFLECTION, lambda v: -v), "against its loads"),
+        (everywhere(DEFLECTION, np.zeros_like), "no deflection, every one is the same"),
+        (everywhere(DEFLECTION, lambda v: 0.0 * v + 1e-4), "no deflection, every one is the same"),
+        (
+            {n: np.random.default_rng(k).permutation for k, n in enumerate(DEFLECTION)},
+            "no compliance of this robot explains",
+        ),
+        (
+            {
+                n: lambda v, k=k: 1e-6 * np.random.default_rng(k).normal(size=v.shape)
+                for k, n in enumerate(DEFLECTION)
+            },
+            "no compliance of this robot explains",
+        ),
+        ({"limb_2__position": lambda v: 0.0 * v}, "limb_2.position at sample 0"),
+        ({"limb_2__position": lambda v: 0.0 * v + 0.29}, "--beyond-limits"),
+    ],
+)
+def test_numbers_that_are_no_recording_of_this_machine(
+    capsys, tmp_path, monkeypatch, columns, text
+):
+    monkeypatch.chdir(tmp_path)
+    plain = table(tmp_path / "plain.csv", rows=slice(0, 90))
+    path = changed(tmp_path / "changed.csv", plain, **columns)
+    done = command(capsys, "fit", "upr_rpu", path, "--what", "compliance")
+    assert done.code == 1
+    assert text in done.one_line_error()
+    assert not list(tmp_path.glob("fitted*"))
+
+
+def test_columns_and_topics_that_nothing_reads(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plain = table(tmp_path / "plain.csv", rows=slice(0, 60))
+    text = plain.read_text()
+    for wrong, right in (("dX", "dx"), ("Fz", "fz"), ("limb_1.postion", "limb_1.position")):
+        path = tmp_path / "misspelt.csv"
+        path.write_text(text.replace(right, wrong, 1))
+        done = command(capsys, "fit", "upr_rpu", path, "--what", "compliance")
+        assert done.code == 1
+        assert right in done.one_line_error()
+    for what in ("compliance", "friction"):
+        done = command(capsys, "fit", "upr_rpu", plain, "--what", what, "--topic", "/wrench")
+        assert done.code == 2
+        assert "--topic is for bags" in done.err
+
+
+def test_beyond_limits_is_refused_or_marked_everywhere(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robot = tmp_path / "short.yaml"
+    source = (FOLDER.parent / "config" / "upr_rpu.yaml").read_text()
+    robot.write_text(source.replace("limb_length: [0.300, 1.000]", "limb_length: [0.62, 1.0]"))
+    plain = table(tmp_path / "plain.csv", rows=slice(0, 90))
+    arguments = ("fit", robot, plain, "--what", "compliance")
+    assert "--beyond-limits" in command(capsys, *arguments).one_line_error()
+    done = command(capsys, *arguments, "--beyond-limits", "--json")
+    assert done.code == 0, done.err
+    (line, *_) = json.loads(done.out)["beyond_limits"]
+    assert line.startswith("beyond limits: plain.csv: limb_")
+    assert f"# {line}" in (tmp_path / "fitted.yaml").read_text()
+    assert line in (tmp_path / "fitted.html").read_text()
+
+
+def test_an_element_that_a_bound_holds_stays_a_compliance(capsys, tmp_path, monkeypatch):
+    """The written file can be read: zero is no compliance."""
+    monkeypatch.chdir(tmp_path)
+    recording = noisy(twin_recording({"1B": 0.02, "2B": 0.02}), np.random.default_rng(3), SENSORS)
+    names = [f"{name}.position" for name in load("upr_rpu").joint_names]
+    data = np.concatenate([recording.q, recording.wrench, recording.deflection], -1)
+    names += [*WRENCH, *DEFLECTION]
+    np.savetxt("stiff.csv", data[:150], "%.17g", ",", header=",".join(names), comments="")
+    done = command(capsys, "fit", "upr_rpu", "stiff.csv", "--what", "compliance")
+    assert done.code == 0, done.err
+    assert min(load("fitted.yaml").element_compliance.values()) > 0.0
+
+
+def test_a_deflection_type_without_its_fields(capsys, tmp_path, monkeypatch):
+    """A definition of one's own below the right type's name, its messages sound."""
+    monkeypatch.chdir(tmp_path)
+    topics = {"/joint_states": "JointState", "/wrench": "WrenchStamped"}
+    with BagWriter("bag.mcap") as bag:
+        for topic, kind in topics.items():
+            package = "sensor_msgs" if kind == "JointState" else "geometry_msgs"
+            bag.add_topic(topic, f"{package}/msg/{kind}")
+        bag.add_topic(
+            "/measured_deflection", "geometry_msgs/msg/TransformStamped", definition="float64 x"
+        )
+        for k, message in enumerate(open_bag(SOFT).messages(list(topics))):
+            if k == 100:
+                break
+            bag.write(message.topic, message.message, message.log_time)
+            bag.write("/measured_deflection", {"x": 1.0}, message.log_time)
+    done = command(capsys, "fit", "upr_rpu", "bag.mcap", "--what", "compliance")
+    assert done.code == 1
+    assert "/measured_deflection: the bag's definition" in done.one_line_error()
+    assert "differs at the field 'header'" in done.err
+
+
+def test_wrenches_in_two_frames_have_no_middle(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with BagWriter("bag.mcap") as bag:
+        bag.add_topic("/joint_states", "sensor_msgs/msg/JointState")
+        bag.add_topic("/wrench", "geometry_msgs/msg/WrenchStamped")
+        bag.add_topic("/measured_deflection", "geometry_msgs/msg/TransformStamped")
+        topics = ["/joint_states", "/wrench", "/measured_deflection"]
+        for k, message in enumerate(open_bag(SOFT).messages(topics)):
+            if k == 300:
+                break
+            if message.topic == "/wrench" and k > 150:
+                message.message.header.frame_id = "base_link"
+            bag.write(message.topic, message.message, message.log_time)
+    done = command(capsys, "fit", "upr_rpu", "bag.mcap", "--what", "compliance")
+    assert "wrenches in several frames, base_link, platform" in done.one_line_error()
+
+
+def test_a_robots_own_numbers_are_read_as_the_twin_reads_them(capsys, tmp_path, monkeypatch):
+    """1e-01 is a word for other readers of YAML; below a millionth no element is elastic."""
+    monkeypatch.chdir(tmp_path)
+    source = (FOLDER.parent / "config" / "upr_rpu.yaml").read_text()
+    plain = table(tmp_path / "plain.csv", rows=slice(0, 90))
+    for value, code in (("9e-1", 0), ("1e-300", 1), ("1e7", 1)):
+        (tmp_path / "mine.yaml").write_text(f"{source}element_compliance: {{3R: {value}}}\n")
+        done = command(
+            capsys, "fit", "mine.yaml", plain, "--what", "compliance", "--overwrite", "--no-report"
+        )
+        assert done.code == code, done.err
+        if code:
+            assert "element_compliance.3R" in done.one_line_error()

@@ -45,7 +45,7 @@ example in [new_machine.md](new_machine.md). `friction` and `limits` stand at th
 | `bodies`, `joints`, `rods` |  | mappings of names to entries | none |
 | `joint_map` |  | a mapping of names to entries | none |
 | `uncertainty` |  | a mapping of paths to entries | none |
-| `element_compliance` |  | a mapping of names to numbers above 0, at most 1e+06 | none |
+| `element_compliance` |  | a mapping of names to numbers, at least 1e-06, at most 1e+06 | none |
 | `limbs` |  | one section or a list: `azimuths` (rad), `bodies`, `joints`, `rods` | none |
 
 What stands in `limbs` is given for azimuth 0, copied and turned about base z by each azimuth, its

@@ -178,6 +178,12 @@ def test_the_cache_is_an_optimisation(tmp_path):
         stored[0].write_bytes(damaged)
         assert finished(start(folder)) == first
         assert [path.read_bytes() for path in sorted(folder.iterdir())] == whole
+    # Nobody writes into that FIFO, and the device never ends.
+    for kind in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
+        stored[0].unlink()
+        kind(stored[0])
+        assert finished(start(folder)) == first
+        assert [path.read_bytes() for path in sorted(folder.iterdir())] == whole
     blocked = tmp_path / "file"
     blocked.write_text("no folder")
     out, lines = finished(start(blocked))

@@ -48,6 +48,36 @@ def test_signals_end_a_node_whose_parent_ignores_them(domain, number):
         assert "Traceback" not in said(output)
 
 
+@pytest.mark.parametrize("command", ["node", "guard-check"])
+def test_a_home_that_cannot_be_written_costs_log_files_alone(domain, command):
+    """The middleware itself would not start. In /proc not even root makes a folder."""
+    environment = domain.environment() | {"ROS_LOG_DIR": "/proc/none/log"}
+    program = {
+        "node": [sys.executable, "-m", MODULE],
+        "guard-check": [
+            sys.executable, "-m", "pkm_twin.apps.cli", "guard-check", "--wait", "0.1", "/none"
+        ],
+    }[command]  # fmt: skip
+    with tempfile.TemporaryFile("w+") as output:
+        process = subprocess.Popen(
+            program, stdout=output, stderr=subprocess.STDOUT, cwd=tempfile.gettempdir(),
+            env=environment,
+        )  # fmt: skip
+        try:
+            end = time.monotonic() + DEADLINE
+            while "joints" not in said(output) and process.poll() is None:
+                assert time.monotonic() < end, said(output)
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(DEADLINE) == (0 if command == "node" else 1), said(output)
+        finally:
+            process.kill()
+            process.wait()
+        lines = [line for line in said(output).splitlines() if "no log files: " in line]
+        assert len(lines) == 1 and "set ROS_LOG_DIR" in lines[0]
+        assert "Traceback" not in said(output)
+
+
 def test_a_signal_while_an_executor_is_made_leaves_no_traceback():
     """A context that has ended by then: rclpy stops half-way, and its clean-up must not fail."""
     script = """

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What commands write: whole or not at all, over nothing but files, whatever names are about."""
+
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import threading
+
+import pytest
+from support.command import command, forked
+
+from pkm_twin import load
+from pkm_twin.bags.reader import BagWriter, open_bag
+from pkm_twin.errors import BagError
+from pkm_twin.files import replace_file, replacing
+from test.bags.test_recordings import FOLDER
+from test.commands.test_fit_compliance import SOFT, table
+
+REPOSITORY = FOLDER.parent
+EXCITE = ("excite", "five_bar", "--trials", 10, "--duration", 2)
+ODD = "a$\\x$ \udcff\nb"
+"""A formula that is none, a byte that is no text, and a new line."""
+
+
+@pytest.fixture
+def deflections(tmp_path):
+    return table(tmp_path / "deflections.csv", rows=slice(0, 60))
+
+
+def commands(deflections, target):
+    """Every command that writes a file, by what its name ends in."""
+    stem = target.with_suffix("")
+    return {
+        ".html": ("fit", "upr_rpu", deflections, "--what", "compliance", "--out", f"{stem}.yaml"),
+        ".yaml": ("fit", "upr_rpu", deflections, "--what", "compliance", "--out", f"{stem}.yaml"),
+        ".yml": ("calibrate", "upr_rpu", deflections, "--out", f"{stem}.yml"),
+        ".mcap": (*EXCITE, "--out", f"{stem}.mcap"),
+        ".csv": (*EXCITE, "--out", f"{stem}.mcap"),
+        ".png": ("info", "five_bar", "--picture", f"{stem}.png"),
+        ".bag": ("recover", SOFT, f"{stem}.bag"),
+        ".nc": ("atlas", "five_bar", "workspace", "--points", 1000, "--out", f"{stem}.nc"),
+    }
+
+
+@pytest.mark.parametrize(
+    "ending", [".html", ".yaml", ".yml", ".mcap", ".csv", ".png", ".bag", ".nc"]
+)
+@pytest.mark.parametrize("kind", ["a FIFO", "a folder", "a character device"])
+def test_only_files_are_replaced(capsys, tmp_path, deflections, ending, kind):
+    target = tmp_path / f"target{ending}"
+    {
+        "a FIFO": os.mkfifo,
+        "a folder": os.mkdir,
+        "a character device": lambda path: path.symlink_to("/dev/null"),
+    }[kind](target)
+    before = os.lstat(target).st_ino
+    done = command(capsys, *commands(deflections, target)[ending], "--overwrite")
+    assert done.code == 1
+    assert str(target) in done.one_line_error() and "regular file" in done.err
+    assert os.lstat(target).st_ino == before
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+    assert {p.name for p in tmp_path.iterdir()} == {target.name, deflections.name}
+
+
+def test_a_name_as_long_as_the_file_system_takes(capsys, tmp_path, deflections):
+    longest = "n" * 250
+    for arguments in (
+        ("fit", "upr_rpu", deflections, "--what", "compliance", "--out", f"{longest}.yaml"),
+        ("recover", SOFT, f"{longest}.mcap"),
+        (*EXCITE, "--out", f"m{longest[1:]}.mcap"),
+    ):
+        done = forked(tmp_path, *arguments)
+        assert done.code == 0, done.err
+    assert {p.suffix for p in tmp_path.glob("?nnn*")} == {".yaml", ".html", ".mcap", ".csv"}
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_two_writers_of_one_target_leave_one_of_two_whole_files(tmp_path):
+    target = tmp_path / "fitted.yaml"
+    texts = [bytes([letter]) * 300_000 for letter in b"ab"]
+
+    def write(text):
+        for _ in range(50):
+            replace_file(target, text)
+
+    writers = [threading.Thread(target=write, args=(text,)) for text in texts]
+    for writer in writers:
+        writer.start()
+    while any(writer.is_alive() for writer in writers):
+        if target.exists():
+            assert target.read_bytes() in texts
+    for writer in writers:
+        writer.join()
+    assert [p.name for p in tmp_path.iterdir()] == [target.name]
+
+
+def test_two_recorders_of_one_bag_leave_one_of_two_whole_bags(tmp_path):
+    target = tmp_path / "bag.mcap"
+    message = {"data": True}
+    bags = []
+    for _ in range(2):
+        bag = BagWriter(target, overwrite=True)
+        bag.add_topic("/contact", "std_msgs/msg/Bool", definition="bool data")
+        bags.append(bag)
+    for k in range(2000):
+        bags[k % 2].write("/contact", message, k)
+    for bag in bags:
+        bag.close()
+    assert len(list(open_bag(target).messages())) == 1000
+    with pytest.raises(BagError, match="exists"):
+        BagWriter(target)
+
+
+def test_a_target_that_fails_stays_as_it_was(tmp_path):
+    target = tmp_path / "a.yaml"
+    target.write_text("before")
+    with pytest.raises(OSError, match="No space"), replacing(target) as hidden:
+        hidden.write_text("half")
+        raise OSError(28, "No space left on device", str(hidden))
+    assert target.read_text() == "before"
+    assert [p.name for p in tmp_path.iterdir()] == [target.name]
+    # Under its own name, which alone is known.
+    with pytest.raises(OSError, match="No space") as caught, replacing(target) as hidden:
+        raise OSError(28, "No space left on device", str(hidden))
+    assert caught.value.filename == str(target)
+
+
+def test_a_full_disk_is_the_targets(tmp_path):
+    """Not the bag's that is read, and no half of a file stays."""
+    done = forked(tmp_path, "recover", SOFT, "saved.mcap", limit=10_000)
+    assert done.code == 1
+    assert "saved.mcap: cannot be written: File too large" in done.one_line_error()
+    done = forked(tmp_path, "fit", "upr_rpu", SOFT, "--what", "compliance", limit=10_000)
+    assert done.code == 1
+    assert "fitted.html: File too large" in done.one_line_error()
+    assert [p.name for p in tmp_path.iterdir()] == ["fitted.yaml"]
+
+
+def test_what_is_read_is_not_replaced(capsys, tmp_path, deflections):
+    same = tmp_path / "same.yaml"
+    shutil.copy(deflections, same)
+    done = command(capsys, "calibrate", "upr_rpu", same, "--out", same, "--overwrite")
+    assert "the source itself" in done.one_line_error()
+    assert same.read_bytes() == deflections.read_bytes()
+
+
+def test_names_of_anything_in_titles_and_comments(tmp_path, deflections):
+    """A formula in a title, a new line in a YAML's comment, a byte that no page can hold."""
+    robot = tmp_path / f"{ODD}.yaml"
+    shutil.copy(REPOSITORY / "config" / "upr_rpu.yaml", robot)
+    recording = tmp_path / f"{ODD}.csv"
+    shutil.copy(deflections, recording)
+    five = tmp_path / f"five {ODD}.yaml"
+    shutil.copy(REPOSITORY / "config" / "five_bar.yaml", five)
+    for arguments in (
+        ("fit", robot.name, recording.name, "--what", "compliance"),
+        ("info", five.name, "--picture", f"{ODD}.png"),
+        (*EXCITE, "--out", "motion.mcap"),
+        ("torques", five.name, "motion.csv", "--out", f"torques {ODD}.csv"),
+        ("atlas", five.name, "workspace", "--points", 1000, "--out", f"{ODD}.nc", "--html"),
+        ("urdf", robot.name),
+        ("info", robot.name, "--json"),
+    ):
+        done = forked(tmp_path, *arguments)
+        assert (done.code, done.err) == (0, ""), (arguments, done.err)
+    assert load(str(tmp_path / "fitted.yaml")).mechanism == "upr_rpu"
+
+
+@pytest.mark.parametrize("closed", [">&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_outputs_lead_nowhere(tmp_path, closed):
+    """Else the first file that is opened gets what is printed."""
+    program = f"{sys.executable} -m pkm_twin.apps.cli"
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    for arguments, code in (("info five_bar", 0), ("info none", 1)):
+        done = subprocess.run(
+            f"{program} {arguments} {closed}", shell=True, env=environment, cwd=tmp_path,
+            capture_output=True, text=True, stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+        assert done.returncode == code
+        assert done.stdout == "" and "Traceback" not in done.stderr
