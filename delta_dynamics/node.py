@@ -65,6 +65,7 @@ SETTINGS = {
     "accept_zero_stamp": "accept_zero_stamp",
     "trip_count": "trip_count",
     "recovery_count": "recovery_count",
+    "extra_joints": "extra_joints",
     "on_stop": "on_stop",
     "singularity_warn": "singularity_warn",
     "singularity_stop": "singularity_stop",
@@ -132,7 +133,7 @@ class DeltaDynamics(health.TwinNode):
             expires=lambda: self._feedforward.settings.stale_after,
         )
         self._action = self._create_action()
-        follow_changes(self, self._prepare, self._take)
+        follow_changes(self, [*CHANGES, *SETTINGS], self._prepare, self._take)
         self._last_heard = 0
         self._watchdog: Any = None
         self._watch_every(stale_after)
@@ -147,11 +148,13 @@ class DeltaDynamics(health.TwinNode):
     def time_jumped_backward(self) -> None:
         """No torque across the seam: the stream starts anew."""
         self._feedforward.reset()
+        self._estimates.reset()
 
     def time_jumped_forward(self) -> None:
         """What was fresh is stale now: a running stream stops."""
         with self._telling_stop():
             self._feedforward.time_jumped_forward()
+        self._estimates.reset()
 
     def stream_broken(self, where: str) -> None:
         """Whatever failed: the stream is stopped."""

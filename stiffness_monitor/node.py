@@ -27,7 +27,13 @@ from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
-from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench
+from pkm_twin.ros.wrench import (
+    SECONDS,
+    WRENCH_CHANGES,
+    changed,
+    declare_mounts,
+    declare_wrench,
+)
 from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from stiffness_monitor.compliance import kernels
@@ -93,8 +99,9 @@ class StiffnessMonitor(health.TwinNode):
         self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
         follow_changes(
             self,
+            WRENCH_CHANGES,
             lambda values: changed(self._monitor.settings, values),
-            self._monitor.change_settings,
+            self._change_settings,
         )
         self.start()
 
@@ -127,9 +134,7 @@ class StiffnessMonitor(health.TwinNode):
             "wrenches answered": core.wrenches.accepted,
             "older stamps dropped": core.dropped,
         }
-        if self._correction.wanted:
-            values["corrections at their bound"] = self._correction.bounded
-        values |= self._alarm.diagnose()
+        values |= self._correction.diagnose() | self._alarm.diagnose()
         values |= {f"joint states rejected: {k}": v for k, v in core.states.rejected.items()}
         values |= {f"wrenches rejected: {k}": v for k, v in core.wrenches.rejected.items()}
         return level, message, values
@@ -158,6 +163,12 @@ class StiffnessMonitor(health.TwinNode):
                 "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
             ),
         )  # fmt: skip
+
+    def _change_settings(self, settings: Settings) -> None:
+        """What the stamps of set points and deflections have to keep to, too."""
+        self._monitor.change_settings(settings)
+        self._correction.change_rules(settings.stamp_rules)
+        self._alarm.change_rules(settings.stamp_rules)
 
     def _on_joint_state(self, data: bytes) -> None:
         try:
