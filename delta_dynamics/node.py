@@ -22,7 +22,7 @@ from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
 from pkm_twin.bags.cdr import message_definition
-from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine.robot import MAX_MASS, Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
@@ -445,8 +445,15 @@ class DeltaDynamics(health.TwinNode):
             self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))
         if self._commands is not None:
             self._commands.publish(self._numbers_message.fill(core.sent(torques.effort)))
-        self._estimates.take(torques)
-        # A dense solve a sample is too much for the stream's own rate.
+        for tell in (self._estimates.take, self._tell_reactions):
+            try:
+                tell(torques)
+            except (PkmTwinError, ValueError) as error:
+                # In a constraint singularity, say: the torque is sound all the same.
+                self.log_throttled("beside", f"no reactions or estimates: {error}")
+
+    def _tell_reactions(self, torques: Torques) -> None:
+        """At a rate of their own: a dense solve a sample is too much for the stream's."""
         if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
             self._reactions_due = torques.stamp
             self._publish_reactions(Time(nanoseconds=torques.stamp).to_msg(), torques)
