@@ -168,7 +168,8 @@ class StiffnessMonitor(health.TwinNode):
         """What the stamps of set points and deflections have to keep to, too."""
         self._monitor.change_settings(settings)
         self._correction.change_rules(settings.stamp_rules)
-        self._alarm.change_rules(settings.stamp_rules)
+        platform = self._platform_frame or settings.platform_frame
+        self._alarm.change_rules(settings.stamp_rules, (settings.base_frame, platform))
 
     def _on_joint_state(self, data: bytes) -> None:
         try:
@@ -200,8 +201,12 @@ class StiffnessMonitor(health.TwinNode):
         deflection.header.frame_id = frame
         deflection.child_frame_id = f"{frame}_deflected"
         self._deflection.publish(deflection)
-        self._correction.take(answer)
-        self._alarm.take(answer)
+        for take in (self._correction.take, self._alarm.take):
+            try:
+                take(answer)
+            except (PkmTwinError, ValueError) as error:
+                # Close to a singularity, say: the compliance is sound all the same.
+                self.log_throttled("beside", f"no correction or judgement: {error}")
 
     def _publish_frequencies(self) -> None:
         """Of the latest joint state: a pose costs milliseconds, so not of every one."""

@@ -80,3 +80,34 @@ def test_set_points_are_corrected_by_the_measured_wrench(peer, launch):
     told = counts_of(array, "set points rejected")
     assert told["future stamp"] == told["not finite"] == 1
     assert int(values_of(array)["set points corrected"]) >= 1
+
+
+SINGULAR = """
+import stiffness_monitor.node as node
+from pkm_twin.errors import SingularityError
+def singular(self, answer):
+    raise SingularityError("correction", (), 0.0, 1e-9)
+node.SetpointCorrection.take = node.StiffnessAlarmTopics.take = singular
+node.main()
+"""
+
+
+def test_a_wrench_without_a_correction_has_its_compliance(peer, launch):
+    remap = ["-r", "__node:=loose"]
+    process = launch(None, "correct_setpoint:=true", code=SINGULAR, arguments=remap)
+    peer.talk(JointState, "/joint_states")
+    peer.talk(WrenchStamped, "/wrench")
+    peer.hear(JointState, "/loose/compliance_stamped")
+    peer.hear(DiagnosticArray, "/diagnostics")
+
+    def push():
+        for _ in range(10):
+            load_case = WrenchStamped(header=state(peer, Q).header)
+            peer.send("/joint_states", state(peer, Q))
+            load_case.header.frame_id = "platform"
+            load_case.wrench.force.x = 100.0
+            peer.send("/wrench", load_case)
+
+    peer.until(lambda: peer.received("/loose/compliance_stamped"), repeat=push)
+    peer.until(lambda: "no correction or judgement: " in process.output)
+    assert values_of(peer.diagnostics("/loose"))["exceptions"] == "0"
