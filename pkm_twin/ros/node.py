@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 import traceback
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, Final, TypeVar
 
@@ -631,6 +631,10 @@ class TwinNode(LifecycleNode):
             most = len(self._parameters) if field == "parameters" else MAX_ASKED
             if entries > most:
                 raise ParameterError(field, entries, f"at most {most} in a request")
+        named = Counter(parameter.name for parameter in getattr(request, "parameters", ()))
+        for name, times in named.items():
+            if times > 1:
+                raise ParameterError(name, times, "once in a request")
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         ended = self.reset_stop()

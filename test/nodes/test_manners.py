@@ -130,6 +130,12 @@ class TestRequests:
         (result,) = answer.results
         assert not result.successful
         assert "parameters: 2000 is refused; allowed: at most" in result.reason
+        answer = call(twin, SetParameters, "set_parameters", parameters=[entry] * 2)
+        (result,) = answer.results
+        assert (
+            result.reason
+            == "ParameterError: payload.mass: 2 is refused; allowed: once in a request"
+        )
         answer = call(
             twin, SetParametersAtomically, "set_parameters_atomically", parameters=[entry] * 2000
         )
