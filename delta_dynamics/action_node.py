@@ -15,12 +15,17 @@ from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 
+from delta_dynamics.feedforward import SLICE
 from pkm_twin.errors import MessageError
 from pkm_twin.ros import node as health
 
 Efforts = Callable[[Any], Generator[None, None, "np.ndarray[Any, Any]"]]
 
 NAME = "~/follow_joint_trajectory"
+LOOK = 0.5
+"""How often it is looked whether the controller of goals that are under way is still there, s."""
+MISSING = 4
+"""How often in a row it has to be missing: what is discovered anew may flicker."""
 
 
 class EffortAction:
@@ -41,6 +46,10 @@ class EffortAction:
         self._client = ActionClient(node, FollowJointTrajectory, controller)
         self._handles: dict[bytes, Any] = {}
         self._waiting: dict[bytes, Any] = {}
+        self._sent: dict[bytes, Any] = {}
+        """Goals that the controller has, whether it has answered or not."""
+        self._missing = 0
+        node.create_guarded_timer(LOOK, self._watch)
         self._server = ActionServer(
             node,
             FollowJointTrajectory,
@@ -58,6 +67,14 @@ class EffortAction:
         """
         for goal in list(self._waiting.values()):
             self._abort(goal, "the node was deactivated")
+
+    def _watch(self) -> None:
+        """A controller that was killed ends no goal: its goals are aborted here."""
+        gone = bool(self._sent) and not self._client.server_is_ready()
+        self._missing = self._missing + 1 if gone else 0
+        if self._missing >= MISSING:
+            for goal in list(self._sent.values()):
+                self._abort(goal, f"{self._controller} has gone with the goal")
 
     def _accepted(self, goal: Any) -> None:
         self._waiting[_key(goal)] = goal
@@ -80,19 +97,23 @@ class EffortAction:
     def _fill(self, goal: Any) -> health.Task:
         trajectory = goal.request.trajectory
         efforts = yield from self._efforts(trajectory)
-        for point, effort in zip(trajectory.points, efforts.tolist(), strict=True):
+        for k, (point, effort) in enumerate(zip(trajectory.points, efforts.tolist(), strict=True)):
             point.effort = effort
+            if k % SLICE == SLICE - 1:
+                yield
         if goal.is_cancel_requested:
             self._finish(goal, GoalStatus.STATUS_CANCELED, FollowJointTrajectory.Result())
         elif not self._client.server_is_ready():
             self._abort(goal, f"no controller serves {self._controller}")
         else:
-            del self._waiting[_key(goal)]
+            self._sent[_key(goal)] = self._waiting.pop(_key(goal))
             self._client.send_goal_async(
                 goal.request, feedback_callback=lambda m: goal.publish_feedback(m.feedback)
             ).add_done_callback(lambda future: self._answered(goal, future.result()))
 
     def _answered(self, goal: Any, handle: Any) -> None:
+        if _key(goal) not in self._sent:
+            return
         if not handle.accepted:
             self._abort(
                 goal,
@@ -121,9 +142,12 @@ class EffortAction:
         self._finish(goal, GoalStatus.STATUS_ABORTED, result)
 
     def _finish(self, goal: Any, status: int, result: Any) -> None:
-        """End a goal as the controller has ended it."""
-        self._handles.pop(_key(goal), None)
-        self._waiting.pop(_key(goal), None)
+        """End a goal as the controller has ended it; once, whatever comes late."""
+        key = _key(goal)
+        if key not in self._waiting and key not in self._sent:
+            return
+        for table in (self._handles, self._waiting, self._sent):
+            table.pop(key, None)
 
         def end(goal: Any) -> Any:
             if status == GoalStatus.STATUS_SUCCEEDED:

@@ -110,6 +110,8 @@ class Estimates:
         self._last = self._due = 0
         if self._contact is not None:
             self._contact.reset()
+        if self._payload is not None:
+            self._payload.begin_anew()
 
     def change_robot(self, robot: Robot) -> None:
         """Another payload, gravity or friction was set."""
@@ -122,7 +124,8 @@ class Estimates:
         """A sample whose torques were published; without measured efforts it tells nothing."""
         if torques.residual is None:
             return
-        if torques.stamp - self._last > GAP * SECOND:
+        # The stream may have begun anew at earlier stamps, as where a bag loops.
+        if not 0 < torques.stamp - self._last <= GAP * SECOND:
             self.reset()
         self._last = torques.stamp
         effort = torques.effort + torques.residual

@@ -144,6 +144,8 @@ class Feedforward:
         self.stream.trip_count = settings.trip_count
         self.stream.recovery_count = settings.recovery_count
         self._rules = settings.stamp_rules
+        if settings.extra_joints != before.extra_joints:
+            self._reader = JointReader(self.robot, extra_joints=settings.extra_joints)
         self._continuity.warn = settings.singularity_warn
         self._continuity.stop = settings.singularity_stop
         if self.wrenches is not None:

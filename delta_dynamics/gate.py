@@ -20,6 +20,7 @@ from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import SECOND, JointReader, StampRules
 from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.wrench import counting
 
 Array = NDArray[np.float64]
 
@@ -58,6 +59,7 @@ class Gate:
         s = self.settings
         self.stream = StreamMonitor(s.trip_count, s.recovery_count)
         self.stream.stop(WAITING, "no torque yet")
+        self.states = counting()
         self.last_reject = ""
         self._rules = StampRules(
             future_tolerance=round(s.future_tolerance * SECOND),
@@ -94,19 +96,34 @@ class Gate:
             sample = self._reader.efforts(message, now, self._rules)
             self._check(sample.stamp, sample.effort)
         except MessageError as error:
-            self.stream.reject(error.reason, str(error))
-            self.last_reject = str(error)
+            self.refuse_torques(error)
             raise
         self._last_stamp = sample.stamp
         self._last_arrival = steady
         return sample.effort if self.stream.accept() else None
 
+    def refuse_torques(self, error: MessageError) -> None:
+        """Count torques that are refused; several in a row close the gate."""
+        self.stream.reject(error.reason, str(error))
+        self.last_reject = str(error)
+
     def joint_state(self, message: Any, now: int, steady: int) -> None:
         """Keep where the robot stands: gravity is that of a measured state, never of a guess.
 
-        :raises MessageError: the message is refused.
+        :raises MessageError: the message is refused, and counted.
         """
-        self._state = steady, self._reader.joint_state(message, now, self._rules).q
+        try:
+            q = self._reader.joint_state(message, now, self._rules).q
+        except MessageError as error:
+            self.refuse_joint_state(error)
+            raise
+        self._state = steady, q
+        self.states.accept()
+
+    def refuse_joint_state(self, error: MessageError) -> None:
+        """Count a joint state that is refused."""
+        self.states.reject(error.reason, str(error))
+        self.last_reject = str(error)
 
     def watch(self, steady: int) -> None:
         """Close the gate where the torques have gone silent."""

@@ -16,9 +16,12 @@ from std_msgs.msg import Float64MultiArray
 from delta_dynamics.gate import Gate, GateSettings, effort_limits
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin import load
+from pkm_twin.bags.cdr import message_definition
+from pkm_twin.errors import MessageError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
+from pkm_twin.ros.intake import JointStateDecoder
 
 PAYLOAD = {
     "payload.mass": ("mass", "kg"),
@@ -45,20 +48,28 @@ class CommandGate(health.TwinNode):
         # The same with names and a stamp, for recordings and plots.
         self._stamped = self.create_guarded_publisher(JointState, "~/commands_stamped")
         self._declare_robot(settings)
+        # A stranger's message of any size takes no time of the torques.
+        definition = message_definition("sensor_msgs/msg/JointState")
+        self._decode_torques = JointStateDecoder(definition)
+        self._decode_state = JointStateDecoder(definition)
         self.create_guarded_subscription(
             JointState,
             "delta_dynamics/joint_torques",
             self._on_torques,
+            raw=True,
             awaited=True,
             expires=lambda: settings.deadline,
             expiry=settings.deadline,
         )
         if settings.on_stop == "gravity":
             self.create_guarded_subscription(
-                JointState, "joint_states", self._on_joint_state, awaited=True
+                JointState, "joint_states", self._on_joint_state, raw=True, awaited=True
             )
         follow_changes(
-            self, lambda values: _changed(self._gate.robot, values), self._gate.change_robot
+            self,
+            ["effort_limits", *PAYLOAD],
+            lambda values: _changed(self._gate.robot, values),
+            self._gate.change_robot,
         )
         self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._watch)
         self.start(leap=settings.deadline + settings.future_tolerance)
@@ -115,6 +126,7 @@ class CommandGate(health.TwinNode):
             "controllers": self._commands.get_subscription_count(),
         }
         values |= {f"torques rejected: {k}": v for k, v in stream.rejected.items()}
+        values |= {f"joint states rejected: {k}": v for k, v in self._gate.states.rejected.items()}
         values |= {f"closed: {k}": v for k, v in stream.stops.items()}
         return level, message, values
 
@@ -166,9 +178,14 @@ class CommandGate(health.TwinNode):
             inverse_dynamics(robot, robot.inverse(robot.home()), zeros, zeros)
         self._gate.change_robot(robot)
 
-    def _on_torques(self, message: JointState) -> None:
+    def _on_torques(self, data: bytes) -> None:
         running = not self._gate.stream.stopped
         try:
+            try:
+                message = self._decode_torques(data)
+            except MessageError as error:
+                self._gate.refuse_torques(error)
+                raise
             command = self._gate.torques(message, self.now(), time.monotonic_ns())
         finally:
             if running and self._gate.stream.stopped:
@@ -176,7 +193,12 @@ class CommandGate(health.TwinNode):
         if command is not None:
             self._send(command)
 
-    def _on_joint_state(self, message: JointState) -> None:
+    def _on_joint_state(self, data: bytes) -> None:
+        try:
+            message = self._decode_state(data)
+        except MessageError as error:
+            self._gate.refuse_joint_state(error)
+            raise
         self._gate.joint_state(message, self.now(), time.monotonic_ns())
 
     def _watch(self) -> None:

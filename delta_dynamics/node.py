@@ -22,7 +22,7 @@ from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
 from pkm_twin.bags.cdr import message_definition
-from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine.robot import MAX_MASS, Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
@@ -65,6 +65,7 @@ SETTINGS = {
     "accept_zero_stamp": "accept_zero_stamp",
     "trip_count": "trip_count",
     "recovery_count": "recovery_count",
+    "extra_joints": "extra_joints",
     "on_stop": "on_stop",
     "singularity_warn": "singularity_warn",
     "singularity_stop": "singularity_stop",
@@ -132,7 +133,7 @@ class DeltaDynamics(health.TwinNode):
             expires=lambda: self._feedforward.settings.stale_after,
         )
         self._action = self._create_action()
-        follow_changes(self, self._prepare, self._take)
+        follow_changes(self, [*CHANGES, *SETTINGS], self._prepare, self._take)
         self._last_heard = 0
         self._watchdog: Any = None
         self._watch_every(stale_after)
@@ -147,11 +148,13 @@ class DeltaDynamics(health.TwinNode):
     def time_jumped_backward(self) -> None:
         """No torque across the seam: the stream starts anew."""
         self._feedforward.reset()
+        self._estimates.reset()
 
     def time_jumped_forward(self) -> None:
         """What was fresh is stale now: a running stream stops."""
         with self._telling_stop():
             self._feedforward.time_jumped_forward()
+        self._estimates.reset()
 
     def stream_broken(self, where: str) -> None:
         """Whatever failed: the stream is stopped."""
@@ -442,8 +445,15 @@ class DeltaDynamics(health.TwinNode):
             self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))
         if self._commands is not None:
             self._commands.publish(self._numbers_message.fill(core.sent(torques.effort)))
-        self._estimates.take(torques)
-        # A dense solve a sample is too much for the stream's own rate.
+        for tell in (self._estimates.take, self._tell_reactions):
+            try:
+                tell(torques)
+            except (PkmTwinError, ValueError) as error:
+                # In a constraint singularity, say: the torque is sound all the same.
+                self.log_throttled("beside", f"no reactions or estimates: {error}")
+
+    def _tell_reactions(self, torques: Torques) -> None:
+        """At a rate of their own: a dense solve a sample is too much for the stream's."""
         if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
             self._reactions_due = torques.stamp
             self._publish_reactions(Time(nanoseconds=torques.stamp).to_msg(), torques)

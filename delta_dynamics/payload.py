@@ -93,13 +93,17 @@ class PayloadEstimator:
         self._weighted = self._information @ self._own
         self._average = np.zeros(self.robot.joints_count)
         self._since = 0.0
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Forget when the last sample was, as where the clock goes back; the load stays."""
         self._last: float | None = None
 
     def push(
         self, time: float, q: Array, qd: Array, qdd: Array, effort: Array,
         wrench: Array | None = None,
     ) -> PayloadEstimate | None:  # fmt: skip
-        """Take a sample; None for the first one after a reset.
+        """Take a sample; None for the first one after a reset or a new beginning.
 
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), with rates, accelerations and measured efforts (n,).

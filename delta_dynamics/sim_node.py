@@ -6,12 +6,15 @@ from __future__ import annotations
 import sys
 import time
 from array import array
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
@@ -51,6 +54,7 @@ CLOCK_PERIOD: Final = 5_000_000
 ALONE: Final = 1.0
 """In lockstep: how long an answer is waited for, s of the wall."""
 LOOK: Final = 0.05
+OWN_CLOCK: Final = "false: the machine has a clock of its own"
 
 
 class MachineSim(health.TwinNode):
@@ -126,6 +130,7 @@ class MachineSim(health.TwinNode):
         }
         values |= {f"effort commands rejected: {k}": v for k, v in sim.stream.rejected.items()}
         values |= {f"trajectories rejected: {k}": v for k, v in sim.trajectories.rejected.items()}
+        values |= {f"applied wrenches rejected: {k}": v for k, v in sim.wrenches.rejected.items()}
         return level, message, values
 
     def _declare_spread(self, robot: Robot) -> Variation:
@@ -155,7 +160,8 @@ class MachineSim(health.TwinNode):
         self._simulated = self._clock_kind != "wall"
         self._lockstep = self._clock_kind == "lockstep"
         if self.get_parameter("use_sim_time").value:
-            raise ParameterError("use_sim_time", True, "false: the machine has a clock of its own")
+            raise ParameterError("use_sim_time", True, OWN_CLOCK)
+        self.add_on_set_parameters_callback(_refuse_sim_time)
         if not self._simulated:
             self._factor = 1.0
 
@@ -266,7 +272,12 @@ class MachineSim(health.TwinNode):
                 self._advance()
 
     def _on_trajectory(self, data: bytes) -> None:
-        self._simulation.trajectory(RawTrajectory.of(data).fields)
+        try:
+            raw = RawTrajectory.of(data)
+        except MessageError as error:
+            self._simulation.refuse_trajectory(error)
+            raise
+        self._simulation.trajectory(raw.fields)
 
     def _catch_up(self) -> None:
         """As many periods as are due, by the steady clock."""
@@ -344,6 +355,13 @@ class MachineSim(health.TwinNode):
         self._drawn.publish(message)
         for name, value in drawn.items():
             self.get_logger().info(f"drawn: {name} {value:.6g}")
+
+
+def _refuse_sim_time(changes: Sequence[Parameter]) -> SetParametersResult:
+    """While the node runs as at its start."""
+    good = not any(change.name == "use_sim_time" and change.value for change in changes)
+    reason = "" if good else str(ParameterError("use_sim_time", True, OWN_CLOCK))
+    return SetParametersResult(successful=good, reason=reason)
 
 
 def _numbers(values: Array) -> array[float]:

@@ -33,6 +33,7 @@ from pkm_twin.ros.messages import (
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.path import JointPath
+from pkm_twin.streams.wrench import counting
 
 Array = NDArray[np.float64]
 OnSilence = Literal["zeros", "hold"]
@@ -133,7 +134,9 @@ class Simulation:
         self.robot, self.settings = robot, settings
         self.stream = StreamMonitor(trip_count=2**62, recovery_count=1)
         """Effort commands, and what has stopped the machine."""
-        self.trajectories = StreamMonitor(trip_count=2**62, recovery_count=1)
+        self.trajectories = counting()
+        self.wrenches = counting()
+        """What is applied to the platform by a topic."""
         self.saturations = 0
         self.now = start
         self._reader = JointReader(robot, with_effort=True)
@@ -198,18 +201,27 @@ class Simulation:
         try:
             t = self._reader.trajectory(message, self.now)
         except MessageError as error:
-            self.trajectories.reject(error.reason, str(error))
+            self.refuse_trajectory(error)
             raise
         self.trajectories.accept()
         self._path = (t.stamp or self.now, JointPath(t).from_here(self._seen))
 
+    def refuse_trajectory(self, error: MessageError) -> None:
+        """Count a trajectory that is refused."""
+        self.trajectories.reject(error.reason, str(error))
+
     def push(self, message: Any, frame: str) -> None:
         """A geometry_msgs/WrenchStamped in the base frame, which stays until the next.
 
-        :raises MessageError: refused.
+        :raises MessageError: it is refused, and counted.
         """
         rules = StampRules(accept_zero=True, future_tolerance=SECOND)
-        self._pushed = read_wrench(message, self.now, rules, frame, False).wrench
+        try:
+            self._pushed = read_wrench(message, self.now, rules, frame, False).wrench
+        except MessageError as error:
+            self.wrenches.reject(error.reason, str(error))
+            raise
+        self.wrenches.accept()
 
     def measured(self) -> Measured:
         """What the sensors tell now."""

@@ -102,6 +102,11 @@ class StiffnessAlarmTopics:
         if self._core is not None:
             self._core.reset()
 
+    def change_rules(self, rules: StampRules, frames: tuple[str, str]) -> None:
+        """Judge stamps and frames by other rules from the next deflection on."""
+        if self._core is not None:
+            self._core.rules, self._core.frames = rules, frames
+
     def take(self, answer: Answer) -> None:
         """What a wrench did by the model."""
         if self._core is not None:

@@ -17,6 +17,7 @@ from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.messages import SECOND, JointReader, StampRules
+from pkm_twin.streams.wrench import counting
 from stiffness_monitor.correction import setpoint_correction
 from stiffness_monitor.monitor import Answer
 
@@ -37,6 +38,8 @@ class SetpointCorrection:
         self._reader = JointReader(robot)
         self._offset: tuple[int, Any] | None = None
         self.bounded = 0
+        self.setpoints = counting()
+        """Set points that were corrected, and those that were refused."""
         wanted = node.declare(
             "correct_setpoint",
             False,
@@ -86,6 +89,10 @@ class SetpointCorrection:
         """Forget the last wrench, as when the clock jumps."""
         self._offset = None
 
+    def change_rules(self, rules: StampRules) -> None:
+        """Judge stamps by other rules from the next set point on."""
+        self._rules = rules
+
     def take(self, answer: Answer) -> None:
         """What a wrench did: how the joints undo it."""
         if not self.wanted:
@@ -105,7 +112,25 @@ class SetpointCorrection:
         """A difference of positions in the controller's numbers."""
         return offset * self._robot.controller.factors
 
+    def diagnose(self) -> dict[str, object]:
+        """Values of the node's diagnostic status."""
+        if not self.wanted:
+            return {}
+        values: dict[str, object] = {
+            "corrections at their bound": self.bounded,
+            "set points corrected": self.setpoints.accepted,
+        }
+        return values | {f"set points rejected: {k}": v for k, v in self.setpoints.rejected.items()}
+
     def _on_setpoint(self, data: bytes) -> None:
+        try:
+            self._correct(data)
+        except MessageError as error:
+            self.setpoints.reject(error.reason, str(error))
+            raise
+        self.setpoints.accept()
+
+    def _correct(self, data: bytes) -> None:
         sample = self._reader.positions(self._decode(data), self._node.now(), self._rules)
         if self._offset is None:
             raise MessageError("no wrench", "no wrench has arrived that tells a correction")

@@ -27,7 +27,13 @@ from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
-from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench
+from pkm_twin.ros.wrench import (
+    SECONDS,
+    WRENCH_CHANGES,
+    changed,
+    declare_mounts,
+    declare_wrench,
+)
 from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from stiffness_monitor.compliance import kernels
@@ -93,8 +99,9 @@ class StiffnessMonitor(health.TwinNode):
         self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
         follow_changes(
             self,
+            WRENCH_CHANGES,
             lambda values: changed(self._monitor.settings, values),
-            self._monitor.change_settings,
+            self._change_settings,
         )
         self.start()
 
@@ -127,9 +134,7 @@ class StiffnessMonitor(health.TwinNode):
             "wrenches answered": core.wrenches.accepted,
             "older stamps dropped": core.dropped,
         }
-        if self._correction.wanted:
-            values["corrections at their bound"] = self._correction.bounded
-        values |= self._alarm.diagnose()
+        values |= self._correction.diagnose() | self._alarm.diagnose()
         values |= {f"joint states rejected: {k}": v for k, v in core.states.rejected.items()}
         values |= {f"wrenches rejected: {k}": v for k, v in core.wrenches.rejected.items()}
         return level, message, values
@@ -158,6 +163,13 @@ class StiffnessMonitor(health.TwinNode):
                 "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
             ),
         )  # fmt: skip
+
+    def _change_settings(self, settings: Settings) -> None:
+        """What the stamps of set points and deflections have to keep to, too."""
+        self._monitor.change_settings(settings)
+        self._correction.change_rules(settings.stamp_rules)
+        platform = self._platform_frame or settings.platform_frame
+        self._alarm.change_rules(settings.stamp_rules, (settings.base_frame, platform))
 
     def _on_joint_state(self, data: bytes) -> None:
         try:
@@ -189,8 +201,12 @@ class StiffnessMonitor(health.TwinNode):
         deflection.header.frame_id = frame
         deflection.child_frame_id = f"{frame}_deflected"
         self._deflection.publish(deflection)
-        self._correction.take(answer)
-        self._alarm.take(answer)
+        for take in (self._correction.take, self._alarm.take):
+            try:
+                take(answer)
+            except (PkmTwinError, ValueError) as error:
+                # Close to a singularity, say: the compliance is sound all the same.
+                self.log_throttled("beside", f"no correction or judgement: {error}")
 
     def _publish_frequencies(self) -> None:
         """Of the latest joint state: a pose costs milliseconds, so not of every one."""

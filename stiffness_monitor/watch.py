@@ -6,7 +6,7 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 
 from __future__ import annotations
 
-from collections import deque
+from bisect import insort
 from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -25,7 +25,7 @@ from stiffness_monitor.monitor import Answer
 Array = NDArray[np.float64]
 
 WAITING: Final = 64
-"""Deflections that wait for the wrench after them."""
+"""Deflections that wait for the wrench after them; of more the latest by their stamps go."""
 JUDGED: Final = 1.0
 """Between two judgements, s of stamps."""
 
@@ -53,7 +53,8 @@ class StiffnessWatch:
         """What the last judgement found; None before there was one."""
         self._alarm = StiffnessAlarm(self.robot, self.settings)
         self._answers: Recent[Answer] = Recent(1024)
-        self._waiting: deque[DeflectionSample] = deque()
+        self._waiting: list[DeflectionSample] = []
+        """By their stamps: what is never paired does not stand before what is."""
         self._last = self._due = self._judged = 0
         self._judging: object | None = None
 
@@ -97,9 +98,12 @@ class StiffnessWatch:
         except MessageError as error:
             self._refuse(error)
             raise
-        self._last = sample.stamp
-        self._waiting.append(sample)
+        insort(self._waiting, sample, key=lambda waiting: waiting.stamp)
         self._pair()
+        if len(self._waiting) > WAITING:
+            self._waiting.pop()
+            text = f"{WAITING} deflections wait for the wrench behind them already"
+            self._refuse(MessageError("no wrench", text))
 
     def judgement(self) -> Generator[None, None, bool] | None:
         """A judgement in slices of a few milliseconds, where it is time for one; else None.
@@ -131,19 +135,19 @@ class StiffnessWatch:
     def _pair(self) -> None:
         """Pair what waits and has a wrench behind it."""
         latest = self._answers.latest
-        while self._waiting:
-            late = len(self._waiting) > WAITING
-            if not late and (latest is None or latest[0] < self._waiting[0].stamp):
-                break
+        while self._waiting and latest is not None and self._waiting[0].stamp <= latest[0]:
+            sample = self._waiting.pop(0)
             try:
-                self._take(self._waiting.popleft())
+                self._take(sample)
             except MessageError as error:
                 self._refuse(error)
+                continue
+            self._last = sample.stamp
+            self.taken.accept()
 
     def _take(self, sample: DeflectionSample) -> None:
         before, after = self._around(sample.stamp)
         if sample.stamp - self._due < self.period * SECOND:
-            self.taken.accept()
             return
         span = after.stamp - before.stamp
         part = (sample.stamp - before.stamp) / span if span else 0.0
@@ -157,7 +161,6 @@ class StiffnessWatch:
         except (UnreachableError, SingularityError, ValueError) as error:
             raise MessageError("pose", str(error)) from error
         self._due = sample.stamp
-        self.taken.accept()
 
     def _around(self, stamp: int) -> tuple[Answer, Answer]:
         """The wrenches on either side.

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -18,10 +18,14 @@ V = TypeVar("V")
 
 
 def follow_changes(
-    node: TwinNode, prepare: Callable[[dict[str, Any]], V], take: Callable[[V], object]
+    node: TwinNode,
+    names: Iterable[str],
+    prepare: Callable[[dict[str, Any]], V],
+    take: Callable[[V], object],
 ) -> None:
     """A set of parameters is taken or refused whole, between two messages.
 
+    :param names: of all parameters that ``prepare`` knows.
     :param prepare: makes what the new values, by name, come to; nothing else hangs on it yet. A
         PkmTwinError refuses the set.
     :param take: goes on with that, once the parameters have their values.
@@ -45,5 +49,6 @@ def follow_changes(
         while prepared:
             take(prepared.pop())
 
+    node.followed.update(names)
     node.add_on_set_parameters_callback(judge)
     node.add_post_set_parameters_callback(follow)

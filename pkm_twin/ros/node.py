@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 import traceback
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, Final, TypeVar
 
@@ -75,6 +75,9 @@ MAX_TEXT: Final = 500
 """Characters of a line in the log or of a value in the diagnostics."""
 MAX_TASKS: Final = 10
 """How much work may wait beside the callbacks."""
+MAX_ASKED: Final = 1000
+"""Entries of a request that only asks; one that sets has at most as many as the node has
+parameters. More take the stream's time."""
 
 SELDOM_PERIOD: Final = 0.1
 SELDOM_TURNS: Final = 3
@@ -168,11 +171,16 @@ class TwinNode(LifecycleNode):
         self._statistics: dict[str, TopicStatistics] = {}
         self._awaited: list[str] = []
         self._tasks: deque[tuple[str, Task]] = deque()
+        self._soon: list[Callable[[], None]] = []
+        """What is done once the present callback is over."""
         self._reported = (0, 0, 0, 0)
         self._unfit: dict[str, str] = {}
         self._incompatible = 0
         self._last_clock = 0
         self.active = False
+        self.followed: set[str] = set()
+        """Parameters whose changes are taken while the node runs."""
+        self._changeable: set[str] = set()
         self._active_since = 0
         self.seldom = SeldomGroup()
         super().__init__(name)
@@ -200,6 +208,10 @@ class TwinNode(LifecycleNode):
         :param leap: how far the ROS clock goes forward at once for :meth:`time_jumped_forward`, s.
         """
         self.refuse_unknown_parameters()
+        deaf = sorted(self._changeable - self.followed)
+        if deaf:
+            # A set of it would be answered as taken.
+            raise NotImplementedError(f"nothing follows a change of {', '.join(deaf)}")
         self.add_pre_set_parameters_callback(self._with_floats)
         self.add_on_set_parameters_callback(_refuse_nameless)
         self.create_guarded_timer(1.0, self._publish_diagnostics)
@@ -327,6 +339,8 @@ class TwinNode(LifecycleNode):
             value = given.value if given is not None else None
             raise ParameterError(name, value, constraints or f"a value like {default!r}") from error
         self.check_parameter(name, value)
+        if not read_only:
+            self._changeable.add(name)
         return value
 
     def check_parameter(self, name: str, value: Any) -> None:
@@ -449,9 +463,10 @@ class TwinNode(LifecycleNode):
 
         def misfit(event: Any) -> None:
             if self._misfit(topic, event) == "reliability" and not (best_effort or given):
-                self.defer(topic, relax())
+                # Told once a publisher: neither other work nor the life cycle may lose it.
+                self._soon.append(relax)
 
-        def relax() -> Task:
+        def relax() -> None:
             """Take publishers of both kinds; not within a callback of the old subscription."""
             nonlocal subscription, relaxed
             if not relaxed:
@@ -459,7 +474,6 @@ class TwinNode(LifecycleNode):
                 self.destroy_subscription(subscription)
                 subscription = subscribe()
                 self.log_throttled("qos", f"{topic}: best effort from here on, as its publisher")
-            yield
 
         subscription = subscribe()
 
@@ -525,6 +539,8 @@ class TwinNode(LifecycleNode):
     def turned(self) -> None:
         """A turn of the executor is over: one step of what waits."""
         self.seldom.turned()
+        while self._soon:
+            self._soon.pop()()
         if self._tasks:
             self._work()
 
@@ -581,13 +597,14 @@ class TwinNode(LifecycleNode):
         """A service callback, rclpy's own ones too, that refuses what it cannot take."""
 
         def guarded(request: Any, response: Any) -> Any:
-            if kind is SetParameters and len(request.parameters) > 1:
-                # Each for itself, as rclpy does: what is refused does not hide what was set.
-                for parameter in request.parameters:
-                    one = guarded(kind.Request(parameters=[parameter]), kind.Response())
-                    response.results.extend(one.results)
-                return response
             try:
+                self._check_size(request)
+                if kind is SetParameters and len(request.parameters) > 1:
+                    # Each for itself, as rclpy does: what is refused does not hide what was set.
+                    for parameter in request.parameters:
+                        one = guarded(kind.Request(parameters=[parameter]), kind.Response())
+                        response.results.extend(one.results)
+                    return response
                 return callback(request, response)
             except Exception as error:
                 if not self.context.ok():
@@ -604,6 +621,21 @@ class TwinNode(LifecycleNode):
             return response
 
         return guarded
+
+    def _check_size(self, request: Any) -> None:
+        """Refuse a request that would hold up the stream by its length.
+
+        :raises ParameterError: it has too many entries.
+        """
+        for field in ("parameters", "names", "prefixes"):
+            entries = len(getattr(request, field, ()))
+            most = len(self._parameters) if field == "parameters" else MAX_ASKED
+            if entries > most:
+                raise ParameterError(field, entries, f"at most {most} in a request")
+        named = Counter(parameter.name for parameter in getattr(request, "parameters", ()))
+        for name, times in named.items():
+            if times > 1:
+                raise ParameterError(name, times, "once in a request")
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         ended = self.reset_stop()

@@ -20,6 +20,8 @@ PARAMETERS = {
     "sensor.rpy": "sensor_rpy",
 }
 """Parameters that every such node has, and their settings."""
+WRENCH_CHANGES = (*PARAMETERS, "max_state_age", "future_tolerance", "accept_zero_stamp")
+"""Those that :func:`changed` takes of a node that pairs wrenches with joint states."""
 
 
 def declare_wrench(node: TwinNode, read_only: bool = False, **others: Any) -> WrenchSettings:

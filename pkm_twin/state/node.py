@@ -25,7 +25,14 @@ from pkm_twin.ros import outputs
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
 from pkm_twin.ros.messages import SECOND
-from pkm_twin.ros.wrench import SECONDS, changed, declare_mounts, declare_wrench, triple
+from pkm_twin.ros.wrench import (
+    SECONDS,
+    WRENCH_CHANGES,
+    changed,
+    declare_mounts,
+    declare_wrench,
+    triple,
+)
 from pkm_twin.state.scene import Load, Scales, Scene
 from pkm_twin.state.state import MachineState, State
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
@@ -73,6 +80,7 @@ class MachineStateNode(health.TwinNode):
         self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
         follow_changes(
             self,
+            WRENCH_CHANGES,
             lambda values: changed(self._core.settings, values),
             self._core.change_settings,
         )

@@ -6,11 +6,15 @@ import pytest
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from pkm_twin import load
 from stiffness_monitor import setpoint_correction, strain_energy
+from test.nodes.harness import counts_of, values_of
 
 ROBOT = load("upr_rpu")
 Q = np.array([0.62, 0.6, 0.65])
@@ -60,3 +64,50 @@ def test_set_points_are_corrected_by_the_measured_wrench(peer, launch):
     assert np.abs(expected).max() > 1e-5
     found = peer.received(CORRECTED)[-1].position
     np.testing.assert_allclose(found, Q + 1e-3 + expected, rtol=0, atol=1e-12)
+    # What the stamps of wrenches have to keep to holds for set points, as soon as it is set.
+    peer.hear(DiagnosticArray, "/diagnostics")
+    request = SetParameters.Request()
+    request.parameters = [Parameter("future_tolerance", value=0.1).to_parameter_msg()]
+    (result,) = peer.call(SetParameters, "/stiffness_monitor/set_parameters", request).results
+    assert result.successful
+    late = state(peer, Q)
+    late.header.stamp.sec += 300
+    for bad in (late, state(peer, [np.nan, 0.6, 0.65])):
+        peer.send("/setpoint", bad)
+    array = peer.diagnostics(
+        "/stiffness_monitor", lambda a: len(counts_of(a, "set points rejected")) >= 2
+    )
+    told = counts_of(array, "set points rejected")
+    assert told["future stamp"] == told["not finite"] == 1
+    assert int(values_of(array)["set points corrected"]) >= 1
+
+
+SINGULAR = """
+import stiffness_monitor.node as node
+from pkm_twin.errors import SingularityError
+def singular(self, answer):
+    raise SingularityError("correction", (), 0.0, 1e-9)
+node.SetpointCorrection.take = node.StiffnessAlarmTopics.take = singular
+node.main()
+"""
+
+
+def test_a_wrench_without_a_correction_has_its_compliance(peer, launch):
+    remap = ["-r", "__node:=loose"]
+    process = launch(None, "correct_setpoint:=true", code=SINGULAR, arguments=remap)
+    peer.talk(JointState, "/joint_states")
+    peer.talk(WrenchStamped, "/wrench")
+    peer.hear(JointState, "/loose/compliance_stamped")
+    peer.hear(DiagnosticArray, "/diagnostics")
+
+    def push():
+        for _ in range(10):
+            load_case = WrenchStamped(header=state(peer, Q).header)
+            peer.send("/joint_states", state(peer, Q))
+            load_case.header.frame_id = "platform"
+            load_case.wrench.force.x = 100.0
+            peer.send("/wrench", load_case)
+
+    peer.until(lambda: peer.received("/loose/compliance_stamped"), repeat=push)
+    peer.until(lambda: "no correction or judgement: " in process.output)
+    assert values_of(peer.diagnostics("/loose"))["exceptions"] == "0"

@@ -13,8 +13,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
 from delta_dynamics import inverse_dynamics
+from delta_dynamics.estimates_node import Estimates
+from delta_dynamics.feedforward import Torques
 from pkm_twin import load
-from test.nodes.harness import Maker, Ros
+from test.nodes.harness import SECOND, Maker, Ros
 
 ROBOT = load("delta_cu")
 PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=600.0")
@@ -78,3 +80,51 @@ def test_a_load_and_a_push_are_told(peer, launch):
     peer.until(lambda: pushed and pushed[-1].wrench.force.x > 50.0, repeat=swing.send)
     assert pushed[-1].header.frame_id == "base_link"
     peer.until(lambda: events and events[-1].data, repeat=swing.send)
+
+
+class Topics:
+    """A node for the estimates alone: everything is wanted, what is published is kept."""
+
+    def __init__(self):
+        self.published = {}
+
+    def declare(self, name, default, *_, **__):
+        return default if name.startswith("observer") else True
+
+    def create_guarded_publisher(self, _, topic, **__):
+        self.published[topic] = []
+        return type("Publisher", (), {"publish": staticmethod(self.published[topic].append)})
+
+    def create_service(self, *_):
+        pass
+
+
+@pytest.mark.parametrize("back", [1_500_000_000, 3600 * SECOND])
+def test_a_stream_that_begins_anew_at_earlier_stamps_is_estimated_as_before(back):
+    """A bag that loops; steps of time below zero are none."""
+    node, rest = Topics(), np.zeros(3)
+    estimates = Estimates(node, lambda: ROBOT, ("base_link", "platform"))
+    wave = np.array([3.0, 4.0, 5.0])
+    counts = []
+    for begin in (back + SECOND, SECOND):
+        for topic in node.published.values():
+            topic.clear()
+        for tick in range(1500):
+            t = 1e-3 * tick
+            motion = (
+                ROBOT.inverse(ROBOT.home()) + 0.05 * np.sin(wave * t),
+                0.05 * wave * np.cos(wave * t),
+                -0.05 * wave**2 * np.sin(wave * t),
+            )
+            effort = inverse_dynamics(ROBOT, *motion)
+            estimates.take(Torques(begin + 1_000_000 * tick, motion, effort, rest, False))
+        counts.append({topic: len(told) for topic, told in node.published.items()})
+        assert not node.published["~/contact"]
+        pushed = [m.wrench.force.x for m in node.published["~/external_wrench"]]
+        assert np.abs(pushed).max() < 1.0
+        last = node.published["~/payload"][-1].inertia.m
+        assert last == pytest.approx(ROBOT.payload.mass, abs=1e-3)
+    # Whether a sum of steps has reached a time hangs on rounding.
+    assert counts[1] == pytest.approx(counts[0], abs=1)
+    assert counts[0]["~/payload"] > 300
+    assert counts[0]["~/external_wrench"] > 1200

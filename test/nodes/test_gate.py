@@ -192,6 +192,8 @@ class TestGravity:
         with pytest.raises(MessageError):
             self.state(core, make, STEP, position=(math.nan, 0.2, 0.3))
         assert (core.stop_command(STEP) == 0.0).all()
+        assert core.states.rejected == {"not finite": 1}
+        assert "arm_1 is nan" in core.last_reject
 
 
 def test_a_clock_jump_closes_the_gate_and_begins_anew(make):

@@ -8,10 +8,13 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.simulation import MachineSettings, Simulation, WrenchSignal, tuned
@@ -119,6 +122,34 @@ def test_a_bad_command_is_refused_and_time_stands(peer, machine):
     assert refused(array) == {"not finite": 1, "length": greeted + 1}
     # One period alone a second and nothing else.
     assert stamp_of(peer.received("/joint_states")[-1]) - before < SECOND // 10
+
+
+def test_the_clock_of_others_is_refused_while_it_runs_too(peer, machine):
+    request = SetParameters.Request()
+    request.parameters = [Parameter("use_sim_time", value=True).to_parameter_msg()]
+    (result,) = peer.call(SetParameters, "/machine_sim/set_parameters", request).results
+    assert not result.successful
+    assert result.reason == "use_sim_time: True is refused; allowed: false: the machine has a " + (
+        "clock of its own"
+    )
+
+
+def test_what_is_refused_is_counted(peer, machine):
+    """Wrenches of a wrong frame, and bytes that are no trajectory."""
+    push, way = "/machine_sim/applied_wrench", "/machine_sim/joint_trajectory"
+    peer.talk(WrenchStamped, push)
+    peer.talk(JointTrajectory, way)
+
+    def send():
+        peer.send(push, WrenchStamped())
+        peer.send(way, bytes([0, 7, 0, 0, *range(40)]))
+
+    def counted(array):
+        wrenches = counts_of(array, "applied wrenches rejected")
+        return wrenches.get("frame") and counts_of(array, "trajectories rejected").get("cdr")
+
+    told = peer.received("/diagnostics")
+    peer.until(lambda: any(map(counted, told)), repeat=send)
 
 
 def test_who_comes_late_gets_what_was_drawn(peer, machine):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from test.nodes.harness import SECOND, counts_of, stamp_of, text_of, values_of
+from test.nodes.harness import SECOND, counts_of, one_line_refusal, stamp_of, text_of, values_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -19,6 +19,7 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import (
     DescribeParameters,
     GetParameters,
+    GetParameterTypes,
     ListParameters,
     SetParameters,
     SetParametersAtomically,
@@ -79,6 +80,23 @@ def strange(kind):
     return ParameterMessage(name="stale_after", value=ParameterValue(type=kind))
 
 
+DEAF = """
+from pkm_twin.ros import node
+class Deaf(node.TwinNode):
+    def __init__(self):
+        super().__init__("deaf")
+        self.declare("volume", 1.0, "that nothing hears")
+        self.start()
+raise SystemExit(node.run(Deaf))
+"""
+
+
+def test_no_node_starts_with_a_parameter_whose_change_nothing_follows(launch):
+    """A set of it would be answered as taken."""
+    line = one_line_refusal(launch(MODULE, code=DEAF))
+    assert line == "refused to start: nothing follows a change of volume"
+
+
 class TestRequests:
     @pytest.mark.parametrize("kind", STRANGE)
     def test_a_parameter_of_no_type_is_refused_and_the_next_one_is_set(self, twin, kind):
@@ -104,6 +122,61 @@ class TestRequests:
             answer = call(twin, SetParameters, "set_parameters", parameters=value)
             assert not any(result.successful for result in answer.results)
         answered(twin)
+
+    def test_requests_of_masses_of_entries_are_refused_unread(self, twin):
+        """Each entry of a set costs what a set does: a long one would hold up the stream."""
+        entry = Parameter("payload.mass", value=0.5).to_parameter_msg()
+        answer = call(twin, SetParameters, "set_parameters", parameters=[entry] * 2000)
+        (result,) = answer.results
+        assert not result.successful
+        assert "parameters: 2000 is refused; allowed: at most" in result.reason
+        answer = call(twin, SetParameters, "set_parameters", parameters=[entry] * 2)
+        (result,) = answer.results
+        assert (
+            result.reason
+            == "ParameterError: payload.mass: 2 is refused; allowed: once in a request"
+        )
+        answer = call(
+            twin, SetParametersAtomically, "set_parameters_atomically", parameters=[entry] * 2000
+        )
+        assert not answer.result.successful
+        names = ["payload.mass"] * 2000
+        assert not call(twin, GetParameters, "get_parameters", names=names).values
+        assert not call(twin, GetParameterTypes, "get_parameter_types", names=names).types
+        assert not call(twin, DescribeParameters, "describe_parameters", names=names).descriptors
+        told = call(twin, ListParameters, "list_parameters", prefixes=["payload"] * 2000)
+        assert not told.result.names
+        (value,) = call(twin, GetParameters, "get_parameters", names=["payload.mass"]).values
+        assert value.double_value == 0.0
+        answered(twin)
+
+    def test_all_parameters_at_once_are_one_request(self, twin):
+        """As ``ros2 param dump`` and ``load`` ask."""
+        names = call(twin, ListParameters, "list_parameters").result.names
+        values = call(twin, GetParameters, "get_parameters", names=names).values
+        assert len(values) == len(names) > 30
+        given = [ParameterMessage(name=n, value=v) for n, v in zip(names, values, strict=True)]
+        answer = call(twin, SetParameters, "set_parameters", parameters=given)
+        assert len(answer.results) == len(names)
+        assert any(result.successful for result in answer.results)
+        answered(twin)
+
+    def test_joints_of_others_are_answered_as_soon_as_the_parameter_says_so(self, twin):
+        names = (*NAMES, "telescope")
+        rows, zero = [(*Q, 0.5)], [(0.0,) * 4]
+        assert twin.set(extra_joints="zero").successful
+        message = MAKE.trajectory(names, [SECOND], rows, zero, zero, twin.begin())
+        (answer,) = twin.ask(message)
+        effort = list(answer.points[0].effort)
+        assert effort[3] == 0.0
+        assert effort[:3] == pytest.approx(inverse_dynamics(ROBOT, Q, [0.0] * 3, [0.0] * 3))
+        assert twin.set(extra_joints="refuse").successful
+        before = counts_of(twin.diagnostics(), "trajectories rejected").get("unknown joint", 0)
+        message = MAKE.trajectory(names, [SECOND], rows, zero, zero, twin.begin())
+        twin.peer.send(f"/{twin.name}/joint_trajectory", message)
+        twin.diagnostics(
+            lambda a: counts_of(a, "trajectories rejected").get("unknown joint", 0) > before
+        )
 
     def test_a_transition_that_does_not_exist_is_refused(self, twin):
         for transition in (Transition(id=77), Transition(label="fly"), Transition(id=3)):

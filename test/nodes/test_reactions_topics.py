@@ -6,10 +6,11 @@ import pytest
 
 from delta_dynamics import reactions
 from pkm_twin import load
-from test.nodes.harness import Maker, Ros, stamp_of
+from test.nodes.harness import Maker, Ros, stamp_of, values_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 
@@ -50,3 +51,39 @@ def test_every_joint_has_its_wrench_where_asked_for(peer, launch):
         got = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
         np.testing.assert_allclose(got, expected.wrenches[k], atol=1e-9)
     assert stamps
+
+
+SINGULAR = """
+import delta_dynamics.node as node
+from pkm_twin.errors import SingularityError
+solve = node.reactions
+def singular(robot, q, *rest):
+    if q[0] == 0.125:
+        raise SingularityError("constraints", (), 0.0, 1e-9)
+    return solve(robot, q, *rest)
+node.reactions = singular
+node.main()
+"""
+
+
+def test_a_state_without_reactions_has_its_torque(peer, launch):
+    """In a constraint singularity, where the parameters let the stream pass, reactions are none."""
+    make, name = Maker(Ros()), "loose"
+    peer.talk(JointState, f"/{name}/states")
+    peer.hear(JointState, f"/{name}/joint_torques")
+    peer.hear(DiagnosticArray, "/diagnostics")
+    parameters = ("publish_reactions:=true", "reactions_rate:=1000.0", "recovery_count:=1")
+    remap = ["-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states"]
+    process = launch(None, *parameters, code=SINGULAR, arguments=remap)
+    q = [0.125, 0.3, 0.1]
+
+    def send():
+        for _ in range(30):
+            state = make.joint_state(ROBOT.joint_names, q, [0.0] * 3, stamp=peer.now())
+            peer.send(f"/{name}/states", state)
+
+    peer.until(lambda: len(peer.received(f"/{name}/joint_torques")) > 5, repeat=send)
+    peer.until(lambda: "no reactions or estimates: " in process.output)
+    values = values_of(peer.diagnostics(f"/{name}"))
+    assert values["exceptions"] == "0"
+    assert "stopped: exception" not in values

@@ -12,10 +12,15 @@ from geometry_msgs.msg import TransformStamped, WrenchStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from pkm_twin import load
 from pkm_twin.bags.reader import open_bag
+from pkm_twin.errors import MessageError
+from pkm_twin.ros.messages import StampRules
+from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from test.bags.test_recordings import FOLDER
 from test.nodes.harness import SECOND, counts_of, values_of
 
+ROBOT = load("upr_rpu")
 TOPICS = {
     "/joint_states": JointState,
     "/wrench": WrenchStamped,
@@ -112,3 +117,38 @@ def test_a_joint_three_times_softer_is_found_by_name_live(peer, launch):
     answer = peer.call(Trigger, "/stiffness_monitor/reset_stiffness", Trigger.Request())
     assert answer.success
     peer.diagnostics("/stiffness_monitor", lambda a: "as soft as" not in a.status[0].message)
+
+
+class Quiet:
+    """A node for the alarm's topics alone, which nothing comes from."""
+
+    def now(self):
+        return SECOND
+
+    def declare(self, _, default, *__, **___):
+        return default
+
+    def nothing(self, *_, **__):
+        pass
+
+    create_guarded_publisher = create_guarded_subscription = create_service = defer = nothing
+
+
+def test_rules_and_frames_that_change_hold_for_the_next_deflection():
+    """Where the sensor's place is set anew, its frame is no longer the platform's."""
+    topics = StiffnessAlarmTopics(Quiet(), ROBOT, StampRules(), ("base_link", "sensor"))
+    message = TransformStamped()
+    message.header.stamp.sec, message.transform.rotation.w = 1, 1.0
+
+    def refused(frame, ahead=0):
+        message.header.frame_id, message.header.stamp.nanosec = frame, ahead
+        try:
+            topics._on_deflection(message)
+        except MessageError as error:
+            return error.reason
+        return ""
+
+    assert [refused("sensor"), refused("platform")] == ["", "frame"]
+    topics.change_rules(StampRules(future_tolerance=0), ("base_link", "platform"))
+    assert [refused("sensor"), refused("platform")] == ["frame", ""]
+    assert refused("platform", 1_000_000) == "future stamp"

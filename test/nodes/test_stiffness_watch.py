@@ -191,6 +191,23 @@ def test_a_deflection_waits_for_the_wrench_behind_it_and_is_refused_without_one_
     assert watch.count == 0
 
 
+@pytest.mark.parametrize("count", [1, 3 * WAITING])
+def test_a_deflection_that_is_refused_in_the_end_does_not_blind_the_good_ones(count):
+    """Sound by itself and ahead of the clock: no wrench comes near it."""
+    watch, monitor = StiffnessWatch(ROBOT, StampRules(), FRAMES), Monitor(ROBOT)
+    now, step, ahead = SECOND, SECOND // 200, 99_000_000
+    answers(watch, monitor, [now])
+    for k in range(count):
+        watch.deflection(deflection(now + ahead + k), now)
+    for _ in range(15):
+        now += step
+        watch.deflection(deflection(now - step // 2), now)
+        answers(watch, monitor, [now])
+    assert watch.taken.accepted == 15
+    answers(watch, monitor, [now + SECOND])
+    assert watch.taken.rejected == {"no wrench": count}
+
+
 def test_axes_and_rotations_of_a_deflection():
     half = 0.02
     turn = (0.0, np.sin(half), 0.0, np.cos(half))
