@@ -38,7 +38,7 @@ OnStop = Literal["nothing", "zeros", "gravity"]
 STOPPING: Final = ("non-finite result", "singular", "jump", "no wrench")
 """Reasons for which one sample stops the stream: it is none that the model describes."""
 SLICE: Final = 256
-"""Points of a trajectory that are answered in one go: about a millisecond."""
+"""Points of a trajectory that are answered in one go."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class Feedforward:
                 return cast(Array, end.value)
 
     def trajectory_steps(self, message: Any, now: int) -> Generator[None, None, Array]:
-        """As :meth:`trajectory`, a few milliseconds at a time: it yields between them.
+        """As :meth:`trajectory`, some points at a time: it yields between them.
 
         The robot and the settings are those of the beginning.
 

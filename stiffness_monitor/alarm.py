@@ -236,7 +236,7 @@ class StiffnessAlarm:
                 return found
 
     def judging(self) -> Generator[None, None, tuple[Departure, ...] | None]:
-        """The same in slices of a few milliseconds, of the samples that there are at the first."""
+        """The same in slices, of the samples that there are at the first."""
         if not self._samples:
             return None
         sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])

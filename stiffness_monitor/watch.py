@@ -106,7 +106,7 @@ class StiffnessWatch:
             self._refuse(MessageError("no wrench", text))
 
     def judgement(self) -> Generator[None, None, bool] | None:
-        """A judgement in slices of a few milliseconds, where it is time for one; else None.
+        """A judgement in slices, where it is time for one; else None.
 
         One at a time. It ends with whether ``departures`` are new: not where all was forgotten
         meanwhile.
