@@ -49,14 +49,14 @@ lint: $(VENV)/test.stamp
 types: $(VENV)/test.stamp
 	$(BIN)/mypy
 
-# Three at a time, as most wait for processes: a test that needs quiet waits for conditions, none for a clock.
+# Four at a time, as many wait for processes: a test that needs quiet waits for conditions, none for a clock.
 # A file is one worker's: what its tests share is made once. Bytecode is kept, as hundreds of
 # processes start.
 unit: $(VENV)/test.stamp
-	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n 3 --dist loadfile
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder
 
 long: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -n 3 --dist loadfile -m long $(ENDLESS:%=--ignore=%)
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m long $(ENDLESS:%=--ignore=%)
 
 bags: $(VENV)/bags.stamp
 	$(BIN)/python -m bags.recording
