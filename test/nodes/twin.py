@@ -161,6 +161,30 @@ class Twin:
             elif stamp_of(array) - stamp_of(first) > 1.5 * SECOND:
                 return array
 
+    def even(self):
+        """Diagnostics at rest in which everything sent before is counted.
+
+        Of what was lost last only a later one tells, so one is sent, and after each second another
+        until it is counted.
+        """
+        first, more, due = count_of(self.at_rest()), 0, 0.0
+        told = self.peer.received("/diagnostics")
+        told.clear()
+
+        def again():
+            nonlocal more, due
+            if time.monotonic() >= due:
+                more += 1
+                self.send_state(state(self.stamp()))
+                due = time.monotonic() + 1.0
+
+        def counted():
+            own = [a for a in told if a.status[0].name == f"/{self.name}"]
+            return more and any(count_of(a) >= first + more for a in own)
+
+        self.peer.until(counted, repeat=again)
+        return self.at_rest()
+
     def balance(self, total):
         """The diagnostics up to where every one of ``total`` samples is taken or counted as lost.
 
