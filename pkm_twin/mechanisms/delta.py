@@ -22,6 +22,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,10 @@ class Geometry:
         if self.closures.count("rcu") > 1:
             raise ParameterError(f"{path}.closures", list(self.closures), "at most one rcu limb")
         check_azimuths(self.azimuths, f"{path}.azimuths")
+
+
+_HOMES: WeakKeyDictionary[Geometry, tuple[Array, Array]] = WeakKeyDictionary()
+"""Found once a geometry: a mass that is changed while a stream runs leaves it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +163,11 @@ class Delta(Robot):
     @cached_property
     def _home(self) -> tuple[Array, Array]:
         """Joints and platform at home: equal angles, as far from singularities as they can be."""
+        if self.geometry not in _HOMES:
+            _HOMES[self.geometry] = self._find_home()
+        return _HOMES[self.geometry]
+
+    def _find_home(self) -> tuple[Array, Array]:
         best: tuple[float, Array, Array] | None = None
         for angle in np.linspace(-1.5, 1.5, 61):
             q = np.full(3, angle)

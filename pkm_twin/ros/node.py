@@ -58,7 +58,13 @@ from std_srvs.srv import Trigger
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.ros.context import middleware_arguments
 from pkm_twin.ros.messages import SECOND
-from pkm_twin.ros.signals import SIGNALS, first_signal, ignore_signals, noted_signals
+from pkm_twin.ros.signals import (
+    SIGNALS,
+    first_signal,
+    ignore_signals,
+    noted_signals,
+    nothing_raised,
+)
 from pkm_twin.streams.monitor import TopicStatistics
 from pkm_twin.threads import one_blas_thread
 
@@ -820,7 +826,7 @@ def run(
     node: TwinNode | None = None
     begun = False
     try:
-        # The middleware's handler for SIGINT calls this one; SIGTERM is the middleware's alone.
+        # Until it spins: the middleware's handler for SIGINT calls this one, that for SIGTERM none.
         with first_signal(KeyboardInterrupt, SIGNALS if farewell else (signal.SIGINT,)):
             rclpy.init(
                 args=middleware_arguments(sys.argv if arguments is None else arguments),
@@ -833,7 +839,9 @@ def run(
             gc.collect()
             gc.freeze()
             if not farewell:
-                spin(node)
+                # The middleware's handler ends its context, and with it the loop.
+                with nothing_raised():
+                    spin(node)
                 return 0
             with noted_signals() as asked:
                 spin(node, asked)
