@@ -24,7 +24,8 @@ def independent_rows(matrices: Array, bound: float = 1e-9) -> list[int]:
     transpose); ties take the earlier row. As many as the least rank of the matrices.
     """
     rest = matrices.astype(float).copy()
-    scale = np.linalg.norm(rest, axis=-1).max(-1, initial=0.0)
+    # Of a matrix of zeros no row is independent.
+    scale = np.maximum(np.linalg.norm(rest, axis=-1).max(-1, initial=0.0), 1e-300)
     left = list(range(rest.shape[1]))
     chosen: list[int] = []
     while left and len(chosen) < rest.shape[2]:

@@ -139,6 +139,9 @@ def test_independent_rows_are_a_basis_of_all_rows(rng):
     chosen = independent_rows(mixed)
     assert len(chosen) == 4
     assert (np.linalg.matrix_rank(mixed[:, chosen]) == 4).all()
+    mixed[1] = 0.0
+    with np.errstate(all="raise"):
+        assert independent_rows(mixed) == []
 
 
 PROGRAM = """
