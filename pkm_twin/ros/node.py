@@ -33,6 +33,7 @@ from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import (
+    InvalidHandle,
     InvalidParameterTypeException,
     InvalidParameterValueException,
     ParameterException,
@@ -51,7 +52,7 @@ from rclpy.qos import (
     qos_policy_name_from_kind,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.signals import SignalHandlerOptions
+from rclpy.signals import SignalHandlerGuardCondition, SignalHandlerOptions
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
@@ -783,6 +784,19 @@ def _as_float(given: Parameter, like: Any) -> Parameter:
     return given
 
 
+class _NeverMade:
+    """For the handle of a guard that a signal keeps from being made: its end is quiet then."""
+
+    def __enter__(self) -> None:
+        raise InvalidHandle("never made")
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing was entered."""
+
+
+SignalHandlerGuardCondition._GuardCondition__gc = _NeverMade()
+
+
 class _Executor(SingleThreadedExecutor):
     """One whose making a signal may interrupt: rclpy's own end asks for what is not there then."""
 
@@ -794,6 +808,8 @@ def spin(node: TwinNode, ended: Callable[[], bool] = lambda: False) -> None:
 
     :param ended: asked between two callbacks; true ends it too.
     """
+    if not node.context.ok():
+        return  # A signal has come before: rclpy cannot make an executor any more, and prints so.
     events = node.executor_kind == "events"
     executor = EventsExecutor() if events else _Executor()
     executor.add_node(node)

@@ -48,6 +48,30 @@ def test_signals_end_a_node_whose_parent_ignores_them(domain, number):
         assert "Traceback" not in said(output)
 
 
+def test_what_a_signal_keeps_rclpy_from_making_ends_quietly():
+    """The context ends at any time, also between two guards of an executor."""
+    script = """
+import signal, time
+import rclpy
+from pkm_twin.ros.node import _Executor
+from rclpy.signals import SignalHandlerGuardCondition
+rclpy.init()
+made = SignalHandlerGuardCondition()
+made.destroy()
+signal.raise_signal(signal.SIGTERM)
+while rclpy.ok():
+    time.sleep(0.01)
+for kind in (SignalHandlerGuardCondition, _Executor):
+    try:
+        kind()
+    except RuntimeError:
+        print("not made")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split("\n")[:2] == ["not made", "not made"]
+
+
 @pytest.mark.parametrize("command", ["node", "guard-check"])
 def test_a_home_that_cannot_be_written_costs_log_files_alone(domain, command):
     """The middleware itself would not start. In /proc not even root makes a folder."""
