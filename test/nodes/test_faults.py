@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node delta_dynamics does about clocks, silence, bursts, and nodes that do not fit."""
 
+import itertools
 import re
 import signal
 import time
@@ -355,6 +356,14 @@ class TestClocks:
         timed = fleet["timed"]
         timed.peer.talk(Clock, "/clock")
         timed.peer.until(timed.peer.matched)
+        # What is sent before the node has found this side is lost: it is greeted, at a later time.
+        later = self.start + SECOND
+        self.tick(timed, later)
+        greetings = (later - SECOND // 2 + i * STEP for i in itertools.count())
+        timed.peer.until(
+            lambda: timed.received("joint_torques"),
+            repeat=lambda: timed.send_state(state(next(greetings))),
+        )
         self.tick(timed, self.start)
         assert self.stream(timed, self.start, 20) == list(range(WINDOW - 1, 20))
         # Back, as when a bag begins anew: the window is filled anew. By as little as stamps may be
