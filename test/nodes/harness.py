@@ -332,12 +332,23 @@ class Peer:
         self._executor.spin_once(timeout_sec=0.001)
 
     def call(self, kind, service, request):
+        """The answer of a service; after each five seconds without one it is asked again.
+
+        A server that has not found this side's reader yet answers to nobody.
+        """
         client = self.node.create_client(kind, service)
         self.until(client.service_is_ready)
-        future = client.call_async(request)
-        self.until(future.done)
+        futures, due = [], 0.0
+
+        def ask():
+            nonlocal due
+            if time.monotonic() >= due:
+                futures.append(client.call_async(request))
+                due = time.monotonic() + 5.0
+
+        done = self.until(lambda: next((f for f in futures if f.done()), None), repeat=ask)
         self.node.destroy_client(client)
-        return future.result()
+        return done.result()
 
     def close(self):
         self._executor.shutdown()
