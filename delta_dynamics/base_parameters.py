@@ -134,12 +134,13 @@ def independent(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, .
     :param preference: shape (p,): greater ones are taken first.
     :returns: indices, rising, and the matrix B, shape (b, p), with table = table[:, indices] B.
     """
+    # Here, as a stream's start would pay for what it does not need.
+    from scipy.linalg import qr  # type: ignore[import-untyped]
+
     norms = np.linalg.norm(table, axis=0)
     seen = np.flatnonzero(norms > ABSENT * norms.max())
     weights = np.broadcast_to(np.asarray(preference, np.float64), norms.shape)
     norms = norms / weights
-    from scipy.linalg import qr  # type: ignore[import-untyped]  # dear, and a stream needs none
-
     r, pivots = qr(table[:, seen] / norms[seen], mode="r", pivoting=True)
     diagonal = np.abs(np.diag(r))
     rank = int((diagonal > RANK * weights.max()).sum())

@@ -30,6 +30,7 @@ from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.wrench import counting
 
 Array = NDArray[np.float64]
 LimitPolicy = Literal["warn", "reject", "clamp"]
@@ -111,7 +112,7 @@ class Feedforward:
         s = self.settings
         self.stream = StreamMonitor(s.trip_count, s.recovery_count)
         # Each trajectory stands for itself: a bad one does not speak against the next.
-        self.trajectories = StreamMonitor(trip_count=2**62, recovery_count=1)
+        self.trajectories = counting()
         self.saturations = 0
         self.dropped = 0
         self.near_singular = False

@@ -31,7 +31,6 @@ from pkm_twin.ros.messages import (
     read_wrench,
 )
 from pkm_twin.streams.continuity import Continuity
-from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.path import JointPath
 from pkm_twin.streams.wrench import counting
 
@@ -132,7 +131,7 @@ class Simulation:
                 if not low <= q <= high:
                     raise ParameterError(f"start, {name}", float(q), f"{low:g} to {high:g}")
         self.robot, self.settings = robot, settings
-        self.stream = StreamMonitor(trip_count=2**62, recovery_count=1)
+        self.stream = counting()
         """Effort commands, and what has stopped the machine."""
         self.trajectories = counting()
         self.wrenches = counting()

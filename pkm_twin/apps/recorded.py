@@ -48,6 +48,12 @@ MSG: std_msgs/Header
 builtin_interfaces/Time stamp
 string frame_id
 """
+_VECTOR3 = """================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
 _DEFINITIONS: Final = {
     JOINT_STATE: _STAMPED
     + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
@@ -60,12 +66,8 @@ _DEFINITIONS: Final = {
 MSG: geometry_msgs/Wrench
 Vector3 force
 Vector3 torque
-================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-""",
+"""
+    + _VECTOR3,
     TRANSFORM: _STAMPED
     + "string child_frame_id\nTransform transform"
     + _HEADER
@@ -74,12 +76,9 @@ float64 z
 MSG: geometry_msgs/Transform
 Vector3 translation
 Quaternion rotation
-================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-================================================================================
+"""
+    + _VECTOR3
+    + """================================================================================
 MSG: geometry_msgs/Quaternion
 float64 x
 float64 y

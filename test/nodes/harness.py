@@ -310,8 +310,8 @@ class Peer:
 
         return self.until(found)
 
-    def until(self, condition, timeout=DEADLINE, repeat=None):
-        """Spin until the condition is true; ``repeat`` is called every 50 ms until then.
+    def until(self, condition, timeout=DEADLINE, repeat=None, every=0.05):
+        """Spin until the condition is true; until then ``repeat`` is called ``every`` so many s.
 
         :returns: what the condition gave.
         """
@@ -322,7 +322,7 @@ class Peer:
             now = time.monotonic()
             if repeat is not None and now >= due:
                 repeat()
-                due = now + 0.05
+                due = now + every
             self._executor.spin_once(timeout_sec=0.05)
 
         return wait_until(condition, spin, timeout, "what this test waits for")
@@ -338,15 +338,12 @@ class Peer:
         """
         client = self.node.create_client(kind, service)
         self.until(client.service_is_ready)
-        futures, due = [], 0.0
-
-        def ask():
-            nonlocal due
-            if time.monotonic() >= due:
-                futures.append(client.call_async(request))
-                due = time.monotonic() + 5.0
-
-        done = self.until(lambda: next((f for f in futures if f.done()), None), repeat=ask)
+        futures = []
+        done = self.until(
+            lambda: next((f for f in futures if f.done()), None),
+            repeat=lambda: futures.append(client.call_async(request)),
+            every=5.0,
+        )
         self.node.destroy_client(client)
         return done.result()
 

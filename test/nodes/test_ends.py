@@ -17,6 +17,7 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 from diagnostic_msgs.msg import DiagnosticArray
 
 from test.nodes.twin import COMMON, MODULE, Twin, state
+from test.support.waiting import wait_until
 
 
 def deaf():
@@ -88,10 +89,12 @@ def test_a_home_that_cannot_be_written_costs_log_files_alone(domain, command):
             env=environment,
         )  # fmt: skip
         try:
-            end = time.monotonic() + DEADLINE
-            while "joints" not in said(output) and process.poll() is None:
-                assert time.monotonic() < end, said(output)
-                time.sleep(0.05)
+            wait_until(
+                lambda: "joints" in said(output) or process.poll() is not None,
+                lambda: time.sleep(0.05),
+                DEADLINE,
+                "a robot's joints or an end",
+            )
             process.send_signal(signal.SIGINT)
             assert process.wait(DEADLINE) == (0 if command == "node" else 1), said(output)
         finally:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A running delta_dynamics and its topics, seen from the other side; needs rclpy."""
 
-import time
-
 import numpy as np
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
@@ -71,17 +69,16 @@ class Twin:
         Where many wait already, as at a node's start, one is refused as busy.
         """
         received = self.received("joint_trajectory_ff")
-        sent, due = [], 0.0
+        sent = []
 
-        def repeat():
-            nonlocal due
-            if time.monotonic() >= due:
-                message = trajectory(stamp=self.begin())
-                sent.append(stamp_of(message))
-                self.peer.send(f"/{self.name}/joint_trajectory", message)
-                due = time.monotonic() + 1.0
+        def ask():
+            message = trajectory(stamp=self.begin())
+            sent.append(stamp_of(message))
+            self.peer.send(f"/{self.name}/joint_trajectory", message)
 
-        self.peer.until(lambda: any(stamp_of(m) in sent[-1:] for m in received), repeat=repeat)
+        self.peer.until(
+            lambda: any(stamp_of(m) in sent[-1:] for m in received), repeat=ask, every=1.0
+        )
         received.clear()
 
     def ready(self):
@@ -167,22 +164,20 @@ class Twin:
         Of what was lost last only a later one tells, so one is sent, and after each second another
         until it is counted.
         """
-        first, more, due = count_of(self.at_rest()), 0, 0.0
+        first, more = count_of(self.at_rest()), 0
         told = self.peer.received("/diagnostics")
         told.clear()
 
         def again():
-            nonlocal more, due
-            if time.monotonic() >= due:
-                more += 1
-                self.send_state(state(self.stamp()))
-                due = time.monotonic() + 1.0
+            nonlocal more
+            more += 1
+            self.send_state(state(self.stamp()))
 
         def counted():
             own = [a for a in told if a.status[0].name == f"/{self.name}"]
             return more and any(count_of(a) >= first + more for a in own)
 
-        self.peer.until(counted, repeat=again)
+        self.peer.until(counted, repeat=again, every=1.0)
         return self.at_rest()
 
     def balance(self, total):
