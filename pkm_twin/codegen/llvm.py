@@ -18,8 +18,19 @@ from typing import Any, Final
 
 import llvmlite
 import llvmlite.binding as binding
-from llvmlite import ir
 
+from pkm_twin.codegen.assembly import (
+    BIT,
+    DOUBLE,
+    INT64,
+    Function,
+    Value,
+    every,
+    real,
+    undefined,
+    vector,
+    whole,
+)
 from pkm_twin.codegen.expressions import PARAMETER, PARAMETERS, SAMPLE, Expression, ordered, uses
 from pkm_twin.codegen.program import (
     CHANGE,
@@ -38,13 +49,11 @@ OPTIMISATION: Final = 2
 LONG: Final = 100
 """Entries of an output from which on they are stored in a loop."""
 
-DOUBLE: Final = ir.DoubleType()
-INT64: Final = ir.IntType(64)
-INT32: Final = ir.IntType(32)
-BIT: Final = ir.IntType(1)
-VECTOR: Final = ir.VectorType(DOUBLE, LANES)
-INTEGERS: Final = ir.VectorType(INT64, LANES)
-MASK: Final = ir.VectorType(BIT, LANES)
+VECTOR: Final = vector(DOUBLE, LANES)
+INTEGERS: Final = vector(INT64, LANES)
+MASK: Final = vector(BIT, LANES)
+TRUE: Final = every(Value(BIT, "true"), LANES)
+ONE: Final = whole(1)
 
 # Minimax polynomials of sine and cosine up to a quarter turn, and pi / 2 in three parts
 # (Cody and Waite 1980; coefficients as in Cephes, public domain).
@@ -101,42 +110,35 @@ class _Emitter:
     """Values of expressions at one place of the code, scalar or in lanes."""
 
     def __init__(
-        self, builder: ir.IRBuilder, used: Mapping[int, int], known: Mapping[int, Any], wide: bool
+        self, function: Function, used: Mapping[int, int], known: Mapping[int, Value], wide: bool
     ) -> None:
-        self.b, self.used, self.wide = builder, used, wide
+        self.b, self.used, self.wide = function, used, wide
         self.known = dict(known)
         self.type = VECTOR if wide else DOUBLE
         self.integer = INTEGERS if wide else INT64
-        self._turned: dict[int, tuple[Any, Any]] = {}
+        self._turned: dict[int, tuple[Value, Value]] = {}
 
-    def number(self, value: float) -> Any:
-        return ir.Constant(self.type, [value] * LANES) if self.wide else ir.Constant(DOUBLE, value)
+    def number(self, value: float) -> Value:
+        return every(real(value), LANES) if self.wide else real(value)
 
-    def whole(self, value: int) -> Any:
-        return (
-            ir.Constant(self.integer, [value] * LANES) if self.wide else ir.Constant(INT64, value)
-        )
+    def whole(self, value: int) -> Value:
+        return every(whole(value), LANES) if self.wide else whole(value)
 
-    def call(self, name: str, *arguments: Any) -> Any:
+    def call(self, name: str, *arguments: Value) -> Value:
         full = f"llvm.{name}.{f'v{LANES}f64' if self.wide else 'f64'}"
-        module = self.b.module
-        function = module.globals.get(full)
-        if function is None:
-            kind = ir.FunctionType(self.type, [self.type] * len(arguments))
-            function = ir.Function(module, kind, full)
-        return self.b.call(function, arguments)
+        return self.b.call(full, self.type, arguments)
 
-    def fused(self, x: Any, y: Any, z: Any) -> Any:
+    def fused(self, x: Value, y: Value, z: Value) -> Value:
         """X y + z."""
         return self.call("fma", x, y, z) if FUSED else self.b.fadd(self.b.fmul(x, y), z)
 
-    def polynomial(self, x: Any, coefficients: Sequence[float]) -> Any:
+    def polynomial(self, x: Value, coefficients: Sequence[float]) -> Value:
         result = self.number(coefficients[0])
         for c in coefficients[1:]:
             result = self.fused(result, x, self.number(c))
         return result
 
-    def sine_cosine(self, number: int, x: Any) -> tuple[Any, Any]:
+    def sine_cosine(self, number: int, x: Value) -> tuple[Value, Value]:
         if number in self._turned:
             return self._turned[number]
         b, n = self.b, self.number
@@ -150,9 +152,9 @@ class _Emitter:
             self.fused(z, n(-0.5), n(1.0)), b.fmul(b.fmul(z, z), self.polynomial(z, _COSINE))
         )
         k = b.fptosi(quarters, self.integer)
-        odd = b.icmp_signed("!=", b.and_(k, self.whole(1)), self.whole(0))
+        odd = b.icmp("ne", b.and_(k, self.whole(1)), self.whole(0))
 
-        def signed(value: Any, turns: Any) -> Any:
+        def signed(value: Value, turns: Value) -> Value:
             flip = b.shl(b.and_(turns, self.whole(2)), self.whole(62))
             return b.bitcast(b.xor(b.bitcast(value, self.integer), flip), self.type)
 
@@ -163,31 +165,32 @@ class _Emitter:
         self._turned[number] = pair
         return pair
 
-    def arctangent(self, y: Any, x: Any) -> Any:
+    def arctangent(self, y: Value, x: Value) -> Value:
         b, n = self.b, self.number
         ay, ax = self.call("fabs", y), self.call("fabs", x)
-        steep = b.fcmp_ordered(">", ay, ax)
+        steep = b.fcmp("ogt", ay, ax)
         small, large = b.select(steep, ax, ay), b.select(steep, ay, ax)
-        zero = b.fcmp_ordered("==", large, n(0.0))
+        zero = b.fcmp("oeq", large, n(0.0))
         t = b.fdiv(small, b.select(zero, n(1.0), large))
-        high = b.fcmp_ordered(">", t, n(0.66))
+        high = b.fcmp("ogt", t, n(0.66))
         u = b.select(high, b.fdiv(b.fsub(t, n(1.0)), b.fadd(t, n(1.0))), t)
         z = b.fmul(u, u)
         ratio = b.fdiv(self.polynomial(z, _ATAN_P), self.polynomial(z, _ATAN_Q))
         angle = self.fused(b.fmul(u, z), ratio, u)
         angle = b.select(high, b.fadd(b.fadd(angle, n(_MORE / 2)), n(math.pi / 4)), angle)
         angle = b.select(steep, b.fadd(b.fsub(n(math.pi / 2), angle), n(_MORE)), angle)
-        back = b.icmp_signed("<", b.bitcast(x, self.integer), self.whole(0))
+        back = b.icmp("slt", b.bitcast(x, self.integer), self.whole(0))
         angle = b.select(back, b.fadd(b.fsub(n(math.pi), angle), n(2 * _MORE)), angle)
         sign = b.and_(b.bitcast(y, self.integer), self.whole(-(2**63)))
         return b.bitcast(b.or_(b.bitcast(angle, self.integer), sign), self.type)
 
-    def value(self, e: Expression, inputs: Mapping[str, Sequence[Any]]) -> Any:
+    def value(self, e: Expression, inputs: Mapping[str, Sequence[Value]]) -> Value:
         b, op = self.b, e.op
         if op == "const":
             return self.number(e.a)
         if op == "in":
-            return inputs[e.a][e.b]
+            found: Value = inputs[e.a][e.b]
+            return found
         if op in ("add", "sub"):
             for first, product, rest in ((True, e.a, e.b), (False, e.b, e.a)):
                 once = product.op == "mul" and self.used.get(product.number, 2) == 1
@@ -199,13 +202,6 @@ class _Emitter:
                     x, z = (x, b.fneg(z)) if first else (b.fneg(x), z)
                 return self.fused(x, y, z)
         x = self.known[e.a.number]
-        y = None if e.b is None else self.known[e.b.number]
-        if op == "add":
-            return b.fadd(x, y)
-        if op == "sub":
-            return b.fsub(x, y)
-        if op == "mul":
-            return b.fmul(x, y)
         if op == "neg":
             return b.fneg(x)
         if op == "inv":
@@ -218,14 +214,22 @@ class _Emitter:
             return self.call("fabs", x)
         if op == "sign":
             zero = self.number(0.0)
-            down = b.select(b.fcmp_ordered("<", x, zero), self.number(-1.0), b.fmul(x, zero))
-            return b.select(b.fcmp_ordered(">", x, zero), self.number(1.0), down)
+            down = b.select(b.fcmp("olt", x, zero), self.number(-1.0), b.fmul(x, zero))
+            return b.select(b.fcmp("ogt", x, zero), self.number(1.0), down)
+        y = self.known[e.b.number]
+        if op == "add":
+            return b.fadd(x, y)
+        if op == "sub":
+            return b.fsub(x, y)
+        if op == "mul":
+            return b.fmul(x, y)
         if op == "atan2":
             return self.arctangent(x, y)
-        less = b.fcmp_ordered("<" if op == "min" else ">", x, y)
-        return b.select(less, x, y)
+        return b.select(b.fcmp("olt" if op == "min" else "ogt", x, y), x, y)
 
-    def run(self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Any]]) -> list[Any]:
+    def run(
+        self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]
+    ) -> list[Value]:
         """Values of the results; every shared expression once."""
         for e in ordered(results):
             if e.number not in self.known:
@@ -238,12 +242,9 @@ class _Writer:
 
     def __init__(self, program: Program) -> None:
         self.program = program
-        self.module = ir.Module(SYMBOL)
-        self.module.triple = binding.get_default_triple()
-        kind = ir.FunctionType(INT64, [INT64.as_pointer()])
-        self.function = ir.Function(self.module, kind, SYMBOL)
+        triple = binding.get_default_triple()
+        b = self.b = Function(SYMBOL, triple, typed_pointers=binding.llvm_version_info < (17,))
         self.used = uses(program.results)
-        b = self.b = ir.IRBuilder(self.function.append_basic_block("entry"))
         names = list(program.inputs)
         self.count, self.steps = self._word(0), self._word(1)
         parameters = self._pointer(2)
@@ -254,34 +255,22 @@ class _Writer:
         self.targets = {name: self._pointer(at + k) for k, name in enumerate(program.outputs)}
         self.status = self._pointer(at + len(program.outputs))
         self.constants = self._hoist(parameters)
-        self.blocks = {
-            name: self.function.append_basic_block(name) for name in ("head", "load", "tail")
-        }
-        self.index, self.flags = self._slot(INT64), self._slot(INT64)
-        b.store(ir.Constant(INT64, 0), self.index)
-        b.store(ir.Constant(INT64, 0), self.flags)
+        self.blocks = {name: b.block(name) for name in ("head", "load", "tail")}
+        self.index, self.flags = b.alloca(INT64), b.alloca(INT64)
+        b.store(whole(0), self.index)
+        b.store(whole(0), self.flags)
 
-    def _word(self, k: int) -> Any:
-        return self.b.load(self.b.gep(self.function.args[0], [ir.Constant(INT64, k)]))
+    def _word(self, k: int) -> Value:
+        return self.b.load(self.b.gep(self.b.words, whole(k)))
 
-    def _pointer(self, k: int) -> Any:
-        return self.b.inttoptr(self._word(k), DOUBLE.as_pointer())
+    def _pointer(self, k: int) -> Value:
+        return self.b.inttoptr(self._word(k), DOUBLE)
 
-    def _slot(self, kind: Any) -> Any:
-        with self.b.goto_entry_block():
-            return self.b.alloca(kind)
-
-    def _splat(self, value: Any, kind: Any = VECTOR) -> Any:
-        b = self.b
-        empty = ir.Constant(kind, ir.Undefined)
-        first = b.insert_element(empty, value, ir.Constant(INT32, 0))
-        return b.shuffle_vector(first, empty, ir.Constant(ir.VectorType(INT32, LANES), [0] * LANES))
-
-    def _hoist(self, parameters: Any) -> dict[int, Any]:
+    def _hoist(self, parameters: Value) -> dict[int, Value]:
         """What hangs on parameters alone, computed once a call."""
         order = ordered(self.program.results)
         needed = {e.b for e in order if e.op == "in" and e.a == PARAMETERS}
-        loaded = {k: self.b.load(self.b.gep(parameters, [ir.Constant(INT64, k)])) for k in needed}
+        loaded = {k: self.b.load(self.b.gep(parameters, whole(k))) for k in needed}
         scalar = _Emitter(self.b, self.used, {}, wide=False)
         wide = _Emitter(self.b, self.used, {}, wide=True)
         for e in order:
@@ -289,83 +278,78 @@ class _Writer:
                 scalar.known[e.number], wide.known[e.number] = scalar.number(e.a), wide.number(e.a)
             elif e.level == PARAMETER:
                 value = scalar.known[e.number] = scalar.value(e, {PARAMETERS: loaded})  # type: ignore[dict-item]
-                wide.known[e.number] = self._splat(value)
+                wide.known[e.number] = self.b.splat(value, LANES)
         return wide.known
 
     def emitter(self) -> _Emitter:
         return _Emitter(self.b, self.used, self.constants, wide=True)
 
-    def _any(self, mask: Any) -> Any:
-        name = f"llvm.vector.reduce.or.v{LANES}i1"
-        function = self.module.globals.get(name)
-        if function is None:
-            function = ir.Function(self.module, ir.FunctionType(BIT, [MASK]), name)
-        return self.b.call(function, [mask])
+    def _any(self, mask: Value) -> Value:
+        return self.b.call(f"llvm.vector.reduce.or.v{LANES}i1", BIT, [mask])
 
-    def _load(self, name: str, size: int) -> list[Any]:
+    def _load(self, name: str, size: int) -> list[Value]:
         """An input's entries, a vector each."""
         base, stride = self.sources[name]
         b = self.b
         rows = [b.mul(place, stride) for place in self.places]
         values = []
         for j in range(size):
-            vector = ir.Constant(VECTOR, ir.Undefined)
+            vector = undefined(VECTOR)
             for lane, row in enumerate(rows):
-                at = b.gep(base, [b.add(row, ir.Constant(INT64, j))])
-                vector = b.insert_element(vector, b.load(at), ir.Constant(INT32, lane))
+                at = b.gep(base, b.add(row, whole(j)))
+                vector = b.insert_element(vector, b.load(at), lane)
             values.append(vector)
         return values
 
-    def _save(self, base: Any, values: Sequence[Any]) -> None:
+    def _save(self, base: Value, values: Sequence[Value]) -> None:
         b = self.b
         if len(values) > LONG:
             self._save_long(base, values)
             return
-        size = ir.Constant(INT64, len(values))
+        size = whole(len(values))
         rows = [b.mul(place, size) for place in self.places]
-        for j, vector in enumerate(values):
+        for j, value in enumerate(values):
             for lane, row in enumerate(rows):
-                at = b.gep(base, [b.add(row, ir.Constant(INT64, j))])
-                b.store(b.extract_element(vector, ir.Constant(INT32, lane)), at)
+                at = b.gep(base, b.add(row, whole(j)))
+                b.store(b.extract_element(value, lane), at)
 
-    def _save_long(self, base: Any, values: Sequence[Any]) -> None:
+    def _save_long(self, base: Value, values: Sequence[Value]) -> None:
         """The same in a loop: thousands of stores in a row take minutes to compile."""
         b = self.b
-        size = ir.Constant(INT64, len(values))
-        with b.goto_entry_block():
-            scratch, counter = b.alloca(VECTOR, len(values)), b.alloca(INT64)
-        for j, vector in enumerate(values):
-            b.store(vector, b.gep(scratch, [ir.Constant(INT64, j)]))
-        loop, done = (self.function.append_basic_block(name) for name in ("save", "saved"))
-        b.store(ir.Constant(INT64, 0), counter)
+        size = whole(len(values))
+        scratch, counter = b.alloca(VECTOR, len(values)), b.alloca(INT64)
+        for j, value in enumerate(values):
+            b.store(value, b.gep(scratch, whole(j)))
+        loop, done = b.block("save"), b.block("saved")
+        b.store(whole(0), counter)
         rows = [b.mul(place, size) for place in self.places]
         b.branch(loop)
-        b.position_at_end(loop)
-        j = b.load(counter)
-        vector = b.load(b.gep(scratch, [j]))
+        b.go_to(loop)
+        k = b.load(counter)
+        value = b.load(b.gep(scratch, k))
         for lane, row in enumerate(rows):
-            at = b.gep(base, [b.add(row, j)])
-            b.store(b.extract_element(vector, ir.Constant(INT32, lane)), at)
-        after = b.add(j, ir.Constant(INT64, 1))
+            at = b.gep(base, b.add(row, k))
+            b.store(b.extract_element(value, lane), at)
+        after = b.add(k, whole(1))
         b.store(after, counter)
-        b.cbranch(b.icmp_signed("<", after, size), loop, done)
-        b.position_at_end(done)
+        b.cbranch(b.icmp("slt", after, size), loop, done)
+        b.go_to(done)
 
     def write(self) -> str:
         b, blocks, program = self.b, self.blocks, self.program
         b.branch(blocks["head"])
-        b.position_at_end(blocks["head"])
+        b.go_to(blocks["head"])
         i = b.load(self.index)
-        b.cbranch(b.icmp_signed("<", i, self.count), blocks["load"], blocks["tail"])
-        b.position_at_end(blocks["load"])
+        b.cbranch(b.icmp("slt", i, self.count), blocks["load"], blocks["tail"])
+        b.go_to(blocks["load"])
         # Lanes beyond the last sample compute it once more, and store the same again.
-        last = b.sub(self.count, ir.Constant(INT64, 1))
+        last = b.sub(self.count, whole(1))
         self.places = []
         for lane in range(LANES):
-            place = b.add(i, ir.Constant(INT64, lane))
-            self.places.append(b.select(b.icmp_signed("<", place, last), place, last))
+            place = b.add(i, whole(lane))
+            self.places.append(b.select(b.icmp("slt", place, last), place, last))
         values = {name: self._load(name, size) for name, size in program.inputs.items()}
-        true = ir.Constant(MASK, [1] * LANES)
+        true = TRUE
         if program.equations is None:
             alive, reached = true, self.emitter().number(1.0)
         else:
@@ -376,9 +360,9 @@ class _Writer:
         good = alive
         if program.equations is not None:
             residual = out.run([program.equations.residual], values)[0]
-            good = b.and_(good, b.fcmp_ordered("<=", residual, out.number(RESIDUAL**2)))
+            good = b.and_(good, b.fcmp("ole", residual, out.number(RESIDUAL**2)))
             for value in out.run(list(program.equations.branch), values):
-                good = b.and_(good, b.fcmp_ordered(">", value, out.number(0.0)))
+                good = b.and_(good, b.fcmp("ogt", value, out.number(0.0)))
         total = out.number(0.0)
         for row in rows.values():
             for value in row:
@@ -387,74 +371,74 @@ class _Writer:
         for name in program.inputs:
             for value in values[name]:
                 total = b.fadd(total, b.fmul(value, out.number(0.0)))
-        finite = b.fcmp_ordered("<", total, out.number(math.inf))
+        finite = b.fcmp("olt", total, out.number(math.inf))
         code = b.select(good, b.select(finite, out.number(0.0), out.number(2.0)), out.number(1.0))
         good = b.and_(good, finite)
         nothing = out.number(math.nan)
         for name in names:
             self._save(self.targets[name], [b.select(good, v, nothing) for v in rows[name]])
         self._save(self.status, [code, reached])
-        bad = b.zext(self._any(b.not_(good)), INT64)
+        bad = b.zext(self._any(b.xor(good, TRUE)), INT64)
         b.store(b.or_(b.load(self.flags), bad), self.flags)
-        b.store(b.add(i, ir.Constant(INT64, LANES)), self.index)
+        b.store(b.add(i, whole(LANES)), self.index)
         b.branch(blocks["head"])
-        b.position_at_end(blocks["tail"])
+        b.go_to(blocks["tail"])
         b.ret(b.load(self.flags))
-        return str(self.module)
+        return str(b)
 
-    def _solve(self, values: Mapping[str, list[Any]]) -> tuple[list[Any], Any, Any]:
+    def _solve(self, values: Mapping[str, list[Value]]) -> tuple[list[Value], Value, Value]:
         """Newton's method in steps; the unknowns, the lanes that got there, and how far."""
         q = self.program.equations
         assert q is not None  # noqa: S101
-        b, slot = self.b, self._slot
-        x = [slot(VECTOR) for _ in q.home]
-        t = [slot(VECTOR) for _ in q.origin]
-        alive, moving = slot(MASK), slot(MASK)
-        size, determinant, reached = slot(VECTOR), slot(VECTOR), slot(VECTOR)
-        step, turn = slot(INT64), slot(INT64)
+        b = self.b
+        x = [b.alloca(VECTOR) for _ in q.home]
+        t = [b.alloca(VECTOR) for _ in q.origin]
+        alive, moving = b.alloca(MASK), b.alloca(MASK)
+        size, determinant, reached = b.alloca(VECTOR), b.alloca(VECTOR), b.alloca(VECTOR)
+        step, turn = b.alloca(INT64), b.alloca(INT64)
         block = {
-            name: self.function.append_basic_block(name)
+            name: b.block(name)
             for name in ("direct", "stepped", "step", "newton", "next", "solved")
         }
         n = self.emitter().number
-        one = ir.Constant(INT64, 1)
-        true = ir.Constant(MASK, [1] * LANES)
+        one = whole(1)
+        true = TRUE
         b.store(true, alive)
         b.store(n(0.0), reached)
         b.store(one, step)
-        once = b.icmp_signed("==", self.steps, one)
+        once = b.icmp("eq", self.steps, one)
         b.cbranch(once, block["direct"], block["stepped"])
 
-        b.position_at_end(block["direct"])
+        b.go_to(block["direct"])
         home = [n(float(v)) for v in q.home]
         start = home if q.start is None else self.emitter().run(list(q.start), values)
         for place, value in zip(x, start, strict=True):
             b.store(value, place)
         b.branch(block["step"])
 
-        b.position_at_end(block["stepped"])
+        b.go_to(block["stepped"])
         for place, value in zip(x, home, strict=True):
             b.store(value, place)
         b.branch(block["step"])
 
-        b.position_at_end(block["step"])
+        b.go_to(block["step"])
         k = b.load(step)
-        unity = ir.Constant(DOUBLE, 1.0)
+        unity = real(1.0)
         left = b.fsub(unity, b.fdiv(b.sitofp(k, DOUBLE), b.sitofp(self.steps, DOUBLE)))
         # As `progress` has it.
         part = b.fsub(unity, b.fmul(b.fmul(left, left), left))
-        final = b.icmp_signed("==", k, self.steps)
+        final = b.icmp("eq", k, self.steps)
         for place, origin, value in zip(t, q.origin, values[q.target], strict=True):
-            way = b.fmul(self._splat(part), b.fsub(value, n(float(origin))))
+            way = b.fmul(b.splat(part, LANES), b.fsub(value, n(float(origin))))
             b.store(b.select(final, value, b.fadd(n(float(origin)), way)), place)
         b.store(b.load(alive), moving)
-        begun = ir.Constant(DOUBLE, q.before), ir.Constant(DOUBLE, 1e300)
-        b.store(self._splat(b.select(once, *begun)), size)
+        begun = real(q.before), real(1e300)
+        b.store(b.splat(b.select(once, *begun), LANES), size)
         b.store(n(0.0), determinant)
-        b.store(ir.Constant(INT64, 0), turn)
+        b.store(whole(0), turn)
         b.branch(block["newton"])
 
-        b.position_at_end(block["newton"])
+        b.go_to(block["newton"])
         on = b.load(moving)
         at = [b.load(place) for place in x]
         out = self.emitter()
@@ -462,39 +446,37 @@ class _Writer:
         *new, square, det = out.run(q.results, inputs)
         for place, old, value in zip(x, at, new, strict=True):
             b.store(b.select(on, value, old), place)
-        contracts = b.fcmp_ordered("<=", square, b.fmul(b.load(size), n(CONTRACTION**2)))
+        contracts = b.fcmp("ole", square, b.fmul(b.load(size), n(CONTRACTION**2)))
         before = b.load(determinant)
-        first = b.fcmp_ordered("==", before, n(0.0))
+        first = b.fcmp("oeq", before, n(0.0))
         steady = b.and_(
-            b.fcmp_ordered("<=", before, b.fmul(det, n(CHANGE))),
-            b.fcmp_ordered("<=", det, b.fmul(before, n(CHANGE))),
+            b.fcmp("ole", before, b.fmul(det, n(CHANGE))),
+            b.fcmp("ole", det, b.fmul(before, n(CHANGE))),
         )
-        least = self._splat(
-            b.select(once, ir.Constant(DOUBLE, q.least), ir.Constant(DOUBLE, STEPPED))
-        )
+        least = b.splat(b.select(once, real(q.least), real(STEPPED)), LANES)
         # NaN fails every comparison.
-        sound = b.and_(b.and_(contracts, b.or_(first, steady)), b.fcmp_ordered(">", det, least))
-        live = b.and_(b.load(alive), b.or_(sound, b.not_(on)))
+        sound = b.and_(b.and_(contracts, b.or_(first, steady)), b.fcmp("ogt", det, least))
+        live = b.and_(b.load(alive), b.or_(sound, b.xor(on, TRUE)))
         b.store(live, alive)
         b.store(square, size)
         b.store(det, determinant)
-        on = b.and_(b.and_(on, live), b.fcmp_ordered(">", square, n(CLOSED**2)))
+        on = b.and_(b.and_(on, live), b.fcmp("ogt", square, n(CLOSED**2)))
         b.store(on, moving)
         done = b.add(b.load(turn), one)
         b.store(done, turn)
-        again = b.and_(self._any(on), b.icmp_signed("<", done, ir.Constant(INT64, TURNS)))
+        again = b.and_(self._any(on), b.icmp("slt", done, whole(TURNS)))
         b.cbranch(again, block["newton"], block["next"])
 
-        b.position_at_end(block["next"])
-        live = b.and_(b.load(alive), b.not_(b.load(moving)))
+        b.go_to(block["next"])
+        live = b.and_(b.load(alive), b.xor(b.load(moving), TRUE))
         b.store(live, alive)
-        b.store(b.select(live, self._splat(part), b.load(reached)), reached)
+        b.store(b.select(live, b.splat(part, LANES), b.load(reached)), reached)
         k = b.add(b.load(step), one)
         b.store(k, step)
-        onward = b.and_(self._any(live), b.icmp_signed("<=", k, self.steps))
+        onward = b.and_(self._any(live), b.icmp("sle", k, self.steps))
         b.cbranch(onward, block["step"], block["solved"])
 
-        b.position_at_end(block["solved"])
+        b.go_to(block["solved"])
         return [b.load(place) for place in x], b.load(alive), b.load(reached)
 
 

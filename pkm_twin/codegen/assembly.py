@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text of LLVM's intermediate language, an instruction a line.
+
+Only what :mod:`pkm_twin.codegen.llvm` says of that language stands here. Types are texts; a
+:class:`Value` is the name of a result, or a constant, with its type.
+
+May import: the standard library.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from typing import Final
+
+DOUBLE: Final = "double"
+INT64: Final = "i64"
+INT32: Final = "i32"
+BIT: Final = "i1"
+
+
+class Value:
+    """A result or a constant; of a pointer, ``target`` is the type that it points at."""
+
+    __slots__ = ("kind", "name", "target")
+
+    def __init__(self, kind: str, name: str, target: str = "") -> None:
+        self.kind, self.name, self.target = kind, name, target
+
+
+def vector(kind: str, lanes: int) -> str:
+    """Type of a vector."""
+    return f"<{lanes} x {kind}>"
+
+
+def real(value: float) -> Value:
+    """A double, exactly."""
+    (bits,) = struct.unpack("<Q", struct.pack("<d", value))
+    return Value(DOUBLE, f"0x{bits:016X}")
+
+
+def whole(value: int, kind: str = INT64) -> Value:
+    """An integer."""
+    return Value(kind, str(value))
+
+
+def every(value: Value, lanes: int) -> Value:
+    """A vector of one constant."""
+    return Value(
+        vector(value.kind, lanes), f"<{', '.join([f'{value.kind} {value.name}'] * lanes)}>"
+    )
+
+
+def undefined(kind: str) -> Value:
+    """A value that is still to be filled."""
+    return Value(kind, "undef")
+
+
+class Block:
+    """Instructions in a row, the last of which leads elsewhere."""
+
+    __slots__ = ("lines", "name")
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.lines: list[str] = []
+
+
+def _two(operation: str) -> Callable[[Function, Value, Value], Value]:
+    """An instruction of two values of one type, which is the result's, too."""
+
+    def add(self: Function, x: Value, y: Value) -> Value:
+        return self.new(x.kind, f"{operation} {x.kind} {x.name}, {y.name}")
+
+    return add
+
+
+def _compared(operation: str) -> Callable[[Function, str, Value, Value], Value]:
+    """A comparison, in each lane: a condition of this language (olt, sgt), then the values."""
+
+    def add(self: Function, condition: str, x: Value, y: Value) -> Value:
+        kind = BIT if x.kind[0] != "<" else vector(BIT, int(x.kind[1 : x.kind.index(" ")]))
+        return self.new(kind, f"{operation} {condition} {x.kind} {x.name}, {y.name}")
+
+    return add
+
+
+def _changed(operation: str) -> Callable[[Function, Value, str], Value]:
+    """A change of type."""
+
+    def add(self: Function, x: Value, kind: str) -> Value:
+        return self.new(kind, f"{operation} {x.kind} {x.name} to {kind}")
+
+    return add
+
+
+class Function:
+    """A function of one pointer to 64-bit words that returns one; it grows where ``go_to`` led.
+
+    :param typed_pointers: as LLVM before 17 has them.
+    """
+
+    def __init__(self, name: str, triple: str, *, typed_pointers: bool) -> None:
+        self._name, self._triple, self._typed = name, triple, typed_pointers
+        self._count = 0
+        self._declared: dict[str, str] = {}
+        self._blocks: list[Block] = []
+        self._room: list[str] = []
+        self.words = Value(self.pointer(INT64), "%words", INT64)
+        self.go_to(self.block("entry"))
+
+    def __str__(self) -> str:
+        first, *others = self._blocks
+        lines = [f'target triple = "{self._triple}"', *self._declared.values()]
+        lines.append(f"define {INT64} @{self._name}({self.words.kind} {self.words.name}) {{")
+        lines += [f"{first.name}:", *self._room, *first.lines]
+        for block in others:
+            lines += [f"{block.name}:", *block.lines]
+        return "\n".join([*lines, "}", ""])
+
+    def pointer(self, target: str) -> str:
+        """Type of a pointer."""
+        return f"{target}*" if self._typed else "ptr"
+
+    def block(self, name: str) -> Block:
+        """A further block, numbered to be told from others of its name."""
+        self._blocks.append(Block(f"{name}{len(self._blocks)}"))
+        return self._blocks[-1]
+
+    def go_to(self, block: Block) -> None:
+        """What follows is added at the end of this block."""
+        self._put = block.lines.append
+
+    def new(self, kind: str, text: str, target: str = "") -> Value:
+        """An instruction with a result."""
+        self._count += 1
+        name = f"%v{self._count}"
+        self._put(f"{name} = {text}")
+        return Value(kind, name, target)
+
+    fadd, fsub, fmul, fdiv = _two("fadd"), _two("fsub"), _two("fmul"), _two("fdiv")
+    add, sub, mul, shl = _two("add"), _two("sub"), _two("mul"), _two("shl")
+    and_, or_, xor = _two("and"), _two("or"), _two("xor")
+    fcmp, icmp = _compared("fcmp"), _compared("icmp")
+    bitcast, zext = _changed("bitcast"), _changed("zext")
+    fptosi, sitofp = _changed("fptosi"), _changed("sitofp")
+
+    def fneg(self, x: Value) -> Value:
+        """Minus x."""
+        return self.new(x.kind, f"fneg {x.kind} {x.name}")
+
+    def select(self, condition: Value, x: Value, y: Value) -> Value:
+        """X where the condition is true, else y."""
+        return self.new(
+            x.kind,
+            f"select {condition.kind} {condition.name}, {x.kind} {x.name}, {y.kind} {y.name}",
+            x.target,
+        )
+
+    def call(self, name: str, kind: str, arguments: Sequence[Value]) -> Value:
+        """The result of an intrinsic function."""
+        if name not in self._declared:
+            kinds = ", ".join(x.kind for x in arguments)
+            self._declared[name] = f"declare {kind} @{name}({kinds})"
+        given = ", ".join([f"{x.kind} {x.name}" for x in arguments])
+        return self.new(kind, f"call {kind} @{name}({given})")
+
+    def inttoptr(self, word: Value, target: str) -> Value:
+        """The pointer that a word is."""
+        kind = self.pointer(target)
+        return self.new(kind, f"inttoptr {word.kind} {word.name} to {kind}", target)
+
+    def alloca(self, kind: str, count: int = 1) -> Value:
+        """Room for values that live through a call, made at its begin."""
+        self._count += 1
+        name = f"%v{self._count}"
+        self._room.append(f"{name} = alloca {kind}, {INT64} {count}")
+        return Value(self.pointer(kind), name, kind)
+
+    def gep(self, place: Value, index: Value) -> Value:
+        """The pointer so many values further on."""
+        return self.new(
+            place.kind,
+            f"getelementptr {place.target}, {place.kind} {place.name}, {index.kind} {index.name}",
+            place.target,
+        )
+
+    def load(self, place: Value) -> Value:
+        """What stands there."""
+        return self.new(place.target, f"load {place.target}, {place.kind} {place.name}")
+
+    def store(self, x: Value, place: Value) -> None:
+        """Write x there."""
+        self._put(f"store {x.kind} {x.name}, {place.kind} {place.name}")
+
+    def extract_element(self, x: Value, lane: int) -> Value:
+        """One entry of a vector."""
+        kind = x.kind[x.kind.index("x") + 2 : -1]
+        return self.new(kind, f"extractelement {x.kind} {x.name}, {INT32} {lane}")
+
+    def insert_element(self, x: Value, value: Value, lane: int) -> Value:
+        """The vector with one entry changed."""
+        return self.new(
+            x.kind, f"insertelement {x.kind} {x.name}, {value.kind} {value.name}, {INT32} {lane}"
+        )
+
+    def splat(self, value: Value, lanes: int) -> Value:
+        """A vector of one value."""
+        kind, order = vector(value.kind, lanes), vector(INT32, lanes)
+        first = self.insert_element(undefined(kind), value, 0)
+        return self.new(
+            kind,
+            f"shufflevector {kind} {first.name}, {kind} undef, {order} zeroinitializer",
+        )
+
+    def branch(self, block: Block) -> None:
+        """Go on there."""
+        self._put(f"br label %{block.name}")
+
+    def cbranch(self, condition: Value, yes: Block, no: Block) -> None:
+        """Go on here or there."""
+        self._put(f"br {BIT} {condition.name}, label %{yes.name}, label %{no.name}")
+
+    def ret(self, x: Value) -> None:
+        """End with this result."""
+        self._put(f"ret {x.kind} {x.name}")
