@@ -176,8 +176,10 @@ def test_the_least_direction_is_global(shift, scales):
         sampled = largest(forms, dense)
         best = np.argsort(sampled)[:12]
         descended = [float(largest(forms, _descended(forms, x))) for x in dense[best]]
-        assert value <= min(descended) + 1e-9 * value
-        assert value <= sampled.min()
+        # Forms that cancel leave the rounding of the largest one.
+        rounding = 16 * np.finfo(float).eps * np.abs(forms).max()
+        assert value <= min(descended) + 1e-9 * value + rounding
+        assert value <= sampled.min() + rounding
         # It is attained close to where the sphere has its best, or lower elsewhere.
         assert value >= 0.5 * sampled.min() - 0.02 * np.abs(forms).max()
 
