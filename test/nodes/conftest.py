@@ -77,17 +77,24 @@ def launch_alone(domain):
 
 
 @pytest.fixture
-def refused(domain, tmp_path):
+def refused(domain):
     """Start a node that ends by itself: refused(module, *parameters)."""
-    return functools.partial(ForkedNode, domain, tmp_path / "output")
+    return functools.partial(ForkedNode, domain)
 
 
 def started(domain):
-    """Gives a function that starts processes, then ends them."""
+    """Gives a function that starts processes, then ends them.
+
+    A fork is cheaper; ``fresh`` asks for an interpreter of its own, code and scripts have it.
+    """
     processes = []
 
-    def start(module, *parameters, **options):
-        processes.append(NodeProcess(domain, module, *parameters, **options))
+    def start(module, *parameters, fresh=False, **options):
+        if fresh or options.get("code") or options.get("script"):
+            processes.append(NodeProcess(domain, module, *parameters, **options))
+        else:
+            options.pop("code", None)
+            processes.append(ForkedNode(domain, module, *parameters, **options))
         return processes[-1]
 
     yield start

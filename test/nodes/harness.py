@@ -155,20 +155,14 @@ def end_with_parent():
 
 
 class Process:
-    """A command in a session of its own, output kept."""
+    """A process in a session of its own; ``output`` is what it has said so far.
 
-    def __init__(self, domain, command):
-        self._output = tempfile.TemporaryFile("w+")  # noqa: SIM115
-        self.process = subprocess.Popen(
-            command,
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            cwd=tempfile.gettempdir(),
-            env=domain.environment(),
-            start_new_session=True,
-            preexec_fn=end_with_parent,
-        )
+    :param process: makes the process, given the file that takes what it says.
+    """
+
+    def __init__(self, process):
+        self._output = tempfile.NamedTemporaryFile("w+")  # noqa: SIM115
+        self.process = process(self._output)
 
     @property
     def output(self):
@@ -199,7 +193,25 @@ class Process:
         self._output.close()
 
 
-class NodeProcess(Process):
+class Command(Process):
+    """A command in a new process."""
+
+    def __init__(self, domain, command):
+        super().__init__(
+            lambda output: subprocess.Popen(
+                command,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                cwd=tempfile.gettempdir(),
+                env=domain.environment(),
+                start_new_session=True,
+                preexec_fn=end_with_parent,
+            )
+        )
+
+
+class NodeProcess(Command):
     """``python -m MODULE --ros-args -p ...``
 
     ``arguments`` are further ROS arguments; ``code`` is run instead of the module, or ``script``,
@@ -207,9 +219,14 @@ class NodeProcess(Process):
     """
 
     def __init__(self, domain, module, *parameters, arguments=(), code=None, script=None):
-        flags = [flag for parameter in parameters for flag in ("-p", parameter)]
         run = script or (["-m", module] if code is None else ["-c", code])
-        super().__init__(domain, [sys.executable, *run, "--ros-args", *flags, *arguments])
+        super().__init__(domain, [sys.executable, *run, *flags(parameters, arguments)])
+
+
+def flags(parameters, arguments):
+    """A node's words after its command."""
+    pairs = [word for parameter in parameters for word in ("-p", parameter)]
+    return ["--ros-args", *pairs, *arguments]
 
 
 NODES = (
@@ -221,44 +238,58 @@ NODES = (
 )
 
 
-def fork_of(module, flags, environment, output):
+def fork_of(module, words, environment, output):
     """Run a node in this process, which is a fork of one that has imported all."""
-    with open(output, "wb") as file:
+    os.setsid()
+    end_with_parent()
+    with open(output, "ab") as file:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(file.fileno(), stream.fileno())
+            stream.reconfigure(line_buffering=True)
+    os.chdir(tempfile.gettempdir())
+    os.environ.clear()
     os.environ.update(environment)
-    sys.argv = [module, *flags]
+    sys.argv = [module, *words]
     importlib.import_module(module).main()
 
 
-class ForkedNode:
-    """A node that ends by itself, in a process that need not import anything: a third of the cost.
+class ForkedNode(Process):
+    """A node in a process that need not import anything: a third of the cost.
 
-    What it says is in ``output`` once it has ended.
+    It ends without the interpreter's own end: what a signal does there needs a NodeProcess.
     """
 
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(NODES))
+    context.set_forkserver_preload([__name__, "pkm_twin.codegen.llvm", *NODES])
 
-    def __init__(self, domain, output, module, *parameters, arguments=()):
-        self._path = output
-        flags = [flag for parameter in parameters for flag in ("-p", parameter)]
-        words = ["--ros-args", *flags, *arguments]
-        self._process = self.context.Process(
-            target=fork_of, args=(module, words, domain.environment(), str(output)), daemon=True
-        )
+    def __init__(self, domain, module, *parameters, arguments=()):
+        given = module, flags(parameters, arguments), domain.environment()
+        super().__init__(lambda output: _Fork(self.context, *given, output.name))
+
+
+class _Fork:
+    """A forked process with the methods of subprocess.Popen."""
+
+    def __init__(self, context, *arguments):
+        self._process = context.Process(target=fork_of, args=arguments, daemon=True)
         self._process.start()
+        self.pid = self._process.pid
 
-    @property
-    def output(self):
-        return self._path.read_text()
-
-    def wait(self, timeout=DEADLINE):
-        """The exit code."""
-        self._process.join(timeout)
-        if self._process.exitcode is None:
-            self._process.kill()
+    def poll(self):
         return self._process.exitcode
+
+    def wait(self, timeout=None):
+        self._process.join(timeout)
+        if self.poll() is None:
+            raise subprocess.TimeoutExpired("a forked node", timeout)
+        return self.poll()
+
+    def send_signal(self, number):
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self):
+        self.send_signal(signal.SIGKILL)
 
 
 class Peer:

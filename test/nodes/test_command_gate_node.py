@@ -54,7 +54,7 @@ class Gated:
     def start(self):
         remap = ("-r", f"__node:={self.name}", "-r", f"joint_states:=/{self.name}/states")
         remap += ("-r", f"delta_dynamics/joint_torques:=/{self.name}/torques")
-        self.process = self._launch(GATE, *self._parameters, arguments=remap)
+        self.process = self._launch(GATE, *self._parameters, arguments=remap, fresh=True)
 
     @property
     def commands(self):

@@ -408,7 +408,7 @@ class TestProcess:
     def test_a_signal_in_the_middle_of_a_stream_ends_the_node(self, peer, launch, number):
         name = f"ending_{number}"
         remap = ("-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states")
-        twin = Twin(peer, launch(MODULE, *COMMON, arguments=remap), name)
+        twin = Twin(peer, launch(MODULE, *COMMON, arguments=remap, fresh=True), name)
         twin.ready()
         enough = threading.Event()
 

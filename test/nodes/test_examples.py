@@ -48,12 +48,14 @@ class TestComputedTorque:
 
     def test_it_follows_a_machine_that_is_one_percent_another(self, launch_alone, peer, commands):
         kinds = "spread_kinds:=[masses, inertias, friction]"
-        sim = launch_alone(SIM, "clock:=lockstep", "spread:=0.01", kinds)
         # Silence is of the wall's time, which a loaded machine has little of.
         controller = example(
             launch_alone, "computed_torque.py", "--deadline", "60", "--seconds", "1.5",
             parameters=(SIM_TIME,),
         )  # fmt: skip
+        # Its whole path takes a second or two: who is to hear it has to be there before.
+        peer.until(lambda: peer.node.count_publishers("/machine_sim/commands"))
+        sim = launch_alone(SIM, "clock:=lockstep", "spread:=0.01", kinds)
         peer.until(lambda: not controller.alive(), PATIENCE)
         assert controller.wait() == 0, controller.output
         samples, worst = numbers(controller.output.splitlines()[-1])

@@ -21,7 +21,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
 from pkm_twin.machine import rotations
 from pkm_twin.machine.robot_urdf import robot_urdf
-from test.nodes.harness import REPOSITORY, Maker, Process, Ros
+from test.nodes.harness import REPOSITORY, Command, Maker, Ros
 
 LAUNCH = REPOSITORY / "launch"
 FILES = ("twin", "cell", "control", "view")
@@ -125,7 +125,7 @@ def mock_hardware(names, positions):
     )
 
 
-class Launched(Process):
+class Launched(Command):
     """``ros2 launch FILE ARGUMENTS``."""
 
     def __init__(self, domain, name, arguments):

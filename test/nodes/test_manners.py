@@ -62,7 +62,9 @@ def waiting(peer, launch):
     """A node that is not started by itself."""
     peer.hear(DiagnosticArray, "/diagnostics")
     remap = ("-r", "__node:=waiting", "-r", "joint_states:=/waiting/states")
-    process = launch(MODULE, *COMMON, "stale_after:=30.0", "autostart:=false", arguments=remap)
+    process = launch(
+        MODULE, *COMMON, "stale_after:=30.0", "autostart:=false", arguments=remap, fresh=True
+    )
     return Twin(peer, process, "waiting")
 
 

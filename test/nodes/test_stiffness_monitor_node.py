@@ -131,7 +131,8 @@ def fleet(peer, launch):
             "wrench": f"/{name}/wrench",
         }
         remap = [part for pair in pairs.items() for part in ("-r", ":=".join(pair))]
-        monitors[name] = Monitor(peer, launch(MODULE, *parameters, arguments=remap), name)
+        process = launch(MODULE, *parameters, arguments=remap, fresh=True)
+        monitors[name] = Monitor(peer, process, name)
     assert monitors["defaults"].ready()
     # The other one expects another frame.
     monitors["fixed"].answer(WRENCH, "base_link")
