@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, savgol_coeffs, sosfiltfilt
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.recorded import Recording, read_recording
@@ -35,6 +34,8 @@ def accelerations(qd: Array, period: float, window: int, newest: bool) -> Array:
 
     Read off at the window's middle, or at its newest sample, where no future is needed.
     """
+    from scipy.signal import savgol_coeffs  # late: a second of imports
+
     at = window - 1 if newest else window // 2
     weights = savgol_coeffs(window, DEGREE, deriv=1, delta=period, pos=at, use="dot")
     found = np.full_like(qd, np.nan)
@@ -102,6 +103,8 @@ def lifts() -> str:
 
 def milling() -> str:
     """The table of the 3-PRRU's recording."""
+    from scipy.signal import butter, sosfiltfilt  # late: a second of imports
+
     r = read_recording(BAGS / "prru_milling.mcap")
     assert r.qd is not None and r.effort is not None
     passes = ((2.0, 9.4), (11.5, 18.9))

@@ -16,7 +16,9 @@ import importlib.util
 import os
 import re
 import struct
+import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from pkm_twin.errors import BagError
@@ -71,6 +73,13 @@ _BUILTIN = {
 
 # Encapsulation header of plain CDR: representation identifier; the options that follow are free.
 _ENDIANNESS = {b"\x00\x00": ">", b"\x00\x01": "<"}
+_NATIVE = "<" if sys.byteorder == "little" else ">"
+_SIZES = {code: struct.calcsize(f"={code}") for code in _CODES.values()}
+_UNPACK = {
+    order: {code: struct.Struct(f"{order}{code}").unpack_from for code in _SIZES} for order in "<>"
+}
+_ARRAY_CODES = {"?": "B"}
+"""Where an array knows no such code, the one of its bytes."""
 _LITTLE_HEADER = b"\x00\x01\x00\x00"
 
 
@@ -296,6 +305,10 @@ class MessageCodec:
             name: _value_class(name.split("/")[1], fields)
             for name, fields in self.definition.items()
         }
+        self._readers = {
+            name: [self._reader(field) for field in fields]
+            for name, fields in self.definition.items()
+        }
 
     def decode(self, data: bytes) -> Any:
         """Decode one message.
@@ -316,24 +329,30 @@ class MessageCodec:
         return self._decode(self._name, source)
 
     def _decode(self, name: str, source: _Source) -> Any:
-        fields = self.definition[name]
-        if not fields:
+        readers = self._readers[name]
+        if not readers:
             # IDL knows no empty structure: ROS 2 puts one byte into it.
             source.number("B")
-        return self._classes[name](*[self._decode_field(field, source) for field in fields])
+        return self._classes[name](*[read(source) for read in readers])
 
-    def _decode_field(self, field: Field, source: _Source) -> Any:
-        code = _CODES.get(field.base)
-        if field.size is None:
-            if code is not None:
-                value = source.number(code)
-                return bytes((value,)) if field.base == "byte" else value
-            return source.text() if field.base == "string" else self._decode(field.base, source)
-        count = field.size if field.fixed else source.number("I")
-        if field.upto and count > field.size:
-            raise source.error(f"field {field.name} has {count} items; at most {field.size}")
+    def _reader(self, field: Field) -> Callable[[_Source], Any]:
+        """What reads a field: decided once a type, not once a message."""
+        code, base = _CODES.get(field.base), field.base
+        if field.size is not None:
+            return partial(self._read_items, field, code)
+        if base == "byte":
+            return lambda source: bytes((source.number("B"),))
         if code is not None:
-            return _sequence_value(field.base, code, source.numbers(code, count))
+            return lambda source: source.number(code)
+        return _Source.text if base == "string" else partial(self._decode, base)
+
+    def _read_items(self, field: Field, code: str | None, source: _Source) -> Any:
+        size = field.size or 0
+        count = size if field.fixed else source.number("I")
+        if field.upto and count > size:
+            raise source.error(f"field {field.name} has {count} items; at most {size}")
+        if code is not None:
+            return _sequence_value(field.base, source.numbers(code, count))
         # Each item takes a byte at least: an absurd count ends here, not in memory.
         source.require(count)
         if field.base == "string":
@@ -413,13 +432,13 @@ def _value_class(name: str, fields: Sequence[Field]) -> Any:
         ) from error
 
 
-def _sequence_value(base: str, code: str, values: tuple[Any, ...]) -> Any:
+def _sequence_value(base: str, values: array.array[Any]) -> Any:
     """Give a primitive array the form it has in a live message."""
     if base == "bool":
-        return list(values)
+        return [value != 0 for value in values]
     if base == "byte":
         return [bytes((value,)) for value in values]
-    return array.array(code, values)
+    return values
 
 
 class _Source:
@@ -428,7 +447,9 @@ class _Source:
     def __init__(self, type_name: str, data: bytes, order: str) -> None:
         self._type_name = type_name
         self._data = data
-        self._order = order
+        self._unpack = _UNPACK[order]
+        self._swapped = order != _NATIVE
+        self._end = len(data)
         self.position = len(_LITTLE_HEADER)
 
     def error(self, text: str) -> BagError:
@@ -436,23 +457,33 @@ class _Source:
 
     def require(self, count: int) -> None:
         """Refuse to go on unless ``count`` bytes are left."""
-        left = len(self._data) - self.position
+        left = self._end - self.position
         if count > left:
             raise self.error(f"needs {count} bytes at {self.position}, {max(left, 0)} are left")
 
-    def numbers(self, code: str, count: int) -> tuple[Any, ...]:
-        if count == 0:
-            return ()
-        size = struct.calcsize(f"={code}")
+    def _align(self, size: int) -> None:
         # CDR aligns to the value's own size, counted from the end of the 4-byte header.
         self.position += -(self.position - len(_LITTLE_HEADER)) % size
-        self.require(count * size)
-        values = struct.unpack_from(f"{self._order}{count}{code}", self._data, self.position)
-        self.position += count * size
+
+    def numbers(self, code: str, count: int) -> array.array[Any]:
+        values: array.array[Any] = array.array(_ARRAY_CODES.get(code, code))
+        if count:
+            self._align(values.itemsize)
+            begin = self.position
+            self.require(count * values.itemsize)
+            self.position += count * values.itemsize
+            values.frombytes(self._data[begin : self.position])
+            if self._swapped:
+                values.byteswap()
         return values
 
     def number(self, code: str) -> Any:
-        return self.numbers(code, 1)[0]
+        size = _SIZES[code]
+        self._align(size)
+        begin = self.position
+        self.require(size)
+        self.position = begin + size
+        return self._unpack[code](self._data, begin)[0]
 
     def text(self) -> str:
         count = self.number("I")

@@ -27,7 +27,7 @@ from pkm_twin import load
 from pkm_twin.errors import ParameterError, SearchError, SingularityError
 from test.support.robots import loaded, loaded_like, random_joints
 
-MASSIVE = [name for name in robots.MASSIVE if len(load(name).joint_names) == 3]
+MASSIVE = [name for name in robots.MASSIVE if len(robots.SHIPPED[name].joint_names) == 3]
 """Directions are on a sphere: machines of three freedoms."""
 THIRD = 2 * np.pi / 3
 TURN = np.array([[np.cos(THIRD), -np.sin(THIRD), 0], [np.sin(THIRD), np.cos(THIRD), 0], [0, 0, 1]])

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from pkm_twin import load
+from pkm_twin import load, robot_names
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.tracking import boundary_distance, follow, track
-from test.support.robots import every_robot, random_poses
+from test.support.robots import every_robot, partly_long, random_poses
 
 
 def stream(robot, rng, count):
@@ -54,7 +54,9 @@ def test_boundary_straight_below_is_the_stretched_limb(variant):
     assert 0.005 < distance <= 0.0101
 
 
-@every_robot
+@pytest.mark.parametrize(
+    "name", partly_long(robot_names(), "delta_cu", "prru", "upr_rpu", "five_bar")
+)
 def test_boundary_distance_is_kept_inside_and_zero_outside(name, rng):
     robot = load(name)
     poses = random_poses(robot, rng, 5)

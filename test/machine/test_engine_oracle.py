@@ -49,7 +49,7 @@ CASES = [(n, k) for n in NAMES for k in range(VARIANTS + 1)]
 
 @pytest.fixture(
     scope="module",
-    params=partly_long(CASES, *((n, 0) for n in NAMES), *((n, 1) for n in NAMES[::3])),
+    params=partly_long(CASES, *((n, 0) for n in NAMES), *((n, 1) for n in NAMES[::7])),
     ids=str,
 )
 def case(request, tmp_path_factory):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pkm_twin import load, robot_names
-from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.errors import MessageError
 from pkm_twin.machine import rotations
 from pkm_twin.state.scene import Load, Scales, Scene, heat
 from pkm_twin.state.state import MachineState
@@ -15,6 +15,7 @@ from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.statics import frame_deflections
 from test.nodes.harness import SECOND, Maker, Plain
+from test.support.robots import ELASTIC
 
 MAKE = Maker(Plain())
 NOW = 1_000 * SECOND
@@ -52,15 +53,6 @@ def loaded(robot, state, wrench=WRENCH):
     )
 
 
-def is_elastic(name):
-    try:
-        _ = load(name).elastic
-    except ParameterError:
-        return False
-    return True
-
-
-ELASTIC = [name for name in robot_names() if is_elastic(name)]
 each_elastic = pytest.mark.parametrize("robot", ELASTIC, indirect=True)
 
 

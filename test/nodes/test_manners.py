@@ -336,9 +336,10 @@ class TestLongTrajectories:
         torques.clear()
         long.header = MAKE.header(twin.begin())
         twin.peer.send(f"/{twin.name}/joint_trajectory", long)
-        twin.peer.until(lambda: answers, repeat=lambda: twin.stream(1))
-        # Of the states that were sent meanwhile.
-        assert len(torques) > 3
+        sent = []
+        twin.peer.until(lambda: answers, repeat=lambda: sent.extend(twin.stream(1)))
+        # Of the states that were sent meanwhile; a node that is held up answers them afterwards.
+        assert len(torques) >= len(sent) // 2
         picked = slice(None, None, 997)
         efforts = np.array([p.effort for p in answers[0].points[picked]])
         exact = inverse_dynamics(ROBOT, *(values[picked] for values in rows))

@@ -53,8 +53,10 @@ def has(robot: Robot, ask: str) -> bool:
     return True
 
 
-MASSIVE = [name for name in robot_names() if has(load(name), "massive")]
-ELASTIC = [name for name in robot_names() if has(load(name), "structure")]
+SHIPPED = {name: load(name) for name in robot_names()}
+"""Loaded once, to decide what is tested with which; a test loads its own."""
+MASSIVE = [name for name, robot in SHIPPED.items() if has(robot, "massive")]
+ELASTIC = [name for name, robot in SHIPPED.items() if has(robot, "structure")]
 
 every_robot = pytest.mark.parametrize("name", robot_names())
 massive = pytest.mark.parametrize("name", MASSIVE)
