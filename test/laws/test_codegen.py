@@ -75,6 +75,12 @@ def test_equal_expressions_are_one_and_constants_fold():
 
 
 @compiled
+def test_constants_keep_their_bits():
+    values = np.tile([0.0, -0.0, 5e-324, 1.7e308, 1 / 3, -1 / 3], (5, 1))
+    for found in both(lambda x: values[0].tolist(), np.zeros((5, 1)), "test constants"):
+        assert found.tobytes() == values.tobytes()
+
+
 def test_sine_cosine_and_arctangent_over_large_ranges(rng):
     """Within an ulp or two of numpy's, from tiny to a million turns, and in every quadrant."""
     size = np.concatenate([10.0 ** rng.uniform(-300, -3, 500), 10.0 ** rng.uniform(-3, 6, 4000)])
