@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signals end a process once and for all."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -99,6 +100,16 @@ print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN, flush=True)
     assert done.stdout.split() == ["ended", "True"]
 
 
+def open_files(process):
+    """What a process has open; one that is closed meanwhile is left out."""
+    names = set()
+    with contextlib.suppress(OSError):
+        for link in Path(f"/proc/{process}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                names.add(os.readlink(link))
+    return names
+
+
 def test_an_interrupted_command_has_its_own_exit_code(tmp_path):
     """Neither good nor bad: a script has to tell them apart."""
     path = tmp_path / "motion.csv"
@@ -113,10 +124,7 @@ def test_an_interrupted_command_has_its_own_exit_code(tmp_path):
         env=environment(),
     )
     # As soon as it reads, which takes a while.
-    files = Path(f"/proc/{process.pid}/fd")
-    while process.poll() is None and not any(
-        os.path.realpath(link) == str(path.resolve()) for link in files.iterdir()
-    ):
+    while process.poll() is None and str(path.resolve()) not in open_files(process.pid):
         time.sleep(0.005)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate()

@@ -72,7 +72,12 @@ def greet(peer):
             peer.send(topic, message)
 
     told = peer.received("/diagnostics")
-    peer.until(lambda: told and int(values_of(told[-1])["deflections taken"]) > 0, repeat=send)
+
+    def taken():
+        # Before the first one nothing is counted.
+        return int(values_of(told[-1]).get("deflections taken", 0)) if told else 0
+
+    peer.until(taken, repeat=send)
 
 
 def test_a_joint_three_times_softer_is_found_by_name_live(peer, launch):
