@@ -121,6 +121,7 @@ def test_an_interrupted_command_has_its_own_exit_code(tmp_path):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        cwd=tmp_path,
         env=environment(),
     )
     # As soon as it reads, which takes a while.
