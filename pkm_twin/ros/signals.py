@@ -35,6 +35,8 @@ class _Process:
 def ignore_signals() -> None:
     """From here on the process is ending, and no signal can change that."""
     _Process.ending = True
+    # Python ends itself by SIGINT if the last text that it ran was interrupted, caught or not.
+    exec("")  # noqa: S102
     if threading.current_thread() is threading.main_thread():
         for number in SIGNALS:
             signal.signal(number, signal.SIG_IGN)

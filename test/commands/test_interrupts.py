@@ -61,6 +61,23 @@ def test_only_the_first_signal_counts(number):
     assert (process.returncode, out, err) == (0, "cleaned up\n", "")
 
 
+def test_an_interrupt_of_executed_text_is_caught_as_any_other():
+    """As data classes are made of text: Python would end by the signal after all."""
+    script = """
+import signal
+from pkm_twin.ros.signals import first_signal
+try:
+    with first_signal(KeyboardInterrupt):
+        exec("signal.raise_signal(signal.SIGINT)")
+except KeyboardInterrupt:
+    print("caught")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment(), capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "caught\n", "")
+
+
 def test_an_exception_that_was_lost_does_not_make_a_process_deaf():
     script = """
 import signal, time
