@@ -501,7 +501,7 @@ class _Source:
 
 
 def _put(out: bytearray, code: str, values: Sequence[Any], where: str) -> None:
-    size = struct.calcsize(f"={code}")
+    size = _SIZES[code]
     out.extend(bytes(-(len(out) - len(_LITTLE_HEADER)) % size))
     try:
         out.extend(struct.pack(f"<{len(values)}{code}", *values))

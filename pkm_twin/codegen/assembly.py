@@ -33,6 +33,14 @@ def vector(kind: str, lanes: int) -> str:
     return f"<{lanes} x {kind}>"
 
 
+def _lanes(kind: str) -> tuple[int, str]:
+    """How many lanes a type has, none if it is no vector, and of what."""
+    if not kind.startswith("<"):
+        return 0, kind
+    lanes, item = kind[1:-1].split(" x ")
+    return int(lanes), item
+
+
 def real(value: float) -> Value:
     """A double, exactly."""
     (bits,) = struct.unpack("<Q", struct.pack("<d", value))
@@ -79,7 +87,8 @@ def _compared(operation: str) -> Callable[[Function, str, Value, Value], Value]:
     """A comparison, in each lane: a condition of this language (olt, sgt), then the values."""
 
     def add(self: Function, condition: str, x: Value, y: Value) -> Value:
-        kind = BIT if x.kind[0] != "<" else vector(BIT, int(x.kind[1 : x.kind.index(" ")]))
+        lanes, _ = _lanes(x.kind)
+        kind = vector(BIT, lanes) if lanes else BIT
         return self.new(kind, f"{operation} {condition} {x.kind} {x.name}, {y.name}")
 
     return add
@@ -131,10 +140,13 @@ class Function:
         """What follows is added at the end of this block."""
         self._put = block.lines.append
 
+    def _next(self) -> str:
+        self._count += 1
+        return f"%v{self._count}"
+
     def new(self, kind: str, text: str, target: str = "") -> Value:
         """An instruction with a result."""
-        self._count += 1
-        name = f"%v{self._count}"
+        name = self._next()
         self._put(f"{name} = {text}")
         return Value(kind, name, target)
 
@@ -172,8 +184,7 @@ class Function:
 
     def alloca(self, kind: str, count: int = 1) -> Value:
         """Room for values that live through a call, made at its begin."""
-        self._count += 1
-        name = f"%v{self._count}"
+        name = self._next()
         self._room.append(f"{name} = alloca {kind}, {INT64} {count}")
         return Value(self.pointer(kind), name, kind)
 
@@ -195,7 +206,7 @@ class Function:
 
     def extract_element(self, x: Value, lane: int) -> Value:
         """One entry of a vector."""
-        kind = x.kind[x.kind.index("x") + 2 : -1]
+        _, kind = _lanes(x.kind)
         return self.new(kind, f"extractelement {x.kind} {x.name}, {INT32} {lane}")
 
     def insert_element(self, x: Value, value: Value, lane: int) -> Value:

@@ -53,6 +53,7 @@ VECTOR: Final = vector(DOUBLE, LANES)
 INTEGERS: Final = vector(INT64, LANES)
 MASK: Final = vector(BIT, LANES)
 TRUE: Final = every(Value(BIT, "true"), LANES)
+ZERO: Final = whole(0)
 ONE: Final = whole(1)
 
 # Minimax polynomials of sine and cosine up to a quarter turn, and pi / 2 in three parts
@@ -257,8 +258,8 @@ class _Writer:
         self.constants = self._hoist(parameters)
         self.blocks = {name: b.block(name) for name in ("head", "load", "tail")}
         self.index, self.flags = b.alloca(INT64), b.alloca(INT64)
-        b.store(whole(0), self.index)
-        b.store(whole(0), self.flags)
+        b.store(ZERO, self.index)
+        b.store(ZERO, self.flags)
 
     def _word(self, k: int) -> Value:
         return self.b.load(self.b.gep(self.b.words, whole(k)))
@@ -283,6 +284,9 @@ class _Writer:
 
     def emitter(self) -> _Emitter:
         return _Emitter(self.b, self.used, self.constants, wide=True)
+
+    def _not(self, mask: Value) -> Value:
+        return self.b.xor(mask, TRUE)
 
     def _any(self, mask: Value) -> Value:
         return self.b.call(f"llvm.vector.reduce.or.v{LANES}i1", BIT, [mask])
@@ -321,7 +325,7 @@ class _Writer:
         for j, value in enumerate(values):
             b.store(value, b.gep(scratch, whole(j)))
         loop, done = b.block("save"), b.block("saved")
-        b.store(whole(0), counter)
+        b.store(ZERO, counter)
         rows = [b.mul(place, size) for place in self.places]
         b.branch(loop)
         b.go_to(loop)
@@ -330,7 +334,7 @@ class _Writer:
         for lane, row in enumerate(rows):
             at = b.gep(base, b.add(row, k))
             b.store(b.extract_element(value, lane), at)
-        after = b.add(k, whole(1))
+        after = b.add(k, ONE)
         b.store(after, counter)
         b.cbranch(b.icmp("slt", after, size), loop, done)
         b.go_to(done)
@@ -343,15 +347,14 @@ class _Writer:
         b.cbranch(b.icmp("slt", i, self.count), blocks["load"], blocks["tail"])
         b.go_to(blocks["load"])
         # Lanes beyond the last sample compute it once more, and store the same again.
-        last = b.sub(self.count, whole(1))
+        last = b.sub(self.count, ONE)
         self.places = []
         for lane in range(LANES):
             place = b.add(i, whole(lane))
             self.places.append(b.select(b.icmp("slt", place, last), place, last))
         values = {name: self._load(name, size) for name, size in program.inputs.items()}
-        true = TRUE
         if program.equations is None:
-            alive, reached = true, self.emitter().number(1.0)
+            alive, reached = TRUE, self.emitter().number(1.0)
         else:
             values[UNKNOWNS], alive, reached = self._solve(values)
         out = self.emitter()
@@ -378,7 +381,7 @@ class _Writer:
         for name in names:
             self._save(self.targets[name], [b.select(good, v, nothing) for v in rows[name]])
         self._save(self.status, [code, reached])
-        bad = b.zext(self._any(b.xor(good, TRUE)), INT64)
+        bad = b.zext(self._any(self._not(good)), INT64)
         b.store(b.or_(b.load(self.flags), bad), self.flags)
         b.store(b.add(i, whole(LANES)), self.index)
         b.branch(blocks["head"])
@@ -401,12 +404,10 @@ class _Writer:
             for name in ("direct", "stepped", "step", "newton", "next", "solved")
         }
         n = self.emitter().number
-        one = whole(1)
-        true = TRUE
-        b.store(true, alive)
+        b.store(TRUE, alive)
         b.store(n(0.0), reached)
-        b.store(one, step)
-        once = b.icmp("eq", self.steps, one)
+        b.store(ONE, step)
+        once = b.icmp("eq", self.steps, ONE)
         b.cbranch(once, block["direct"], block["stepped"])
 
         b.go_to(block["direct"])
@@ -435,7 +436,7 @@ class _Writer:
         begun = real(q.before), real(1e300)
         b.store(b.splat(b.select(once, *begun), LANES), size)
         b.store(n(0.0), determinant)
-        b.store(whole(0), turn)
+        b.store(ZERO, turn)
         b.branch(block["newton"])
 
         b.go_to(block["newton"])
@@ -456,22 +457,22 @@ class _Writer:
         least = b.splat(b.select(once, real(q.least), real(STEPPED)), LANES)
         # NaN fails every comparison.
         sound = b.and_(b.and_(contracts, b.or_(first, steady)), b.fcmp("ogt", det, least))
-        live = b.and_(b.load(alive), b.or_(sound, b.xor(on, TRUE)))
+        live = b.and_(b.load(alive), b.or_(sound, self._not(on)))
         b.store(live, alive)
         b.store(square, size)
         b.store(det, determinant)
         on = b.and_(b.and_(on, live), b.fcmp("ogt", square, n(CLOSED**2)))
         b.store(on, moving)
-        done = b.add(b.load(turn), one)
+        done = b.add(b.load(turn), ONE)
         b.store(done, turn)
         again = b.and_(self._any(on), b.icmp("slt", done, whole(TURNS)))
         b.cbranch(again, block["newton"], block["next"])
 
         b.go_to(block["next"])
-        live = b.and_(b.load(alive), b.xor(b.load(moving), TRUE))
+        live = b.and_(b.load(alive), self._not(b.load(moving)))
         b.store(live, alive)
         b.store(b.select(live, b.splat(part, LANES), b.load(reached)), reached)
-        k = b.add(b.load(step), one)
+        k = b.add(b.load(step), ONE)
         b.store(k, step)
         onward = b.and_(self._any(live), b.icmp("sle", k, self.steps))
         b.cbranch(onward, block["step"], block["solved"])

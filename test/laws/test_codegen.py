@@ -81,6 +81,7 @@ def test_constants_keep_their_bits():
         assert found.tobytes() == values.tobytes()
 
 
+@compiled
 def test_sine_cosine_and_arctangent_over_large_ranges(rng):
     """Within an ulp or two of numpy's, from tiny to a million turns, and in every quadrant."""
     size = np.concatenate([10.0 ** rng.uniform(-300, -3, 500), 10.0 ** rng.uniform(-3, 6, 4000)])
