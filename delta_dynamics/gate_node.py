@@ -16,7 +16,7 @@ from std_msgs.msg import Float64MultiArray
 from delta_dynamics.gate import Gate, GateSettings, effort_limits
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin import load
-from pkm_twin.bags.cdr import message_definition
+from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health

@@ -21,7 +21,7 @@ from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
-from pkm_twin.bags.cdr import message_definition
+from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine.robot import MAX_MASS, Robot
 from pkm_twin.ros import node as health

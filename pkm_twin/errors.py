@@ -19,7 +19,7 @@ class ParameterError(PkmTwinError, ValueError):
     """
 
     def __init__(self, field: str, value: object, bound: str) -> None:
-        text = f"{field}: {_short(value)} is refused; allowed: {bound}"
+        text = f"{field}: {short(value)} is refused; allowed: {bound}"
         super().__init__(one_line(text, 2000))
         self.field = field
         self.value = value
@@ -150,6 +150,7 @@ def one_line(text: str, limit: int = 400) -> str:
     return shown if len(shown) <= limit else f"{shown[: half - 5]} ... {shown[5 - half :]}"
 
 
-def _short(value: object) -> str:
+def short(value: object, limit: int = 80) -> str:
+    """A value as an error shows it, its end cut."""
     text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -22,7 +22,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
 from pkm_twin import load
-from pkm_twin.bags.cdr import message_definition
+from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin import load, robot_names
-from pkm_twin.bags.cdr import parse_definition
+from pkm_twin.bags.definitions import parse_definition
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.console import parse_numbers
 from pkm_twin.errors import BagError, MessageError, ParameterError, one_line

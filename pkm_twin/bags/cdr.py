@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 message definitions and their CDR encoding. Imports the standard library only.
+"""Messages as bytes: their CDR encoding. Imports the standard library only.
 
 Decoded messages have the attributes of live ones (``msg.header.stamp.sec``, ``msg.position``), so
 code that reads attributes takes both. Numeric arrays are ``array.array``, an octet is one byte.
@@ -12,286 +12,25 @@ from __future__ import annotations
 
 import array
 import dataclasses
-import importlib.util
-import os
-import re
 import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from pkm_twin.bags.definitions import CODES, Field, brief, parse_definition
 from pkm_twin.errors import BagError
-
-SEPARATOR = "=" * 80
-"""The line between the parts of a concatenated message definition."""
-
-# .msg name -> struct code. ``byte`` and ``char`` are both unsigned 8-bit in ROS 2.
-_CODES = {
-    "bool": "?",
-    "byte": "B",
-    "char": "B",
-    "int8": "b",
-    "uint8": "B",
-    "int16": "h",
-    "uint16": "H",
-    "int32": "i",
-    "uint32": "I",
-    "int64": "q",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
-# What the message classes print -> what a .msg file says.
-_MSG_NAMES = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}
-
-MAX_DEFINITION_CHARACTERS = 1024**2
-"""Longest definition text; the longest of the common interfaces has some 20,000 characters."""
-MAX_FIELDS = 5_000
-"""Most fields of a message and of all that it holds."""
-MAX_NESTING = 50
-"""How deep a message may hold others."""
-MAX_BOUND = 2**32 - 1
-"""Largest array size and bound: lengths are 32-bit numbers in CDR."""
-
-_TYPE_NAME = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
-_FIELD = re.compile(
-    r"(?P<base>[A-Za-z][\w/]*)(?:<=(?P<chars>\d+))?"
-    r"(?P<array>\[(?:(?P<upto><=)?(?P<size>\d+))?\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)",
-    re.ASCII,
-)
-# package/Type, or package/msg/Type.
-_HELD_NAME = re.compile(r"[A-Za-z]\w*(?:/\w+)*/[A-Za-z]\w*", re.ASCII)
-_SPEC = re.compile(r"(?P<base>[A-Za-z][\w/]*)(?:<(?P<chars>\d+)>)?(?:\[(?P<size>\d+)\])?")
-_SEQUENCE = re.compile(r"sequence<(?P<item>.+?)(?:,\s*(?P<bound>\d+))?>")
-
-# Present in every ROS 2 system; some writers leave their text out of the definition.
-_BUILTIN = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
-    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
-}
 
 # Encapsulation header of plain CDR: representation identifier; the options that follow are free.
 _ENDIANNESS = {b"\x00\x00": ">", b"\x00\x01": "<"}
 _NATIVE = "<" if sys.byteorder == "little" else ">"
-_SIZES = {code: struct.calcsize(f"={code}") for code in _CODES.values()}
+_SIZES = {code: struct.calcsize(f"={code}") for code in CODES.values()}
 _UNPACK = {
     order: {code: struct.Struct(f"{order}{code}").unpack_from for code in _SIZES} for order in "<>"
 }
 _ARRAY_CODES = {"?": "B"}
 """Where an array knows no such code, the one of its bytes."""
 _LITTLE_HEADER = b"\x00\x01\x00\x00"
-
-
-@dataclasses.dataclass(frozen=True)
-class Field:
-    """One field of a message: ``base`` is a .msg primitive, ``string`` or ``package/Type``.
-
-    ``size`` is None for a single value, 0 for an unbounded sequence, else the length or, with
-    ``upto``, the bound. ``chars`` bounds a string (0: none).
-    """
-
-    name: str
-    base: str
-    size: int | None = None
-    upto: bool = False
-    chars: int = 0
-
-    @property
-    def fixed(self) -> bool:
-        """Whether the field is an array without a length in front."""
-        return bool(self.size) and not self.upto
-
-
-Definition = dict[str, tuple[Field, ...]]
-"""Fields by ``package/Type``, the message itself and all that it holds."""
-
-
-def message_class(type_name: str) -> Any:
-    """Return the ROS message class of ``package/msg/Type``.
-
-    :raises BagError: the name is malformed, or its package is not installed here.
-    """
-    if not _TYPE_NAME.fullmatch(type_name):
-        raise BagError(
-            f"{type_name!r} is not a type name; expected package/msg/Type", reason="type"
-        )
-    package, _, name = type_name.split("/")
-    # A bag may name any package: only one of messages is imported.
-    found = importlib.util.find_spec(package)
-    places = (found and found.submodule_search_locations) or ()
-    if not any(os.path.isdir(os.path.join(place, "msg")) for place in places):
-        text = f"message type {type_name} is not installed: no message package {package!r}"
-        raise BagError(text, reason="type")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError) as error:
-        raise BagError(
-            f"message type {type_name} is not installed: {error}", reason="type"
-        ) from error
-
-
-def message_definition(type_name: str) -> str:
-    """Return the ``ros2msg`` text of a type: its fields, then those of every type it holds.
-
-    Made from the message classes, since a pip installation of ROS 2 carries no .msg files.
-    Constants and default values are not part of the classes' field list, and not of the text.
-    """
-    sections: dict[str, str] = {}
-    waiting = [_short_name(type_name)]
-    while waiting:
-        name = waiting.pop(0)
-        if name in sections:
-            continue
-        package, short = name.split("/")
-        cls = message_class(f"{package}/msg/{short}")
-        fields = [_class_field(*item) for item in cls.get_fields_and_field_types().items()]
-        sections[name] = "\n".join(_field_text(field) for field in fields)
-        waiting += [field.base for field in fields if "/" in field.base]
-    (main, *others) = sections.items()
-    parts = [main[1], *(f"MSG: {name}\n{text}" for name, text in others)]
-    return f"\n{SEPARATOR}\n".join(parts) + "\n"
-
-
-def _short_name(type_name: str) -> str:
-    parts = type_name.split("/")
-    return f"{parts[0]}/{parts[-1]}"
-
-
-def _checked_name(type_name: str) -> str:
-    """The short name of a type that a file names."""
-    if not _HELD_NAME.fullmatch(type_name):
-        raise BagError(
-            f"{_brief(type_name)} is no type name; expected package/msg/Type", reason="schema"
-        )
-    return _short_name(type_name)
-
-
-def _class_field(name: str, spec: str) -> Field:
-    """Turn ``sequence<double, 3>`` and its like, as the classes print them, into a field."""
-    sequence = _SEQUENCE.fullmatch(spec)
-    match = _SPEC.fullmatch(sequence["item"] if sequence else spec)
-    if match is None:
-        raise BagError(f"field {name} has the unknown type {spec!r}", reason="type")
-    base = _MSG_NAMES.get(match["base"], match["base"])
-    size: int | None = int(match["size"]) if match["size"] else None
-    if sequence:
-        size = int(sequence["bound"] or 0)
-    return Field(name, base, size, bool(sequence and sequence["bound"]), int(match["chars"] or 0))
-
-
-def _field_text(field: Field) -> str:
-    chars = f"<={field.chars}" if field.chars else ""
-    brackets = "" if field.size is None else f"[{'<=' * field.upto}{field.size or ''}]"
-    return f"{field.base}{chars}{brackets} {field.name}"
-
-
-def parse_definition(type_name: str, text: str) -> Definition:
-    """Parse a concatenated ``ros2msg`` definition; the first entry is the message itself.
-
-    :raises BagError: a line is not a field, a held type has no definition or holds itself, or there
-        is more than MAX_DEFINITION_CHARACTERS, MAX_FIELDS, MAX_NESTING or MAX_BOUND of it.
-    """
-    if len(text) > MAX_DEFINITION_CHARACTERS:
-        raise BagError(
-            f"the definition of {type_name} has {len(text)} characters; "
-            f"at most {MAX_DEFINITION_CHARACTERS}",
-            reason="schema",
-        )
-    own = _checked_name(type_name)
-    texts = dict(_BUILTIN)
-    for index, part in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):
-        name = own
-        fields = part
-        if index:
-            heading, _, fields = part.strip().partition("\n")
-            if not heading.startswith("MSG:"):
-                raise BagError(
-                    f"definition of {type_name}: part {index} starts with {_brief(heading)}, "
-                    "not 'MSG:'",
-                    reason="schema",
-                )
-            name = _checked_name(heading[4:].strip())
-        texts[name] = fields
-    definition: Definition = {}
-    _resolve(own, texts, definition, ())
-    return {own: definition.pop(own), **definition}
-
-
-def _resolve(
-    name: str, texts: Mapping[str, str], definition: Definition, holders: tuple[str, ...]
-) -> None:
-    """Add ``name`` and the types it holds to ``definition``; ``holders`` are those above it."""
-    if name in holders:
-        raise BagError(f"message type {name} holds itself", reason="schema")
-    if name in definition:
-        return
-    if name not in texts:
-        raise BagError(f"no definition of {name}, which {holders[-1]} holds", reason="schema")
-    if len(holders) >= MAX_NESTING:
-        raise BagError(
-            f"{holders[0]} holds types {len(holders)} deep; at most {MAX_NESTING - 1}",
-            reason="schema",
-        )
-    fields = tuple(_parse_fields(name, texts))
-    if len(fields) + sum(map(len, definition.values())) > MAX_FIELDS:
-        raise BagError(
-            f"{(*holders, name)[0]} has more than {MAX_FIELDS} fields with all that it holds",
-            reason="schema",
-        )
-    for field in fields:
-        if "/" in field.base:
-            _resolve(field.base, texts, definition, (*holders, name))
-    definition[name] = fields
-
-
-def _parse_fields(name: str, texts: Mapping[str, str]) -> list[Field]:
-    fields = []
-    for line in texts[name].splitlines():
-        # A string constant may hold a '#', so constants are told apart before comments are cut.
-        match = _FIELD.fullmatch(line.strip())
-        if match is None or match["rest"].startswith("="):
-            if match is None and line.split("#")[0].strip():
-                raise BagError(
-                    f"definition of {name}: {_brief(line)} is not a field", reason="schema"
-                )
-            continue
-        base = _base_type(match["base"], name.split("/", 1)[0], texts)
-        where = f"definition of {name}: field {match['name']}"
-        size = None if match["array"] is None else _bound(match["size"], where)
-        chars = _bound(match["chars"], where)
-        fields.append(Field(match["name"], base, size, bool(match["upto"]), chars))
-    return fields
-
-
-def _bound(digits: str | None, where: str) -> int:
-    """A size or bound as a definition writes it, 0 where it writes none."""
-    # Python refuses to convert thousands of digits.
-    if digits and (len(digits) > 20 or int(digits) > MAX_BOUND):
-        raise BagError(
-            f"{where} has the bound {_brief(digits)}; at most {MAX_BOUND}", reason="schema"
-        )
-    return int(digits or 0)
-
-
-def _base_type(base: str, package: str, texts: Mapping[str, str]) -> str:
-    if base in _CODES or base == "string":
-        return base
-    if base == "wstring":
-        raise BagError("wide strings (wstring) are not supported", reason="schema")
-    if "/" in base:
-        return _short_name(base)
-    local = f"{package}/{base}"
-    # A bare Header is std_msgs/Header by the rules of .msg files.
-    return "std_msgs/Header" if base == "Header" and local not in texts else local
-
-
-def live_type_name(message: object) -> str | None:
-    """Return ``package/msg/Type`` of a live ROS message, None of any other object."""
-    cls = type(message)
-    if not hasattr(cls, "get_fields_and_field_types"):
-        return None
-    return f"{cls.__module__.split('.')[0]}/msg/{cls.__name__}"
 
 
 class MessageCodec:
@@ -337,7 +76,7 @@ class MessageCodec:
 
     def _reader(self, field: Field) -> Callable[[_Source], Any]:
         """What reads a field: decided once a type, not once a message."""
-        code, base = _CODES.get(field.base), field.base
+        code, base = CODES.get(field.base), field.base
         if field.size is not None:
             return partial(self._read_items, field, code)
         if base == "byte":
@@ -389,7 +128,7 @@ class MessageCodec:
         if value is None:
             value = [self._default(field)] * (field.size if field.fixed else 0)
         if isinstance(value, str | Mapping) or not hasattr(value, "__len__"):
-            raise BagError(f"{where} is {_brief(value)}; expected a sequence", reason="message")
+            raise BagError(f"{where} is {brief(value)}; expected a sequence", reason="message")
         count = len(value)
         if (field.fixed and count != field.size) or (field.upto and count > (field.size or 0)):
             expected = f"{'at most ' * field.upto}{field.size}"
@@ -402,7 +141,7 @@ class MessageCodec:
     def _encode_items(
         self, field: Field, values: Sequence[Any], out: bytearray, where: str
     ) -> None:
-        code = _CODES.get(field.base)
+        code = CODES.get(field.base)
         if field.base == "byte":
             values = [
                 item[0] if isinstance(item, bytes) and len(item) == 1 else item for item in values
@@ -418,7 +157,7 @@ class MessageCodec:
 
     @staticmethod
     def _default(field: Field) -> Any:
-        if field.base in _CODES:
+        if field.base in CODES:
             return 0
         return "" if field.base == "string" else {}
 
@@ -506,13 +245,13 @@ def _put(out: bytearray, code: str, values: Sequence[Any], where: str) -> None:
     try:
         out.extend(struct.pack(f"<{len(values)}{code}", *values))
     except (struct.error, OverflowError) as error:
-        text = f"{where} is {_brief(values if len(values) > 1 else values[0])}: {error}"
+        text = f"{where} is {brief(values if len(values) > 1 else values[0])}: {error}"
         raise BagError(text, reason="message") from error
 
 
 def _put_text(out: bytearray, text: object, limit: int, where: str) -> None:
     if not isinstance(text, str):
-        raise BagError(f"{where} is {_brief(text)}; expected text", reason="message")
+        raise BagError(f"{where} is {brief(text)}; expected text", reason="message")
     if limit and len(text) > limit:
         raise BagError(f"{where} has {len(text)} characters; at most {limit}", reason="message")
     raw = text.encode()
@@ -535,11 +274,6 @@ def _getter(message: object, fields: Sequence[Field], where: str) -> Callable[[s
     missing = [name for name in names if not hasattr(message, name)]
     if missing:
         raise BagError(
-            f"{where} is {_brief(message)}, without {', '.join(missing)}", reason="message"
+            f"{where} is {brief(message)}, without {', '.join(missing)}", reason="message"
         )
     return lambda name: getattr(message, name)
-
-
-def _brief(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -20,7 +20,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pkm_twin.bags.cdr import MessageCodec, message_definition
+from pkm_twin.bags.cdr import MessageCodec
+from pkm_twin.bags.definitions import message_definition
 from pkm_twin.bags.format import (
     MESSAGE,
     TOTAL_CAP,

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pkm_twin.bags.cdr import parse_definition
+from pkm_twin.bags.definitions import parse_definition
 from pkm_twin.bags.format import (
     ATTACHMENT,
     ATTACHMENT_INDEX,

@@ -77,7 +77,7 @@ class _Layout:
 class JointStateDecoder:
     """Decodes sensor_msgs/JointState, quickly where names and lengths are those of the last.
 
-    :param definition: the type's definition, as :func:`pkm_twin.bags.cdr.message_definition` says.
+    :param definition: as :func:`pkm_twin.bags.definitions.message_definition` gives it.
     """
 
     def __init__(self, definition: str) -> None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pkm_twin.bags.cdr import message_class, message_definition, parse_definition
+from pkm_twin.bags.definitions import message_class, message_definition, parse_definition
 from pkm_twin.bags.qos import OfferedQos, parse_qos, require_topic
 from pkm_twin.bags.reader import Bag, TopicInfo, open_bag
 from pkm_twin.errors import BagError, ParameterError

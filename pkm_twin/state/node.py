@@ -15,7 +15,7 @@ from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
 from pkm_twin import load
-from pkm_twin.bags.cdr import message_definition
+from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
 from pkm_twin.machine.robot import Robot

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pkm_twin.bags.cdr import (
+from pkm_twin.bags.cdr import MessageCodec
+from pkm_twin.bags.definitions import (
     Field,
-    MessageCodec,
     live_type_name,
     message_class,
     message_definition,

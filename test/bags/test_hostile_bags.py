@@ -17,7 +17,8 @@ from mcap.writer import CompressionType, Writer
 
 from pkm_twin.bags import format as mcap_format
 from pkm_twin.bags import reader as bag_reader
-from pkm_twin.bags.cdr import MAX_FIELDS, MAX_NESTING, MessageCodec, message_class
+from pkm_twin.bags.cdr import MessageCodec
+from pkm_twin.bags.definitions import MAX_FIELDS, MAX_NESTING, message_class
 from pkm_twin.bags.reader import BagWriter, inspect, open_bag, read_messages
 from pkm_twin.bags.recover import recover
 from pkm_twin.errors import BagError, one_line

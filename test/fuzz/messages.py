@@ -21,7 +21,8 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward, Settings
 from delta_dynamics.gate import Gate, GateSettings
 from pkm_twin import load
-from pkm_twin.bags.cdr import MessageCodec, message_definition
+from pkm_twin.bags.cdr import MessageCodec
+from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.intake import JointStateDecoder, RawTrajectory

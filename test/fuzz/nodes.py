@@ -22,7 +22,8 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from pkm_twin import load
-from pkm_twin.bags.cdr import MessageCodec, message_definition
+from pkm_twin.bags.cdr import MessageCodec
+from pkm_twin.bags.definitions import message_definition
 from test.fuzz.messages import JOINT_STATE, NOW, TRAJECTORY, VALUES, WRENCH, Source
 from test.fuzz.rules import Rules
 from test.nodes.harness import SECOND, stamp_of, values_of

@@ -15,7 +15,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from pkm_twin.bags.cdr import message_definition
+from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
 from pkm_twin.ros.messages import COLUMNS, TrajectoryFields
