@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import functools
+import gc
 import os
 import signal
 
@@ -10,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
-from pkm_twin import load
 from test.support.command import command
 from test.support.robots import (  # noqa: F401
     LIMITED,
     both_ways,
     finite_difference,
+    load,
     parameters_of,
     random_joints,
     random_poses,
@@ -37,6 +38,12 @@ def pytest_collection_modifyitems(items):
     others = [path for path in files if path not in place]
     place |= {path: k / len(others) for k, path in enumerate(others)}
     items.sort(key=lambda item: place[item.path])
+
+
+def pytest_collection_finish():
+    """What is there by now stays: it is not looked through for garbage again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ pytest.importorskip("xarray")
 pytest.importorskip("h5netcdf")
 pytest.importorskip("h5py")
 
-from pkm_twin import load
 from pkm_twin.atlas import modes, workspace
 from pkm_twin.atlas.isotropy import isotropy_sweep
 from pkm_twin.atlas.modes import modes_sweep
@@ -18,6 +17,7 @@ from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.strain_energy import strain_energy_sweep
 from pkm_twin.atlas.workspace import workspace_sweep
+from test.support.robots import load
 
 
 def same(one, other):

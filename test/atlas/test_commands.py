@@ -14,14 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.atlas import kinds
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import Parts, open_atlas
 from pkm_twin.atlas.strain_energy import strain_energy_sweep
 from test.atlas.conftest import same
 from test.support.command import forked
-from test.support.robots import partly_long
+from test.support.robots import load, partly_long
 
 ROOT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "pkm_twin.apps.cli"]

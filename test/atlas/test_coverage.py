@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkm_twin import load, robot_names
+from pkm_twin import robot_names
 from pkm_twin.atlas import kinds, workspace
 from pkm_twin.atlas.grids import height_range, largest_distance
 from pkm_twin.atlas.run import run
@@ -16,7 +16,7 @@ from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace import planes, workspace_sweep
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import reachable, singularity_at, try_forward
-from test.support.robots import SHIPPED, partly_long
+from test.support.robots import SHIPPED, load, partly_long
 
 COUNTS = partly_long([20_000, 100_000], 20_000)
 """Random joint states."""

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from delta_dynamics import energy_transfer_range, max_driving_force_range, tilted_pose
-from pkm_twin import load
 from test.support.pages import numbers
+from test.support.robots import load
 
 PAGE = "docs/gallery.md"
 AZIMUTHS = np.radians(np.arange(0, 360, 30))

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.atlas.modes import modes_sweep, structure_edges
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.errors import ParameterError
 from stiffness_monitor import reachable
 from stiffness_monitor.modes import modes, natural_frequencies
 from stiffness_monitor.structure import structural_model
+from test.support.robots import load
 
 ROBOTS = pytest.mark.parametrize("name", ["prru", "delta_cu", "upr_rpu"])
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.strain_energy import (
@@ -20,7 +19,7 @@ from pkm_twin.atlas.strain_energy import (
 )
 from pkm_twin.errors import ParameterError
 from stiffness_monitor import regular_workspace, strain_energy
-from test.support.robots import partly_long
+from test.support.robots import load, partly_long
 
 ROBOT = load("upr_rpu")
 

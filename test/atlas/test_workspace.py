@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.atlas import workspace
 from pkm_twin.atlas.grids import circles, height_range, largest_cylinder, largest_distance, nice
 from pkm_twin.atlas.run import run
@@ -17,7 +16,7 @@ from pkm_twin.kinematics.clearance import clearance
 from pkm_twin.kinematics.workspace import CLEAR, RAYS, singularity_at
 from stiffness_monitor import reachable, regular_workspace
 from test.atlas.conftest import LAYERS
-from test.support.robots import parameters_of, partly_long
+from test.support.robots import load, parameters_of, partly_long
 
 ROBOTS = ("prru", "delta_cu", "upr_rpu")
 TURN = np.linspace(0, 2 * np.pi, 1001)
@@ -215,12 +214,13 @@ def test_all_taken_away_is_still_an_atlas(tmp_path, few_layers):
 def test_without_members_there_is_no_clearance(small_atlases, tmp_path, few_layers, monkeypatch):
     from matplotlib import pyplot
 
+    import pkm_twin
     from pkm_twin.atlas import kinds
 
-    robot = load("delta")
+    robot = pkm_twin.load("delta")
     whole = small_atlases["workspace delta"]
     monkeypatch.setattr(type(robot), "beams", ())
-    bare = run(workspace_sweep(load("delta"), 4000), tmp_path / "bare.nc", workers=1)
+    bare = run(workspace_sweep(pkm_twin.load("delta"), 4000), tmp_path / "bare.nc", workers=1)
     with open_atlas(whole) as one, open_atlas(bare) as other:
         assert set(one.variables) - set(other.variables) == {"clearance", "interference"}
         for variable in other.variables:
@@ -229,7 +229,7 @@ def test_without_members_there_is_no_clearance(small_atlases, tmp_path, few_laye
         assert "limbs" not in figure.get_suptitle()
         pyplot.close(figure)
     with pytest.raises(ParameterError) as caught:
-        workspace_sweep(load("delta"), 4000, least_clearance=0.01)
+        workspace_sweep(pkm_twin.load("delta"), 4000, least_clearance=0.01)
     assert caught.value.field == "least_clearance"
 
 

@@ -16,11 +16,11 @@ from bags.recording import residuals
 from bags.recording.capture import machine_parameters, parameters_digest
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward
-from pkm_twin import load
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.messages import stamp_of
 from stiffness_monitor.monitor import Monitor
+from test.support.robots import load
 
 FOLDER = Path(__file__).resolve().parents[2] / "bags"
 EPOCH = 1_700_000_000_000_000_000

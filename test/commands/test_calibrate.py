@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from bags.recording.capture import machine_parameters
-from pkm_twin import Robot, load
+from pkm_twin import Robot
 from pkm_twin.apps.calibrate import read_poses
 from pkm_twin.apps.calibration import calibrate, geometric
 from pkm_twin.apps.calibration_state import Poses
 from pkm_twin.apps.cli import app
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.entries import entries, with_entries
-from test.support.robots import random_joints
+from test.support.robots import load, random_joints
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-from pkm_twin import load
 from pkm_twin.apps.cli import app
 from test.commands.conftest import DELTA, REPOSITORY, rewrite
 from test.support.command import Result
+from test.support.robots import load
 
 NOT_RUN = {
     r"pkm-twin .*\b(my_delta|converted)\..*": "of a file that the page writes: test/docs runs them",

@@ -8,7 +8,6 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from pkm_twin.apps.fit_files import robot_text
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.machine.entries import entries, with_entries
@@ -16,7 +15,7 @@ from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
 from test.support.command import command
-from test.support.robots import parameters_of
+from test.support.robots import load, parameters_of
 
 HEAD = ("five_bar", "friction,payload")
 

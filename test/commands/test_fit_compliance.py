@@ -6,12 +6,12 @@ import json
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.bags.reader import BagWriter, open_bag
 from stiffness_monitor import compliance
 from test.bags.test_recordings import FOLDER
 from test.laws.deflections import SENSORS, noisy, twin_recording
 from test.support.command import command
+from test.support.robots import load
 
 SOFT = FOLDER / "upr_rpu_soft_joint.mcap"
 COLLISION = FOLDER / "delta_cu_collision.mcap"

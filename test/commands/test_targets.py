@@ -10,13 +10,13 @@ import threading
 
 import pytest
 
-from pkm_twin import load
 from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.errors import BagError
 from pkm_twin.files import replace_file, replacing
 from test.bags.test_recordings import FOLDER
 from test.commands.test_fit_compliance import SOFT, table
 from test.support.command import command, forked
+from test.support.robots import load
 
 REPOSITORY = FOLDER.parent
 EXCITE = ("excite", "five_bar", "--trials", 10, "--duration", 2)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, reactions
-from pkm_twin import load
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
-from test.support.robots import massless
+from test.support.robots import load, massless
 
 TERMS = ("gravity", "inertia", "velocity", "payload", "friction", "external")
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")

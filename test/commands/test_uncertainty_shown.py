@@ -8,11 +8,10 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin import load
 from pkm_twin.apps.check import DEVIATIONS, motion, read_recording, residuals
 from test.commands.conftest import DELTA, rewrite
 from test.support.command import command
-from test.support.robots import parameters_of
+from test.support.robots import load, parameters_of
 
 UNCERTAINTY = {
     "inertia.platform_mass": {"deviation": 0.004},

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.apps.elastic_fit import Deflected
 from pkm_twin.apps.elastic_recordings import read_deflected
 from stiffness_monitor.response import ElementResponse, element_response
+from test.support.robots import load
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 

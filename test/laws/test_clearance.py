@@ -13,13 +13,12 @@ import yaml
 from scipy.optimize import lsq_linear
 
 from delta_dynamics.isotropy import tilted_pose
-from pkm_twin import load
 from pkm_twin.atlas.workspace import workspace_sweep
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.clearance import clearance, distance, has_clearance
 from pkm_twin.kinematics.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import Member, structural_model
-from test.support.robots import SHIPPED, both_ways, parameters_of, random_poses
+from test.support.robots import SHIPPED, both_ways, load, parameters_of, random_poses
 
 ROBOTS = [name for name, robot in SHIPPED.items() if has_clearance(robot)]
 

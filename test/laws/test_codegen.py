@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.codegen import expressions as ex
 from pkm_twin.codegen import kernels
 from pkm_twin.codegen.cholesky import FLOOR, traces_over
@@ -16,7 +15,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU, independent_rows
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
-from test.support.robots import every_robot, random_joints
+from test.support.robots import every_robot, load, random_joints
 
 NONE = np.zeros(0)
 compiled = pytest.mark.skipif(not kernels.compiled(), reason="no compiler here")

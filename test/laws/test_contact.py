@@ -10,12 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import Contact, ContactMonitor
-from pkm_twin import Robot, load
+from pkm_twin import Robot
 from pkm_twin.apps.check import motion
 from pkm_twin.apps.recorded import Recording, read_recording
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.entries import given
+from test.support.robots import load
 
 Array = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pkm_twin import Robot, load
+from pkm_twin import Robot
 from pkm_twin.apps.recorded import read_recording
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.machine.rotations import skew
 from stiffness_monitor import setpoint_correction, strain_energy
-from test.support.robots import elastic, every_robot, joint_range
+from test.support.robots import elastic, every_robot, joint_range, load
 
 Array = NDArray[np.float64]
 

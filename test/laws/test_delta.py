@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from pkm_twin.errors import UnreachableError
-from test.support.robots import random_joints
+from test.support.robots import load, random_joints
 
 ROBOTS = ["delta", "delta_cu"]
 

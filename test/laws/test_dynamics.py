@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from delta_dynamics import energy, forward_dynamics, inverse_dynamics, mass_matrix
-from pkm_twin import load
 from pkm_twin.errors import SingularityError, UnreachableError
 from test.support.bodies import bodies, rubs
 from test.support.robots import (
     FREE,
     MASSIVE,
     both_ways,
+    load,
     loaded,
     massive,
     parameters_of,

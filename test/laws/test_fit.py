@@ -15,14 +15,14 @@ from delta_dynamics import inverse_dynamics, regressor
 from delta_dynamics.estimation import estimate, possible
 from delta_dynamics.file_parameters import file_parameters
 from delta_dynamics.fit import Fit, Recorded, fit
-from pkm_twin import Robot, load
+from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.entries import entries, with_entries
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.shared import pseudo_inertia
 from test.laws.recordings import smooth_motion
-from test.support.robots import massive, parameters_of, random_motion
+from test.support.robots import load, massive, parameters_of, random_motion
 
 Array = NDArray[np.float64]
 

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.fit import fit
 from delta_dynamics.fit_rows import Recorded
-from pkm_twin import Robot, load
+from pkm_twin import Robot
 from pkm_twin.apps.certificate.maximal import Maximal, State
 from pkm_twin.machine.robot_urdf import robot_description
 from test.laws.recordings import engine_efforts, smooth_motion
 from test.laws.test_fit import truths
+from test.support.robots import load
 
 Array = NDArray[np.float64]
 

@@ -23,9 +23,8 @@ from delta_dynamics import (
 )
 from delta_dynamics.cones import largest
 from delta_dynamics.least_form import _descended, least_direction
-from pkm_twin import load
 from pkm_twin.errors import ParameterError, SearchError, SingularityError
-from test.support.robots import loaded, loaded_like, random_joints
+from test.support.robots import load, loaded, loaded_like, random_joints
 
 MASSIVE = [name for name in robots.MASSIVE if len(robots.SHIPPED[name].joint_names) == 3]
 """Directions are on a sphere: machines of three freedoms."""

@@ -11,14 +11,13 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from stiffness_monitor import compliance
 from stiffness_monitor.beams import assemble
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
 from stiffness_monitor.statics import frame_compliance
 from stiffness_monitor.structure import Carried, Member, structural_model
-from test.support.robots import ELASTIC, elastic, parameters_of, random_joints
+from test.support.robots import ELASTIC, elastic, load, parameters_of, random_joints
 
 DELTAS = ("delta", "delta_cu")
 

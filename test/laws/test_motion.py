@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.passive import passive_program
@@ -16,6 +15,7 @@ from test.support.robots import (
     every_robot,
     finite_difference,
     joint_units_of_size,
+    load,
     loaded,
     random_joints,
 )

@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import MomentumObserver, inverse_dynamics, platform_wrench
-from pkm_twin import Robot, load
-from test.support.robots import FREE, joint_range, loaded, massive
+from pkm_twin import Robot
+from test.support.robots import FREE, joint_range, load, loaded, massive
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix
-from pkm_twin import load
+from test.support.robots import load
 
 
 @pytest.mark.parametrize("heavy_first", [True, False])

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import PayloadEstimator, inverse_dynamics
-from pkm_twin import Robot, load
+from pkm_twin import Robot
 from pkm_twin.apps.check import motion
 from pkm_twin.apps.recorded import read_recording
-from test.support.robots import joint_range
+from test.support.robots import joint_range, load
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,7 @@ import pytest
 
 from delta_dynamics import energy, inverse_dynamics, mass_matrix
 from delta_dynamics.plant import Plant, _least
-from pkm_twin import load
-from test.support.robots import FREE, massive, random_joints
+from test.support.robots import FREE, load, massive, random_joints
 
 STEP = 1e-3
 NO_WRENCH = np.zeros(6)

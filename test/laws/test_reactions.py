@@ -8,12 +8,12 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
 from delta_dynamics.reactions import _joints, _loads
-from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from test.support.bodies import bodies, rubs
 from test.support.robots import (
     FREE,
     MASSIVE,
+    load,
     loaded,
     loaded_like,
     massive,

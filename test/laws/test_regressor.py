@@ -15,10 +15,10 @@ from delta_dynamics import (
     regressor,
 )
 from delta_dynamics.base_parameters import random_states
-from pkm_twin import Robot, load
+from pkm_twin import Robot
 from pkm_twin.machine.catalogue import robot_of_data
 from test.machine.random_machines import NAMES, variant
-from test.support.robots import loaded, massive, random_motion
+from test.support.robots import load, loaded, massive, random_motion
 
 
 def complete(name: str) -> Robot:

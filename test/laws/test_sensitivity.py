@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pkm_twin import Robot, load
+from pkm_twin import Robot
 from pkm_twin.apps.calibration import geometric
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.maximal import GraphChange, Placement, assembled
 from pkm_twin.kinematics.sensitivity import platform_change, platform_twists
 from pkm_twin.machine.entries import changed_graph, entries, put, with_entries
-from test.support.robots import joint_range
+from test.support.robots import joint_range, load
 
 Array = NDArray[np.float64]
 

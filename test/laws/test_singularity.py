@@ -12,7 +12,7 @@ import yaml
 from scipy.optimize import minimize_scalar
 
 from delta_dynamics import reactions
-from pkm_twin import Robot, load, robot_names
+from pkm_twin import Robot, robot_names
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.rows import stacked
 from pkm_twin.errors import SingularityError
@@ -21,7 +21,7 @@ from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.robot_urdf import robot_description
 from stiffness_monitor import compliance
 from test.machine.random_machines import NAMES, plain
-from test.support.robots import joint_range, random_joints
+from test.support.robots import joint_range, load, random_joints
 
 SURFACE = np.array([0.34222, -0.09515, -0.18159])
 """A pose of the Delta-CU, inside its limits and its reach, where its platform is free to turn."""

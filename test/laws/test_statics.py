@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 import yaml
 
-from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from stiffness_monitor import compliance, stiffness, strain_energy
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.statics import frame_energies
-from test.support.robots import ELASTIC, parameters_of, random_joints
+from test.support.robots import ELASTIC, load, parameters_of, random_joints
 
 FRAMES = [name for name in ELASTIC if not load(name).element_names]
 """Robots whose compliance comes from finite elements, not from a closed form."""

@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.workspace import regular_workspace
 from pkm_twin.machine import schema
 from pkm_twin.machine.catalogue import config_folder
 from pkm_twin.mechanisms.upr_rpu import UprRpu
 from stiffness_monitor import compliance, reachable, stiffness, strain_energy
+from test.support.robots import load
 
 ROBOT = load("upr_rpu")
 FILE = schema.read_yaml(config_folder() / "upr_rpu.yaml")

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from delta_dynamics import Terms, dynamics_terms, inverse_dynamics, mass_matrix
-from pkm_twin import load
 from pkm_twin.errors import ParameterError, UnreachableError
 from test.support.bodies import bodies, rubs
-from test.support.robots import FREE, loaded, massive, massless, random_motion
+from test.support.robots import FREE, load, loaded, massive, massless, random_motion
 
 NAMES = tuple(field.name for field in fields(Terms))
 

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from pkm_twin import load, robot_names
+from pkm_twin import robot_names
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.tracking import boundary_distance, follow, track
-from test.support.robots import every_robot, partly_long, random_poses
+from test.support.robots import every_robot, load, partly_long, random_poses
 
 
 def stream(robot, rng, count):

@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin import Robot, load
+from pkm_twin import Robot
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.entries import entries, given, with_entries
 from stiffness_monitor import compliance, compliance_deviation
-from test.support.robots import joint_range
+from test.support.robots import joint_range, load
 
 Array = NDArray[np.float64]
 

@@ -10,12 +10,11 @@ import math
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.machine import schema
 from pkm_twin.machine.catalogue import config_folder
 from pkm_twin.mechanisms.upr_rpu import UprRpu
-from test.support.robots import both_ways
+from test.support.robots import both_ways, load
 
 ROBOT = load("upr_rpu")
 FILE = schema.read_yaml(config_folder() / "upr_rpu.yaml")

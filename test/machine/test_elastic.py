@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 import yaml
 
-from pkm_twin import load
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.clearance import clearance
 from pkm_twin.machine.catalogue import config_folder
 from pkm_twin.machine.entries import with_entries
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.modes import natural_frequencies
+from test.support.robots import load
 
 POSES = [[0.02, 0.03, -0.33], [-0.05, 0.0, -0.36]]
 

@@ -9,14 +9,13 @@ import pytest
 import yaml
 
 from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
-from pkm_twin import load
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import random_states
 from pkm_twin.apps.certify import effort_differences, relative
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.catalogue import CATALOGUE
 from test.machine.random_machines import NAMES, plain, variant
-from test.support.robots import partly_long
+from test.support.robots import load, partly_long
 
 if "machine" not in CATALOGUE:
     pytest.skip("load knows no mechanism machine", allow_module_level=True)

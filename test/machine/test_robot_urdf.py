@@ -10,11 +10,12 @@ import pinocchio as pin
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load, robot_names
+from pkm_twin import robot_names
 from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.machine.robot_urdf import robot_description, robot_urdf
 from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.mechanisms.machine import Machine
+from test.support.robots import load
 
 from .sketches import closure_rows
 

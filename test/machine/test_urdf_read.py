@@ -10,10 +10,10 @@ import pinocchio as pin
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.mechanisms.machine import Machine
+from test.support.robots import load
 
 from .sketches import SKETCHES, Z, closure_rows, five_bar
 

@@ -9,10 +9,9 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from stiffness_monitor import compliance, strain_energy
 from test.nodes.harness import Domain, ForkedNode, Maker, NodeProcess, Peer, Plain, Ros
-from test.support.robots import parameters_of
+from test.support.robots import load, parameters_of
 
 
 @pytest.fixture(scope="session", params=["plain", "ros"])

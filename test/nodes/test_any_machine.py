@@ -8,8 +8,8 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward, Settings
-from pkm_twin import load
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
+from test.support.robots import load
 
 NOW = 1_000 * SECOND
 STEP = SECOND // 1000

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load, robot_names
+from pkm_twin import robot_names
 from test.nodes.harness import (
     SECOND,
     counts_of,
@@ -16,7 +16,7 @@ from test.nodes.harness import (
     text_of,
     values_of,
 )
-from test.support.robots import partly_long
+from test.support.robots import load, partly_long
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 

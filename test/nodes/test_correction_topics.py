@@ -12,9 +12,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from pkm_twin import load
 from stiffness_monitor import setpoint_correction, strain_energy
 from test.nodes.harness import counts_of, values_of
+from test.support.robots import load
 
 ROBOT = load("upr_rpu")
 Q = np.array([0.62, 0.6, 0.65])

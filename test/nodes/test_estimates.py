@@ -15,8 +15,8 @@ from std_msgs.msg import Bool
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Torques
-from pkm_twin import load
 from test.nodes.harness import SECOND, Maker, Ros
+from test.support.robots import load
 
 ROBOT = load("delta_cu")
 PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=600.0")

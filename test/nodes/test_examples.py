@@ -11,8 +11,8 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from test.nodes.harness import REPOSITORY
+from test.support.robots import load
 
 EXAMPLES = REPOSITORY / "examples"
 SIM = "delta_dynamics.sim_node"

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from delta_dynamics import feedforward, inverse_dynamics
 from delta_dynamics.feedforward import SLICE, Feedforward, Settings
-from pkm_twin import load
 from pkm_twin.errors import MessageError, ParameterError, SingularityError
 from test.nodes.harness import SECOND, Maker, Plain
+from test.support.robots import load
 
 NOW = 1_000 * SECOND
 STEP = SECOND // 1000

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.gate import Gate, GateSettings
-from pkm_twin import load, robot_names
+from pkm_twin import robot_names
 from pkm_twin.errors import MessageError
 from test.nodes.harness import SECOND, Maker, Plain
+from test.support.robots import load
 
 NOW = 1_000 * SECOND
 STEP = SECOND // 1000

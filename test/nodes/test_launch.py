@@ -18,10 +18,11 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load, robot_names
+from pkm_twin import robot_names
 from pkm_twin.machine import rotations
 from pkm_twin.machine.robot_urdf import robot_urdf
 from test.nodes.harness import REPOSITORY, Command, Maker, Ros
+from test.support.robots import load
 
 LAUNCH = REPOSITORY / "launch"
 FILES = ("twin", "cell", "control", "view")

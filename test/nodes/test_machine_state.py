@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from pkm_twin import load, robot_names
+from pkm_twin import robot_names
 from pkm_twin.errors import MessageError
 from pkm_twin.machine import rotations
 from pkm_twin.state.scene import Load, Scales, Scene, heat
@@ -15,7 +15,7 @@ from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.statics import frame_deflections
 from test.nodes.harness import SECOND, Maker, Plain
-from test.support.robots import ELASTIC
+from test.support.robots import ELASTIC, load
 
 MAKE = Maker(Plain())
 NOW = 1_000 * SECOND

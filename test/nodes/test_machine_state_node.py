@@ -6,7 +6,6 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.machine import rotations
 from pkm_twin.machine.robot_urdf import robot_urdf
 from pkm_twin.state.scene import Load, Scales, Scene
@@ -14,6 +13,7 @@ from pkm_twin.state.state import MachineState
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.statics import frame_deflections
 from test.nodes.harness import SECOND, Maker, Ros, counts_of, one_line_refusal, stamp_of, values_of
+from test.support.robots import load
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 

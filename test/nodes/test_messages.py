@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pkm_twin import load
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.messages import (
     MAX_ACCELERATION,
@@ -24,6 +23,7 @@ from pkm_twin.ros.messages import (
     stamp_of,
 )
 from test.nodes.harness import SECOND, Maker, Plain
+from test.support.robots import load
 
 NOW = 1_000 * SECOND
 NAMES = ("arm_1", "arm_2", "arm_3")

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pkm_twin import load
 from pkm_twin.errors import MessageError, SingularityError
 from stiffness_monitor import compliance, monitor, strain_energy
 from stiffness_monitor.monitor import Monitor, Settings
 from test.nodes.harness import SECOND, Maker, Plain
+from test.support.robots import load
 
 NOW = 1_000 * SECOND
 ROBOT = load("upr_rpu")

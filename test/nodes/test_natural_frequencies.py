@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 import yaml
 
-from pkm_twin import load
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.modes import natural_frequencies
 from test.nodes.harness import SECOND, Maker, Ros, one_line_refusal
-from test.support.robots import massless, parameters_of
+from test.support.robots import load, massless, parameters_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 

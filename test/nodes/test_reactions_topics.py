@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from delta_dynamics import reactions
-from pkm_twin import load
 from test.nodes.harness import Maker, Ros, stamp_of, values_of
+from test.support.robots import load
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 

@@ -6,11 +6,11 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.machine import rotations
 from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor.monitor import Monitor
 from test.nodes.harness import SECOND, Maker, Plain, Ros, counts_of
+from test.support.robots import load
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 if find_spec("tf2_ros") is None:

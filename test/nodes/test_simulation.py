@@ -15,10 +15,10 @@ from delta_dynamics.simulation import (
     WrenchSignal,
     tuned,
 )
-from pkm_twin import load
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.variation import varied
 from test.nodes.harness import SECOND
+from test.support.robots import load
 
 ROBOT = load("delta_cu")
 HOME = ROBOT.inverse(ROBOT.home())

@@ -12,13 +12,13 @@ from geometry_msgs.msg import TransformStamped, WrenchStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from pkm_twin import load
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.messages import StampRules
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from test.bags.test_recordings import FOLDER
 from test.nodes.harness import SECOND, counts_of, values_of
+from test.support.robots import load
 
 ROBOT = load("upr_rpu")
 TOPICS = {

@@ -7,7 +7,6 @@ import signal
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from stiffness_monitor import compliance, strain_energy
 from test.nodes.harness import (
     SECOND,
@@ -19,6 +18,7 @@ from test.nodes.harness import (
     text_of,
     values_of,
 )
+from test.support.robots import load
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 

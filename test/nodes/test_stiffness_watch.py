@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.messages import SECOND, StampRules
@@ -17,6 +16,7 @@ from stiffness_monitor.watch import WAITING, StiffnessWatch
 from test.bags.test_recordings import FOLDER
 from test.laws.deflections import SENSORS, noisy, twin_recording
 from test.nodes.harness import Maker, Plain
+from test.support.robots import load
 
 ROBOT = load("upr_rpu")
 FRAMES = ("base_link", "platform")

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from test.nodes.harness import SECOND, Maker, Ros, counts_of, stamp_of, values_of
+from test.support.robots import load
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 

@@ -8,7 +8,6 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from pkm_twin import load
 from pkm_twin.apps.nodes import MODULES
 from pkm_twin.state.scene import Load, Scene
 from pkm_twin.state.state import MachineState
@@ -16,6 +15,7 @@ from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.statics import frame_deflections
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
 from test.nodes.test_tables import rows
+from test.support.robots import load
 
 VIEW = REPOSITORY / "launch" / "view"
 

@@ -9,11 +9,11 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 from sensor_msgs.msg import JointState
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from pkm_twin.apps.view.command import listening
 from pkm_twin.apps.view.live import Live
 from pkm_twin.errors import PkmTwinError
 from test.nodes.harness import Maker, Ros
+from test.support.robots import load
 
 
 def test_a_running_nodes_torques_and_residuals_are_heard(domain, peer, launch, monkeypatch):

@@ -9,7 +9,6 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward, Settings
-from pkm_twin import load
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine import rotations
@@ -18,6 +17,7 @@ from pkm_twin.streams.matched import WrenchWindow, window_weights
 from pkm_twin.streams.wrench import Mount, Recent, WrenchReader, WrenchSettings
 from stiffness_monitor.monitor import Monitor
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
+from test.support.robots import load
 
 MAKE = Maker(Plain())
 NOW = 1_000 * SECOND

@@ -8,8 +8,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from pkm_twin import load
 from test.nodes.harness import SECOND, Maker, Ros, stamp_of, values_of
+from test.support.robots import load
 
 MODULE = "delta_dynamics.node"
 ROBOT = load("delta_cu")

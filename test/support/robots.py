@@ -6,6 +6,7 @@ A law asks the robot what it is, so that a file added to ``config/`` joins all l
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import subprocess
@@ -19,7 +20,8 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from pkm_twin import Robot, load, robot_names
+import pkm_twin
+from pkm_twin import Robot, robot_names
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.catalogue import config_folder
 
@@ -53,8 +55,15 @@ def has(robot: Robot, ask: str) -> bool:
     return True
 
 
+_shipped = functools.cache(pkm_twin.load)
+
+
+def load(robot: str | Path) -> Robot:
+    """As the library's; a shipped robot once, as it does not change."""
+    return _shipped(robot) if robot in robot_names() else pkm_twin.load(robot)
+
+
 SHIPPED = {name: load(name) for name in robot_names()}
-"""Loaded once, to decide what is tested with which; a test loads its own."""
 MASSIVE = [name for name, robot in SHIPPED.items() if has(robot, "massive")]
 ELASTIC = [name for name, robot in SHIPPED.items() if has(robot, "structure")]
 
@@ -77,6 +86,7 @@ def massless(path: Path) -> Path:
     return path
 
 
+@functools.cache
 def loaded(name: str) -> Robot:
     """A shipped robot with a payload, gravity in no special direction, and friction."""
     return loaded_like(load(name))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
+from test.support.robots import load
 
 HOME_ANGLE = 0.22  # rad, inferred
 LOAD = np.array([0.0, 0.0, -25.0, 0.0, 0.0, 0.0])  # N, inferred

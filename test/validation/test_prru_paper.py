@@ -17,11 +17,10 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
 from test.support.bodies import bodies
-from test.support.robots import partly_long
+from test.support.robots import load, partly_long
 
 Array = NDArray[Any]
 

@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from stiffness_monitor import (
     compliance,
     reachable,
     regular_workspace,
     strain_energy,
 )
+from test.support.robots import load
 
 ROBOT = load("upr_rpu")
 

@@ -15,13 +15,13 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.apps.view.door import listen
 from pkm_twin.apps.view.texts import number
 from stiffness_monitor import strain_energy
 from test.atlas.browser import Browser, find_browser
 from test.commands.conftest import DELTA, REPOSITORY
 from test.nodes.harness import end_with_parent
+from test.support.robots import load
 
 TOKEN = "a-token-that-is-long-enough"
 needs_viser = pytest.mark.usefixtures("viser")

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load, robot_names
+from pkm_twin import robot_names
 from pkm_twin.apps.view import texts
 from pkm_twin.apps.view.model import Model, _round, _step
 from pkm_twin.apps.view.scene import SCALE, Scene, plate, round_mesh, share_colours
 from pkm_twin.kinematics.clearance import clearance
 from stiffness_monitor import compliance
+from test.support.robots import load
 
 URDF = Path(__file__).resolve().parents[1] / "machine/five_bar.urdf"
 NAMES = [*robot_names(), URDF.name]

@@ -4,7 +4,6 @@
 import numpy as np
 import pytest
 
-from pkm_twin import load
 from pkm_twin.apps.check import residuals
 from pkm_twin.apps.recorded import read_recording
 from pkm_twin.apps.view import texts
@@ -13,6 +12,7 @@ from pkm_twin.apps.view.timeline import POINTS, Timeline
 from stiffness_monitor import strain_energy
 from test.commands.conftest import DELTA, MILLING, rewrite
 from test.nodes.harness import SECOND, Maker, Plain
+from test.support.robots import load
 
 MAKE = Maker(Plain())
 PLAIN = Plain()
