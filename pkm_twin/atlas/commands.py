@@ -183,7 +183,7 @@ def workspace(
     ] = 0.0,
 ) -> Sweep:
     """Reach, singularities, limb interference, regular part."""
-    from pkm_twin.atlas.workspace import workspace_sweep
+    from pkm_twin.atlas.workspace.sweep import workspace_sweep
 
     return workspace_sweep(
         machine, points, least_singularity=least_singularity, least_clearance=least_clearance
@@ -199,7 +199,7 @@ def strain_energy(
     ] = "P1",
 ) -> Sweep:
     """Where a wrench stores its energy (upr_rpu)."""
-    from pkm_twin.atlas.strain_energy import WRENCHES, strain_energy_sweep
+    from pkm_twin.atlas.strain_energy.sweep import WRENCHES, strain_energy_sweep
 
     load = wrench if wrench in WRENCHES else numbers(wrench, 6, WRENCH)
     return strain_energy_sweep(machine, load, points)
@@ -220,7 +220,7 @@ def isotropy(
     ] = False,
 ) -> Sweep:
     """Kinetic energy and driving force over directions (prru, delta)."""
-    from pkm_twin.atlas.isotropy import isotropy_sweep
+    from pkm_twin.atlas.isotropy.sweep import isotropy_sweep
 
     return isotropy_sweep(
         machine, points, height=height, energy=energy, beyond_limits=beyond_limits
@@ -230,7 +230,7 @@ def isotropy(
 @_kind
 def modes(machine: Robot, points: int | None) -> Sweep:
     """The six lowest natural frequencies and their shapes."""
-    from pkm_twin.atlas.modes import modes_sweep
+    from pkm_twin.atlas.modes.sweep import modes_sweep
 
     return modes_sweep(machine, points)
 
@@ -256,7 +256,8 @@ def _present(file: Path, picture: bool, html: bool, out: Path | None = None) -> 
 
 def _factors(data: Dataset) -> Table:
     """Global factors beside the paper's table 2."""
-    from pkm_twin.atlas.strain_energy import table_2, wrench_of
+    from pkm_twin.atlas.strain_energy.stored import wrench_of
+    from pkm_twin.atlas.strain_energy.sweep import table_2
 
     printed = table_2(wrench_of(data))
     table = Table(title="global strain-energy factors")

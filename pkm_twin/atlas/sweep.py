@@ -160,7 +160,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Kind:
-    """What is drawn of a stored atlas of one kind; each module of a kind ends with its own.
+    """What is drawn of a stored atlas of one kind; each package of a kind has its own.
 
     ``figures``: name to the function that draws it; ``page``: the plotly figure; ``title``: of
     the page; ``help``: the line below it.

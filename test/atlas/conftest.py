@@ -11,12 +11,12 @@ pytest.importorskip("h5netcdf")
 pytest.importorskip("h5py")
 
 from pkm_twin.atlas import modes, workspace
-from pkm_twin.atlas.isotropy import isotropy_sweep
-from pkm_twin.atlas.modes import modes_sweep
+from pkm_twin.atlas.isotropy.sweep import isotropy_sweep
+from pkm_twin.atlas.modes.sweep import modes_sweep
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
-from pkm_twin.atlas.strain_energy import strain_energy_sweep
-from pkm_twin.atlas.workspace import workspace_sweep
+from pkm_twin.atlas.strain_energy.sweep import strain_energy_sweep
+from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from test.support.robots import load
 
 
@@ -68,7 +68,7 @@ class Atlases:
             kind, robot, *whole = name.split()
             with pytest.MonkeyPatch.context() as patch:
                 if whole != [WHOLE]:
-                    for module in (workspace, modes):
+                    for module in (workspace.sweep, modes.sweep):
                         patch.setattr(module, "LAYERS", LAYERS)
                 sweep = MAKE[kind](load(robot))
                 kept.write_bytes(pickle.dumps(sweep))

@@ -15,10 +15,10 @@ import llvmlite
 import psutil
 
 from pkm_twin import load
-from pkm_twin.atlas.isotropy import isotropy_sweep
-from pkm_twin.atlas.modes import modes_sweep
-from pkm_twin.atlas.strain_energy import strain_energy_sweep
-from pkm_twin.atlas.workspace import workspace_sweep
+from pkm_twin.atlas.isotropy.sweep import isotropy_sweep
+from pkm_twin.atlas.modes.sweep import modes_sweep
+from pkm_twin.atlas.strain_energy.sweep import strain_energy_sweep
+from pkm_twin.atlas.workspace.sweep import workspace_sweep
 
 SWEEPS = {
     "workspace": workspace_sweep,

@@ -17,7 +17,7 @@ import pytest
 from pkm_twin.atlas import kinds
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import Parts, open_atlas
-from pkm_twin.atlas.strain_energy import strain_energy_sweep
+from pkm_twin.atlas.strain_energy.sweep import strain_energy_sweep
 from test.atlas.conftest import same
 from test.support.command import forked
 from test.support.robots import load, partly_long

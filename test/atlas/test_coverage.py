@@ -13,7 +13,8 @@ from pkm_twin.atlas import kinds, workspace
 from pkm_twin.atlas.grids import height_range, largest_distance
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
-from pkm_twin.atlas.workspace import planes, workspace_sweep
+from pkm_twin.atlas.workspace.stored import planes
+from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import reachable, singularity_at, try_forward
 from test.support.robots import SHIPPED, load, partly_long
@@ -60,7 +61,7 @@ VOLUMES = partly_long(
 @pytest.mark.parametrize("name", VOLUMES)
 def test_the_volume_is_that_of_random_poses(name, count, rng, monkeypatch, tmp_path):
     """By Monte Carlo in the search box, which the atlas's own box has no part in."""
-    monkeypatch.setattr(workspace, "LAYERS", 3)
+    monkeypatch.setattr(workspace.sweep, "LAYERS", 3)
     robot = load(name)
     low, high = robot.search_box().T
     share = reachable(robot, rng.uniform(low, high, (count, len(low)))).mean()
@@ -142,9 +143,9 @@ def test_a_workspace_without_end_is_refused(name, key):
 
 @pytest.mark.parametrize("kind", ["isotropy", "modes", "strain-energy"])
 def test_kinds_that_need_more_say_what(kind):
-    from pkm_twin.atlas.isotropy import isotropy_sweep
-    from pkm_twin.atlas.modes import modes_sweep
-    from pkm_twin.atlas.strain_energy import strain_energy_sweep
+    from pkm_twin.atlas.isotropy.sweep import isotropy_sweep
+    from pkm_twin.atlas.modes.sweep import modes_sweep
+    from pkm_twin.atlas.strain_energy.sweep import strain_energy_sweep
 
     make = {"isotropy": isotropy_sweep, "modes": modes_sweep, "strain-energy": strain_energy_sweep}
     with pytest.raises(ParameterError):

@@ -48,14 +48,14 @@ def test_all_figures_have_axes_with_labels(name, small_atlases):
 @pytest.mark.parametrize(
     ("name", "draw"),
     [
-        ("strain-energy upr_rpu", strain_energy.plane),
-        ("strain-energy upr_rpu", strain_energy.global_factors),
-        ("isotropy prru", isotropy.spheres),
-        ("isotropy delta_cu", isotropy.spread_over_poses),
-        ("workspace prru", workspace.section),
-        ("workspace delta_cu", workspace.circle_radii),
-        ("modes upr_rpu", modes.frequency),
-        ("modes delta_cu", modes.frequency_range),
+        ("strain-energy upr_rpu", strain_energy.figures.plane),
+        ("strain-energy upr_rpu", strain_energy.figures.global_factors),
+        ("isotropy prru", isotropy.figures.spheres),
+        ("isotropy delta_cu", isotropy.figures.spread_over_poses),
+        ("workspace prru", workspace.figures.section),
+        ("workspace delta_cu", workspace.figures.circle_radii),
+        ("modes upr_rpu", modes.figures.frequency),
+        ("modes delta_cu", modes.figures.frequency_range),
     ],
 )
 def test_functions_draw_on_given_axes_or_their_own(name, draw, small_atlases):
@@ -72,7 +72,10 @@ def test_functions_draw_on_given_axes_or_their_own(name, draw, small_atlases):
 
 @pytest.mark.parametrize(
     ("name", "draw"),
-    [("strain-energy upr_rpu", strain_energy.stack), ("modes prru", modes.mode_shape)],
+    [
+        ("strain-energy upr_rpu", strain_energy.figures.stack),
+        ("modes prru", modes.figures.mode_shape),
+    ],
 )
 def test_functions_draw_on_given_axes_in_space_or_their_own(name, draw, small_atlases):
     from matplotlib import pyplot
@@ -92,9 +95,9 @@ def test_a_drawn_mode_is_the_stored_shape_enlarged(name, small_atlases):
         rest = data.position.values
         size = np.linalg.norm(np.ptp(rest, axis=0))
         for mode in data.mode.values.tolist():
-            moved, far = modes.deformed(data, mode)
+            moved, far = modes.stored.deformed(data, mode)
             steps = np.linalg.norm(moved - rest, axis=1)
-            assert steps.max() == pytest.approx(modes.ENLARGED * size)
+            assert steps.max() == pytest.approx(modes.stored.ENLARGED * size)
             assert far == pytest.approx(steps / steps.max())
             shape = data.displacement.sel(mode=mode).values
             assert np.cross(moved - rest, shape) == pytest.approx(np.zeros_like(rest), abs=1e-12)
@@ -103,7 +106,7 @@ def test_a_drawn_mode_is_the_stored_shape_enlarged(name, small_atlases):
 @pytest.mark.parametrize("name", MODES)
 def test_a_machine_stands_on_the_ground_with_its_three_limbs(name, small_atlases):
     with open_atlas(small_atlases[name]) as data:
-        ground = modes.grounded(data)
+        ground = modes.stored.grounded(data)
         assert [str(n).rpartition(" ")[2] for n in data.node.values[ground]] == ["0/8"] * 3
 
 
@@ -111,9 +114,9 @@ def test_the_title_of_a_mode_names_the_parts_that_hold_most_energy(small_atlases
     with open_atlas(small_atlases["modes upr_rpu"]) as data:
         share = data.strain_share.sel(mode=1)
         first = str(data.element.values[np.argmax(share.values)])
-        text = modes.largest_shares(data, 1)
+        text = modes.stored.largest_shares(data, 1)
         assert text.startswith(f"{first} {100 * float(share.max()):.0f} %")
-        title = modes.mode_shape(data, 1).get_title()
+        title = modes.figures.mode_shape(data, 1).get_title()
         assert text in title
         assert f"{float(data.shape_frequency.sel(mode=1)):.4g} Hz" in title
 
@@ -124,11 +127,11 @@ def test_a_sphere_is_seen_from_its_side():
     theta, phi = np.meshgrid(polar, turn, indexing="ij")
     x = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
     for k in range(3):
-        image = isotropy.sphere_image(x[..., k], polar, turn)
-        middle = isotropy.PIXELS // 2
-        assert image[middle, middle] == pytest.approx(isotropy.VIEW[k], abs=1e-3)
+        image = isotropy.figures.sphere_image(x[..., k], polar, turn)
+        middle = isotropy.figures.PIXELS // 2
+        assert image[middle, middle] == pytest.approx(isotropy.figures.VIEW[k], abs=1e-3)
         # Beyond the rim, which cuts the picture off, the rim's value goes on.
-        right, up = isotropy._view()
+        right, up = isotropy.figures._view()
         assert image[0, 0] == pytest.approx(-(right + up)[k] / np.sqrt(2), abs=1e-3)
         assert np.abs(image).max() <= 1.0
 
@@ -192,12 +195,12 @@ def test_show_writes_the_page_of_a_stored_modes_atlas(name, small_atlases, tmp_p
 def test_a_mode_on_the_page_changes_shape_slices_and_what_swings(name, small_atlases):
     pytest.importorskip("plotly")
     with open_atlas(small_atlases[name]) as data:
-        figure = modes.page(data)
+        figure = modes.page.page(data)
         change, layout, (swing, discs) = figure.layout.updatemenus[0].buttons[3].args
-        path = modes._path(data.line.values)
-        moved = modes.deformed(data, 4)[0]
+        path = modes.page._path(data.line.values)
+        moved = modes.stored.deformed(data, 4)[0]
         for k, axis in enumerate("xyz"):
-            assert change[axis][0] == modes._picked(moved[:, k], path)
+            assert change[axis][0] == modes.page._picked(moved[:, k], path)
         mesh = figure.data[discs]
         corners = np.stack([mesh.x, mesh.y], -1)
         for n, z in enumerate(data.z.values):
@@ -215,16 +218,16 @@ def test_a_mode_on_the_page_changes_shape_slices_and_what_swings(name, small_atl
         assert layout["sliders"][0]["steps"][1]["args"][0] == ["4/1"]
         assert layout["updatemenus[1].buttons"][0]["args"][0][:2] == ["4/0", "4/1"]
         frames = {frame.name: frame for frame in figure.frames}
-        assert len(frames) == 6 * modes.PHASES
+        assert len(frames) == 6 * modes.page.PHASES
         # Half a swing later the shape is on the other side of rest.
         rest = data.position.values
-        other = frames[f"4/{modes.PHASES // 2}"].data[0]
+        other = frames[f"4/{modes.page.PHASES // 2}"].data[0]
         assert list(frames["4/0"].traces) == [swing]
-        assert list(other.x) == modes._picked(2 * rest[:, 0] - moved[:, 0], path)
+        assert list(other.x) == modes.page._picked(2 * rest[:, 0] - moved[:, 0], path)
 
 
 def test_lines_of_a_frame_are_drawn_in_one_go():
     pytest.importorskip("plotly")
-    from pkm_twin.atlas.modes import _path
+    from pkm_twin.atlas.modes.page import _path
 
     assert _path(np.array([[1, 2], [2, 3], [0, 4]])).tolist() == [1, 2, 3, -1, 0, 4]

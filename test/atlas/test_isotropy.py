@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics.isotropy import energy_transfer, max_driving_force, tilted_pose
-from pkm_twin.atlas.isotropy import isotropy_sweep
+from pkm_twin.atlas.isotropy.sweep import isotropy_sweep
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.errors import ParameterError
 from test.atlas.conftest import finite

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkm_twin.atlas.modes import modes_sweep, structure_edges
+from pkm_twin.atlas.modes.sweep import modes_sweep, structure_edges
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.errors import ParameterError
 from stiffness_monitor import reachable

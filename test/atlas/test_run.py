@@ -18,7 +18,7 @@ from pkm_twin.atlas import run as running
 from pkm_twin.atlas.extras import MissingExtraError
 from pkm_twin.atlas.run import ClusterError, run
 from pkm_twin.atlas.store import AtlasError, Parts, open_atlas
-from pkm_twin.atlas.strain_energy import WRENCHES, strain_energy_sweep
+from pkm_twin.atlas.strain_energy.sweep import WRENCHES, strain_energy_sweep
 from pkm_twin.errors import PkmTwinError
 from test.atlas.conftest import same
 from test.atlas.scale import command

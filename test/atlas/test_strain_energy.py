@@ -11,7 +11,7 @@ import pytest
 
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
-from pkm_twin.atlas.strain_energy import (
+from pkm_twin.atlas.strain_energy.sweep import (
     ELEMENTS,
     TABLE_2,
     WRENCHES,

@@ -10,7 +10,7 @@ from pkm_twin.atlas import workspace
 from pkm_twin.atlas.grids import circles, height_range, largest_cylinder, largest_distance, nice
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
-from pkm_twin.atlas.workspace import workspace_sweep
+from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.clearance import clearance
 from pkm_twin.kinematics.workspace import CLEAR, RAYS, singularity_at
@@ -30,7 +30,7 @@ def reach_atlas(request, small_atlases):
 
 @pytest.fixture
 def few_layers(monkeypatch):
-    monkeypatch.setattr(workspace, "LAYERS", LAYERS)
+    monkeypatch.setattr(workspace.sweep, "LAYERS", LAYERS)
 
 
 def test_reach_and_singularity_are_those_of_the_library(reach_atlas):

@@ -13,7 +13,7 @@ import yaml
 from scipy.optimize import lsq_linear
 
 from delta_dynamics.isotropy import tilted_pose
-from pkm_twin.atlas.workspace import workspace_sweep
+from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.clearance import clearance, distance, has_clearance
 from pkm_twin.kinematics.workspace import reachable, regular_workspace

@@ -1,33 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Strain-energy atlas: total energy and the elements' factors over the regular workspace.
+"""Strain-energy sweep: the energy of one wrench, and which elements of the limbs have it.
 
 The grid: heights, tilts and azimuths of the tilt, beta = tilt cos(azimuth), gamma = tilt
 sin(azimuth). Tilts beyond a height's circle are left out (NaN, element -1).
+
+May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.atlas import figures, pages, plots
 from pkm_twin.atlas.grids import circles, cylinder, height_range, ladder, nice, turns
-from pkm_twin.atlas.sweep import Chunk, Field, Kind, Sweep, Values, Variable
+from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.compliance import strain_energy
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from xarray import Dataset
 
 Array = NDArray[np.float64]
 
@@ -48,8 +43,6 @@ TABLE_2: Final[Mapping[str, tuple[float, ...]]] = MappingProxyType(
     }
 )
 """Global strain-energy factors of the paper's table 2, in the order of ``ELEMENTS``."""
-PLANE: Final = -0.6
-"""Height of the paper's figures, m."""
 
 CHUNK: Final = 65536
 LEAST_RADIUS: Final = math.radians(10.0)
@@ -257,223 +250,3 @@ def _sweep(
     tilts = ladder(tilt_step, max(rungs, 2))
     rows = max(1, CHUNK // azimuths)
     return StrainEnergySweep(robot, wrench, heights, radii, tilts, azimuths, rows)
-
-
-# Figures
-
-
-def plane(
-    atlas: Dataset,
-    variable: str = "energy",
-    z: float | None = None,
-    ax: Axes | None = None,
-    **options: Any,
-) -> Axes:
-    """One field of a strain-energy atlas over the plane of beta and gamma at one height.
-
-    :param variable: ``energy``, or the name of an element for its factor.
-    :param z: m; the nearest height is drawn; default that of the paper's figures.
-    :param options: for ``contourf``; ``least``: the value of the first colour.
-    """
-    ax = figures.axes_or_new(ax)
-    layer = atlas.isel(z=nearest_height(atlas, z))
-    tilt = figures.thin(atlas.tilt.values)
-    azimuth = figures.thin(atlas.azimuth.values)
-    steps = {
-        "tilt": figures.every(atlas.sizes["tilt"]),
-        "azimuth": figures.every(atlas.sizes["azimuth"]),
-    }
-    layer = layer.isel({dim: slice(None, None, step) for dim, step in steps.items()})
-    if variable == "energy":
-        values, unit = figures.prefixed(layer.energy.values, "J")
-        label = f"total strain energy ({unit})"
-    else:
-        values, label = layer.factor.sel(element=variable).values, f"factor of {variable} (1)"
-    shown = np.isfinite(values).any(1)
-    turn, values = figures.around(azimuth, values[shown])
-    beta, gamma = (np.degrees(tilt[shown])[:, None] * f(turn) for f in (np.cos, np.sin))
-    figures.contours(ax, gamma, beta, values, label, **options)
-    first, second = lateral_of(atlas)
-    ax.set_xlabel(f"{second} (deg)")
-    ax.set_ylabel(f"{first} (deg)")
-    ax.set_title(f"z = {float(layer.z):.3f} m")
-    return ax
-
-
-def global_factors(atlas: Dataset, ax: Axes | None = None) -> Axes:
-    """Global strain-energy factors, beside the paper's where it prints them."""
-    ax = figures.axes_or_new(ax)
-    names = [str(name) for name in atlas.element.values]
-    bars = [("this atlas", atlas.global_factor.values, plots.COLOURS[0])]
-    printed = table_2(wrench_of(atlas))
-    if printed is not None:
-        bars.append(("paper, table 2", np.array(printed), plots.COLOURS[4]))
-    bars.append(("this atlas, mean over the volume", atlas.volume_factor.values, plots.COLOURS[2]))
-    width = 0.8 / len(bars)
-    for k, (label, values, colour) in enumerate(bars):
-        place = np.arange(len(names)) + (k - (len(bars) - 1) / 2) * width
-        ax.bar(place, values, width, label=label, color=colour)
-    ax.set_xticks(np.arange(len(names)), names)
-    ax.set_xlabel("element: limb, and revolute joint, bar or universal joint")
-    ax.set_ylabel("global strain-energy factor (1)")
-    ax.grid(axis="y", alpha=0.3)
-    ax.legend()
-    return ax
-
-
-def stack(atlas: Dataset, ax: Any = None, layers: int = 6) -> Any:
-    """Total energy on slices of the regular workspace, stacked by height, on 3-D axes."""
-    if ax is None:
-        ax = (
-            figures.pyplot()
-            .figure(figsize=(8, 7), layout="constrained")
-            .add_subplot(projection="3d")
-        )
-    from matplotlib import cm, colors
-
-    picked = np.unique(np.linspace(0, atlas.sizes["z"] - 1, layers).round().astype(int))
-    every = {d: max(1, math.ceil(atlas.sizes[d] / 48)) for d in ("tilt", "azimuth")}
-    part = atlas.isel({d: slice(None, None, s) for d, s in every.items()})
-    energy, unit = figures.prefixed(part.energy.isel(z=picked).values, "J")
-    norm = colors.LogNorm(np.nanmin(energy), np.nanmax(energy))
-    for k, layer in zip(picked, energy, strict=True):
-        shown = np.isfinite(layer).any(1)
-        turn, values = figures.around(part.azimuth.values, layer[shown], 144)
-        tilt = np.degrees(part.tilt.values[shown])[:, None]
-        beta, gamma = tilt * np.cos(turn), tilt * np.sin(turn)
-        height = np.full_like(values, float(atlas.z[k]))
-        ax.plot_surface(
-            gamma,
-            beta,
-            height,
-            facecolors=figures.colours(norm, values),
-            rstride=1,
-            cstride=1,
-            shade=False,
-            linewidth=0,
-            antialiased=False,
-        )
-    ax.view_init(elev=24, azim=-60)
-    ax.set_box_aspect((1, 1, 0.8), zoom=1.12)
-    first, second = lateral_of(atlas)
-    ax.set_xlabel(f"{second} (deg)")
-    ax.set_ylabel(f"{first} (deg)")
-    ax.set_zlabel("z (m)", labelpad=8)
-    bar = ax.figure.colorbar(cm.ScalarMappable(norm, figures.MAP), ax=ax, shrink=0.75, pad=0.12)
-    bar.set_label(f"total strain energy ({unit})")
-    figures.plain_ticks(bar)
-    return ax
-
-
-def _energy_plane(atlas: Dataset) -> Figure:
-    figure, ax = figures.subplots(figsize=(7, 6), layout="constrained")
-    plane(atlas, ax=ax)
-    figure.suptitle(f"{load_case(atlas)}: total strain energy")
-    return figure
-
-
-def _energy_slices(atlas: Dataset) -> Figure:
-    figure = figures.new_figure(figsize=(8, 6.2), layout="constrained")
-    stack(atlas, figure.add_subplot(projection="3d"))
-    figure.suptitle(f"{load_case(atlas)}: total strain energy over the regular workspace")
-    return figure
-
-
-def _factor_plane(atlas: Dataset) -> Figure:
-    figure, axes = figures.subplots(3, 3, figsize=(13.5, 10), layout="constrained")
-    height = float(atlas.z[nearest_height(atlas, None)])
-    for name, ax in zip(atlas.element.values, axes.T.ravel(), strict=True):
-        plane(atlas, str(name), ax=ax, least=0.0)
-        ax.set_title(f"element {name}")
-    figure.suptitle(f"{load_case(atlas)}: strain-energy factors at z = {height:.3f} m")
-    return figure
-
-
-def _global(atlas: Dataset) -> Figure:
-    figure, ax = figures.subplots(figsize=(9, 4.5), layout="constrained")
-    global_factors(atlas, ax)
-    figure.suptitle(f"{load_case(atlas)}: global strain-energy factors")
-    return figure
-
-
-def nearest_height(atlas: Dataset, z: float | None) -> int:
-    """Index of the height nearest to z; default -0.6 m, or the middle where that is outside."""
-    heights = atlas.z.values
-    if z is None:
-        z = PLANE if heights.min() <= PLANE <= heights.max() else float(heights.mean())
-    return int(np.abs(heights - z).argmin())
-
-
-def wrench_of(atlas: Dataset) -> tuple[float, ...]:
-    """The wrench that made a strain-energy atlas, N and N m."""
-    return tuple(json.loads(atlas.attrs["settings"])["wrench"])
-
-
-def load_case(atlas: Dataset) -> str:
-    """Robot and wrench of a strain-energy atlas, as text."""
-    wrench = wrench_of(atlas)
-    name = "".join(f"{name} = " for name, value in WRENCHES.items() if tuple(value) == wrench)
-    numbers = ", ".join(f"{value:g}" for value in wrench)
-    return f"{atlas.attrs['robot']} under {name}({numbers}) N, N m"
-
-
-def lateral_of(atlas: Dataset) -> tuple[str, str]:
-    """Names of the two tilts, at azimuth 0 and a quarter turn."""
-    first, second = atlas.attrs["lateral"].split()
-    return first, second
-
-
-# Page
-
-
-def title(atlas: Dataset) -> str:
-    """What the page shows, in a line."""
-    return f"Strain energy of {load_case(atlas)}"
-
-
-def page(atlas: Dataset) -> Any:
-    """Slices of a strain-energy atlas.
-
-    A menu chooses total energy or an element's factor, a slider one height or all.
-    """
-    part = pages.thinned(atlas, {"z": 12, "tilt": pages.MOST, "azimuth": 2 * pages.MOST})
-    turn = np.append(part.azimuth.values, part.azimuth.values[0] + 2 * np.pi)
-    tilt = np.degrees(part.tilt.values)[:, None]
-    energy, unit = figures.prefixed(part.energy.values, "J")
-
-    def closed(values: Array) -> Array:
-        return np.stack([pages.closed(layer) for layer in values])
-
-    # Over two decades: in steps of equal ratio, or all but the edge is one colour. Nothing has a
-    # logarithm where nothing bears the wrench.
-    ratio = bool(np.nanmin(energy) > 0.0)
-    label = f"total strain energy ({unit})"
-    fields = [pages.Shown(label, "energy", unit, closed(energy), logarithmic=ratio)]
-    for k, name in enumerate(part.element.values):
-        values = closed(part.factor.values[..., k])
-        fields.append(pages.Shown(f"factor of {name} (1)", f"factor of {name}", "", values))
-    first, second = lateral_of(atlas)
-    return pages.layers(
-        title(atlas),
-        tilt * np.sin(turn),
-        tilt * np.cos(turn),
-        part.z.values,
-        (second, first, "z"),
-        ("deg", "deg", "m"),
-        fields,
-    )
-
-
-KIND: Final = Kind(
-    "strain-energy",
-    figures={
-        "plane": _energy_plane,
-        "factors": _factor_plane,
-        "slices": _energy_slices,
-        "global": _global,
-    },
-    page=page,
-    title=title,
-    help="Each slice is one height; the slider shows one alone. The menu chooses the total "
-    "energy or one element's part of it.",
-)

@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Workspace atlas: what a machine reaches, how far from a singularity, and the regular part."""
+
+from typing import Final
+
+from pkm_twin.atlas.sweep import Kind
+from pkm_twin.atlas.workspace import figures, page
+
+KIND: Final = Kind(
+    "workspace",
+    figures=figures.FIGURES,
+    page=page.page,
+    title=page.title,
+    help="Reachable poses, coloured by the distance to a singularity: 0 in one, 1 at best. The "
+    "menu chooses what is shown, the slider one layer alone.",
+)
