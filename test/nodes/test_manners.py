@@ -345,22 +345,27 @@ node.main()
 """
 
 
-@pytest.mark.parametrize("executor", ["single", "events"])
-def test_the_stream_is_answered_while_a_trajectory_is_worked_on(peer, launch, executor):
-    """A state is sent once the one before is answered: the node answers between slices of work."""
+@pytest.fixture(scope="module", params=["single", "events"])
+def slow(request, peer, launch):
+    """A node whose work on trajectories takes 50 ms a slice, by either executor."""
     peer.hear(DiagnosticArray, "/diagnostics")
-    name = f"slow_{executor}"
+    name = f"slow_{request.param}"
     remap = ("-r", f"__node:={name}", "-r", f"joint_states:=/{name}/states")
-    options = (*COMMON, "stale_after:=30", f"executor:={executor}")
-    slow = Twin(peer, launch(None, *options, arguments=remap, code=SLOW), name).ready()
+    options = (*COMMON, "stale_after:=30", f"executor:={request.param}")
+    return Twin(peer, launch(None, *options, arguments=remap, code=SLOW), name).ready()
+
+
+def test_the_stream_is_answered_while_a_trajectory_is_worked_on(slow):
+    """A state is sent once the one before is answered: the node answers between slices of work."""
     answered(slow)
     answers, torques = slow.received("joint_trajectory_ff"), slow.received("joint_torques")
     times = [i * STEP for i in range(10_000)]
     rest = np.zeros((len(times), 3))
-    slow.peer.send(f"/{name}/joint_trajectory", MAKE.trajectory(NAMES, times, rest, rest, rest))
+    message = MAKE.trajectory(NAMES, times, rest, rest, rest)
+    slow.peer.send(f"/{slow.name}/joint_trajectory", message)
     while not answers:
         sent = []
-        peer.until(
+        slow.peer.until(
             lambda sent=sent: answers or any(stamp_of(m) in sent for m in torques[-1:]),
             repeat=lambda sent=sent: sent.extend(slow.stream(1)),
             every=1.0,
@@ -369,6 +374,21 @@ def test_the_stream_is_answered_while_a_trajectory_is_worked_on(peer, launch, ex
     counts = [int(n) for n in re.findall(r"answered (\d+)", slow.process.output)][-38:]
     assert len(counts) == 38
     assert counts[-1] - counts[0] >= 3
+
+
+def test_more_than_can_wait_is_refused_by_name(slow):
+    def send():
+        message = trajectory(stamp=slow.begin())
+        slow.peer.send(f"/{slow.name}/joint_trajectory", message)
+
+    def refused():
+        told = [
+            a for a in slow.peer.received("/diagnostics") if a.status[0].name == f"/{slow.name}"
+        ]
+        return told and counts_of(told[-1], "trajectories rejected").get("busy", 0)
+
+    slow.peer.until(refused, repeat=send, every=0.01)
+    slow.ask_anew()
 
 
 class TestLongTrajectories:
@@ -384,26 +404,6 @@ class TestLongTrajectories:
         exact = inverse_dynamics(ROBOT, *(values[picked] for values in rows))
         assert np.abs(efforts - exact).max() < 1e-9
         assert len(answers[0].points) == POINTS
-
-    def test_more_than_can_wait_is_refused_by_name(self, twin):
-        before = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0)
-        count = 40
-        for _ in range(count):
-            # Made anew each time: faster than that, the middleware loses some.
-            message = trajectory(count=2000, stamp=twin.begin())
-            for point, time in zip(message.points, range(2000), strict=True):
-                point.time_from_start.sec, point.time_from_start.nanosec = divmod(
-                    time * STEP * 100, SECOND
-                )
-            twin.peer.send(f"/{twin.name}/joint_trajectory", message)
-        answers = twin.received("joint_trajectory_ff")
-
-        def all_told():
-            busy = counts_of(twin.diagnostics(), "trajectories rejected").get("busy", 0) - before
-            return len(answers) + busy >= count
-
-        twin.peer.until(all_told)
-        answers.clear()
 
 
 class TestLifeCycle:

@@ -58,9 +58,9 @@ def has(robot: Robot, ask: str) -> bool:
 _shipped = functools.cache(pkm_twin.load)
 
 
-def load(source: str | Path, **options: Any) -> Robot:
+def load(robot: str | Path, **options: Any) -> Robot:
     """As the library's; a shipped robot once, as it does not change."""
-    return _shipped(source) if source in robot_names() else pkm_twin.load(source, **options)
+    return _shipped(robot) if robot in robot_names() else pkm_twin.load(robot, **options)
 
 
 SHIPPED = {name: load(name) for name in robot_names()}
