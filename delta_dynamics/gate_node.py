@@ -22,6 +22,7 @@ from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
+from pkm_twin.ros.run import run
 
 PAYLOAD = {
     "payload.mass": ("mass", "kg"),
@@ -246,7 +247,7 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
 
 def main() -> None:
     """Entry point of ``ros2 run pkm_twin command_gate``."""
-    sys.exit(health.run(CommandGate, farewell=True))
+    sys.exit(run(CommandGate, farewell=True))
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
 from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import SECONDS, declare_mounts, declare_wrench
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.wrench import WrenchReader
@@ -538,7 +539,7 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
 
 def main() -> None:
     """Run the node until a signal ends it."""
-    sys.exit(health.run(DeltaDynamics))
+    sys.exit(run(DeltaDynamics))
 
 
 if __name__ == "__main__":

@@ -39,6 +39,7 @@ from pkm_twin.machine.variation import KINDS, MAX_SPREAD, Variation, varied
 from pkm_twin.ros import node as health
 from pkm_twin.ros.intake import RawTrajectory
 from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.run import run
 
 Array = NDArray[np.float64]
 
@@ -370,7 +371,7 @@ def _numbers(values: Array) -> array[float]:
 
 def main() -> None:
     """Entry point of ``ros2 run pkm_twin machine_sim``."""
-    sys.exit(health.run(MachineSim))
+    sys.exit(run(MachineSim))
 
 
 if __name__ == "__main__":

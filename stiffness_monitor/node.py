@@ -27,6 +27,7 @@ from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
+from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import (
     SECONDS,
     WRENCH_CHANGES,
@@ -290,7 +291,7 @@ def _transform(answer: Answer) -> TransformStamped:
 
 def main() -> None:
     """Run the node until a signal ends it."""
-    sys.exit(health.run(StiffnessMonitor))
+    sys.exit(run(StiffnessMonitor))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every node of the suite shares: start and end, life cycle, parameters, guards, diagnostics.
+"""What every node of the suite shares: life cycle, parameters, guards, diagnostics.
 
 Nothing that runs while a node spins can end it: what a message, a request or a clock breaks is
 caught, counted and told.
@@ -7,24 +7,16 @@ caught, counted and told.
 
 from __future__ import annotations
 
-import difflib
-import gc
 import inspect
 import os
-import signal
-import sys
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator
 from typing import Any, Final, TypeVar
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
     SetParametersResult,
 )
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
@@ -32,50 +24,27 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.exceptions import (
-    InvalidHandle,
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-    ParameterException,
-)
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.experimental import EventsExecutor
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.parameter import Parameter
+from rclpy.executors import ExternalShutdownException
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.qos import (
-    DurabilityPolicy,
     QoSCompatibility,
-    QoSPolicyKind,
-    QoSProfile,
-    ReliabilityPolicy,
     qos_check_compatible,
     qos_policy_name_from_kind,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.signals import SignalHandlerGuardCondition, SignalHandlerOptions
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
-from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.ros.context import middleware_arguments
+from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.ros.messages import SECOND
-from pkm_twin.ros.signals import (
-    SIGNALS,
-    first_signal,
-    ignore_signals,
-    noted_signals,
-    nothing_raised,
-)
+from pkm_twin.ros.parameters import ParameterNode
+from pkm_twin.ros.qos import EXPIRY, OVERRIDES, input_qos, latched_qos, output_qos
 from pkm_twin.streams.monitor import TopicStatistics
-from pkm_twin.threads import one_blas_thread
 
 OK: Final = DiagnosticStatus.OK
 WARN: Final = DiagnosticStatus.WARN
 ERROR: Final = DiagnosticStatus.ERROR
 
-OVERRIDES: Final = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
-EXPIRY: Final = (QoSPolicyKind.LIFESPAN, QoSPolicyKind.DEADLINE)
-"""QoS policies that parameters may override; the second ones of topics that expire."""
 OVERRUN_SHARE: Final = 100
 """One callback in so many may take longer than its period before the diagnostics warn."""
 MAX_TEXT: Final = 500
@@ -89,8 +58,6 @@ parameters. More take the stream's time."""
 SELDOM_PERIOD: Final = 0.1
 SELDOM_TURNS: Final = 3
 """How often requests and events are looked for, s, and how many at a time at least."""
-LOOK: Final = 0.5
-"""How often the events executor looks whether the context has ended, s."""
 
 M = TypeVar("M")
 Task = Generator[None, None, None]
@@ -121,47 +88,7 @@ class SeldomGroup(MutuallyExclusiveCallbackGroup):
         return self._turns > 0 and bool(super().can_execute(entity))
 
 
-class UnknownParametersError(PkmTwinError):
-    """Parameters that no declaration knows: one line each, what is closest first."""
-
-    def __init__(self, unknown: Iterable[str], valid: Iterable[str]) -> None:
-        names = sorted(valid)
-        self.lines = []
-        for name in unknown:
-            close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
-            hint = f"did you mean {close[0]!r}? " if close else ""
-            rest = [n for n in names if n not in close and not n.startswith("qos_overrides.")]
-            self.lines.append(f"unknown parameter {name!r}; {hint}valid: {', '.join(close + rest)}")
-        super().__init__("; ".join(self.lines))
-
-
-def output_qos() -> QoSProfile:
-    """Reliable and volatile: a torque or a compliance is for now, never for a late joiner."""
-    return QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-
-
-def latched_qos() -> QoSProfile:
-    """What does not change while a node runs, such as a description: late joiners get it too."""
-    return QoSProfile(
-        depth=1,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
-
-
-def input_qos(depth: int, *, best_effort: bool, expiry: float | None = None) -> QoSProfile:
-    """Best effort takes what publishers of both kinds send; reliable only what reliable ones do.
-
-    :param expiry: lifespan and deadline that they have to offer, s; None is any.
-    """
-    kind = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-    qos = QoSProfile(depth=depth, reliability=kind)
-    if expiry is not None:
-        qos.lifespan = qos.deadline = Duration(seconds=expiry)
-    return qos
-
-
-class TwinNode(LifecycleNode):
+class TwinNode(ParameterNode):
     """A life-cycle node with guarded callbacks, diagnostics at 1 Hz and checked parameters.
 
     Everything is made and every parameter checked before the first state; a node that is not
@@ -185,9 +112,6 @@ class TwinNode(LifecycleNode):
         self._incompatible = 0
         self._last_clock = 0
         self.active = False
-        self.followed: set[str] = set()
-        """Parameters whose changes are taken while the node runs."""
-        self._changeable: set[str] = set()
         self._active_since = 0
         self.seldom = SeldomGroup()
         super().__init__(name)
@@ -214,13 +138,7 @@ class TwinNode(LifecycleNode):
 
         :param leap: how far the ROS clock goes forward at once for :meth:`time_jumped_forward`, s.
         """
-        self.refuse_unknown_parameters()
-        deaf = sorted(self._changeable - self.followed)
-        if deaf:
-            # A set of it would be answered as taken.
-            raise NotImplementedError(f"nothing follows a change of {', '.join(deaf)}")
-        self.add_pre_set_parameters_callback(self._with_floats)
-        self.add_on_set_parameters_callback(_refuse_nameless)
+        self.close_declarations()
         self.create_guarded_timer(1.0, self._publish_diagnostics)
         self.create_service(Trigger, "~/reset", self._on_reset)
         for service in self.services:
@@ -261,7 +179,7 @@ class TwinNode(LifecycleNode):
         self.time_jumped_backward()
 
     def farewell(self) -> None:
-        """The last thing to do while the topics are still there; see :func:`run`."""
+        """The last thing to do while the topics are still there; see ``ros.run``."""
 
     def stream_broken(self, where: str) -> None:
         """A callback failed: whatever it feeds cannot be trusted now."""
@@ -305,73 +223,6 @@ class TwinNode(LifecycleNode):
         # As Clock.now, without its objects: it is asked twice a sample.
         nanoseconds: int = self.get_clock().handle.get_now().nanoseconds
         return nanoseconds
-
-    def declare(
-        self,
-        name: str,
-        default: Any,
-        description: str,
-        *,
-        unit: str = "",
-        low: float | None = None,
-        high: float | None = None,
-        choices: Sequence[str] = (),
-        read_only: bool = False,
-    ) -> Any:
-        """Declare a parameter and return its value; a whole number is taken for a float.
-
-        :param low: least value, ``high``: greatest; ``choices``: the words that are allowed.
-        :raises ParameterError: the given value has another type or is out of range, naming both.
-        """
-        constraints = f"one of {', '.join(choices)}" if choices else ""
-        descriptor = ParameterDescriptor(
-            description=description + (f"; {unit}" if unit else ""),
-            additional_constraints=constraints,
-            read_only=read_only,
-        )
-        if low is not None and high is not None:
-            if isinstance(default, float):
-                descriptor.floating_point_range = [
-                    FloatingPointRange(from_value=float(low), to_value=float(high))
-                ]
-            else:
-                descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-            constraints = f"{low:g} to {high:g} {unit}".strip()
-        given = self._parameter_overrides.get(name)
-        if given is not None:
-            given = self._parameter_overrides[name] = _as_float(given, default)
-        try:
-            value = self.declare_parameter(name, default, descriptor).value
-        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            value = given.value if given is not None else None
-            raise ParameterError(name, value, constraints or f"a value like {default!r}") from error
-        self.check_parameter(name, value)
-        if not read_only:
-            self._changeable.add(name)
-        return value
-
-    def check_parameter(self, name: str, value: Any) -> None:
-        """Refuse what a parameter's declaration does not allow.
-
-        :raises ParameterError: out of range, not a number, or not one of the words.
-        """
-        descriptor = self.describe_parameter(name)
-        for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
-            # rclpy lets a value that is not a number pass.
-            if not limits.from_value <= value <= limits.to_value:
-                raise ParameterError(name, value, f"{limits.from_value:g} to {limits.to_value:g}")
-        words = descriptor.additional_constraints.removeprefix("one of ").split(", ")
-        if words != [""] and value not in words:
-            raise UnknownNameError(name, value, words)
-
-    def refuse_unknown_parameters(self) -> None:
-        """A parameter that no declaration knows is a misspelling.
-
-        :raises UnknownParametersError: naming each.
-        """
-        unknown = [name for name in self._parameter_overrides if name not in self._parameters]
-        if unknown:
-            raise UnknownParametersError(unknown, self._parameters)
 
     def create_subscription(
         self,
@@ -650,15 +501,6 @@ class TwinNode(LifecycleNode):
         response.message = f"ended: {ended}" if ended else "no stop was latched"
         return response
 
-    def _with_floats(self, changes: list[Parameter]) -> list[Parameter]:
-        """Whole numbers for floats where the declaration has floats."""
-        return [
-            _as_float(change, self._parameters[change.name].value)
-            if change.name in self._parameters
-            else change
-            for change in changes
-        ]
-
     def _jumped(self, jump: Any) -> None:
         try:
             # One is an enumeration of Python, the other may be the binding's.
@@ -761,124 +603,3 @@ class TwinNode(LifecycleNode):
 def _cut(text: str) -> str:
     """A text that strangers may have made long."""
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}... ({len(text)} characters)"
-
-
-def _refuse_nameless(changes: list[Parameter]) -> SetParametersResult:
-    """Refuse what rclpy would declare by the way."""
-    good = all(change.name for change in changes)
-    return SetParametersResult(successful=good, reason="" if good else "a parameter without a name")
-
-
-def _as_float(given: Parameter, like: Any) -> Parameter:
-    """A parameter of whole numbers as one of floats, where what it is for is one of floats."""
-    if isinstance(like, float) and given.type_ == Parameter.Type.INTEGER:
-        return Parameter(given.name, value=float(given.value))
-    many = not isinstance(like, str) and hasattr(like, "__len__")
-    if (
-        many
-        and len(like)
-        and isinstance(like[0], float)
-        and given.type_ == Parameter.Type.INTEGER_ARRAY
-    ):
-        return Parameter(given.name, value=[float(value) for value in given.value])
-    return given
-
-
-class _NeverMade:
-    """For the handle of a guard that a signal keeps from being made: its end is quiet then."""
-
-    def __enter__(self) -> None:
-        raise InvalidHandle("never made")
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing was entered."""
-
-
-SignalHandlerGuardCondition._GuardCondition__gc = _NeverMade()
-
-
-class _Executor(SingleThreadedExecutor):
-    """One whose making a signal may interrupt: rclpy's own end asks for what is not there then."""
-
-    _sigint_gc = None
-
-
-def spin(node: TwinNode, ended: Callable[[], bool] = lambda: False) -> None:
-    """Run callbacks, and between them a step of what waits, until the context ends.
-
-    :param ended: asked between two callbacks; true ends it too.
-    """
-    if not node.context.ok():
-        return  # A signal has come before: rclpy cannot make an executor any more, and prints so.
-    events = node.executor_kind == "events"
-    executor = EventsExecutor() if events else _Executor()
-    executor.add_node(node)
-    # Without a bound the one waits for ever; with one the other makes a timer a message.
-    patience = LOOK if events else None
-    going, turn = node.context.ok, executor.spin_once
-    while going() and not ended():
-        try:
-            turn(0.0 if node.busy else patience)
-            node.turned()
-        except (KeyboardInterrupt, ExternalShutdownException):
-            raise
-        except Exception as error:
-            # The last line of defence: rclpy's own code, on the way to a callback or back.
-            node.caught("rclpy", error)
-
-
-def run(
-    factory: Callable[[], TwinNode],
-    arguments: Sequence[str] | None = None,
-    *,
-    farewell: bool = False,
-) -> int:
-    """Run a node until SIGINT or SIGTERM.
-
-    :param farewell: call :meth:`TwinNode.farewell` at the end. Signals are then not the
-        middleware's, which would close the topics at once, and end the node at its next event.
-    :returns: 0 after a signal, 1 where the node refuses its configuration.
-    """
-    node: TwinNode | None = None
-    begun = False
-    try:
-        # Until it spins: the middleware's handler for SIGINT calls this one, that for SIGTERM none.
-        with first_signal(KeyboardInterrupt, SIGNALS if farewell else (signal.SIGINT,)):
-            rclpy.init(
-                args=middleware_arguments(sys.argv if arguments is None else arguments),
-                signal_handler_options=SignalHandlerOptions.NO if farewell else None,
-            )
-            begun = True
-            node = factory()
-            one_blas_thread()
-            # What is loaded by now stays: the collector need not look at it again.
-            gc.collect()
-            gc.freeze()
-            if not farewell:
-                # The middleware's handler ends its context, and with it the loop.
-                with nothing_raised():
-                    spin(node)
-                return 0
-            with noted_signals() as asked:
-                spin(node, asked)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except (PkmTwinError, ParameterException, RuntimeError) as error:
-        if begun and not rclpy.ok():
-            return 0  # A signal in the middle of a call of the middleware.
-        if node is not None:
-            raise
-        # The middleware's own refusals (arguments, types, QoS overrides) have many lines.
-        lines = error.lines if isinstance(error, UnknownParametersError) else [str(error)]
-        for line in lines:
-            print(f"refused to start: {' '.join(line.split())}", file=sys.stderr)
-        return 1
-    finally:
-        ignore_signals()
-        if node is not None:
-            if farewell:
-                node.farewell()
-            node.destroy_node()
-        # rclpy.try_shutdown would bring the old signal handlers back.
-        rclpy.get_default_context().try_shutdown()
-    return 0

@@ -25,6 +25,7 @@ from pkm_twin.ros import outputs
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
 from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import (
     SECONDS,
     WRENCH_CHANGES,
@@ -277,7 +278,7 @@ def _warm_up(robot: Robot) -> None:
 
 def main() -> None:
     """Run the node until a signal ends it."""
-    sys.exit(health.run(MachineStateNode))
+    sys.exit(run(MachineStateNode))
 
 
 if __name__ == "__main__":

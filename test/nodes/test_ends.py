@@ -54,7 +54,7 @@ def test_what_a_signal_keeps_rclpy_from_making_ends_quietly():
     script = """
 import signal, time
 import rclpy
-from pkm_twin.ros.node import _Executor
+from pkm_twin.ros.run import _Executor
 from rclpy.signals import SignalHandlerGuardCondition
 rclpy.init()
 made = SignalHandlerGuardCondition()
@@ -109,11 +109,11 @@ def test_a_signal_while_an_executor_is_made_leaves_no_traceback():
     """A context that has ended by then: rclpy stops half-way, and its clean-up must not fail."""
     script = """
 import rclpy
-from pkm_twin.ros import node
+from pkm_twin.ros import run
 rclpy.init()
 rclpy.get_default_context().shutdown()
 try:
-    node._Executor()
+    run._Executor()
 except Exception as error:
     print(type(error).__name__)
 """

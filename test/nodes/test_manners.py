@@ -85,12 +85,13 @@ def strange(kind):
 
 DEAF = """
 from pkm_twin.ros import node
+from pkm_twin.ros.run import run
 class Deaf(node.TwinNode):
     def __init__(self):
         super().__init__("deaf")
         self.declare("volume", 1.0, "that nothing hears")
         self.start()
-raise SystemExit(node.run(Deaf))
+raise SystemExit(run(Deaf))
 """
 
 

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node's parameters: declared with bounds, whole numbers taken for floats, no others."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.lifecycle import LifecycleNode
+from rclpy.parameter import Parameter
+
+from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+
+
+class UnknownParametersError(PkmTwinError):
+    """Parameters that no declaration knows: one line each, what is closest first."""
+
+    def __init__(self, unknown: Iterable[str], valid: Iterable[str]) -> None:
+        names = sorted(valid)
+        self.lines = []
+        for name in unknown:
+            close = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+            hint = f"did you mean {close[0]!r}? " if close else ""
+            rest = [n for n in names if n not in close and not n.startswith("qos_overrides.")]
+            self.lines.append(f"unknown parameter {name!r}; {hint}valid: {', '.join(close + rest)}")
+        super().__init__("; ".join(self.lines))
+
+
+class ParameterNode(LifecycleNode):
+    """A life-cycle node that refuses parameters and values that no declaration allows."""
+
+    def __init__(self, name: str) -> None:
+        self.followed: set[str] = set()
+        """Parameters whose changes are taken while the node runs."""
+        self._changeable: set[str] = set()
+        super().__init__(name)
+
+    def declare(
+        self,
+        name: str,
+        default: Any,
+        description: str,
+        *,
+        unit: str = "",
+        low: float | None = None,
+        high: float | None = None,
+        choices: Sequence[str] = (),
+        read_only: bool = False,
+    ) -> Any:
+        """Declare a parameter and return its value; a whole number is taken for a float.
+
+        :param low: least value, ``high``: greatest; ``choices``: the words that are allowed.
+        :raises ParameterError: the given value has another type or is out of range, naming both.
+        """
+        constraints = f"one of {', '.join(choices)}" if choices else ""
+        descriptor = ParameterDescriptor(
+            description=description + (f"; {unit}" if unit else ""),
+            additional_constraints=constraints,
+            read_only=read_only,
+        )
+        if low is not None and high is not None:
+            if isinstance(default, float):
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=float(low), to_value=float(high))
+                ]
+            else:
+                descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+            constraints = f"{low:g} to {high:g} {unit}".strip()
+        given = self._parameter_overrides.get(name)
+        if given is not None:
+            given = self._parameter_overrides[name] = _as_float(given, default)
+        try:
+            value = self.declare_parameter(name, default, descriptor).value
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            value = given.value if given is not None else None
+            raise ParameterError(name, value, constraints or f"a value like {default!r}") from error
+        self.check_parameter(name, value)
+        if not read_only:
+            self._changeable.add(name)
+        return value
+
+    def check_parameter(self, name: str, value: Any) -> None:
+        """Refuse what a parameter's declaration does not allow.
+
+        :raises ParameterError: out of range, not a number, or not one of the words.
+        """
+        descriptor = self.describe_parameter(name)
+        for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
+            # rclpy lets a value that is not a number pass.
+            if not limits.from_value <= value <= limits.to_value:
+                raise ParameterError(name, value, f"{limits.from_value:g} to {limits.to_value:g}")
+        words = descriptor.additional_constraints.removeprefix("one of ").split(", ")
+        if words != [""] and value not in words:
+            raise UnknownNameError(name, value, words)
+
+    def close_declarations(self) -> None:
+        """All parameters are declared: from here on others are refused, now and when set.
+
+        :raises UnknownParametersError: some were given already; a misspelling, it names each.
+        """
+        unknown = [name for name in self._parameter_overrides if name not in self._parameters]
+        if unknown:
+            raise UnknownParametersError(unknown, self._parameters)
+        deaf = sorted(self._changeable - self.followed)
+        if deaf:
+            # A set of it would be answered as taken.
+            raise NotImplementedError(f"nothing follows a change of {', '.join(deaf)}")
+        self.add_pre_set_parameters_callback(self._with_floats)
+        self.add_on_set_parameters_callback(_refuse_nameless)
+
+    def _with_floats(self, changes: list[Parameter]) -> list[Parameter]:
+        """Whole numbers for floats where the declaration has floats."""
+        return [
+            _as_float(change, self._parameters[change.name].value)
+            if change.name in self._parameters
+            else change
+            for change in changes
+        ]
+
+
+def _refuse_nameless(changes: list[Parameter]) -> SetParametersResult:
+    """Refuse what rclpy would declare by the way."""
+    good = all(change.name for change in changes)
+    return SetParametersResult(successful=good, reason="" if good else "a parameter without a name")
+
+
+def _as_float(given: Parameter, like: Any) -> Parameter:
+    """A parameter of whole numbers as one of floats, where what it is for is one of floats."""
+    if isinstance(like, float) and given.type_ == Parameter.Type.INTEGER:
+        return Parameter(given.name, value=float(given.value))
+    many = not isinstance(like, str) and hasattr(like, "__len__")
+    if (
+        many
+        and len(like)
+        and isinstance(like[0], float)
+        and given.type_ == Parameter.Type.INTEGER_ARRAY
+    ):
+        return Parameter(given.name, value=[float(value) for value in given.value])
+    return given
