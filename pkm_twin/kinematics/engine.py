@@ -236,10 +236,7 @@ class Engine:
         """Scaled derivatives of kept closures and pose equations by u and qd."""
         ju, jq = self._scaled(rows)
         extra = self._pose_rows(motion, pose)
-        scale = np.array(
-            [1.0 / self.tree.size if c.axis is not None else 1.0 for c in self.coordinates]
-        )
-        table = scale[:, None] * numbers(extra)
+        table = np.array(self._pose_scales)[:, None] * numbers(extra)
         n = self.tree.unknown_rates
         drives = np.array([self._drive_scale(name) for name in self.graph.actuated])
         lower = np.hstack([table[:, :n] / np.array(self.tree.scales), table[:, n:] / drives])
