@@ -25,27 +25,28 @@ from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.entries import given
 from pkm_twin.machine.graph import (
-    AXES,
     BASE,
     FREEDOMS,
     Body,
     Graph,
-    Joint,
-    Rod,
     array,
     rotation_about_z,
-    unit,
+)
+from pkm_twin.machine.graph_file import (
+    KINDS,
+    JointSpec,
+    LimitSpec,
+    Source,
+    graph_of_entries,
+    written_out,
 )
 from pkm_twin.machine.joint_map import JointMapEntry
-from pkm_twin.machine.members import Beam, Structure, Tube, compliances
+from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.robot import (
     Payload,
     Robot,
-    check_angles,
     friction_of,
-    length,
     limits_of,
-    mass,
 )
 from pkm_twin.machine.robot_urdf import robot_description
 from pkm_twin.machine.shared import Key, Shared, drive_units, shared_body, shared_number
@@ -57,196 +58,6 @@ MOST_JOINTS: Final = 6
 """Most actuated joints."""
 
 
-@dataclass(frozen=True, eq=False)
-class MemberSpec:
-    """A body as an elastic bar between two of its points, m; or as a capsule of a radius, m.
-
-    ``section``: with the body's mass along the bar; without one the body is rigid.
-    """
-
-    start: Array = schema.vector(3, key="from", unit="m")
-    end: Array = schema.vector(3, key="to", unit="m")
-    section: Tube | None = schema.section(Tube, default=None)
-    radius: float | None = length(default=None)
-
-    def verify(self, path: str) -> None:
-        """A length, and a radius from somewhere."""
-        if not float(np.linalg.norm(self.end - self.start)) > 1e-9:
-            raise ParameterError(f"{path}.to", self.end.tolist(), "a point apart from `from`")
-        if self.section is None and self.radius is None:
-            raise ParameterError(path, None, "a section, or a radius")
-
-    @property
-    def outer(self) -> float:
-        """Outer radius, m."""
-        return (
-            self.section.outer_diameter / 2 if self.section is not None else float(self.radius or 0)
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class BodySpec:
-    """Mass (kg), centre of mass (m) and inertia about it (kg m2), base axes at home."""
-
-    mass: float = mass(default=0.0)
-    com: Array | None = schema.vector(3, unit="m", default=None)
-    inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
-    member: MemberSpec | None = schema.section(MemberSpec, default=None)
-
-    def verify(self, path: str) -> None:
-        """A mass needs a place."""
-        if self.com is None and (self.mass > 0.0 or self.inertia.any()):
-            raise ParameterError(f"{path}.com", None, "the centre of mass of a body with mass, m")
-
-
-@dataclass(frozen=True, eq=False)
-class FrictionSpec:
-    """Friction of one joint: N m s/rad or N s/m, and N m or N.
-
-    ``offset``: what an actuated joint's drive needs beside, whatever the motion.
-    """
-
-    viscous: float = schema.number(at_least=0.0, unit="{effort} per {joint}/s", default=0.0)
-    coulomb: float = schema.number(at_least=0.0, unit="{effort}", default=0.0)
-    offset: float = schema.number(unit="{effort}", default=0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class LimitSpec:
-    """Limits of one actuated joint: position [min, max], rate, effort."""
-
-    position: Array | None = schema.interval(unit="{joint}", default=None)
-    velocity: float | None = schema.number(above=0.0, unit="{joint}/s", default=None)
-    effort: float | None = schema.number(above=0.0, unit="{effort}", default=None)
-
-
-@dataclass(frozen=True, eq=False)
-class DriveSpec:
-    """A drive: inertia of the rotor (kg m2) behind a gear of ``ratio`` turns a turn, or of a screw
-    or belt of ``lead`` metres a turn; reflected to the joint it is ``rotor_inertia``.
-    """
-
-    inertia: float = schema.number(at_least=0.0, unit="kg m2")
-    ratio: float | None = schema.number(
-        at_least=1e-6, at_most=1e6, unit="turns a turn", default=None
-    )
-    lead: float | None = schema.number(at_least=1e-6, at_most=1e6, unit="m a turn", default=None)
-
-    def verify(self, path: str) -> None:
-        """One of the two."""
-        if (self.ratio is None) == (self.lead is None):
-            raise ParameterError(path, None, "one of ratio (turns a turn) and lead (m a turn)")
-
-    def reflected(self, slides: bool, path: str) -> float:
-        """Kg m2 of a joint that turns, kg of one that slides."""
-        if slides != (self.lead is not None):
-            what = "lead, m a turn" if slides else "ratio, turns a turn"
-            raise ParameterError(path, None, f"{what}, for this type of joint")
-        factor = 2 * math.pi / self.lead if self.lead is not None else float(self.ratio or 0.0)
-        return self.inertia * factor**2
-
-
-@dataclass(frozen=True, eq=False)
-class JointSpec:
-    """A joint between an inner and an outer body, through the point ``at`` (m) at home.
-
-    Its number is the motion of the outer body against the inner one, along or about ``axis``, and
-    ``home`` at home. ``axes``: of a universal joint, the first fixed in the inner body, the second
-    in the outer one. A ``translation`` is three slides along base axes. ``limits`` are those of
-    actuated joints. ``rotor_inertia``: of the drive, reflected to the joint, inertia without
-    weight; or ``drive``, which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a
-    screw's or belt's ``lead`` (joints that slide). ``compliance``: in the joint's own axes.
-    """
-
-    type: str = schema.choice(*FREEDOMS)
-    between: tuple[str, ...] = schema.names(2)
-    at: Array | None = schema.vector(3, unit="m", default=None)
-    axis: Array | None = schema.vector(3, default=None)
-    axes: Array | None = schema.matrix(2, 3, default=None)
-    actuated: bool = schema.flag(default=False)
-    home: float = schema.number(unit="{joint}", default=0.0)
-    limits: LimitSpec | None = schema.section(LimitSpec, default=None)
-    friction: FrictionSpec | None = schema.section(FrictionSpec, default=None)
-    rotor_inertia: float = schema.number(at_least=0.0, unit="{rotor}", default=0.0)
-    drive: DriveSpec | None = schema.section(DriveSpec, default=None)
-    compliance: Array | None = compliances(default=None)
-
-    def verify(self, path: str) -> None:
-        """The axes that its type has, and a point where there has to be one."""
-        count = AXES.get(self.type, 0)
-        for key, wanted in (("axis", count == 1), ("axes", count == 2)):
-            value = getattr(self, key)
-            if wanted and value is None:
-                raise ParameterError(f"{path}.{key}", None, f"required for a {self.type} joint")
-            if value is not None and not wanted:
-                raise ParameterError(
-                    f"{path}.{key}", value.tolist(), f"none for a {self.type} joint"
-                )
-            for row in [] if value is None else np.atleast_2d(value):
-                if not float(np.linalg.norm(row)) > 1e-9:
-                    raise ParameterError(f"{path}.{key}", row.tolist(), "a vector with a length")
-        if self.at is None and self.type not in ("translation", "prismatic", "fixed"):
-            raise ParameterError(f"{path}.at", None, f"the point of a {self.type} joint, m")
-        steps = FREEDOMS[self.type]
-        if self.actuated and steps not in ("R", "P"):
-            raise ParameterError(f"{path}.actuated", self.type, "a revolute or prismatic joint")
-        if self.friction is not None and self.friction.offset and not self.actuated:
-            raise ParameterError(
-                f"{path}.friction.offset", self.friction.offset, "0 at a joint that is not actuated"
-            )
-        if self.rotor_inertia and self.drive is not None:
-            raise ParameterError(f"{path}.drive", "given", "either drive or rotor_inertia")
-        for key in ("limits", "friction", "rotor_inertia", "drive", "home"):
-            if getattr(self, key) and steps not in ("R", "P"):
-                raise ParameterError(
-                    f"{path}.{key}", self.type, "a revolute or prismatic joint, of one freedom"
-                )
-        if steps == "R":
-            check_angles(self.home, f"{path}.home")
-
-    def joint(self, name: str, path: str) -> Joint:
-        """As a joint of the graph."""
-        rub = self.friction or FrictionSpec()
-        rotor = self.rotor_inertia
-        if self.drive is not None:
-            rotor = self.drive.reflected(FREEDOMS[self.type] == "P", f"{path}.drive")
-        rows = self.axes if self.axes is not None else self.axis
-        axes = (
-            np.zeros((0, 3)) if rows is None else np.array([unit(r) for r in np.atleast_2d(rows)])
-        )
-        inner, outer = self.between
-        at = np.zeros(3) if self.at is None else self.at
-        return Joint(
-            name, self.type, inner, outer, array(at), array(axes), self.actuated, self.home,
-            rub.viscous, rub.coulomb, rotor,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class RodSpec:
-    """A thin even straight bar with a ball joint at each end: points (m), mass (kg)."""
-
-    between: tuple[str, ...] = schema.names(2)
-    ends: Array = schema.matrix(2, 3, unit="m")
-    mass: float = mass(default=0.0)
-    section: Tube | None = schema.section(Tube, default=None)
-    radius: float | None = length(default=None)
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where an entry stands in the file, its name there, and which copy of how many it is."""
-
-    path: Key
-    name: str
-    copy: int = 0
-    copies: int = 1
-    azimuth: float = 0.0
-
-
-_RUBS: Final = ("viscous", "coulomb", "offset")
-KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
-"""The three mappings of a graph, and the schema of their entries."""
 _KEYS: Final = (
     "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs", "joint_map",
     "uncertainty", "element_compliance",
@@ -257,7 +68,6 @@ _ELASTIC: Final = (
 """What a graph has no place for, by the kind of its entry."""
 _TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
 _SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
-_TURNED: Final = ("com", "at", "axis", "axes", "ends")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -279,8 +89,8 @@ class Machine(Robot):
         for key in data:
             if key not in _KEYS:
                 raise UnknownNameError(str(key), key, _KEYS)
-        specs, sources = _written_out(data)
-        graph = _graph(data, specs)
+        specs, sources = written_out(data)
+        graph = graph_of_entries(data, specs)
         graph.check()
         drives = graph.actuated
         if len(drives) > MOST_JOINTS:
@@ -337,7 +147,7 @@ class Machine(Robot):
     @classmethod
     def graph_of(cls, data: Mapping[str, Any]) -> Graph:
         """Of a file that a robot was made of; what its joints hold is not looked at."""
-        graph = _graph(data, _written_out(data)[0])
+        graph = graph_of_entries(data, written_out(data)[0])
         graph.check()
         return graph
 
@@ -596,132 +406,6 @@ def _offset(joint: JointSpec) -> float:
     return 0.0 if joint.friction is None else joint.friction.offset
 
 
-def _section(data: Mapping[str, Any], key: str, path: str) -> Mapping[str, Any]:
-    value = data.get(key) or {}
-    if not isinstance(value, Mapping):
-        raise ParameterError(f"{path}{key}", value, "a mapping of names to entries")
-    for name in value:
-        if not isinstance(name, str) or not name:
-            raise ParameterError(f"{path}{key}", name, "names as text")
-    return value
-
-
-def _written_out(
-    data: Mapping[str, Any],
-) -> tuple[dict[str, dict[str, Any]], dict[tuple[str, str], Source]]:
-    """All entries by name, checked, the limbs' copies turned about base z; where each stands."""
-    result: dict[str, dict[str, Any]] = {
-        kind: {
-            name: schema.build(spec, entry, f"{kind}.{name}")
-            for name, entry in _section(data, kind, "").items()
-        }
-        for kind, spec in KINDS.items()
-    }
-    sources = {(kind, n): Source((kind, n), n) for kind, all_ in result.items() for n in all_}
-    limbs = data.get("limbs") or []
-    sections = limbs if isinstance(limbs, list) else [limbs]
-    for k, section in enumerate(sections):
-        path = f"limbs[{k}]." if isinstance(limbs, list) else "limbs."
-        if not isinstance(section, Mapping):
-            raise ParameterError(path[:-1], section, "azimuths, bodies, joints and rods")
-        for key in section:
-            if key not in ("azimuths", *KINDS):
-                raise UnknownNameError(f"{path}{key}", key, ("azimuths", *KINDS))
-        azimuths = schema.checked(schema.many(), f"{path}azimuths", section.get("azimuths"))
-        for i, azimuth in enumerate(azimuths):
-            check_angles(float(azimuth), f"{path}azimuths[{i}]")
-        own = set(_section(section, "bodies", path))
-        count = len(azimuths)
-        checked: dict[str, dict[str, list[Any]]] = {
-            kind: {
-                name: [
-                    schema.build(spec, one, f"{path}{kind}.{name}")
-                    for one in _copies(entry, count, f"{path}{kind}.{name}")
-                ]
-                for name, entry in _section(section, kind, path).items()
-            }
-            for kind, spec in KINDS.items()
-        }
-        place: Key = ("limbs", k) if isinstance(limbs, list) else ("limbs",)
-        for number, azimuth in enumerate(azimuths, 1):
-            for kind, entries in checked.items():
-                for name, entry in entries.items():
-                    full = f"{name}_{number}"
-                    if full in result[kind]:
-                        raise ParameterError(
-                            f"{path}{kind}.{name}", full, "a name that is not taken"
-                        )
-                    copy = entry[number - 1]
-                    result[kind][full] = _turned(copy, float(azimuth), own, number)
-                    sources[kind, full] = Source(
-                        (*place, kind, name), name, number - 1, count, float(azimuth)
-                    )
-    return result, sources
-
-
-def _copies(entry: Any, count: int, path: str) -> list[Any]:
-    """A limb's entry for each azimuth: drives' numbers may be lists, one number a copy."""
-    result = [entry] * count
-    if not isinstance(entry, Mapping):
-        return result
-    for keys in (("rotor_inertia",), *(("friction", what) for what in _RUBS)):
-        value: Any = entry
-        for key in keys:
-            value = value.get(key) if isinstance(value, Mapping) else None
-        if not isinstance(value, list):
-            continue
-        if len(value) != count:
-            raise ParameterError(
-                f"{path}.{'.'.join(keys)}", value, f"one number, or {count}, one a copy"
-            )
-        for k in range(count):
-            inner = {keys[-1]: value[k]}
-            whole = inner if len(keys) == 1 else {keys[0]: {**result[k][keys[0]], **inner}}
-            result[k] = {**result[k], **whole}
-    return result
-
-
-def _turned(entry: Any, azimuth: float, own: set[str], number: int) -> Any:
-    """A copy of a limb's entry, turned about base z, its own bodies' names with their number."""
-    rotation = rotation_about_z(azimuth)
-    new: dict[str, Any] = {}
-    for key in _TURNED:
-        value = getattr(entry, key, None)
-        if value is not None:
-            new[key] = array(value @ rotation.T)
-    if isinstance(entry, BodySpec):
-        new["inertia"] = array(rotation @ entry.inertia @ rotation.T)
-        m = entry.member
-        if m is not None:
-            new["member"] = dataclasses.replace(
-                m, start=array(rotation @ m.start), end=array(rotation @ m.end)
-            )
-    else:
-        new["between"] = tuple(f"{b}_{number}" if b in own else b for b in entry.between)
-    return dataclasses.replace(entry, **new)
-
-
-def _graph(data: Mapping[str, Any], specs: Mapping[str, Mapping[str, Any]]) -> Graph:
-    bodies = {
-        name: Body(name, b.mass, array(np.zeros(3) if b.com is None else b.com), b.inertia)
-        for name, b in specs["bodies"].items()
-    }
-    platform = data.get("platform", "platform")
-    if not bodies:
-        raise ParameterError("bodies", None, "the machine's bodies, by name")
-    if not isinstance(platform, str) or platform not in bodies:
-        raise UnknownNameError("platform", platform, bodies)
-    origin = data.get("origin")
-    place = (
-        bodies[platform].com
-        if origin is None
-        else schema.checked(schema.vector(3), "origin", origin)
-    )
-    joints = {n: j.joint(n, f"joints.{n}") for n, j in specs["joints"].items()}
-    rods = {n: Rod(n, r.between[0], r.between[1], r.ends, r.mass) for n, r in specs["rods"].items()}
-    return Graph(bodies, joints, rods, platform, array(place))
-
-
 def _limbs(graph: Graph) -> dict[str, int]:
     """By body and rod the number of its limb: what hangs together without base and platform."""
     outside = {BASE, graph.platform}
@@ -742,6 +426,3 @@ def _limbs(graph: Graph) -> dict[str, int]:
                         todo.append(y)
         number |= dict.fromkeys(found, max(number.values(), default=-1) + 1)
     return number | {graph.platform: -1}
-
-
-__all__ = ["BodySpec", "JointSpec", "Machine", "RodSpec"]

@@ -8,12 +8,13 @@ import inspect
 import sys
 from pathlib import Path
 
+from pkm_twin.machine.graph_file import BodySpec, JointSpec, RodSpec
 from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.members import Tube
 from pkm_twin.machine.robot import Payload, friction_of, limits_of
 from pkm_twin.machine.schema import plain
 from pkm_twin.machine.uncertainty import UncertaintyEntry
-from pkm_twin.mechanisms import delta, machine, prru, upr_rpu
+from pkm_twin.mechanisms import delta, prru, upr_rpu
 
 HEAD = """# Parameters
 
@@ -130,9 +131,9 @@ def page():
         parts.append(f"And {shared}, which may be left out: see below.")
     parts.append(MACHINE)
     for title, kind in (
-        ("`bodies.NAME`", machine.BodySpec),
-        ("`joints.NAME`", machine.JointSpec),
-        ("`rods.NAME`", machine.RodSpec),
+        ("`bodies.NAME`", BodySpec),
+        ("`joints.NAME`", JointSpec),
+        ("`rods.NAME`", RodSpec),
     ):
         parts.append(table(title, kind))
     parts.append("And `payload` and `gravity`, as everywhere.")
