@@ -23,7 +23,8 @@ from delta_dynamics.reactions import reactions
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
-from pkm_twin.machine.robot import MAX_MASS, Robot
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.sections import MAX_MASS
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory

@@ -29,11 +29,7 @@ from pkm_twin.machine.graph import (
     unit,
 )
 from pkm_twin.machine.members import Tube, compliances
-from pkm_twin.machine.robot import (
-    check_angles,
-    length,
-    mass,
-)
+from pkm_twin.machine.sections import check_angles, length, mass
 from pkm_twin.machine.shared import Key
 
 Array = NDArray[np.float64]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every robot has: sections of its parameter file, and kinematics by the engine.
+"""What every robot has: a parameter file, and kinematics by the engine.
 
 A mechanism is a schema, a function from its parameters to a graph, and, where they exist, closed
 forms of the start and of the inverse with the branch rules.
@@ -13,9 +13,8 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache as remembered
 from functools import cached_property
-from typing import Any, ClassVar, Final, Protocol, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,12 +33,13 @@ from pkm_twin.kinematics.passive import (
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import FREEDOMS, MIN_LENGTH, Graph
+from pkm_twin.machine.graph import FREEDOMS, Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import position_box
+from pkm_twin.machine.sections import JointLimits, Payload, friction_of, limits_of
 from pkm_twin.machine.shared import Shared, drive_units, shared_number, shared_payload
 from pkm_twin.machine.uncertainty import (
     Factor,
@@ -52,109 +52,10 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 R = TypeVar("R", bound="Robot")
 
-MAX_LENGTH: Final = 100.0
-MAX_MASS: Final = 1e5
 SINGULARITY_BOUND: Final = 1e-9
 """Least singularity measure (0 singular, 1 best) at which a Jacobian is inverted."""
 
 _NONE: Final = np.zeros(0)
-
-
-def length(**options: Any) -> Any:
-    """Field: a length that may be divided by, m."""
-    return schema.number(at_least=MIN_LENGTH, at_most=MAX_LENGTH, unit="m", **options)
-
-
-def mass(**options: Any) -> Any:
-    """Field: a mass of zero or more, kg."""
-    return schema.number(at_least=0.0, at_most=MAX_MASS, unit="kg", **options)
-
-
-def check_azimuths(azimuths: Array, path: str) -> None:
-    """Refuse limbs that stand in one place."""
-    for i in range(len(azimuths)):
-        check_angles(float(azimuths[i]), f"{path}[{i}]")
-        apart = math.remainder(float(azimuths[i] - azimuths[i - 1]), 2 * math.pi)
-        if abs(apart) < 1e-3:
-            raise ParameterError(path, azimuths.tolist(), "limbs at least 0.001 rad apart")
-
-
-@dataclass(frozen=True, eq=False)
-class Payload:
-    """A body fixed to the platform: com from its reference point, inertia about the com."""
-
-    mass: float = mass(default=0.0)
-    com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
-    inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
-
-
-def check_angles(angle: float, path: str) -> None:
-    """Refuse an angle that was meant in degrees."""
-    if abs(angle) > 4 * math.pi:
-        raise ParameterError(
-            path,
-            angle,
-            f"an angle in rad; degrees? {angle:g} degrees are {math.radians(angle):.6g}",
-        )
-
-
-@remembered
-def friction_of(joints: int) -> Any:
-    """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign.
-
-    ``offset``: what the drive needs beside, whatever the motion.
-    """
-    field: dict[str, Any] = {"spread": True, "default": [0.0] * joints}
-    units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
-    entries = [
-        (n, Array, schema.vector(joints, unit=u, at_least=0.0, **field)) for n, u in units.items()
-    ]
-    entries.append(("offset", Array, schema.vector(joints, unit="{effort}", **field)))
-    return _section("Friction", entries, joints)
-
-
-@remembered
-def limits_of(joints: int) -> Any:
-    """Schema of limits of so many actuated joints; absent is None, one value stands for all."""
-    above: dict[str, Any] = {"above": 0.0, "infinite": True, "spread": True, "default": None}
-    entries = [
-        ("position", Any, schema.interval(count=joints, unit="{joint}", default=None)),
-        ("velocity", Any, schema.vector(joints, unit="{joint}/s", **above)),
-        ("effort", Any, schema.vector(joints, unit="{effort}", **above)),
-    ]
-    return _section("Limits", entries, joints)
-
-
-def _section(name: str, entries: list[tuple[str, Any, Any]], joints: int) -> Any:
-    """A section's class for so many joints; what it makes passes between processes."""
-
-    def reduce(self: Any) -> tuple[Any, ...]:
-        return _rebuilt, (name, joints, [getattr(self, entry[0]) for entry in entries])
-
-    return dataclasses.make_dataclass(
-        name, entries, frozen=True, eq=False, namespace={"__reduce__": reduce}
-    )
-
-
-def _rebuilt(name: str, joints: int, values: list[Any]) -> Any:
-    schema_of = friction_of if name == "Friction" else limits_of
-    return schema_of(joints)(*values)
-
-
-class JointLimits(Protocol):
-    """Limits of the actuated joints, as every mechanism's section has them."""
-
-    @property
-    def position(self) -> Array | None:
-        """Least and greatest, shape (n, 2), rad or m."""
-
-    @property
-    def velocity(self) -> Array | None:
-        """Greatest rates, shape (n,), rad/s or m/s."""
-
-    @property
-    def effort(self) -> Array | None:
-        """Greatest efforts, shape (n,), N m or N."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,8 @@ from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, Rod, arr
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
 from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import Inverse, Robot, check_azimuths, length, mass
+from pkm_twin.machine.robot import Inverse, Robot
+from pkm_twin.machine.sections import check_azimuths, length, mass
 from pkm_twin.machine.shared import Key, Shared, above_zero, bar, point_mass, shared_number
 
 Array = NDArray[np.float64]

@@ -42,13 +42,9 @@ from pkm_twin.machine.graph_file import (
 )
 from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
-from pkm_twin.machine.robot import (
-    Payload,
-    Robot,
-    friction_of,
-    limits_of,
-)
+from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.robot_urdf import robot_description
+from pkm_twin.machine.sections import Payload, friction_of, limits_of
 from pkm_twin.machine.shared import Key, Shared, drive_units, shared_body, shared_number
 from pkm_twin.machine.uncertainty import UncertaintyEntry, check_uncertainty
 

@@ -46,14 +46,8 @@ from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.inertia import transport
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
 from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import (
-    SINGULARITY_BOUND,
-    Inverse,
-    Robot,
-    check_azimuths,
-    length,
-    mass,
-)
+from pkm_twin.machine.robot import SINGULARITY_BOUND, Inverse, Robot
+from pkm_twin.machine.sections import check_azimuths, length, mass
 from pkm_twin.machine.shared import (
     Key,
     Shared,

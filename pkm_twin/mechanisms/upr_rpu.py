@@ -43,7 +43,8 @@ from pkm_twin.machine.graph import BASE, MIN_LENGTH, Body, Direction, Graph, Joi
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Section, Structure, compliances, disc, modulus
 from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import Inverse, LimbElements, Robot, length, mass
+from pkm_twin.machine.robot import Inverse, LimbElements, Robot
+from pkm_twin.machine.sections import length, mass
 from pkm_twin.machine.shared import Shared, shared_body, shared_number
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from pathlib import Path
 from pkm_twin.machine.graph_file import BodySpec, JointSpec, RodSpec
 from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.members import Tube
-from pkm_twin.machine.robot import Payload, friction_of, limits_of
 from pkm_twin.machine.schema import plain
+from pkm_twin.machine.sections import Payload, friction_of, limits_of
 from pkm_twin.machine.uncertainty import UncertaintyEntry
 from pkm_twin.mechanisms import delta, prru, upr_rpu
 
