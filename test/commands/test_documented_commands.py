@@ -2,11 +2,9 @@
 """Every `pkm-twin` line of every page: it parses as it stands, and it runs as it stands."""
 
 import itertools
-import os
 import re
 import shlex
 import subprocess
-import sys
 from functools import cache
 
 import numpy as np
@@ -15,7 +13,7 @@ from typer.main import get_command
 
 from pkm_twin.apps.cli import app
 from test.commands.conftest import DELTA, REPOSITORY, rewrite
-from test.support.command import Result
+from test.support.command import SHELL, typed_line
 from test.support.robots import load
 
 NOT_RUN = {
@@ -31,7 +29,6 @@ NOT_RUN = {
 """Lines that are parsed but not run, and why."""
 ENDS = {"pkm-twin recover damaged.mcap saved.mcap": 3}
 """Exit codes other than 0, as the page says."""
-SHELL = (">", ">>", "<", "|", "&&", ";", "2>")
 INLINE_NAMES = r"ROBOT|FILE|BAG|TOPIC|COMMAND|KIND|HOST| N\b"
 """Words that stand for something in running text; a line to type has none."""
 
@@ -123,15 +120,6 @@ def write_poses(path):
     path.write_text("\n".join(lines) + "\n")
 
 
-def by_shell(line):
-    """A line that redirects or pipes, in processes of their own."""
-    program = f"{shlex.quote(sys.executable)} -m pkm_twin.apps.cli"
-    shell = f'pkm-twin() {{ {program} "$@"; }}\n{line}'
-    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
-    done = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, env=environment)
-    return Result(done.returncode, done.stdout, done.stderr)
-
-
 @pytest.mark.timeout(900)
 def test_it_runs_as_it_stands(folder, twin, monkeypatch):
     """In the order of the page, in one folder: a later line may use what an earlier one wrote."""
@@ -141,8 +129,7 @@ def test_it_runs_as_it_stands(folder, twin, monkeypatch):
         if not block or line in done or reason(line):
             continue
         done.add(line)
-        words = shlex.split(line)[1:]
-        result = by_shell(line) if set(words) & set(SHELL) else twin(*words)
+        result = typed_line(twin, line)
         assert result.code == ENDS.get(line, 0), f"{page}: {line}\n{result.err}"
         assert "Traceback" not in result.err
     assert len(done) >= 8

@@ -13,6 +13,7 @@ import pytest
 
 from pkm_twin import robot_names
 from test.docs import architecture, engine, parameters
+from test.support.command import typed_line
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -25,12 +26,14 @@ def blocks(page):
         yield language, block, named and named[1]
 
 
-def run(language, block, folder):
+def run(language, block, folder, twin):
     """What a block prints."""
-    shell = f'pkm-twin() {{ "{sys.executable}" -m pkm_twin.apps.cli "$@"; }}\nset -e\n{block}'
-    command = ["bash", "-c", shell] if language == "bash" else [sys.executable, "-c", block]
+    if language == "bash":
+        results = [typed_line(twin, line) for line in block.splitlines()]
+        assert all(result.code == 0 for result in results), [result.err for result in results]
+        return "".join(result.out for result in results)
     done = subprocess.run(
-        command,
+        [sys.executable, "-c", block],
         cwd=folder,
         capture_output=True,
         text=True,
@@ -42,7 +45,8 @@ def run(language, block, folder):
 
 
 @pytest.mark.timeout(900)
-def test_a_new_machine_from_an_empty_file_to_torques(tmp_path):
+def test_a_new_machine_from_an_empty_file_to_torques(tmp_path, twin, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     printed, ran = "", 0
     for language, block, name in blocks("new_machine.md"):
         if name:
@@ -50,7 +54,7 @@ def test_a_new_machine_from_an_empty_file_to_torques(tmp_path):
         elif language == "text":
             assert printed.strip() == block.strip()
         else:
-            printed = run(language, block, tmp_path)
+            printed = run(language, block, tmp_path, twin)
             ran += 1
     assert ran >= 7
     lines = (tmp_path / "my_delta.yaml").read_text().splitlines()

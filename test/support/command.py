@@ -6,7 +6,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import resource
+import shlex
+import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,9 @@ import pytest
 
 from pkm_twin.apps import cli
 
+REPOSITORY = Path(__file__).parents[2]
+SHELL = (">", ">>", "<", "|", "&&", ";", "2>")
+"""Words of a line that are the shell's."""
 _FORK = multiprocessing.get_context("fork")
 
 
@@ -41,6 +47,21 @@ def command(capture: Any, *arguments: Any) -> Result:
         cli.main([str(argument) for argument in arguments])
     captured = capture.readouterr()
     return Result(int(end.value.code or 0), captured.out, captured.err)
+
+
+def typed_line(twin: Callable[..., Result], line: str) -> Result:
+    """What a line gives as it is typed; one that redirects or pipes, in processes of its own.
+
+    :param twin: the fixture that runs a command in this process.
+    """
+    words = shlex.split(line)[1:]
+    if not set(words) & set(SHELL):
+        return twin(*words)
+    program = f"{shlex.quote(sys.executable)} -m pkm_twin.apps.cli"
+    shell = f'pkm-twin() {{ {program} "$@"; }}\n{line}'
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(["bash", "-c", shell], capture_output=True, text=True, env=environment)
+    return Result(done.returncode, done.stdout, done.stderr)
 
 
 def forked(folder: Path, *arguments: Any, limit: int = resource.RLIM_INFINITY) -> Result:
