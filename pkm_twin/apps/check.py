@@ -12,15 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
+from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.limits import ranges
-from pkm_twin.apps.recorded import (
-    Load,
-    Recording,
-    Topics,
-    by_load,
-    read_recording,
-    why_no_torques,
-)
+from pkm_twin.apps.loads import Load, by_load
+from pkm_twin.apps.recorded import Recording, read_recording
+from pkm_twin.apps.topics import Topics
 from pkm_twin.apps.verdict import Item, Verdict
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.machine.robot import Robot

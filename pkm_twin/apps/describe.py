@@ -8,8 +8,17 @@ from typing import Any
 import numpy as np
 
 from delta_dynamics import reactions
-from pkm_twin.apps.recorded import why_no_torques
+from pkm_twin.errors import ParameterError
 from pkm_twin.machine.robot import Robot
+
+
+def why_no_torques(robot: Robot) -> str:
+    """Why the model has no torques for this robot; empty where it has."""
+    try:
+        robot.massive()
+    except ParameterError as error:
+        return str(error)
+    return ""
 
 
 def summary(robot: Robot) -> str:

@@ -52,7 +52,7 @@ Platform = Annotated[
 
 def load_of(payload: str | None, times: str | None) -> Any:
     """The payload that a command line tells of, None where it tells of none."""
-    from pkm_twin.apps.recorded import Load, parse_payload, parse_times
+    from pkm_twin.apps.loads import Load, parse_payload, parse_times
 
     if payload is None:
         if times is not None:

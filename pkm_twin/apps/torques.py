@@ -17,7 +17,8 @@ from pkm_twin import load
 from pkm_twin.apps.check import motion
 from pkm_twin.apps.columns import read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
-from pkm_twin.apps.recorded import Load, by_load, read_recording
+from pkm_twin.apps.loads import Load, by_load
+from pkm_twin.apps.recorded import read_recording
 from pkm_twin.errors import (
     BagError,
     ParameterError,

@@ -8,7 +8,7 @@ import random
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from pkm_twin.apps.recorded import JOINT_STATE, WRENCH
+from pkm_twin.apps.topics import JOINT_STATE, WRENCH
 from pkm_twin.bags.reader import BagWriter, inspect, open_bag, read_messages
 from test.bags.folders import make_folder
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.apps.check import predicted
-from pkm_twin.apps.recorded import Recording, why_no_torques
+from pkm_twin.apps.describe import why_no_torques
+from pkm_twin.apps.recorded import Recording
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The payload of a recording: as its bag tells it, or as it is asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.bags.reader import Bag
+from pkm_twin.console import parse_numbers
+from pkm_twin.errors import BagError, ParameterError
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Load:
+    """A payload that is no part of the robot's file, and when it is on the platform.
+
+    mass in kg, com in m from the platform's reference point; times in s since the first joint
+    state, empty where it is there all the time. ``source`` says who tells: ``bag`` or ``option``.
+    """
+
+    mass: float
+    com: tuple[float, float, float] | None = None
+    times: tuple[tuple[float, float], ...] = ()
+    source: str = "option"
+
+    def held(self, time: Array) -> NDArray[np.bool_]:
+        """When it is on the platform, shape (n,)."""
+        if not self.times:
+            return np.ones(len(time), np.bool_)
+        spans = [(time >= begin) & (time <= end) for begin, end in self.times]
+        return np.asarray(np.logical_or.reduce(spans), np.bool_)
+
+    def near_change(self, time: Array, within: float) -> NDArray[np.bool_]:
+        """Where a pick or release is less than ``within`` seconds away, shape (n,)."""
+        edges = [edge for span in self.times for edge in span]
+        if not edges:
+            return np.zeros(len(time), np.bool_)
+        near = [np.abs(time - edge) < within for edge in edges]
+        return np.asarray(np.logical_or.reduce(near), np.bool_)
+
+    def on(self, robot: Robot) -> Robot:
+        """The robot with this payload.
+
+        :raises ParameterError: the robot takes none, or not such a one.
+        """
+        changes: dict[str, Any] = {"mass": self.mass}
+        if self.com is not None:
+            changes["com"] = list(self.com)
+        return robot.changed(payload=changes)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data, units in the keys; no times where it is held all the time."""
+        return {
+            "mass_kg": self.mass,
+            "com_m": None if self.com is None else list(self.com),
+            "held_s": [list(span) for span in self.times] or None,
+            "source": self.source,
+        }
+
+    def __str__(self) -> str:
+        at = "" if self.com is None else " at " + ", ".join(f"{v:g}" for v in self.com) + " m"
+        spans = ", ".join(f"{begin:g} to {end:g} s" for begin, end in self.times) or "all the time"
+        told = "as the bag tells" if self.source == "bag" else "as asked for"
+        return f"{self.mass:g} kg{at}, {spans}, {told}"
+
+
+def told_load(bag: Bag) -> Load | None:
+    """The payload that the bag's metadata tell of.
+
+    :raises BagError: a value is missing or no number.
+    """
+    facts = bag.report.metadata.get("pkm_twin", {})
+    if "payload_picked_s" not in facts:
+        return None
+    names = ("payload_mass_kg", "payload_picked_s", "payload_released_s")
+    mass, picked, released = (_fact(bag, facts, name) for name in names)
+    if mass < 0:
+        raise metadata_error(bag, names[0], facts[names[0]], "0 or more")
+    if released < picked:
+        raise metadata_error(bag, names[2], facts[names[2]], f"{names[1]}, {picked:g}, or later")
+    return Load(mass, None, ((picked, released),), "bag")
+
+
+def _fact(bag: Bag, facts: Mapping[str, str], name: str) -> float:
+    try:
+        value = float(facts[name])
+    except (KeyError, ValueError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise metadata_error(bag, name, facts.get(name), "a finite number")
+    return value
+
+
+def metadata_error(bag: Bag, name: str, value: str | None, expected: str) -> BagError:
+    """The refusal of a value of the bag's own metadata."""
+    return BagError(
+        f"metadata 'pkm_twin': {name} is {value!r}; expected {expected}",
+        path=bag.report.path,
+        reason="metadata",
+    )
+
+
+def parse_payload(text: str) -> tuple[float, tuple[float, float, float] | None]:
+    """Mass (kg) and, where given, centre (m) of ``MASS[,x,y,z]``.
+
+    :raises ParameterError: it is not 1 or 4 finite numbers, or the mass is negative.
+    """
+    numbers = parse_numbers(text)
+    if len(numbers) not in (1, 4) or numbers[0] < 0:
+        raise ParameterError("payload", text, "MASS or MASS,x,y,z: kg, 0 or more, and m")
+    return numbers[0], (numbers[1], numbers[2], numbers[3]) if len(numbers) == 4 else None
+
+
+def parse_times(text: str) -> tuple[tuple[float, float], ...]:
+    """Spans of ``FROM,TO[,FROM,TO...]``, s.
+
+    :raises ParameterError: the numbers are not pairs, finite and rising.
+    """
+    numbers = parse_numbers(text)
+    rising = all(one < other for one, other in pairwise(numbers))
+    if not numbers or len(numbers) % 2 or not rising:
+        raise ParameterError("load-times", text, "FROM,TO[,FROM,TO...] in s, rising")
+    return tuple(zip(numbers[::2], numbers[1::2], strict=True))
+
+
+def by_load(
+    robot: Robot, carried: Load | None, time: Array, longest: int
+) -> Iterator[tuple[Robot, slice]]:
+    """The robot as it is loaded, and the samples in a row (at most ``longest``) for which."""
+    held = np.zeros(len(time), np.bool_) if carried is None else carried.held(time)
+    loaded = robot if carried is None else carried.on(robot)
+    edges = [0, *(np.flatnonzero(np.diff(held)) + 1).tolist(), len(time)]
+    for begin, end in pairwise(edges):
+        for start in range(begin, end, longest):
+            stop = min(start + longest, end)
+            yield (loaded if held[start] else robot), slice(start, stop)

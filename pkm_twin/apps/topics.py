@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which topics of a bag are a machine's joint states and wrenches."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from pkm_twin.bags.definitions import parse_definition
+from pkm_twin.bags.reader import Bag
+from pkm_twin.errors import BagError, one_line
+from pkm_twin.machine.robot import Robot
+
+JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
+WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
+TWIN_OUTPUTS: Final = (
+    "joint_torques",
+    "torque_residual",
+    "reactions",
+    "machine_state",
+    "commands_stamped",
+    "compliance_stamped",
+    "strain_energy_stamped",
+    "natural_frequencies_stamped",
+)
+"""Last names of the twin's own topics of these two types, or a name before the last."""
+
+_STAMPED = "std_msgs/Header header\n"
+_HEADER = """
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+_VECTOR3 = """================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+_DEFINITIONS: Final = {
+    JOINT_STATE: _STAMPED
+    + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
+    + _HEADER,
+    WRENCH: _STAMPED
+    + "Wrench wrench"
+    + _HEADER
+    + """
+================================================================================
+MSG: geometry_msgs/Wrench
+Vector3 force
+Vector3 torque
+"""
+    + _VECTOR3,
+    TRANSFORM: _STAMPED
+    + "string child_frame_id\nTransform transform"
+    + _HEADER
+    + """
+================================================================================
+MSG: geometry_msgs/Transform
+Vector3 translation
+Quaternion rotation
+"""
+    + _VECTOR3
+    + """================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+""",
+}
+# How many messages of a topic are looked at for the robot's joints.
+_LOOK = 50
+
+
+@dataclass(frozen=True)
+class Topics:
+    """The topics that are read, and by name why others of their types are not."""
+
+    joint_states: str
+    wrench: str | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        text = f"joint states {self.joint_states}, wrench {self.wrench or 'none'}"
+        if self.left_out:
+            text += "; left out: " + ", ".join(f"{k} ({v})" for k, v in self.left_out.items())
+        return one_line(text, 1000)
+
+
+def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = ()) -> Topics:
+    """The joint-state topic that carries the robot's joints, and the wrench topic.
+
+    The twin's own outputs are left out. Of several that fit, ``/joint_states`` and ``/wrench`` are
+    taken; ``wanted`` names them otherwise.
+
+    :raises BagError: a wanted topic is missing or of another type, no topic has the joints, or
+        several fit.
+    """
+    kinds: dict[str, list[str]] = {JOINT_STATE: [], WRENCH: []}
+    for name in wanted:
+        info = bag.report.topics.get(name)
+        if info is None or info.type not in kinds:
+            fit = [n for n, i in bag.report.topics.items() if i.type in kinds]
+            is_a = "is not in the bag" if info is None else f"is a {info.type}"
+            raise _choice_error(bag, f"topic {name} {is_a}; topics that fit: {', '.join(fit)}")
+        kinds[info.type].append(name)
+    for kind, names in kinds.items():
+        if len(set(names)) > 1:
+            raise _choice_error(bag, f"{' and '.join(names)} are both {kind}; choose one")
+    left_out: dict[str, str] = {}
+    joints = _choose_joints(bag, robot, kinds[JOINT_STATE], left_out)
+    wrench = _choose_wrench(bag, kinds[WRENCH], bool(wanted), left_out)
+    for name in filter(None, (joints, wrench)):
+        require_definition(bag, name)
+    return Topics(joints, wrench, left_out)
+
+
+def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str, str]) -> str:
+    named = _candidates(bag, JOINT_STATE, wanted, left_out)
+    filled = [name for name in named if bag.report.topics[name].count]
+    if not filled:
+        aside = "".join(f"; {name}: {why}" for name, why in left_out.items())
+        raise _choice_error(bag, f"no joint states in the bag{aside}", "no joint states")
+    for name in filled:
+        require_definition(bag, name)
+    # As the controller calls them, which recorded them.
+    joints = robot.controller.names
+    seen = _names_on(bag, filled, set(joints))
+    fit = [name for name in filled if set(joints) <= seen[name]]
+    for name in filled:
+        if name not in fit:
+            left_out[name] = f"joints {', '.join(sorted(seen[name])) or 'none'}"
+    if not fit:
+        name = filled[0]
+        missing = next(joint for joint in joints if joint not in seen[name])
+        raise _choice_error(
+            bag,
+            f"no topic has all joints of {robot.name}: on {name} joint {missing!r} is missing, "
+            f"it has {', '.join(sorted(seen[name])) or 'none'}",
+            "no joint states",
+        )
+    return _only(bag, "joint states", fit, "joint_states", left_out)
+
+
+def _choose_wrench(
+    bag: Bag, wanted: list[str], chosen: bool, left_out: dict[str, str]
+) -> str | None:
+    fit = _candidates(bag, WRENCH, wanted, left_out)
+    if not fit:
+        return None
+    if chosen and not wanted and len(fit) > 1:
+        # Who names the joint states alone, and there is no telling which wrench, wants none.
+        left_out.update({name: "not chosen" for name in fit})
+        return None
+    return _only(bag, "wrenches", fit, "wrench", left_out)
+
+
+def _candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]) -> list[str]:
+    """Topics of a type: the wanted ones, else all but the twin's own."""
+    fit = []
+    for name in (name for name, info in bag.report.topics.items() if info.type == kind):
+        if wanted and name not in wanted:
+            left_out[name] = "not chosen"
+        elif not wanted and any(part in TWIN_OUTPUTS for part in name.split("/")[-2:]):
+            left_out[name] = "the twin's own"
+        else:
+            fit.append(name)
+    return fit
+
+
+def _only(bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[str, str]) -> str:
+    preferred = [name for name in fit if name.split("/")[-1] == usual]
+    if len(fit) > 1 and len(preferred) != 1:
+        raise _choice_error(bag, f"{what} on {', '.join(fit)}; choose one with --topic")
+    chosen = preferred[0] if preferred else fit[0]
+    left_out.update({name: f"{chosen} is taken" for name in fit if name != chosen})
+    return chosen
+
+
+def _names_on(bag: Bag, topics: list[str], joints: set[str]) -> dict[str, set[str]]:
+    """Joint names of the first message of each topic, or of one soon after that has all joints."""
+    seen: dict[str, set[str]] = {}
+    count: Counter[str] = Counter()
+    open_topics = set(topics)
+    for message in bag.messages(topics, order="file"):
+        if message.topic not in open_topics:
+            continue
+        names = set(message.message.name)
+        count[message.topic] += 1
+        if message.topic not in seen or joints <= names:
+            seen[message.topic] = names
+        if joints <= names or count[message.topic] >= _LOOK:
+            open_topics.discard(message.topic)
+            if not open_topics:
+                break
+    return seen
+
+
+def require_definition(bag: Bag, topic: str) -> None:
+    """Refuse a type whose recorded fields are not the ones that are read.
+
+    :raises BagError: naming the field.
+    """
+    info = bag.report.topics[topic]
+    if info.encoding != "cdr" or info.schema_encoding != "ros2msg":
+        return  # the first message's decoding tells
+    try:
+        recorded = parse_definition(info.type, info.definition)
+    except BagError as error:
+        raise _choice_error(bag, f"topic {topic}: {error}", error.reason) from None
+    for held, fields in parse_definition(info.type, _DEFINITIONS[info.type]).items():
+        found = recorded.get(held, ())
+        if found == fields:
+            continue
+        wrong = next((f for f, g in zip(fields, found, strict=False) if f != g), None)
+        name = wrong.name if wrong else [*fields, *found][min(len(fields), len(found))].name
+        raise BagError(
+            f"topic {topic}: the bag's definition of {held} differs at the field {name!r} from "
+            f"{', '.join(f.name for f in fields)}",
+            path=bag.report.path,
+            reason="type",
+        )
+
+
+def _choice_error(bag: Bag, text: str, reason: str = "topic") -> BagError:
+    return BagError(text, path=bag.report.path, reason=reason)
