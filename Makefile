@@ -40,7 +40,9 @@ $(VENV)/%.stamp: $(VENV)/demo.stamp
 demo: $(VENV)/demo.stamp
 	$(BIN)/python -m pkm_twin.apps.demo --bags bags --out out
 
-test: lint types unit
+# At once, as types are one process's work: the last lines are those of the tests.
+test: $(VENV)/test.stamp
+	$(MAKE) --no-print-directory -j 3 lint types unit
 
 lint: $(VENV)/test.stamp
 	$(BIN)/ruff check .

@@ -81,20 +81,25 @@ def reason(line):
     return next((why for like, why in NOT_RUN.items() if re.fullmatch(like, line)), None)
 
 
+@pytest.fixture(scope="module")
+def tree():
+    """All commands with their options."""
+    return get_command(app)
+
+
 @pytest.mark.parametrize(("page", "line"), list(commands()))
-def test_it_parses_as_it_stands(page, line):
+def test_it_parses_as_it_stands(tree, page, line):
     """Every word is an argument or option of the command, with a value of its type."""
     words = shlex.split(line)[1:]
     # What the shell does with it is no word of the command.
     words = list(itertools.takewhile(lambda word: word not in SHELL, words))
-    command = get_command(app)
     if words[0].startswith("-"):
-        assert words[0] in {name for option in command.params for name in option.opts}
+        assert words[0] in {name for option in tree.params for name in option.opts}
         return
-    assert words[0] in command.commands
+    assert words[0] in tree.commands
     # A command's name alone, in running text, is only named.
     if "--help" not in words and (commands()[page, line] or len(words) > 1):
-        command.commands[words[0]].make_context(words[0], words[1:])
+        tree.commands[words[0]].make_context(words[0], words[1:])
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +34,7 @@ def rows() -> list[Row]:
     ]
 
 
+@functools.cache
 def names_in(path: Path) -> set[str]:
     """Names of a file's tests as pytest has them, without its collecting them."""
     found = set()
