@@ -20,9 +20,8 @@ from math import comb
 from typing import Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import NDArray
-from scipy import signal  # type: ignore[import-untyped]
-from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
 Array = NDArray[np.float64]
 
@@ -97,10 +96,10 @@ def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
         change = _derivative(window, DEGREE, 2, period)
         error, size = np.zeros(noise.shape), np.zeros(noise.shape)
         for q in pieces:
-            rough = signal.savgol_filter(q, window, DEGREE, 2, period, axis=0)
+            rough = scipy.signal.savgol_filter(q, window, DEGREE, 2, period, axis=0)
             size += np.mean(rough**2, 0)
             if window > DEGREE + 3:
-                fine = signal.savgol_filter(q, window, DEGREE + 2, 2, period, axis=0)
+                fine = scipy.signal.savgol_filter(q, window, DEGREE + 2, 2, period, axis=0)
                 inner = slice(window, -window)
                 extra = _derivative(window, DEGREE + 2, 2, period) - change
                 made = noise**2 * (extra @ extra)
@@ -113,7 +112,7 @@ def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
 
 
 def _derivative(window: int, degree: int, order: int, period: float) -> Array:
-    return np.asarray(signal.savgol_coeffs(window, degree, order, period), np.float64)
+    return np.asarray(scipy.signal.savgol_coeffs(window, degree, order, period), np.float64)
 
 
 def even_pieces(time: Array, columns: list[Array]) -> list[tuple[Array, list[Array]]]:
@@ -128,7 +127,7 @@ def even_pieces(time: Array, columns: list[Array]) -> list[tuple[Array, list[Arr
         own = [c[begin:end] for c in columns]
         if np.abs(np.diff(t) - period).max() > UNEVEN * period:
             even = np.arange(t[0], t[-1], period)
-            own = [np.asarray(CubicSpline(t, c)(even), np.float64) for c in own]
+            own = [np.asarray(scipy.interpolate.CubicSpline(t, c)(even), np.float64) for c in own]
             t = even
         pieces.append((t, own))
     return pieces
@@ -151,7 +150,7 @@ def tracks(
     result = []
     for t, (place, force, load, carried) in pieces:
         smooth, rate, second = (
-            np.asarray(signal.savgol_filter(place, width, DEGREE, k, period, axis=0))
+            np.asarray(scipy.signal.savgol_filter(place, width, DEGREE, k, period, axis=0))
             for k in range(3)
         )
         cut = slice(width // 2, len(t) - width // 2)
@@ -182,8 +181,8 @@ def low_pass(values: Array, period: float, how: Filtering) -> Array:
     """Signals along the first axis, filtered without phase, thinned out, ends left out."""
     if how.cutoff is None:
         return values
-    sections = signal.butter(4, 2.0 * how.cutoff * period, output="sos")
-    smooth = signal.sosfiltfilt(sections, values, axis=0)
+    sections = scipy.signal.butter(4, 2.0 * how.cutoff * period, output="sos")
+    smooth = scipy.signal.sosfiltfilt(sections, values, axis=0)
     # What the filter makes up at the ends dies out in a period of its cut-off.
     edge = min(int(1.0 / (how.cutoff * period)), len(values) // 4)
     return np.asarray(smooth[edge : len(values) - edge : how.keep_every], np.float64)

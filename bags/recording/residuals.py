@@ -12,6 +12,7 @@ from textwrap import fill
 from typing import Any, Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
@@ -34,10 +35,8 @@ def accelerations(qd: Array, period: float, window: int, newest: bool) -> Array:
 
     Read off at the window's middle, or at its newest sample, where no future is needed.
     """
-    from scipy.signal import savgol_coeffs  # late: a second of imports
-
     at = window - 1 if newest else window // 2
-    weights = savgol_coeffs(window, DEGREE, deriv=1, delta=period, pos=at, use="dot")
+    weights = scipy.signal.savgol_coeffs(window, DEGREE, deriv=1, delta=period, pos=at, use="dot")
     found = np.full_like(qd, np.nan)
     rates = np.lib.stride_tricks.sliding_window_view(qd, window, axis=0) @ weights
     found[at : at + len(rates)] = rates
@@ -103,15 +102,13 @@ def lifts() -> str:
 
 def milling() -> str:
     """The table of the 3-PRRU's recording."""
-    from scipy.signal import butter, sosfiltfilt  # late: a second of imports
-
     r = read_recording(BAGS / "prru_milling.mcap")
     assert r.qd is not None and r.effort is not None
     passes = ((2.0, 9.4), (11.5, 18.9))
     cut = np.logical_or.reduce([(r.time > a) & (r.time < b) for a, b in passes])
     near = np.logical_or.reduce([(r.time > a - AROUND) & (r.time < b + AROUND) for a, b in passes])
     peak = float(np.abs(r.effort).max())
-    low: Any = butter(4, SLOW, fs=1000.0, output="sos")
+    low: Any = scipy.signal.butter(4, SLOW, fs=1000.0, output="sos")
     rows = [
         "| window (ms) | out of the cut | in it, wrench left out | in it, with the wrench | "
         f"of that slower than {SLOW:g} Hz |",
@@ -120,7 +117,7 @@ def milling() -> str:
     for window in (5, 41):
         qdd = accelerations(r.qd, 1e-3, window, False)
         bare, known = residual(r, qdd), residual(r, qdd, r.wrench)
-        slow = np.asarray(sosfiltfilt(low, known, axis=0))
+        slow = np.asarray(scipy.signal.sosfiltfilt(low, known, axis=0))
         cells = (share(bare[~near], peak), share(bare[cut], peak), share(known[cut], peak))
         text = " | ".join(f"{cell:.1f} %" for cell in cells)
         rows.append(f"| {window} | {text} | {share(slow[cut], peak):.2f} % |")
