@@ -332,14 +332,13 @@ class Peer:
 
     def diagnostics(self, node, condition=lambda array: True):
         """The next diagnostics of a node, by its full name, that meet the condition."""
+        self._received["/diagnostics"].clear()
+        return self.until(lambda: next(filter(condition, self.told(node)), None))
+
+    def told(self, node):
+        """The diagnostics of a node, by its full name, that were heard."""
         received = self._received["/diagnostics"]
-        received.clear()
-
-        def found():
-            own = [array for array in received if array.status[0].name == node]
-            return next((array for array in own if condition(array)), None)
-
-        return self.until(found)
+        return [array for array in received if array.status[0].name == node]
 
     def until(self, condition, timeout=DEADLINE, repeat=None, every=0.05):
         """Spin until the condition is true; until then ``repeat`` is called ``every`` so many s.

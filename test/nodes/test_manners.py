@@ -383,9 +383,7 @@ def test_more_than_can_wait_is_refused_by_name(slow):
         slow.peer.send(f"/{slow.name}/joint_trajectory", message)
 
     def refused():
-        told = [
-            a for a in slow.peer.received("/diagnostics") if a.status[0].name == f"/{slow.name}"
-        ]
+        told = slow.peer.told(f"/{slow.name}")
         return told and counts_of(told[-1], "trajectories rejected").get("busy", 0)
 
     slow.peer.until(refused, repeat=send, every=0.01)

@@ -55,15 +55,15 @@ def has(robot: Robot, ask: str) -> bool:
     return True
 
 
-_shipped = functools.cache(pkm_twin.load)
+SHIPPED = {name: pkm_twin.load(name) for name in robot_names()}
 
 
 def load(robot: str | Path, **options: Any) -> Robot:
     """As the library's; a shipped robot once, as it does not change."""
-    return _shipped(robot) if robot in robot_names() else pkm_twin.load(robot, **options)
+    found = SHIPPED.get(str(robot))
+    return found if found is not None else pkm_twin.load(robot, **options)
 
 
-SHIPPED = {name: load(name) for name in robot_names()}
 MASSIVE = [name for name, robot in SHIPPED.items() if has(robot, "massive")]
 ELASTIC = [name for name, robot in SHIPPED.items() if has(robot, "structure")]
 
