@@ -355,11 +355,10 @@ class Engine:
         x = np.array([*self.tree.home, *self.graph.home], float)
         still = np.zeros(self.tree.unknown_rates + self.joints)
         (values, flat, _), _ = walk(_NO_PARAMETERS, x, pose, still)
-        # Without closures, in a serial chain, the platform itself falls short.
-        names = [*self._parts, *([self.graph.platform] * len(self.coordinates))]
+        names = self._parts
         for _ in range(40):
             if not (np.isfinite(values).all() and np.isfinite(flat).all()):
-                return names[0], math.inf, False
+                return self.graph.platform, math.inf, False
             table = flat.reshape(len(values), -1)
             damped = table.T @ table + 1e-6 * np.eye(table.shape[1])
             step = np.asarray(np.linalg.solve(damped, -table.T @ values), np.float64)
@@ -367,9 +366,11 @@ class Engine:
             (_, _, x), _ = walk(_NO_PARAMETERS, x, pose, step)
             (values, flat, _), _ = walk(_NO_PARAMETERS, x, pose, still)
         misses = np.abs(values)
-        misses[len(self._parts) :] /= POSE_WEIGHT
-        worst = int(misses.argmax())
-        return names[worst], float(misses[worst]) * self.tree.size, float(misses[worst]) < MET
+        if not names:
+            # A serial chain: what falls short is the platform itself.
+            return self.graph.platform, float(misses.max()) * self.tree.size / POSE_WEIGHT, False
+        worst = int(misses[: len(names)].argmax())
+        return names[worst], float(misses[worst]) * self.tree.size, float(misses.max()) < MET
 
     # As programs.
 
