@@ -230,7 +230,7 @@ def _loads(t: Traced) -> Program:
         joint_rows += motion.point(joint.outer, joint.at).tolist()
         for direction in reaction_directions(joint):
             joint_rows += motion.direction(direction.body, direction.vector).tolist()
-        if joint.kind == "universal":
+        if len(joint.axes) == 2:
             first = motion.direction(joint.inner, joint.axes[0])
             joint_rows += cross(motion.direction(joint.outer, joint.axes[1]), first).tolist()
         else:
@@ -258,33 +258,39 @@ def _joints(graph: Graph, rods: Array, places: Array) -> list[_Joint]:
 
 
 def _graph_joint(joint: Joint, vectors: Array) -> _Joint:
-    """Directions across its slides hold forces, those across its turns hold moments."""
+    """Directions across its slides hold forces, those across its turns hold moments.
+
+    A screw's force along its axis comes with the moment that its thread makes of it.
+    """
     name = joint.label or joint.name
-    directions = reaction_directions(joint)
-    kind = joint.kind
+    freedoms = joint.freedoms
+    pair = len(joint.axes) == 2
     forces: dict[str, Array] = {}
     moments: dict[str, Array] = {}
+    threads: dict[str, Array] = {}
     effort: str | None = None
-    for k, direction in enumerate(directions):
+    for k, direction in enumerate(reaction_directions(joint)):
         vector = vectors[..., 1 + k, :]
-        along = float(joint.axes[0] @ direction.vector) if len(joint.axes) else 0.0
-        driven = joint.actuated and abs(along) > 0.5
-        if kind not in ("translation", "prismatic", "cylindrical") or (
-            kind != "translation" and abs(along) < 0.5
-        ):
+        own = [f for f in freedoms if abs(float(f.axis @ direction.vector)) > 0.5]
+        if all(f.turns for f in own):
             forces[direction.name] = vector
-        if kind in ("fixed", "prismatic", "translation") or (
-            kind in ("revolute", "cylindrical") and abs(along) < 0.5
-        ):
+            screws = [f.slide for f in own if f.slide]
+            if screws:
+                threads[direction.name] = -screws[0] * vector
+        # The directions of two axes stand in their plane, whose normal is held.
+        if not pair and not any(f.turns for f in own):
             moments[direction.name] = vector
-        if driven:
-            table, what = (forces, "force") if kind == "prismatic" else (moments, "moment")
-            table[direction.name] = vector * np.sign(along)
+        if joint.actuated and own:
+            table, what = (moments, "moment") if own[0].turns else (forces, "force")
+            table[direction.name] = vector * np.sign(own[0].axis @ direction.vector)
             effort = f"{name}: {what} along {direction.name}"
-    if kind == "universal":
+    if pair:
         normal = vectors[..., 4, :]
         moments[joint.normal] = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-    return _joint(name, (joint.inner, joint.outer), vectors[..., 0, :], forces, moments, effort)
+    return _joint(
+        name, (joint.inner, joint.outer), vectors[..., 0, :], forces, moments, effort,
+        threads=threads,
+    )  # fmt: skip
 
 
 def _rod_joints(rod: Rod, vectors: Array) -> list[_Joint]:
@@ -320,16 +326,21 @@ def _joint(
     moments: Mapping[str, Array],
     effort: str | None,
     passed: Mapping[str, Array] | None = None,
+    threads: Mapping[str, Array] | None = None,
 ) -> _Joint:
-    """A joint from unit directions, shape (..., 3); ``passed``: couples shared with another."""
+    """A joint from unit directions, shape (..., 3).
+
+    ``passed``: couples shared with another; ``threads``: moments that come with a force.
+    """
     names = [f"{name}: force along {key}" for key in forces]
     names += [f"{name}: moment along {key}" for key in moments]
     couples = [*moments.values(), *(passed or {}).values()]
     names += list(passed or {})
     count = len(forces)
     basis = np.zeros((*point.shape[:-1], 6, len(names)))
-    for k, direction in enumerate(forces.values()):
+    for k, (key, direction) in enumerate(forces.items()):
         basis[..., :3, k] = direction
+        basis[..., 3:, k] = (threads or {}).get(key, 0.0)
     for k, direction in enumerate(couples):
         basis[..., 3:, count + k] = direction
     return _Joint(name, *bodies, point, tuple(names), basis, effort)

@@ -17,7 +17,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.motion import Motion, cross
-from pkm_twin.machine.graph import BASE, FREEDOMS, Joint, Rod
+from pkm_twin.machine.graph import BASE, Joint, Rod
 from pkm_twin.machine.inertia import Layout, loaded_joints
 from pkm_twin.machine.robot import Robot
 
@@ -215,7 +215,7 @@ class Forces:
         m, a, b = self.motion, joint.inner, joint.outer
         axis = m.direction(a, joint.axes[0])
         second: Any = 0.0
-        if FREEDOMS[joint.kind] == "R":
+        if not joint.slides:
             if accelerated:
                 second = axis @ (m.alpha[b] - m.alpha[a])
             return axis @ (m.omega[b] - m.omega[a]), second
@@ -230,7 +230,7 @@ class Forces:
         """An effort along a joint's freedom on its outer body, its opposite on the inner one."""
         m, a, b = self.motion, joint.inner, joint.outer
         load = m.direction(a, joint.axes[0]) * amount
-        if FREEDOMS[joint.kind] == "R":
+        if not joint.slides:
             self.moment[b] = self.moment[b] + load
             self.moment[a] = self.moment[a] - load
             return
@@ -248,11 +248,14 @@ class Forces:
             force, moment = self.force[link.body], self.moment[link.body]
             absolute = free = False
             for step in link.steps:
-                if step.kind in "RP":
-                    along = m.axis[id(step)] @ (moment if step.kind == "R" else force)
+                if not (step.ball or step.free):
+                    axis = m.axis[id(step)]
+                    along: Any = axis @ moment if step.turns else 0.0
+                    if step.slide:
+                        along = along + step.slide * (axis @ force)
                     (driven if step.actuated else unknown)[step.rate] = step.sign * along
                     continue
-                absolute, free = True, step.kind == "F"
+                absolute, free = True, step.free
                 unknown[step.rate : step.rate + 3] = moment
                 if free:
                     unknown[step.rate + 3 : step.rate + 6] = force

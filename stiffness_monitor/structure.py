@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.kinematics.motion import reaction_directions
-from pkm_twin.machine.graph import BASE, FREEDOMS, Joint, Rod
+from pkm_twin.machine.graph import BASE, Joint, Rod
 from pkm_twin.machine.members import Beam, Section, Structure
 from pkm_twin.machine.outline import Posture
 from pkm_twin.machine.robot import Robot
@@ -195,7 +195,7 @@ class _Builder:
         axes = np.column_stack([self.rotations[d.body] @ d.vector for d in directions])
         values = list(self.structure.compliances.get(self._name(joint), RIGID))
         values = [0.0 if v == FREE else float(v) for v in values]
-        if joint.kind == "universal":
+        if len(joint.axes) == 2:
             first = self.rotations[joint.inner] @ joint.axes[0]
             second = self.rotations[joint.outer] @ joint.axes[1]
             normal = cross(first, second)
@@ -206,12 +206,10 @@ class _Builder:
             axes = turned
             values = [values[k] for k in order] + [values[3 + k] for k in order]
             values[3] = values[4] = FREE
-        elif joint.kind == "spherical":
-            values[3:] = [FREE] * 3
         elif not joint.actuated:
-            for kind, axis in zip(FREEDOMS[joint.kind], [*joint.axes] * 2, strict=False):
-                k = int(np.argmax([abs(float(d.vector @ axis)) for d in directions]))
-                values[3 * (kind == "R") + k] = FREE
+            for freedom in joint.freedoms:
+                k = int(np.argmax([abs(float(d.vector @ freedom.axis)) for d in directions]))
+                values[3 * freedom.turns + k] = FREE
         return axes, tuple(values)
 
     def _hang(self, joint: Joint, left: list[Joint]) -> None:

@@ -28,7 +28,7 @@ from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
-from pkm_twin.machine.graph import FREEDOMS, Array, Graph
+from pkm_twin.machine.graph import Array, Graph
 from pkm_twin.machine.tree import Tree, snapped
 
 _NO_PARAMETERS: Final = np.zeros(0)
@@ -102,7 +102,7 @@ class Engine:
         return left * ju / np.array(self.tree.scales), left * jq / drives
 
     def _drive_scale(self, name: str) -> float:
-        return 1.0 / self.tree.size if FREEDOMS[self.graph.joints[name].kind] == "P" else 1.0
+        return 1.0 / self.tree.size if self.graph.joints[name].slides else 1.0
 
     def close(self, q: Numbers, start: Numbers | None = None) -> Array | None:
         """Unknowns of a state near a known one, on numbers; None where they are not found."""

@@ -17,7 +17,8 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import BASE, FREEDOMS, Array, Graph, Joint, Rod, across
+from pkm_twin.machine.graph import BASE, Array, Graph, Joint, Rod
+from pkm_twin.machine.joints import TURN, UNITS, Constraint, across
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import about_vector
 
@@ -31,7 +32,10 @@ FAR: Final = 1.0
 """A longer correction leads to another assembly, rad or m."""
 MISS: Final = 1e-7
 """Part of the machine's size by which equations may be missed before the last correction."""
-_UNITS: Final = np.eye(3)
+
+
+Parts = Sequence[tuple[str, Array, Array, Array]]
+"""Of a row: body, point, force-like and moment-like weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +56,7 @@ class Placement:
         turned, places = robot.placements(q)
         origin = {name: at - turned[name] @ home[name] for name, at in places.items()}
         batch = q.shape[:-1]
-        still = {BASE: np.broadcast_to(_UNITS, (*batch, 3, 3))}
+        still = {BASE: np.broadcast_to(UNITS, (*batch, 3, 3))}
         return cls({**turned, **still}, {**origin, BASE: np.zeros((*batch, 3))})
 
     def point(self, body: str, at: Array) -> Array:
@@ -160,9 +164,7 @@ class Equations:
         right = back @ -self.values[..., None]
         return np.asarray(np.linalg.solve(back @ table, right)[..., 0], np.float64)
 
-    def _add(
-        self, value: Array, parts: Sequence[tuple[str, Array, Array, Array]], geometry: Array
-    ) -> None:
+    def _add(self, value: Array, parts: Parts, geometry: Array) -> None:
         """A row: by body the weights of the velocity of a point and of the angular velocity.
 
         :param value: of the equation, zero where it holds, shape (...).
@@ -186,36 +188,51 @@ class Equations:
         return np.asarray(self.rotation[body] @ np.reshape(vectors, (-1, 3)).T, np.float64)
 
     def _joint(self, joint: Joint) -> None:
-        kind, axes = joint.kind, joint.axes
-        pair = across(axes[0]) if len(axes) == 1 else ()
-        if kind in ("revolute", "universal", "spherical", "fixed"):
-            for unit in _UNITS:
-                self._offset(joint, unit, fixed=True)
-        if kind in ("prismatic", "cylindrical"):
-            for e in pair:
-                self._offset(joint, e)
-        if kind in ("revolute", "cylindrical"):
-            for e in pair:
-                self._angle(joint, (e, 0), (axes[0], 0))
-        if kind in ("prismatic", "fixed", "translation"):
-            for i in range(3):
-                self._angle(joint, (_UNITS[i], 0), (_UNITS[(i + 1) % 3], 0))
-        if kind == "universal":
-            self._angle(joint, (axes[0], 0), (axes[1], 1))
+        for held in joint.constraints:
+            if held.kind == "point":
+                for unit in UNITS:
+                    self._add(*self._offset(joint, unit, fixed=True))
+            elif held.kind == "plane":
+                self._add(*self._offset(joint, held.inner))
+            elif held.kind == "screw":
+                self._add(*self._thread(joint, held))
+            else:
+                first, second = held.axes
+                self._add(*self._angle(joint, (held.inner, first), (held.outer, second)))
         if joint.actuated:
-            self._drive(joint, pair)
+            self._drive(joint, across(joint.axes[0]))
 
     def _drive(self, joint: Joint, pair: Sequence[Array]) -> None:
         """The actuated joint keeps the value that its sensor shows."""
         homes = np.array([change.homes[joint.name] for change in self.changes])
         value = self.q[..., self.graph.actuated.index(joint.name)] - joint.home
-        if FREEDOMS[joint.kind] == "P":
-            self._offset(joint, joint.axes[0], goal=value, extra=homes)
-            return
+        if joint.slides:
+            self._add(*self._offset(joint, joint.axes[0], goal=value, extra=homes))
+        else:
+            self._add(*self._turn(joint, pair, value, homes))
+
+    def _turn(
+        self, joint: Joint, pair: Sequence[Array], value: Array, extra: Array | float = 0.0
+    ) -> tuple[Array, Parts, Array]:
+        """The outer body is turned about the axis by a value; its derivatives are the turn's."""
         first, second = pair
         # Across where the outer body's first vector has to be, turned by the value.
         e = np.cos(value)[..., None] * second - np.sin(value)[..., None] * first
-        self._angle(joint, (e, 0), (first, 0), extra=homes)
+        return self._angle(joint, (e, 0), (first, 0), extra=extra)
+
+    def _thread(self, joint: Joint, held: Constraint) -> tuple[Array, Parts, Array]:
+        """The outer body goes along the axis in proportion to its turn, whole ones left out."""
+        along, parts, geometry = self._offset(joint, held.inner)
+        first, second = across(held.inner)
+        mark = self.rotation[joint.outer] @ first
+        rotation = self.rotation[joint.inner]
+        angle = np.arctan2(
+            (mark * (rotation @ second)).sum(-1), (mark * (rotation @ first)).sum(-1)
+        )
+        _, turning, turned = self._turn(joint, (first, second), angle)
+        scaled = [(body, at, f, -held.slide * m) for body, at, f, m in turning]
+        value = np.remainder(along / held.slide - angle + np.pi, TURN) - np.pi
+        return held.slide * value, [*parts, *scaled], geometry - held.slide * turned
 
     def _axis_turn(self, joint: Joint, which: int, vector: Array) -> Array:
         """How a vector that an axis carries along changes with it, shape (..., 3, changes)."""
@@ -228,7 +245,7 @@ class Equations:
     def _angle(
         self, joint: Joint, inner: tuple[Array, int], outer: tuple[Array, int],
         extra: Array | float = 0.0,
-    ) -> None:  # fmt: skip
+    ) -> tuple[Array, Parts, Array]:  # fmt: skip
         """A vector of the inner body and one of the outer body keep their angle."""
         a, b = joint.inner, joint.outer
         (e, i), (u, k) = inner, outer
@@ -245,12 +262,12 @@ class Equations:
         goal = 0.0 if drive else float(e @ u)
         same = 0.0 if drive else at_home
         parts = [(b, here, none, normal), (a, here, none, -normal)]
-        self._add((ea * ub).sum(-1) - goal, parts, moved - same + extra)
+        return (ea * ub).sum(-1) - goal, parts, moved - same + extra
 
     def _offset(
         self, joint: Joint, e: Array, *, fixed: bool = False, goal: Array | float = 0.0,
         extra: Array | float = 0.0,
-    ) -> None:  # fmt: skip
+    ) -> tuple[Array, Parts, Array]:  # fmt: skip
         """The outer body's point is at a distance along e, fixed in space or in the inner body."""
         a, b = joint.inner, joint.outer
         ea = e + np.zeros((*self.q.shape[:-1], 3)) if fixed else self.rotation[a] @ e
@@ -262,7 +279,7 @@ class Equations:
             geometry = geometry + _dot(self.rotation[a] @ self._axis_turn(joint, 0, e), xb - xa)
             turning = np.cross(ea, xb - xa)
         value = (ea * (xb - xa)).sum(-1) - goal
-        self._add(value, [(b, xb, ea, 0 * ea), (a, xa, -ea, turning)], geometry + extra)
+        return value, [(b, xb, ea, 0 * ea), (a, xa, -ea, turning)], geometry + extra
 
     def _rod(self, rod: Rod) -> None:
         """The ends keep their distance."""

@@ -12,16 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.expressions import Numbers, Objects, cos, sin, sqrt
-from pkm_twin.machine.graph import BASE, Array, Direction, Joint, Rod, across, unit
+from pkm_twin.machine.graph import BASE, Array, Direction, Joint, Rod
+from pkm_twin.machine.joints import UNITS, Constraint, across, unit
 from pkm_twin.machine.tree import Link, Step, Tree, snapped
 
-UNITS: Final = np.eye(3)
 Columns = dict[tuple[str, int], Any]
 """By rate ("u" or "q", index): a vector, or a number."""
 
@@ -87,31 +87,34 @@ class Motion:
             turned = self.rotation[link.parent]
             lever = turned @ link.arm
             for step in link.steps:
-                if step.kind == "P":
-                    axis = self.axis[id(step)] = turned @ step.local
-                    lever = lever + axis * self._value(step, x, q, origin)
-                elif step.kind == "R":
+                if step.ball or step.free:
+                    k = step.position
+                    turned = _quaternion_matrix(x[k : k + 4])
+                    if step.free:
+                        lever = link.at + np.array(x[k + 4 : k + 7], dtype=object)
+                    continue
+                if step.turns:
                     own = turned if (step.before == UNITS).all() else turned @ step.before
-                    angle = self._value(step, x, q, origin)
-                    s, c = sin(angle), cos(angle)
                     self.axis[id(step)] = own[:, 2]
+                    angle = self._value(step, x, q, origin, step.offset)
+                    s, c = sin(angle), cos(angle)
                     turned = np.array(
                         [own[:, 0] * c + own[:, 1] * s, own[:, 1] * c - own[:, 0] * s, own[:, 2]],
                         dtype=object,
                     ).T
                 else:
-                    k = step.position
-                    turned = _quaternion_matrix(x[k : k + 4])
-                    if step.kind == "F":
-                        lever = link.at + np.array(x[k + 4 : k + 7], dtype=object)
+                    self.axis[id(step)] = turned @ step.local
+                if step.slide:
+                    way = step.slide * self._value(step, x, q, origin)
+                    lever = lever + self.axis[id(step)] * way
             self.rotation[link.body] = turned
             self.lever[link.body] = lever
             self.origin[link.body] = self.origin[link.parent] + lever
 
     @staticmethod
-    def _value(step: Step, x: Numbers, q: Numbers, origin: Array) -> Any:
+    def _value(step: Step, x: Numbers, q: Numbers, origin: Array, offset: float = 0.0) -> Any:
         k = step.position
-        value = q[k] - (float(origin[k]) - step.sign * step.offset) if step.actuated else x[k]
+        value = q[k] - (float(origin[k]) - step.sign * offset) if step.actuated else x[k]
         return -value if step.sign < 0.0 else value
 
     # Points and directions that are fixed in a body, given at home.
@@ -147,16 +150,18 @@ class Motion:
             link, absolute = self.tree.links[body], False
             for step in reversed(link.steps):
                 key = ("q" if step.actuated else "u", step.rate)
-                if step.kind == "R":
-                    out[key] = step.sign * cross(self.axis[id(step)], at - self.origin[body])
-                elif step.kind == "P":
-                    out[key] = step.sign * self.axis[id(step)]
-                else:
+                if step.ball or step.free:
                     absolute = True
                     for i in range(3):
                         out["u", step.rate + i] = cross(UNITS[i], at - self.origin[body])
-                        if step.kind == "F":
+                        if step.free:
                             out["u", step.rate + 3 + i] = UNITS[i]
+                    continue
+                axis = self.axis[id(step)]
+                column: Any = cross(axis, at - self.origin[body]) if step.turns else 0.0
+                if step.slide:
+                    column = column + step.slide * axis
+                out[key] = step.sign * column
             if absolute:
                 # Nothing of the parents' turning is inherited, only their translation.
                 at = self.origin[body]
@@ -169,10 +174,10 @@ class Motion:
         while body != BASE:
             link = self.tree.links[body]
             for step in reversed(link.steps):
-                if step.kind == "R":
+                if step.turns:
                     key = ("q" if step.actuated else "u", step.rate)
                     out[key] = step.sign * self.axis[id(step)]
-                elif step.kind in "SF":
+                elif step.ball or step.free:
                     for i in range(3):
                         out["u", step.rate + i] = UNITS[i]
                     return out
@@ -184,28 +189,15 @@ class Motion:
     def closures(self) -> list[Row]:
         """The equations of all cut joints and rods."""
         rows: list[Row] = []
+        kinds = {"point": self._meeting, "plane": self._offset, "angle": self._angle}
         for name in self.tree.cut:
-            rows += self._cut(self.graph.joints[name])
+            joint = self.graph.joints[name]
+            for constraint in joint.constraints:
+                rows += kinds[constraint.kind](joint, constraint)
         rows += [self._rod(rod) for rod in self.graph.rods.values()]
         return rows
 
-    def _cut(self, joint: Joint) -> list[Row]:
-        rows: list[Row] = []
-        kind = joint.kind
-        if kind in ("revolute", "universal", "spherical", "fixed"):
-            rows += self._meeting(joint)
-        pair = across(joint.axes[0]) if len(joint.axes) == 1 else ()
-        if kind in ("prismatic", "cylindrical"):
-            rows += [self._offset(joint, e) for e in pair]
-        if kind in ("revolute", "cylindrical"):
-            rows += [self._angle(joint, e, joint.axes[0]) for e in pair]
-        if kind in ("prismatic", "fixed", "translation"):
-            rows += [self._angle(joint, UNITS[i], UNITS[(i + 1) % 3]) for i in range(3)]
-        if kind == "universal":
-            rows.append(self._angle(joint, joint.axes[0], joint.axes[1]))
-        return rows
-
-    def _meeting(self, joint: Joint) -> list[Row]:
+    def _meeting(self, joint: Joint, _: Constraint) -> list[Row]:
         """Both bodies' points are at one place."""
         a, b, at = joint.inner, joint.outer, joint.at
         xa, xb = self.point(a, at), self.point(b, at)
@@ -222,10 +214,10 @@ class Motion:
             for i in range(3)
         ]  # fmt: skip
 
-    def _angle(self, joint: Joint, e: Array, u: Array) -> Row:
-        """e, fixed in the inner body, and u, in the outer one, keep their angle."""
+    def _angle(self, joint: Joint, held: Constraint) -> list[Row]:
+        """A vector of the inner body and one of the outer body keep their angle."""
         a, b = joint.inner, joint.outer
-        ea, ub = self.direction(a, e), self.direction(b, u)
+        ea, ub = self.direction(a, held.inner), self.direction(b, held.outer)
         normal = cross(ub, ea)
         columns = difference(self.turn_columns(b), self.turn_columns(a))
 
@@ -235,15 +227,18 @@ class Motion:
             turning = (self.alpha[b] - self.alpha[a]) @ normal
             return turning + cross(wa, va) @ ub + cross(wb, vb) @ ea + 2.0 * (va @ vb)
 
-        return Row(
-            joint.name, ea @ ub - float(e @ u), {k: c @ normal for k, c in columns.items()}, bias,
-            1.0, a, b, self.point(b, joint.at), np.zeros(3), normal, angle=True,
-        )  # fmt: skip
+        return [
+            Row(
+                joint.name, ea @ ub - float(held.inner @ held.outer),
+                {k: c @ normal for k, c in columns.items()}, bias,
+                1.0, a, b, self.point(b, joint.at), np.zeros(3), normal, angle=True,
+            )
+        ]  # fmt: skip
 
-    def _offset(self, joint: Joint, e: Array) -> Row:
-        """The outer body's point stays in the plane across e of the inner body."""
+    def _offset(self, joint: Joint, held: Constraint) -> list[Row]:
+        """The outer body's point stays in the plane across a vector of the inner body."""
         a, b, at = joint.inner, joint.outer, joint.at
-        ea, xa, xb = self.direction(a, e), self.point(a, at), self.point(b, at)
+        ea, xa, xb = self.direction(a, held.inner), self.point(a, at), self.point(b, at)
         apart = xb - xa
         normal = cross(ea, apart)
         linear = difference(self.point_columns(b, xb), self.point_columns(a, xa))
@@ -261,9 +256,12 @@ class Motion:
             )
 
         # The force acts on both bodies at the outer point, so no moment is left.
-        return Row(
-            joint.name, ea @ apart, columns, bias, 1.0 / self.tree.size, a, b, xb, ea, np.zeros(3)
-        )
+        return [
+            Row(
+                joint.name, ea @ apart, columns, bias, 1.0 / self.tree.size, a, b, xb, ea,
+                np.zeros(3),
+            )
+        ]  # fmt: skip
 
     def _rod(self, rod: Rod) -> Row:
         """The ends keep their distance."""
@@ -297,18 +295,18 @@ class Motion:
             v = self.speed[link.parent] + cross(w, self.lever[link.body])
             for step in link.steps:
                 k = step.rate
-                if step.kind in "RP":
-                    rate = self._rate[id(step)] = step.sign * (qd[k] if step.actuated else u[k])
-                    axis = self.axis[id(step)]
-                    if step.kind == "P":
-                        v = v + axis * rate
-                    else:
-                        self._before[id(step)] = w
-                        w = w + axis * rate
-                else:
+                if step.ball or step.free:
                     w = np.array(u[k : k + 3], dtype=object)
-                    if step.kind == "F":
+                    if step.free:
                         v = np.array(u[k + 3 : k + 6], dtype=object)
+                    continue
+                rate = self._rate[id(step)] = step.sign * (qd[k] if step.actuated else u[k])
+                axis = self.axis[id(step)]
+                if step.slide:
+                    v = v + axis * (step.slide * rate)
+                if step.turns:
+                    self._before[id(step)] = w
+                    w = w + axis * rate
             self.omega[link.body], self.speed[link.body] = w, v
 
     def set_accelerations(self, du: Numbers, qdd: Numbers, gravity: Any | None = None) -> None:
@@ -325,17 +323,18 @@ class Motion:
             acc = self.change[parent] + self._spin[parent] @ self.lever[link.body]
             for step in link.steps:
                 k = step.rate
-                if step.kind in "RP":
-                    second = step.sign * (qdd[k] if step.actuated else du[k])
-                    axis, rate = self.axis[id(step)], self._rate[id(step)]
-                    if step.kind == "P":
-                        acc = acc + axis * second + 2.0 * rate * cross(w, axis)
-                    else:
-                        al = al + axis * second + cross(self._before[id(step)], axis) * rate
-                else:
+                if step.ball or step.free:
                     al = np.array(du[k : k + 3], dtype=object)
-                    if step.kind == "F":
+                    if step.free:
                         acc = np.array(du[k + 3 : k + 6], dtype=object) - pull
+                    continue
+                second = step.sign * (qdd[k] if step.actuated else du[k])
+                axis, rate = self.axis[id(step)], self._rate[id(step)]
+                if step.slide:
+                    slip, swell = step.slide * rate, step.slide * second
+                    acc = acc + axis * swell + 2.0 * slip * cross(w, axis)
+                if step.turns:
+                    al = al + axis * second + cross(self._before[id(step)], axis) * rate
             self.alpha[link.body], self.change[link.body] = al, acc
             self._spin[link.body] = _spin(self.omega[link.body], al)
 
@@ -359,7 +358,7 @@ class Motion:
                 k, r = step.position, step.rate
                 if step.actuated:
                     continue
-                if step.kind in "RP":
+                if not (step.ball or step.free):
                     new[k] = x[k] + du[r]
                     continue
                 w, v = x[k], np.array(x[k + 1 : k + 4], dtype=object)
@@ -368,7 +367,7 @@ class Motion:
                 length = 1.0 / sqrt(w * w + v @ v)
                 new[k] = w * length
                 new[k + 1 : k + 4] = list(v * length)
-                if step.kind == "F":
+                if step.free:
                     for i in range(3):
                         new[k + 4 + i] = x[k + 4 + i] + du[r + 3 + i]
         return new

@@ -2,8 +2,9 @@
 """Values of the passive joints in a URDF's convention: one number a revolute or prismatic axis.
 
 A spherical joint and a free body's ball are three revolutes in a row (x, y and z at home), a
-universal joint is two, a cylindrical one a slide and a turn, a translation three slides. Rods are
-links on two revolutes, that turn them from their direction at home.
+universal joint is two, a cylindrical one a slide and a turn, a translation three slides, a screw a
+turn and the slide that its thread makes (``NAME_slide``, of an actuated one too). Rods are links on
+two revolutes, that turn them from their direction at home.
 
 May import: numpy, pkm_twin's codegen, machine and this package, the standard library.
 """
@@ -20,7 +21,8 @@ from pkm_twin.codegen.expressions import Numbers, Objects, atan2, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine, Traced
 from pkm_twin.kinematics.motion import cross
-from pkm_twin.machine.graph import Array, Rod, across, unit
+from pkm_twin.machine.graph import Array, Rod
+from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.tree import Link
 
 _LETTERS = "xyz"
@@ -28,9 +30,10 @@ _LETTERS = "xyz"
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """One passive number: its name, its kind (R or P), its axis and a point of it at home.
+    """One single joint: its name, its kind (R, P, or empty: fixed), its axis and a point of it.
 
-    ``inner``, ``outer``: bodies; of several axes in a row those between are named for them.
+    At home. ``inner``, ``outer``: bodies; of several axes in a row those between are named for
+    them. ``driven``: whether its number is one of q.
     """
 
     name: str
@@ -40,46 +43,44 @@ class Axis:
     inner: str
     outer: str
     joint: str
+    driven: bool = False
 
 
-def passive_axes(engine: Engine) -> list[Axis]:
-    """All passive axes of the tree, in order, then those of the rods."""
+def single_joints(engine: Engine) -> list[Axis]:
+    """All single joints of the tree from the ground outwards, then those of the rods."""
     graph, tree = engine.graph, engine.tree
     result: list[Axis] = []
 
     def chain(
         joint: str, kinds: str, axes: Numbers, point: Array, inner: str, outer: str,
-        names: Sequence[str],
+        names: Sequence[str], driven: bool = False,
     ) -> None:  # fmt: skip
         before = inner
         for k, (kind, axis) in enumerate(zip(kinds, axes, strict=True)):
             after = outer if k == len(kinds) - 1 else f"{names[k]}_link"
-            result.append(
-                Axis(names[k], kind, np.asarray(axis, float), point, before, after, joint)
-            )
+            at_home = np.asarray(axis, float)
+            own = driven and k == 0
+            result.append(Axis(names[k], kind, at_home, point, before, after, joint, own))
             before = after
 
     for link in tree.links.values():
         steps = link.steps
-        if not steps or steps[0].actuated:
-            continue
         name = link.joint or f"{link.body}_free"
-        point = link.at
-        if steps[0].kind == "S":
-            names = [f"{name}_{c}" for c in _LETTERS]
-            chain(name, "RRR", np.eye(3), point, link.parent, link.body, names)
-        elif steps[0].kind == "F":
+        ends = link.at, link.parent, link.body
+        if not steps:
+            result.append(Axis(name, "", np.zeros(3), *ends, name))
+        elif steps[0].ball:
+            chain(name, "RRR", np.eye(3), *ends, [f"{name}_{c}" for c in _LETTERS])
+        elif steps[0].free:
             names = [f"{name}_p{c}" for c in _LETTERS] + [f"{name}_{c}" for c in _LETTERS]
-            chain(name, "PPPRRR", [*np.eye(3), *np.eye(3)], point, link.parent, link.body, names)
+            chain(name, "PPPRRR", [*np.eye(3), *np.eye(3)], *ends, names)
         else:
-            kinds = "".join(step.kind for step in steps)
-            labels = {1: [name], 2: [f"{name}_1", f"{name}_2"]}.get(
-                len(steps), [f"{name}_{c}" for c in _LETTERS]
-            )
-            chain(
-                name, kinds, [step.sign * step.axis for step in steps], point, link.parent,
-                link.body, labels,
-            )  # fmt: skip
+            kinds = "".join("R" * step.turns + "P" * bool(step.slide) for step in steps)
+            axes = [step.sign * step.axis for step in steps]
+            names = [f"{name}_{c}" for c in (_LETTERS if len(steps) == 3 else "12")]
+            if len(steps) == 1:
+                names, axes = [name, f"{name}_slide"][: len(kinds)], axes * len(kinds)
+            chain(name, kinds, axes, *ends, names, steps[0].actuated)
     for rod in graph.rods.values():
         first, second = rod_axes(rod)
         names = [f"{rod.name}_1", f"{rod.name}_2"]
@@ -94,7 +95,7 @@ def rod_axes(rod: Rod) -> tuple[Array, Array]:
 
 def passive_names(engine: Engine) -> tuple[str, ...]:
     """Names of all passive numbers."""
-    return tuple(axis.name for axis in passive_axes(engine))
+    return tuple(axis.name for axis in single_joints(engine) if axis.kind and not axis.driven)
 
 
 def passive_program(t: Traced) -> Program:
@@ -102,18 +103,20 @@ def passive_program(t: Traced) -> Program:
     t.solve()
     motion, tree = t.motion, t.tree
     values: list[Any] = []
-    for link in _passive_links(t):
+    for link in t.tree.links.values():
         steps = link.steps
-        if steps[0].kind in "SF":
-            if steps[0].kind == "F":
+        if steps and (steps[0].ball or steps[0].free):
+            if steps[0].free:
                 k = steps[0].position
                 values += list(t.x[k + 4 : k + 7])
             values += _three_angles(_relative(t, link))
             continue
         # A joint of one freedom has its own value at home.
-        single = link.joint is not None and len(steps) == 1
-        home = tree.graph.joints[str(link.joint)].home if single else 0.0
-        values += [t.x[step.position] + home for step in steps]
+        home = tree.graph.joints[steps[0].joint].home if len(steps) == 1 else 0.0
+        for step in steps:
+            value = t.q[step.position] - home if step.actuated else t.x[step.position]
+            values += [] if step.actuated else [value + home]
+            values += [step.slide * value] if step.turns and step.slide else []
     for rod in t.engine.graph.rods.values():
         span = motion.turned(rod.inner).T @ _across_ends(t, rod)
         b, a, x = _rod_sides(rod, span)
@@ -128,17 +131,20 @@ def passive_rates_program(t: Traced) -> Program:
     u = t.set_rates(qd)
     motion = t.motion
     rates: list[Any] = []
-    for link in _passive_links(t):
+    for link in t.tree.links.values():
         steps = link.steps
-        if steps[0].kind in "SF":
+        if steps and (steps[0].ball or steps[0].free):
             k = steps[0].rate
-            if steps[0].kind == "F":
+            if steps[0].free:
                 rates += list(u[k + 3 : k + 6])
             inner = motion.turned(link.parent)
             omega = inner.T @ (motion.omega[link.body] - motion.omega[link.parent])
             rates += _three_rates(_relative(t, link), omega)
             continue
-        rates += [u[step.rate] for step in steps]
+        for step in steps:
+            rate = (qd if step.actuated else u)[step.rate]
+            rates += [] if step.actuated else [rate]
+            rates += [step.slide * rate] if step.turns and step.slide else []
     for rod in t.engine.graph.rods.values():
         inner, apart = motion.turned(rod.inner), _across_ends(t, rod)
         ends = [
@@ -154,11 +160,6 @@ def passive_rates_program(t: Traced) -> Program:
         rates += [(x * va - a * vx) / square, (level * vb - b * change) / (square + b * b)]
     sizes = {"q": t.joints, "qd": t.joints}
     return Program(sizes, 0, {"rates": t.lift(rates)}, t.equations())
-
-
-def _passive_links(t: Traced) -> list[Link]:
-    links = t.tree.links.values()
-    return [link for link in links if link.steps and not link.steps[0].actuated]
 
 
 def _relative(t: Traced, link: Link) -> Objects:

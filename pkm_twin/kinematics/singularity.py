@@ -65,10 +65,8 @@ class Placed(Motion):
         for link in self.tree.links.values():
             self.origin[link.body] = motion.point(link.body, self.tree.at[link.body])
             for step in link.steps:
-                if step.kind in "RP":
-                    # A universal joint's second axis is fixed in the body beyond it.
-                    last = self.graph.joints[str(link.joint)].kind == "universal"
-                    body = link.body if last and step is link.steps[-1] else link.parent
+                if not (step.ball or step.free):
+                    body = link.body if step.beyond else link.parent
                     self.axis[id(step)] = motion.direction(body, step.axis)
 
     def point(self, body: str, point: Array) -> Any:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A machine as a graph of bodies, joints and rods at its home pose, every vector in base axes.
 
-May import: numpy, pkm_twin's errors, the standard library.
+May import: numpy, pkm_twin's errors, joint types, the standard library.
 """
 
 from __future__ import annotations
@@ -15,24 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.joints import TYPES, Constraint, Freedom, JointType
 
 Array = NDArray[np.float64]
 
 BASE: Final = "base"
 """Name of the ground."""
 
-FREEDOMS: Final = {
-    "fixed": "",
-    "revolute": "R",
-    "prismatic": "P",
-    "cylindrical": "PR",
-    "universal": "RR",
-    "spherical": "S",
-    "translation": "PPP",
-}
-"""Joint types: the steps from the inner body to the outer one; R turns, P slides, S is a ball."""
-AXES: Final = {"revolute": 1, "prismatic": 1, "cylindrical": 1, "universal": 2}
-"""How many axes a type has, where it has any."""
 POSE: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Pose coordinates: the reference point, and R = Rz(yaw) Ry(pitch) Rx(roll) relative to home."""
 
@@ -46,21 +35,6 @@ def array(values: ArrayLike) -> Array:
     result = np.array(values, np.float64)
     result.setflags(write=False)
     return result
-
-
-def unit(vector: ArrayLike) -> Array:
-    """The vector at length one."""
-    values = np.asarray(vector, np.float64)
-    return np.asarray(values / np.linalg.norm(values), np.float64)
-
-
-def across(axis: Array) -> tuple[Array, Array]:
-    """Two unit vectors across an axis and each other, right-handed with it."""
-    first = np.zeros(3)
-    # Rounded: where two components are equal, the last bit must not choose.
-    first[int(np.argmin(np.round(np.abs(axis), 9)))] = 1.0
-    first = unit(np.cross(axis, first))
-    return first, np.cross(axis, first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +60,8 @@ class Body:
 class Joint:
     """A joint between an inner and an outer body, through the point ``at`` at home.
 
-    ``axes``: shape (k, 3), see AXES; of a universal joint the first is fixed in the inner body.
+    ``axes``: unit vectors, shape (k, 3), as many as its type has; of a universal joint the first is
+    fixed in the inner body. ``pitch``: of a screw, m a rad.
     ``home``: the joint's value at home. ``viscous``, ``coulomb``: friction along its freedom;
     ``rotor_inertia``: against its acceleration, kg m2 or kg.
     ``given``: a joint that stands for what other parts hold: it carries no load itself.
@@ -109,8 +84,29 @@ class Joint:
     directions: tuple[Direction, ...] = ()
     label: str = ""
     normal: str = "n"
+    pitch: float = 0.0
     limits: Array | None = None
     compliance: Array | None = None
+
+    @property
+    def type(self) -> type[JointType]:
+        """What it lets move and holds."""
+        return TYPES[self.kind]
+
+    @property
+    def freedoms(self) -> tuple[Freedom, ...]:
+        """Its elementary freedoms, from the inner body to the outer one."""
+        return self.type.freedoms(self.axes, self.pitch)
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]:
+        """What it holds."""
+        return self.type.constraints(self.axes, self.pitch)
+
+    @property
+    def slides(self) -> bool:
+        """Whether it has one freedom, and its number is a length."""
+        return [freedom.turns for freedom in self.freedoms] == [False]
 
     @property
     def loaded(self) -> bool:
@@ -201,7 +197,7 @@ class Graph:
         joints = [
             (
                 j.name, j.kind, j.inner, j.outer, j.at.tolist(), j.axes.tolist(), j.actuated,
-                j.home, j.given, j.loaded,
+                j.home, j.given, j.loaded, j.pitch,
             )
             for j in self.joints.values()
         ]  # fmt: skip
@@ -242,9 +238,9 @@ class Graph:
     @staticmethod
     def _check_axes(joint: Joint) -> None:
         path = f"joints.{joint.name}"
-        if joint.kind not in FREEDOMS:
-            raise ParameterError(f"{path}.type", joint.kind, f"one of {', '.join(FREEDOMS)}")
-        count = AXES.get(joint.kind, 0)
+        if joint.kind not in TYPES:
+            raise ParameterError(f"{path}.type", joint.kind, f"one of {', '.join(TYPES)}")
+        count = joint.type.count
         if len(joint.axes) != count:
             name = "axes" if count == 2 else "axis"
             raise ParameterError(f"{path}.{name}", joint.axes.tolist(), f"{count} for {joint.kind}")
@@ -252,8 +248,8 @@ class Graph:
             raise ParameterError(
                 f"{path}.axes", joint.axes.tolist(), "two axes that are not parallel"
             )
-        if joint.actuated and FREEDOMS[joint.kind] not in ("R", "P"):
-            raise ParameterError(f"{path}.actuated", joint.kind, "a revolute or prismatic joint")
+        if joint.actuated and len(joint.freedoms) != 1:
+            raise ParameterError(f"{path}.actuated", joint.kind, "a joint of one freedom")
 
     def _check_connection(self) -> None:
         reached, todo = {BASE}, [BASE]

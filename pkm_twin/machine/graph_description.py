@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.machine.graph import Array, Body, Graph, Joint
+from pkm_twin.machine.joints import TURN
 
 
 def graph_description(graph: Graph) -> dict[str, Any]:
@@ -55,6 +56,8 @@ def _joint(joint: Joint) -> dict[str, Any]:
         data["axis"] = _numbers(joint.axes[0])
     elif len(joint.axes) == 2:
         data["axes"] = [_numbers(axis) for axis in joint.axes]
+    if joint.pitch:
+        data["lead"] = joint.pitch * TURN
     if joint.actuated:
         data["actuated"] = True
     if joint.home:

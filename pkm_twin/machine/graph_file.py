@@ -18,16 +18,14 @@ from numpy.typing import NDArray
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import (
-    AXES,
-    FREEDOMS,
     Body,
     Graph,
     Joint,
     Rod,
     array,
     rotation_about_z,
-    unit,
 )
+from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
 from pkm_twin.machine.sections import check_angles, length, mass
 from pkm_twin.machine.shared import Key
@@ -130,17 +128,20 @@ class JointSpec:
 
     Its number is the motion of the outer body against the inner one, along or about ``axis``, and
     ``home`` at home. ``axes``: of a universal joint, the first fixed in the inner body, the second
-    in the outer one. A ``translation`` is three slides along base axes. ``limits`` are those of
+    in the outer one. ``lead``: how far a ``helical`` joint goes along its axis in a turn, m; its
+    number is the turn, and a left-handed thread has a lead below zero. A ``translation`` is three
+    slides along base axes. ``limits`` are those of
     actuated joints. ``rotor_inertia``: of the drive, reflected to the joint, inertia without
     weight; or ``drive``, which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a
     screw's or belt's ``lead`` (joints that slide). ``compliance``: in the joint's own axes.
     """
 
-    type: str = schema.choice(*FREEDOMS)
+    type: str = schema.choice(*TYPES)
     between: tuple[str, ...] = schema.names(2)
     at: Array | None = schema.vector(3, unit="m", default=None)
     axis: Array | None = schema.vector(3, default=None)
     axes: Array | None = schema.matrix(2, 3, default=None)
+    lead: float | None = schema.number(at_least=-10.0, at_most=10.0, unit="m a turn", default=None)
     actuated: bool = schema.flag(default=False)
     home: float = schema.number(unit="{joint}", default=0.0)
     limits: LimitSpec | None = schema.section(LimitSpec, default=None)
@@ -151,7 +152,8 @@ class JointSpec:
 
     def verify(self, path: str) -> None:
         """The axes that its type has, and a point where there has to be one."""
-        count = AXES.get(self.type, 0)
+        kind = TYPES[self.type]
+        count = kind.count
         for key, wanted in (("axis", count == 1), ("axes", count == 2)):
             value = getattr(self, key)
             if wanted and value is None:
@@ -163,11 +165,14 @@ class JointSpec:
             for row in [] if value is None else np.atleast_2d(value):
                 if not float(np.linalg.norm(row)) > 1e-9:
                     raise ParameterError(f"{path}.{key}", row.tolist(), "a vector with a length")
-        if self.at is None and self.type not in ("translation", "prismatic", "fixed"):
+        if kind.threaded() != bool(self.lead):
+            allowed = "m a turn, not zero" if kind.threaded() else f"none for a {self.type} joint"
+            raise ParameterError(f"{path}.lead", self.lead, allowed)
+        if self.at is None and kind.placed:
             raise ParameterError(f"{path}.at", None, f"the point of a {self.type} joint, m")
-        steps = FREEDOMS[self.type]
-        if self.actuated and steps not in ("R", "P"):
-            raise ParameterError(f"{path}.actuated", self.type, "a revolute or prismatic joint")
+        freedoms = self._freedoms()
+        if self.actuated and len(freedoms) != 1:
+            raise ParameterError(f"{path}.actuated", self.type, "a joint of one freedom")
         if self.friction is not None and self.friction.offset and not self.actuated:
             raise ParameterError(
                 f"{path}.friction.offset", self.friction.offset, "0 at a joint that is not actuated"
@@ -175,28 +180,37 @@ class JointSpec:
         if self.rotor_inertia and self.drive is not None:
             raise ParameterError(f"{path}.drive", "given", "either drive or rotor_inertia")
         for key in ("limits", "friction", "rotor_inertia", "drive", "home"):
-            if getattr(self, key) and steps not in ("R", "P"):
-                raise ParameterError(
-                    f"{path}.{key}", self.type, "a revolute or prismatic joint, of one freedom"
-                )
-        if steps == "R":
+            if getattr(self, key) and len(freedoms) != 1:
+                raise ParameterError(f"{path}.{key}", self.type, "a joint of one freedom")
+        if len(freedoms) == 1 and freedoms[0].turns:
             check_angles(self.home, f"{path}.home")
+
+    @property
+    def slides(self) -> bool:
+        """Whether it has one freedom, and its number is a length."""
+        return [freedom.turns for freedom in self._freedoms()] == [False]
+
+    def _freedoms(self) -> tuple[Freedom, ...]:
+        pitch = 0.0 if self.lead is None else self.lead / TURN
+        return TYPES[self.type].freedoms(self._unit_axes(), pitch)
+
+    def _unit_axes(self) -> Array:
+        rows = self.axes if self.axes is not None else self.axis
+        found = [] if rows is None else [unit(row) for row in np.atleast_2d(rows)]
+        return np.reshape(found, (-1, 3))
 
     def joint(self, name: str, path: str) -> Joint:
         """As a joint of the graph."""
         rub = self.friction or FrictionSpec()
         rotor = self.rotor_inertia
         if self.drive is not None:
-            rotor = self.drive.reflected(FREEDOMS[self.type] == "P", f"{path}.drive")
-        rows = self.axes if self.axes is not None else self.axis
-        axes = (
-            np.zeros((0, 3)) if rows is None else np.array([unit(r) for r in np.atleast_2d(rows)])
-        )
+            rotor = self.drive.reflected(self.slides, f"{path}.drive")
         inner, outer = self.between
         at = np.zeros(3) if self.at is None else self.at
         return Joint(
-            name, self.type, inner, outer, array(at), array(axes), self.actuated, self.home,
-            rub.viscous, rub.coulomb, rotor,
+            name, self.type, inner, outer, array(at), array(self._unit_axes()), self.actuated,
+            self.home, rub.viscous, rub.coulomb, rotor,
+            pitch=0.0 if self.lead is None else self.lead / TURN,
         )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import BASE, FREEDOMS, Array, Graph
+from pkm_twin.machine.graph import BASE, Array, Graph
 
 
 def position_box(graph: Graph, limits: Array | None) -> Array:
@@ -29,14 +29,14 @@ def position_box(graph: Graph, limits: Array | None) -> Array:
     travel: dict[str, float] = {}
     for k, name in enumerate(graph.actuated):
         joint = graph.joints[name]
-        if FREEDOMS[joint.kind] == "P":
-            ends = None if limits is None else np.abs(limits[k] - joint.home)
-            travel[name] = math.inf if ends is None else float(ends.max())
+        if joint.freedoms[0].slide:
+            ends = math.inf if limits is None else float(np.abs(limits[k] - joint.home).max())
+            travel[name] = abs(joint.freedoms[0].slide) * ends
     # Points of bodies: where joints and rods' ends are, and the reference point.
     hops: list[tuple[tuple[str, Array], tuple[str, Array], float]] = []
     for joint in graph.joints.values():
         slack = travel.get(joint.name, 0.0)
-        if not joint.actuated and "P" in FREEDOMS[joint.kind]:
+        if not joint.actuated and any(freedom.slide for freedom in joint.freedoms):
             slack = math.inf
         hops.append(((joint.inner, joint.at), (joint.outer, joint.at), slack))
     for rod in graph.rods.values():

@@ -33,7 +33,7 @@ from pkm_twin.kinematics.passive import (
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import FREEDOMS, Graph
+from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
@@ -362,9 +362,7 @@ class Robot:
     def joint_units(self) -> tuple[str, ...]:
         """Units of q, ``rad`` or ``m``."""
         graph = self.graph
-        return tuple(
-            "m" if FREEDOMS[graph.joints[name].kind] == "P" else "rad" for name in graph.actuated
-        )
+        return tuple("m" if graph.joints[name].slides else "rad" for name in graph.actuated)
 
     @property
     def effort_units(self) -> tuple[str, ...]:

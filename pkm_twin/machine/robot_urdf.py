@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.kinematics.engine import Engine
-from pkm_twin.kinematics.passive import Axis, passive_axes
+from pkm_twin.kinematics.passive import single_joints
 from pkm_twin.machine import schema
 from pkm_twin.machine.entries import has_entry
 from pkm_twin.machine.graph import POSE
@@ -91,27 +90,6 @@ def robot_description(robot: Robot) -> dict[str, Any]:
         if told:
             data[key] = told
     return data
-
-
-def single_joints(engine: Engine) -> list[Axis]:
-    """All single joints from the ground outwards, rods last; fixed ones are of the kind ""."""
-    passive: dict[str, list[Axis]] = {}
-    for axis in passive_axes(engine):
-        passive.setdefault(axis.joint, []).append(axis)
-    joints: list[Axis] = []
-    for link in engine.tree.links.values():
-        name = link.joint or f"{link.body}_free"
-        if name in passive:
-            joints += passive.pop(name)
-            continue
-        kind, axis_at_home = "", np.zeros(3)
-        if link.steps:
-            (step,) = link.steps
-            kind, axis_at_home = step.kind, step.sign * step.axis
-        joints.append(Axis(name, kind, axis_at_home, link.at, link.parent, link.body, name))
-    for rest in passive.values():
-        joints += rest
-    return joints
 
 
 def _drives(robot: Robot) -> dict[str, UrdfDrive]:

@@ -16,7 +16,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from pkm_twin.machine.graph import FREEDOMS, Array, Body, Graph
+from pkm_twin.machine.graph import Array, Body, Graph
 from pkm_twin.machine.inertia import TEN, matrix_of, ten_numbers, transport
 
 Kind = Literal["friction", "rotor", "payload", "inertia"]
@@ -172,7 +172,7 @@ def shared_payload(
 
 def drive_units(graph: Graph, joint: str) -> dict[str, str]:
     """Units of a joint's friction and rotor."""
-    slides = FREEDOMS[graph.joints[joint].kind] == "P"
+    slides = graph.joints[joint].slides
     effort, rate, rotor = ("N", "N s/m", "kg") if slides else ("N m", "N m s/rad", "kg m2")
     return {"viscous": rate, "coulomb": effort, "offset": effort, "rotor_inertia": rotor}
 

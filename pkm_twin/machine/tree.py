@@ -12,6 +12,7 @@ May import: numpy, this package's graph, the standard library.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -19,13 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import BASE, FREEDOMS, Graph, across, rotation_about_z, unit
+from pkm_twin.machine.graph import BASE, Graph, rotation_about_z
+from pkm_twin.machine.joints import Freedom, across, unit
 
 Array = NDArray[np.float64]
 
-RATES: Final = {"R": 1, "P": 1, "S": 3, "F": 6}
-"""Rates of a step; S a ball, F a free body."""
-_START: Final = {"R": (0.0,), "P": (0.0,), "S": (1.0, 0, 0, 0), "F": (1.0, 0, 0, 0, 0, 0, 0)}
+BALL: Final = (1.0, 0.0, 0.0, 0.0)
+FREE: Final = (*BALL, 0.0, 0.0, 0.0)
+"""Unknowns at home of a ball, and of a body that hangs free: a quaternion, and a place."""
 _SNAP: Final = 1e-14
 PARALLEL: Final = 1e-6
 """Sine of an angle, or part of the machine's size, that counts as zero for a choice of axes."""
@@ -49,17 +51,19 @@ def axes_with_z(z: Array, hint: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One elementary freedom of a tree joint.
+    """One elementary freedom of a tree joint, or a ball, or a free body (``ball``, ``free``).
 
-    ``axis``: at home, base axes. ``sign``: -1 where the tree goes from the outer body to the inner
-    one. ``position``, ``rate``: first index among the unknowns, or of an actuated joint among q.
-    ``before``: constant rotation from the body frame before the step to the step's own (R only).
-    ``local``: the axis in the body frame before the step. ``offset``: of an actuated turn, its
-    angle from ``before`` to the body's frame at home, rad.
+    ``axis``: at home, base axes; ``turns`` about it, ``slide`` along it per unit. ``sign``: -1
+    where the tree goes from the outer body to the inner one. ``position``, ``rate``: first index
+    among the unknowns, or of an actuated joint among q. ``before``: constant rotation from the body
+    frame before the step to the step's own, of a turn. ``local``: the axis in the body frame before
+    the step. ``beyond``: whether the axis is fixed in the body beyond it. ``offset``: of a driven
+    turn, its angle from ``before`` to the body's frame at home, rad.
     """
 
-    kind: str
     axis: Array
+    turns: bool
+    slide: float
     actuated: bool
     position: int
     rate: int
@@ -67,7 +71,10 @@ class Step:
     before: Array
     local: Array
     joint: str
+    beyond: bool = False
     offset: float = 0.0
+    ball: bool = False
+    free: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +134,8 @@ class Tree:
         graph = self.graph
         edges: list[tuple[bool, float, int, str | None, str, str]] = []
         for k, joint in enumerate(graph.joints.values()):
-            # Three slides along fixed axes are no dearer than one.
-            freedoms = 1 if joint.kind == "translation" else len(FREEDOMS[joint.kind])
-            weight = 3 if joint.kind == "spherical" else freedoms
-            edges.append((not joint.actuated, weight, k, joint.name, joint.inner, joint.outer))
+            cost = joint.type.cost
+            edges.append((not joint.actuated, cost, k, joint.name, joint.inner, joint.outer))
         edges += [(True, 6, 10**6 + k, None, BASE, body) for k, body in enumerate(graph.bodies)]
         group = {name: name for name in [BASE, *graph.bodies]}
         neighbours: dict[str, list[tuple[str, str | None]]] = {name: [] for name in group}
@@ -144,6 +149,11 @@ class Tree:
         for passive, _, _, name, a, b in sorted(edges, key=lambda edge: edge[:3]):
             if root(a) == root(b):
                 if name is not None:
+                    if graph.joints[name].type.threaded():
+                        # Its turn is known but for whole ones.
+                        raise ParameterError(
+                            f"joints.{name}.type", "helical", "a loop that has other joints too"
+                        )
                     if not passive:
                         raise ParameterError(
                             f"joints.{name}.actuated", True, "actuated joints that close no loop "
@@ -160,27 +170,35 @@ class Tree:
     def _hang(self, parent: str, body: str, name: str | None) -> None:
         graph = self.graph
         if name is None:
-            kinds, axes, backwards, actuated = "F", np.zeros((1, 3)), False, False
-            at = graph.bodies[body].com
+            at, backwards, actuated = graph.bodies[body].com, False, False
+            freedoms: tuple[Freedom, ...] = ()
+            start: tuple[float, ...] = FREE
         else:
             joint = graph.joints[name]
-            kinds, backwards, actuated = FREEDOMS[joint.kind], joint.inner != parent, joint.actuated
-            axes, at = joint.axes, joint.at
-            if joint.kind == "cylindrical":
-                axes = np.repeat(axes, 2, axis=0)
-            elif joint.kind == "translation":
-                axes = np.eye(3)
-            if backwards:
-                kinds, axes = kinds[::-1], axes[::-1]
+            freedoms, at = joint.freedoms, joint.at
+            backwards, actuated = joint.inner != parent, joint.actuated
+            start = BALL if joint.type.ball else ()
+            freedoms = freedoms[::-1] if backwards else freedoms
+        sign, frame = -1.0 if backwards else 1.0, self.axes[parent]
         steps: list[Step] = []
-        frame = self.axes[parent]
-        turns = [k for k, kind in enumerate(kinds) if kind == "R"]
-        for k, kind in enumerate(kinds):
-            axis = unit(axes[k]) if kind in "RP" else np.zeros(3)
+        if start:
+            position, rate = self._claim(start, name or f"free body {body}", len(start) - 1)
+            self.scales += [1.0] * 3 + [1.0 / graph.size] * (len(start) - 4)
+            none = np.zeros(3)
+            steps.append(
+                Step(
+                    none, False, 0.0, False, position, rate, sign, np.eye(3), none, name or body,
+                    ball=start == BALL, free=start == FREE,
+                )
+            )  # fmt: skip
+            freedoms, frame = (), np.eye(3)
+        turns = [freedom.axis for freedom in freedoms if freedom.turns]
+        for freedom in freedoms:
+            axis = unit(freedom.axis)
             before, local, offset = np.eye(3), snapped(frame.T @ axis), 0.0
-            if kind == "R":
-                following = [axes[i] for i in turns if i > k]
-                hint = following[0] if following else self._next_axis(body, name, axis)
+            if freedom.turns:
+                turns = turns[1:]
+                hint = turns[0] if turns else self._next_axis(body, name, axis)
                 turned = axes_with_z(axis, frame[:, 0] if hint is None else hint)
                 if actuated and hint is None:
                     offset = self._tilt(body, turned, at)
@@ -188,24 +206,24 @@ class Tree:
             if actuated:
                 position = rate = graph.actuated.index(str(name))
             else:
-                position, rate = len(self.home), len(self.owners)
-                self.home += _START[kind]
-                self.owners += [name or f"free body {body}"] * RATES[kind]
-                length = 1.0 / graph.size
-                self.scales += {"R": [1.0], "P": [length], "S": [1.0] * 3}.get(
-                    kind, [1.0] * 3 + [length] * 3
-                )
-            sign = -1.0 if backwards else 1.0
+                position, rate = self._claim((0.0,), str(name), 1)
+                self.scales.append(1.0 if freedom.turns else 1.0 / graph.size)
             steps.append(
                 Step(
-                    kind, axis, actuated, position, rate, sign, before, local, name or body, offset
+                    axis, freedom.turns, freedom.slide, actuated, position, rate, sign, before,
+                    local, str(name), freedom.outer != backwards, offset,
                 )
-            )
-        if kinds in ("S", "F"):
-            frame = np.eye(3)
+            )  # fmt: skip
         self.axes[body], self.at[body] = frame, at
         arm = snapped(self.axes[parent].T @ (at - self.at[parent]))
         self.links[body] = Link(body, parent, name, tuple(steps), at, frame, arm)
+
+    def _claim(self, start: Sequence[float], owner: str, rates: int) -> tuple[int, int]:
+        """Unknowns and rates of a step; their first indices."""
+        position, rate = len(self.home), len(self.owners)
+        self.home += start
+        self.owners += [owner] * rates
+        return position, rate
 
     def _tilt(self, body: str, frame: Array, at: Array) -> float:
         """Angle about z by which axes x or y of a frame lie along the body's first lever, rad.

@@ -6,7 +6,6 @@ May import: numpy, this package's graph, outline and URDF writer, the names of p
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
@@ -51,11 +50,11 @@ def urdf_tree(
     """
     known = [BASE, *graph.bodies, *graph.rods]
     links = _link_names([*known, *(axis.outer for axis in axes)])
-    counts = Counter(axis.joint for axis in axes)
     bodies: list[UrdfBody] = []
     singles: list[UrdfJoint] = []
     for axis in axes:
-        joint = graph.joints.get(axis.joint) if counts[axis.joint] == 1 else None
+        # Of several axes of one joint, one at most has its name, its number at home and its drive.
+        joint = graph.joints.get(axis.joint) if axis.name == axis.joint else None
         drive = UrdfDrive()
         if joint is not None:
             position = None if joint.limits is None else (joint.limits[0], joint.limits[1])

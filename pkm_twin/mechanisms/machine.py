@@ -26,7 +26,6 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.entries import given
 from pkm_twin.machine.graph import (
     BASE,
-    FREEDOMS,
     Body,
     Graph,
     array,
@@ -191,14 +190,10 @@ class Machine(Robot):
         for kind, spec in KINDS.items():
             result[kind] = {}
             for name, entry in sections.get(kind, {}).items():
-                slides = FREEDOMS.get(entry.get("type", ""), "") == "P"
+                slides = kind == "joints" and self.graph.joints[name].slides
                 words = _SLIDING if slides else _TURNING
                 result[kind][name] = schema.units(spec, entry, words)
         return result
-
-    def home(self) -> Array:
-        """The pose at home, shape (m,)."""
-        return self.engine.home_pose.copy()
 
     def shared_drives(self) -> tuple[Shared, ...]:
         """Friction of each joint, and the rotors, one for the copies of a limb."""

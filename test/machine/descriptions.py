@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from pkm_twin.kinematics.passive import single_joints
 from pkm_twin.machine.graph import Body, Graph, Joint, Rod, array
-from pkm_twin.machine.robot_urdf import single_joints
 from pkm_twin.machine.tree import Tree
 from pkm_twin.machine.urdf_tree import urdf_tree
 from pkm_twin.machine.urdf_write import UrdfBody, UrdfDrive

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Screws: one whose nut is a carriage on a rail, and one that is driven itself."""
+
+import numpy as np
+import pytest
+
+from delta_dynamics import energy, inverse_dynamics, least_norm_reactions, mass_matrix
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.robot_urdf import robot_description
+
+GRAVITY = 9.81
+SCREW, CARRIAGE, ROTOR = 4e-5, 2.5, 1.2e-5
+VISCOUS, COULOMB = 1e-4, 0.02
+
+
+def slide(lead):
+    """A motor turns a screw; its nut is a carriage on a rail."""
+    return robot_of_data(
+        {
+            "mechanism": "machine",
+            "platform": "carriage",
+            "origin": [0.02, 0, 0.4],
+            "pose": ["z"],
+            "bodies": {
+                "screw": {"mass": 0.8, "com": [0, 0, 0.35], "inertia": [0.02, 0.02, SCREW]},
+                "carriage": {
+                    "mass": CARRIAGE, "com": [0.03, 0.01, 0.42], "inertia": [0.004, 0.005, 0.006]
+                },
+            },
+            "joints": {
+                "motor": {
+                    "type": "revolute", "between": ["base", "screw"], "at": [0, 0, 0],
+                    "axis": [0, 0, 1], "actuated": True, "rotor_inertia": ROTOR,
+                    "friction": {"viscous": VISCOUS, "coulomb": COULOMB},
+                },
+                "nut": {
+                    "type": "helical", "between": ["screw", "carriage"], "at": [0, 0, 0.4],
+                    "axis": [0, 0, 1], "lead": lead,
+                },
+                "rail": {"type": "prismatic", "between": ["base", "carriage"], "axis": [0, 0, 1]},
+            },
+        },
+        "slide",
+    )  # fmt: skip
+
+
+def driven(lead, at):
+    """A drilling quill: the screw joint itself is driven, and its spindle turns off the axis."""
+    return robot_of_data(
+        {
+            "mechanism": "machine",
+            "platform": "quill",
+            "pose": ["x"],
+            "bodies": {"quill": {"mass": 1.5, "com": at, "inertia": [0.01, 0.02, 0.03]}},
+            "joints": {
+                "feed": {
+                    "type": "helical", "between": ["base", "quill"], "at": [0, 0, 0],
+                    "axis": [1, 0, 0], "lead": lead, "actuated": True, "home": 0.3,
+                },
+            },
+        },
+        "quill",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("lead", [0.01, -0.04])
+def test_a_ball_screw_moves_its_carriage_by_its_lead(lead):
+    robot, pitch = slide(lead), lead / (2 * np.pi)
+    q = np.linspace(-50.0, 50.0, 9)[:, None]
+    # The nut does not turn: the screw turns through it, so the carriage goes the other way.
+    np.testing.assert_allclose(robot.forward(q), 0.4 - pitch * q, atol=1e-12)
+    np.testing.assert_allclose(robot.inverse(robot.forward(q)), q, atol=1e-9)
+    assert robot.passive_joints == ("nut", "nut_slide")
+    np.testing.assert_allclose(robot.passive(q), np.hstack([-q, -pitch * q]), atol=1e-12)
+    np.testing.assert_allclose(robot.passive_rates(q, q), np.hstack([-q, -pitch * q]), atol=1e-12)
+
+
+@pytest.mark.parametrize("lead", [0.01, -0.04])
+def test_its_torque_is_that_of_a_screw(lead, rng):
+    robot, pitch = slide(lead), lead / (2 * np.pi)
+    q, qd, qdd, push = rng.normal(size=(4, 20, 1))
+    wrench = np.hstack([np.zeros((20, 2)), push, np.zeros((20, 3))])
+    inertia = SCREW + ROTOR + CARRIAGE * pitch**2
+    axial = CARRIAGE * (GRAVITY - pitch * qdd) - push
+    expected = (SCREW + ROTOR) * qdd - pitch * axial + VISCOUS * qd + COULOMB * np.sign(qd)
+    np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd, wrench), expected, rtol=1e-11)
+    np.testing.assert_allclose(mass_matrix(robot, q)[:, 0, 0], inertia, rtol=1e-12)
+    found = least_norm_reactions(robot, q, qd, qdd, wrench)
+    np.testing.assert_allclose(found.wrench("nut")[:, 2:3], axial, rtol=1e-11)
+    # The thread: its moment about the axis is the axial force's.
+    np.testing.assert_allclose(found.wrench("nut")[:, 5:6], -pitch * axial, rtol=1e-11)
+
+
+@pytest.mark.parametrize("at", [[0.2, 0, 0], [0.1, 0.05, -0.02]])
+def test_a_driven_screw_keeps_the_balance_of_power(at, rng):
+    robot = driven(0.5, at)
+    q, qd, qdd = rng.normal(size=(3, 12, 1))
+    np.testing.assert_allclose(robot.forward(q), at[0] + 0.5 / (2 * np.pi) * (q - 0.3), atol=1e-12)
+
+    def total(s):
+        found = energy(robot, q + s * qd + s * s / 2 * qdd, qd + s * qdd)
+        return found.kinetic + found.potential
+
+    rate = (total(1e-4) - total(-1e-4)) / 2e-4
+    power = (inverse_dynamics(robot, q, qd, qdd) * qd)[:, 0]
+    np.testing.assert_allclose(power, rate, atol=1e-7 * np.abs(power).max())
+
+
+def test_it_is_written_out_and_read_again(rng):
+    robot = slide(0.012)
+    again = robot_of_data(robot_description(robot), "again")
+    motion = rng.normal(size=(3, 5, 1))
+    np.testing.assert_array_equal(
+        inverse_dynamics(again, *motion), inverse_dynamics(robot, *motion)
+    )
+
+
+def test_a_lead_stands_where_there_is_a_thread():
+    for lead, joint in ((None, "nut"), (0.0, "nut"), (0.01, "rail")):
+        data = robot_description(slide(0.01))
+        data["joints"]["nut"].pop("lead")
+        data["joints"]["nut"]["lead"] = 0.01
+        data["joints"][joint]["lead"] = lead
+        with pytest.raises(ParameterError) as caught:
+            robot_of_data(data, "bad")
+        assert caught.value.field == f"joints.{joint}.lead"
