@@ -109,10 +109,11 @@ class Function:
     :param typed_pointers: as LLVM before 17 has them.
     """
 
-    def __init__(self, name: str, triple: str, *, typed_pointers: bool) -> None:
-        self._name, self._triple, self._typed = name, triple, typed_pointers
+    def __init__(self, name: str, *, typed_pointers: bool) -> None:
+        self._name, self._typed = name, typed_pointers
         self._count = 0
-        self._declared: dict[str, str] = {}
+        self.declared: dict[str, str] = {}
+        """Declarations of the intrinsic functions that it calls, by name."""
         self._blocks: list[Block] = []
         self._room: list[str] = []
         self.words = Value(self.pointer(INT64), "%words", INT64)
@@ -120,8 +121,7 @@ class Function:
 
     def __str__(self) -> str:
         first, *others = self._blocks
-        lines = [f'target triple = "{self._triple}"', *self._declared.values()]
-        lines.append(f"define {INT64} @{self._name}({self.words.kind} {self.words.name}) {{")
+        lines = [f"define {INT64} @{self._name}({self.words.kind} {self.words.name}) {{"]
         lines += [f"{first.name}:", *self._room, *first.lines]
         for block in others:
             lines += [f"{block.name}:", *block.lines]
@@ -171,9 +171,9 @@ class Function:
 
     def call(self, name: str, kind: str, arguments: Sequence[Value]) -> Value:
         """The result of an intrinsic function."""
-        if name not in self._declared:
+        if name not in self.declared:
             kinds = ", ".join(x.kind for x in arguments)
-            self._declared[name] = f"declare {kind} @{name}({kinds})"
+            self.declared[name] = f"declare {kind} @{name}({kinds})"
         given = ", ".join([f"{x.kind} {x.name}" for x in arguments])
         return self.new(kind, f"call {kind} @{name}({given})")
 
@@ -235,3 +235,10 @@ class Function:
     def ret(self, x: Value) -> None:
         """End with this result."""
         self._put(f"ret {x.kind} {x.name}")
+
+
+def module(triple: str, functions: Sequence[Function]) -> str:
+    """The text of some functions."""
+    declared = {name: line for each in functions for name, line in each.declared.items()}
+    head = [f'target triple = "{triple}"', *declared.values()]
+    return "\n".join([*head, *(str(each) for each in functions)])

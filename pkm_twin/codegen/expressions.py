@@ -11,6 +11,7 @@ May import: numpy, the standard library.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
@@ -35,10 +36,17 @@ _COMMUTE: Final = frozenset(("add", "mul", "min", "max"))
 
 
 class Tape:
-    """The expressions of one program."""
+    """The expressions of one program.
 
-    def __init__(self) -> None:
+    :param reference: values of the parameters in a known case: what hangs on parameters alone has a
+        value there, and :func:`snapped` may take it for a constant.
+    """
+
+    def __init__(self, reference: Sequence[float] = ()) -> None:
         self._known: dict[tuple[Any, ...], Expression] = {}
+        self.reference = reference
+        self.assumed: list[tuple[Expression, float]] = []
+        """Expressions of parameters that are taken for a constant."""
 
     def __len__(self) -> int:
         return len(self._known)
@@ -47,13 +55,17 @@ class Tape:
         """A number."""
         # The sign of zero counts: it is a different number to atan2.
         key = ("const", value, math.copysign(1.0, value))
-        return self._known.get(key) or self._new(key, "const", float(value), None, CONSTANT)
+        known = self._known.get(key)
+        return known or self._new(key, "const", float(value), None, CONSTANT, float(value))
 
     def input(self, name: str, index: int) -> Expression:
         """Entry ``index`` of the input ``name``."""
         key = ("in", name, index)
-        level = PARAMETER if name == PARAMETERS else SAMPLE
-        return self._known.get(key) or self._new(key, "in", name, index, level)
+        level, value = SAMPLE, math.nan
+        if name == PARAMETERS:
+            level = PARAMETER
+            value = float(self.reference[index]) if index < len(self.reference) else math.nan
+        return self._known.get(key) or self._new(key, "in", name, index, level, value)
 
     def inputs(self, name: str, size: int) -> Objects:
         """All entries of an input, shape (size,)."""
@@ -73,23 +85,31 @@ class Tape:
         known = self._known.get(key)
         if known is not None:
             return known
-        return self._new(key, op, a, b, a.level if b is None else max(a.level, b.level))
+        level = a.level if b is None else max(a.level, b.level)
+        value = math.nan
+        if level == PARAMETER:
+            value = _PLAIN[op](*((a.value,) if b is None else (a.value, b.value)))
+        return self._new(key, op, a, b, level, value)
 
-    def _new(self, key: tuple[Any, ...], op: str, a: Any, b: Any, level: int) -> Expression:
-        result = self._known[key] = Expression(self, op, a, b, len(self._known), level)
+    def _new(
+        self, key: tuple[Any, ...], op: str, a: Any, b: Any, level: int, value: float
+    ) -> Expression:
+        result = self._known[key] = Expression(self, op, a, b, len(self._known), level, value)
         return result
 
 
 class Expression:
     """One operation. ``a``, ``b``: its arguments; of a constant its value, of an input its name
-    and index.
+    and index. ``value``: in the tape's known case, NaN where it hangs on the sample.
     """
 
-    __slots__ = ("a", "b", "level", "number", "op", "tape")
+    __slots__ = ("a", "b", "level", "number", "op", "tape", "value")
 
-    def __init__(self, tape: Tape, op: str, a: Any, b: Any, number: int, level: int) -> None:
+    def __init__(
+        self, tape: Tape, op: str, a: Any, b: Any, number: int, level: int, value: float
+    ) -> None:
         self.tape, self.op, self.a, self.b = tape, op, a, b
-        self.number, self.level = number, level
+        self.number, self.level, self.value = number, level, value
 
     def is_constant(self, value: float) -> bool:
         """Whether it is this number."""
@@ -122,9 +142,25 @@ class Expression:
     def __neg__(self) -> Expression:
         return _negate(self)
 
+    def __pow__(self, power: int) -> Any:
+        result: Any = self
+        for _ in range(power - 1):
+            result = result * self
+        return result
+
+    # As numpy calls them on arrays of objects.
+
     def sqrt(self) -> Any:
-        """As numpy calls it on arrays of objects."""
+        """Square root."""
         return sqrt(self)
+
+    def sin(self) -> Any:
+        """Sine."""
+        return sin(self)
+
+    def cos(self) -> Any:
+        """Cosine."""
+        return cos(self)
 
     def __repr__(self) -> str:
         return f"<{self.op} {self.number}>"
@@ -242,6 +278,36 @@ atan2: Final = _binary("atan2", np.arctan2)
 minimum: Final = _binary("min", np.minimum)
 maximum: Final = _binary("max", np.maximum)
 
+_PLAIN: Final[Mapping[str, Callable[..., float]]] = {
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg,
+    "inv": lambda x: 1.0 / x if x else math.inf,
+    "sqrt": lambda x: math.sqrt(x) if x >= 0.0 else math.nan,
+    "sin": math.sin, "cos": math.cos, "abs": abs, "sign": lambda x: (x > 0.0) - (x < 0.0),
+    "atan2": math.atan2, "min": min, "max": max,
+}  # fmt: skip
+"""Every operation on two floats or one."""
+
+
+def reference(value: Any) -> float:
+    """A number, or an expression's value in its tape's known case."""
+    return value.value if isinstance(value, Expression) else float(value)
+
+
+def snapped(value: Any, tolerance: float = 1e-14) -> Any:
+    """A number beside 0, 1 or -1 as that: rounding left it there, and it folds away so.
+
+    An expression of parameters that is so in the known case is taken for the constant; the tape
+    notes that it was.
+    """
+    known = reference(value)
+    for target in (0.0, 1.0, -1.0):
+        if abs(known - target) < tolerance:
+            if isinstance(value, Expression) and value.op != "const":
+                value.tape.assumed.append((value, target))
+            return target
+    return value
+
+
 OPERATIONS: Final[Mapping[str, str]] = {
     "add": "{a} + {b}",
     "sub": "{a} - {b}",
@@ -260,9 +326,9 @@ OPERATIONS: Final[Mapping[str, str]] = {
 """Every operation, as the plain back end writes it."""
 
 
-def ordered(results: Iterable[Expression]) -> list[Expression]:
-    """Everything that the results hang on, arguments first."""
-    seen: set[int] = set()
+def ordered(results: Iterable[Expression], known: Iterable[int] = ()) -> list[Expression]:
+    """Everything that the results hang on, arguments first; nothing below what is known."""
+    seen: set[int] = set(known)
     order: list[Expression] = []
     for result in results:
         stack = [(result, False)]

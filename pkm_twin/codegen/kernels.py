@@ -6,6 +6,7 @@ May import: numpy, llvmlite if present, this package, the standard library.
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -78,18 +79,18 @@ class _Space:
         self.takers = [memoryview(view.data) for view in self.inputs]
         self.outputs = views[len(inputs) : -1]
         self.status = views[-1]
-        words = [1, 1, 0]
+        words = [1, 1, 1, 0, 0]
         for view in self.inputs:
-            words += [view.ctypes.data, 0]
+            words += [view.ctypes.data, 0, 0]
         words += [view.ctypes.data for view in [*self.outputs, self.status]]
         self.words = np.array(words, np.int64)
         self.address = self.words.ctypes.data
-        self.parameters: Array | None = None
+        self.prepared: Array | None = None
 
-    def point_at(self, p: Array) -> None:
-        """Use these parameters; kept, so that their address stays theirs."""
-        self.parameters = p
-        self.words[2] = p.ctypes.data
+    def point_at(self, prepared: Array) -> None:
+        """Use what was prepared of these parameters; kept, so that its address stays its."""
+        self.prepared = prepared
+        self.words[3] = prepared.ctypes.data
 
 
 def _take_none(*_: Any) -> Array | None:
@@ -128,7 +129,9 @@ def _caller(inputs: int) -> Callable[..., Any]:
 
 
 class Kernel:
-    """One program over batches.
+    """One program over batches, of one machine or of many.
+
+    What hangs on parameters alone is prepared once a machine, see :meth:`prepare`.
 
     :param build: writes the program; called only where no compiled one is stored.
     :param key: text that the program's content hangs on, beside the package's own sources.
@@ -145,12 +148,13 @@ class Kernel:
         return self._build()
 
     @cached_property
-    def _loaded(self) -> tuple[dict[str, Any], Any, Any]:
-        """Sizes, then the code for batches and for one sample."""
+    def _loaded(self) -> tuple[dict[str, Any], Any, Any, Any]:
+        """Sizes, then the code that prepares, that for batches and that for one sample."""
         llvm = _llvm()
         with self._lock:
             if llvm is None:
-                return _header(self.program), PlainCode(self.program), None
+                plain = PlainCode(self.program)
+                return _header(self.program), plain.prepare, plain, None
             name = cache.digest(self._key, _sources(), llvm.IDENTITY)
             stored = cache.read(name)
             if stored is None:
@@ -158,8 +162,9 @@ class Kernel:
                 cache.write(name, header, code)
             else:
                 header, code = stored
-            address = llvm.load_object(code)
-            return header, llvm.PROTOTYPE(address), llvm.LOCKED(address)
+            prepare, address = llvm.load_object(code)
+            prepare = llvm.LOCKED(prepare)
+            return header, prepare, llvm.PROTOTYPE(address), llvm.LOCKED(address)
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -171,123 +176,238 @@ class Kernel:
     def _stepped(self) -> bool:
         return bool(self._loaded[0]["stepped"])
 
-    def warm_up(self) -> None:
-        """Compile, or load what is stored, before the first sample is due."""
-        self.run_one(np.zeros(self._loaded[0]["parameters"]), [np.zeros(n) for n in self.sizes[0]])
+    def prepare(self, p: Array) -> Array:
+        """What samples need of a machine's parameters.
 
-    def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
+        :param p: parameters, shape (k, parameters), contiguous, or of one machine (parameters,).
+        :returns: shape (k, prepared + 1), or (prepared + 1,): last by how much the parameters miss
+            what the program takes for constant, squared.
+        """
+        header, prepare, _, locked = self._loaded
+        if p.shape[-1] != header["parameters"]:
+            raise ValueError(f"{header['parameters']} parameters, the shape is {p.shape}")
+        rows = np.ascontiguousarray(np.atleast_2d(p), np.float64)
+        if locked is None:
+            return np.asarray(prepare(rows).reshape(*p.shape[:-1], -1), np.float64)
+        result = np.empty((len(rows), header["prepared"] + 1))
+        words = np.array([len(rows), rows.ctypes.data, rows.shape[1], result.ctypes.data], np.int64)
+        prepare(words.ctypes.data)
+        return result.reshape(*p.shape[:-1], -1)
+
+    def warm_up(self, prepared: Array) -> None:
+        """Compile, or load what is stored, before the first sample is due."""
+        self.run_one(prepared, [np.zeros(n) for n in self.sizes[0]])
+
+    def run(self, prepared: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
         """Evaluate over leading batch axes.
 
-        :param p: parameters, shape (k,), contiguous.
+        :param prepared: of one machine, contiguous.
         :param inputs: one array an input, shape (..., size), broadcast against each other.
         :returns: outputs, shape (..., size) each, NaN in refused samples; and the status, None
             if all samples are good, else shape (..., 2): 0 good, 1 refused, 2 not finite; and the
             part of the way from home that was reached.
         :raises ValueError: an input's last axis has another size.
         """
+        arrays = self._checked(inputs)
+        if all(array.ndim == 1 for array in arrays):
+            return self.run_one(prepared, arrays)
+        batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
+        count = math.prod(batch)
+        if count == 0:
+            return [np.empty((*batch, size)) for size in self.sizes[1]], None
+        rows = [
+            array.reshape(1, 1, -1)
+            if array.size == array.shape[-1]
+            else np.ascontiguousarray(np.broadcast_to(array, (*batch, array.shape[-1]))).reshape(
+                1, count, -1
+            )
+            for array in arrays
+        ]
+        outputs, status = self._solved(prepared.reshape(1, -1), rows, count)
+        shaped = [output.reshape(*batch, output.shape[-1]) for output in outputs]
+        return shaped, None if status is None else status.reshape(*batch, 2)
+
+    def run_each(self, prepared: Array, *inputs: Array) -> tuple[list[Array], Array | None]:
+        """The same of many machines.
+
+        :param prepared: shape (k, prepared + 1).
+        :param inputs: shape (k, samples, size), or (1, samples, size) for all machines alike, or
+            (k or 1, 1, size) for all samples alike.
+        :returns: outputs, shape (k, samples, size) each, and the status, None or (k, samples, 2).
+        """
+        arrays = self._checked(inputs)
+        machines, count = len(prepared), max(array.shape[1] for array in arrays)
+        if machines * count == 0:
+            return [np.empty((machines, count, size)) for size in self.sizes[1]], None
+        rows = [np.ascontiguousarray(array) for array in arrays]
+        outputs, status = self._solved(np.ascontiguousarray(prepared), rows, count)
+        shaped = [output.reshape(machines, count, -1) for output in outputs]
+        return shaped, None if status is None else status.reshape(machines, count, 2)
+
+    def _checked(self, inputs: Sequence[ArrayLike]) -> list[Array]:
         arrays = [np.asarray(value, _F8) for value in inputs]
         for array, size in zip(arrays, self.sizes[0], strict=True):
             if array.ndim == 0 or array.shape[-1] != size:
                 raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
-        if all(array.ndim == 1 for array in arrays):
-            return self.run_one(p, arrays)
-        batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
-        count = int(np.prod(batch, dtype=np.int64))
-        if count == 0:
-            return [np.empty((*batch, size)) for size in self.sizes[1]], None
-        rows = [
-            array.reshape(1, -1)
-            if array.size == array.shape[-1]
-            else np.ascontiguousarray(np.broadcast_to(array, (*batch, array.shape[-1]))).reshape(
-                count, -1
-            )
-            for array in arrays
-        ]
-        outputs, status = self._run(p, rows, count, 1)
-        if status is not None and self._stepped:
-            self._try_again(p, rows, outputs, status)
-            if not status[:, 0].any():
-                status = None
-        shaped = [output.reshape(*batch, output.shape[-1]) for output in outputs]
-        return shaped, None if status is None else status.reshape(*batch, 2)
+        return arrays
 
-    def run_one(self, p: Array, inputs: Sequence[Any]) -> tuple[list[Array], Array | None]:
-        """One sample of checked shapes, (size,) each; results as the call's."""
-        code = self._loaded[2]
+    def run_one(
+        self, prepared: Array, inputs: Sequence[Any]
+    ) -> tuple[list[Array], Array | None]:
+        """One sample of checked shapes, (size,) each; results as those of :meth:`run`."""
+        code = self._loaded[3]
         if code is None:
-            rows = [np.asarray(value, _F8).reshape(1, -1) for value in inputs]
-            outputs, status = self._run(p, rows, 1, 1)
+            rows = [np.asarray(value, _F8).reshape(1, 1, -1) for value in inputs]
+            outputs, status = self._run(prepared.reshape(1, -1), rows, 1, 1)
         else:
             try:
                 space = self._spaces.pop()
             except IndexError:
                 space = _Space(*self.sizes)
-            if p is not space.parameters:
-                space.point_at(p)
+            if prepared is not space.prepared:
+                space.point_at(prepared)
             for view, value in zip(space.inputs, inputs, strict=True):
                 view[:] = value
             if not code(space.address):
                 results = [view.copy() for view in space.outputs]
                 self._spaces.append(space)
                 return results, None
-            rows = [view.reshape(1, -1).copy() for view in space.inputs]
+            rows = [view.reshape(1, 1, -1).copy() for view in space.inputs]
             outputs = [view.reshape(1, -1).copy() for view in space.outputs]
             status = space.status.reshape(1, 2).copy()
             self._spaces.append(space)
         if status is not None and self._stepped:
-            self._try_again(p, rows, outputs, status)
+            self._try_again(prepared.reshape(1, -1), rows, outputs, status, 1)
             if not status[0, 0]:
                 status = None
         return [output[0] for output in outputs], None if status is None else status[0]
 
-    def first_of_one(self, p: Array) -> Callable[..., Array | None]:
+    def first_of_one(self, prepared: Array) -> Callable[..., Array | None]:
         """The first output of one sample, as fast as can be; on plain Python always None.
 
         The function takes arrays of doubles of exactly the inputs' shapes, (size,) each, else it
         raises TypeError or ValueError; it gives None where a sample is not good at once.
         """
-        code = self._loaded[2]
+        code = self._loaded[3]
         if code is None:
             return _take_none
         sizes = self.sizes
 
         def room() -> tuple[Any, ...]:
             space = _Space(*sizes)
-            space.point_at(p)
+            space.point_at(prepared)
             return (*space.takers, space.address, space.outputs[0].copy, space)
 
         result: Callable[..., Array | None] = _caller(len(sizes[0]))(code, room)
         return result
 
+    def _solved(
+        self, prepared: Array, rows: Sequence[Array], count: int
+    ) -> tuple[list[Array], Array | None]:
+        """All samples of all machines, with more steps where one does not do."""
+        outputs, status = self._run(prepared, rows, count, 1)
+        if status is not None and self._stepped:
+            self._try_again(prepared, rows, outputs, status, count)
+            if not status[:, 0].any():
+                status = None
+        return outputs, status
+
     def _try_again(
-        self, p: Array, rows: Sequence[Array], outputs: Sequence[Array], status: Array
+        self,
+        prepared: Array,
+        rows: Sequence[Array],
+        outputs: Sequence[Array],
+        status: Array,
+        count: int,
     ) -> None:
         """Samples that one step did not reach, in more and more steps; written in place."""
         for steps in STEPS:
             left = np.flatnonzero(status[:, 0] == REFUSED)
             if not len(left):
                 return
-            picked = [row if len(row) == 1 else row[left] for row in rows]
-            found, again = self._run(p, picked, len(left), steps)
-            for output, values in zip(outputs, found, strict=True):
-                output[left] = values
-            status[left] = np.array([GOOD, 1.0]) if again is None else again
+            machines, samples = np.divmod(left, count)
+            for machine in np.unique(machines) if len(prepared) > 1 else [0]:
+                own = left[machines == machine] if len(prepared) > 1 else left
+                at = samples[machines == machine] if len(prepared) > 1 else samples
+                picked = [
+                    row[machine if len(row) > 1 else 0][at if row.shape[1] > 1 else [0]][None]
+                    for row in rows
+                ]
+                alone = prepared[machine : machine + 1]
+                found, again = self._run(alone, picked, len(own), steps)
+                for output, values in zip(outputs, found, strict=True):
+                    output[own] = values
+                status[own] = np.array([GOOD, 1.0]) if again is None else again
 
     def _run(
-        self, p: Array, rows: Sequence[Array], count: int, steps: int
+        self, prepared: Array, rows: Sequence[Array], count: int, steps: int
     ) -> tuple[list[Array], Array | None]:
-        header, code, locked = self._loaded
+        header, _, code, locked = self._loaded
+        machines = len(prepared)
         if locked is None:
-            outputs, status = code.run(p, rows, count, steps)
+            parts = [
+                code.run(
+                    one, [row[k if len(row) > 1 else 0] for row in rows], count, steps
+                )
+                for k, one in enumerate(prepared)
+            ]
+            status = np.concatenate([part[1] for part in parts])
+            outputs = [
+                np.concatenate([part[0][k] for part in parts])
+                for k in range(len(header["outputs"]))
+            ]
             return outputs, status if status[:, 0].any() else None
-        outputs = [np.empty((count, size)) for size in header["outputs"]]
-        status = np.empty((count, 2))
-        words = [count, steps, p.ctypes.data]
+        outputs = [np.empty((machines * count, size)) for size in header["outputs"]]
+        status = np.empty((machines * count, 2))
+        words = [machines, count, steps, prepared.ctypes.data, prepared.shape[1]]
         for row in rows:
-            words += [row.ctypes.data, 0 if len(row) == 1 else row.shape[1]]
+            size = row.shape[2]
+            leap = 0 if len(row) == 1 else row.shape[1] * size
+            words += [row.ctypes.data, 0 if row.shape[1] == 1 else size, leap]
         words += [output.ctypes.data for output in [*outputs, status]]
         block = np.array(words, np.int64)
         return outputs, status if code(block.ctypes.data) else None
+
+
+class Bound:
+    """A kernel with the numbers of one machine's geometry: what hangs on them is prepared once."""
+
+    def __init__(self, kernel: Kernel, geometry: Array) -> None:
+        self.kernel, self.geometry = kernel, geometry
+        self._last: tuple[Array | None, Array] = None, geometry
+
+    @property
+    def program(self) -> Program:
+        """The program itself."""
+        return self.kernel.program
+
+    @property
+    def sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Sizes of inputs and outputs."""
+        return self.kernel.sizes
+
+    def prepared(self, p: Array) -> Array:
+        """What samples need of the program's own parameters and the geometry."""
+        last, prepared = self._last
+        if last is not p:
+            prepared = self.kernel.prepare(np.concatenate([p, self.geometry]))
+            self._last = p, prepared
+        return prepared
+
+    def warm_up(self, p: Array) -> None:
+        """Compile, or load what is stored, before the first sample is due."""
+        self.kernel.warm_up(self.prepared(p))
+
+    def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
+        """Evaluate over leading batch axes, see :meth:`Kernel.run`.
+
+        :param p: the program's own parameters, shape (k,); not changed afterwards.
+        """
+        return self.kernel.run(self.prepared(p), *inputs)
+
+    def first_of_one(self, p: Array) -> Callable[..., Array | None]:
+        """The first output of one sample, see :meth:`Kernel.first_of_one`."""
+        return self.kernel.first_of_one(self.prepared(p))
 
 
 def _header(program: Program) -> dict[str, Any]:
@@ -295,5 +415,6 @@ def _header(program: Program) -> dict[str, Any]:
         "inputs": list(program.inputs.values()),
         "outputs": [len(row) for row in program.outputs.values()],
         "parameters": program.parameters,
+        "prepared": len(program.prepared),
         "stepped": program.equations is not None,
     }

@@ -26,12 +26,13 @@ from pkm_twin.codegen.assembly import (
     Function,
     Value,
     every,
+    module,
     real,
     undefined,
     vector,
     whole,
 )
-from pkm_twin.codegen.expressions import PARAMETER, PARAMETERS, SAMPLE, Expression, ordered, uses
+from pkm_twin.codegen.expressions import PARAMETERS, SAMPLE, Expression, ordered, uses
 from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
@@ -45,6 +46,8 @@ from pkm_twin.codegen.program import (
 
 LANES: Final = 4
 SYMBOL: Final = "kernel"
+PREPARE: Final = "prepare"
+STATUS: Final = " status"
 OPTIMISATION: Final = 2
 LONG: Final = 100
 """Entries of an output from which on they are stored in a loop."""
@@ -232,10 +235,65 @@ class _Emitter:
         self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]
     ) -> list[Value]:
         """Values of the results; every shared expression once."""
-        for e in ordered(results):
-            if e.number not in self.known:
-                self.known[e.number] = self.value(e, inputs)
+        for e in ordered(results, self.known):
+            self.known[e.number] = self.value(e, inputs)
         return [self.known[e.number] for e in results]
+
+
+class _Counter:
+    """A loop: its index stands in a variable, from zero on."""
+
+    def __init__(self, b: Function, name: str, end: Value, step: int = 1) -> None:
+        self.b, self.end, self.step = b, end, step
+        self._place = b.alloca(INT64)
+        self.head, self.body, self.after = (b.block(name) for _ in range(3))
+
+    def begin(self) -> Value:
+        """Go into the loop; its index."""
+        b = self.b
+        b.store(ZERO, self._place)
+        b.branch(self.head)
+        b.go_to(self.head)
+        index = b.load(self._place)
+        b.cbranch(b.icmp("slt", index, self.end), self.body, self.after)
+        b.go_to(self.body)
+        return index
+
+    def close(self) -> None:
+        """Go round, and on behind it."""
+        b = self.b
+        b.store(b.add(b.load(self._place), whole(self.step)), self._place)
+        b.branch(self.head)
+        b.go_to(self.after)
+
+
+def _function(name: str) -> Function:
+    return Function(name, typed_pointers=binding.llvm_version_info < (17,))
+
+
+def _word(b: Function, k: int) -> Value:
+    return b.load(b.gep(b.words, whole(k)))
+
+
+def _preparation(program: Program) -> Function:
+    """What hangs on parameters alone, machine by machine; the words are machines, a pointer to
+    parameters and what they go on by, and a pointer to results."""
+    b = _function(PREPARE)
+    count, stride = _word(b, 0), _word(b, 2)
+    source, target = b.inttoptr(_word(b, 1), DOUBLE), b.inttoptr(_word(b, 3), DOUBLE)
+    results = [*program.prepared, program.missed]
+    machines = _Counter(b, "machine", count)
+    index = machines.begin()
+    here = b.gep(source, b.mul(index, stride))
+    there = b.gep(target, b.mul(index, whole(len(results))))
+    needed = sorted({e.b for e in ordered(results) if e.op == "in"})
+    loaded = {k: b.load(b.gep(here, whole(k))) for k in needed}
+    out = _Emitter(b, uses(results), {}, wide=False)
+    for k, value in enumerate(out.run(results, {PARAMETERS: loaded})):  # type: ignore[dict-item]
+        b.store(value, b.gep(there, whole(k)))
+    machines.close()
+    b.ret(ZERO)
+    return b
 
 
 class _Writer:
@@ -243,43 +301,43 @@ class _Writer:
 
     def __init__(self, program: Program) -> None:
         self.program = program
-        triple = binding.get_default_triple()
-        b = self.b = Function(SYMBOL, triple, typed_pointers=binding.llvm_version_info < (17,))
+        b = self.b = _function(SYMBOL)
         self.used = uses(program.results)
         names = list(program.inputs)
-        self.count, self.steps = self._word(0), self._word(1)
-        parameters = self._pointer(2)
-        self.sources = {
-            name: (self._pointer(3 + 2 * k), self._word(4 + 2 * k)) for k, name in enumerate(names)
-        }
-        at = 3 + 2 * len(names)
-        self.targets = {name: self._pointer(at + k) for k, name in enumerate(program.outputs)}
-        self.status = self._pointer(at + len(program.outputs))
-        self.constants = self._hoist(parameters)
-        self.blocks = {name: b.block(name) for name in ("head", "load", "tail")}
-        self.index, self.flags = b.alloca(INT64), b.alloca(INT64)
-        b.store(ZERO, self.index)
+        self.count, self.steps = _word(b, 1), _word(b, 2)
+        self.flags = b.alloca(INT64)
         b.store(ZERO, self.flags)
-
-    def _word(self, k: int) -> Value:
-        return self.b.load(self.b.gep(self.b.words, whole(k)))
-
-    def _pointer(self, k: int) -> Value:
-        return self.b.inttoptr(self._word(k), DOUBLE)
+        self.strides = {name: _word(b, 6 + 3 * k) for k, name in enumerate(names)}
+        # Pointers, and what each goes on by from one machine to the next.
+        at = 5 + 3 * len(names)
+        leaps = {"": (3, _word(b, 4))}
+        leaps |= {name: (5 + 3 * k, _word(b, 7 + 3 * k)) for k, name in enumerate(names)}
+        sizes = {**{name: len(row) for name, row in program.outputs.items()}, STATUS: 2}
+        for k, (name, size) in enumerate(sizes.items()):
+            leaps[f"to {name}"] = at + k, b.mul(self.count, whole(size))
+        places = {name: b.alloca(INT64) for name in leaps}
+        for name, (k, _) in leaps.items():
+            b.store(_word(b, k), places[name])
+        machines = _Counter(b, "machine", _word(b, 0))
+        machines.begin()
+        self.pointers = {name: b.inttoptr(b.load(at), DOUBLE) for name, at in places.items()}
+        self.constants = self._hoist(self.pointers[""])
+        self._write()
+        for name, (_, leap) in leaps.items():
+            # Pointers are bytes, leaps are doubles.
+            b.store(b.add(b.load(places[name]), b.mul(leap, whole(8))), places[name])
+        machines.close()
+        b.ret(b.load(self.flags))
 
     def _hoist(self, parameters: Value) -> dict[int, Value]:
-        """What hangs on parameters alone, computed once a call."""
-        order = ordered(self.program.results)
-        needed = {e.b for e in order if e.op == "in" and e.a == PARAMETERS}
-        loaded = {k: self.b.load(self.b.gep(parameters, whole(k))) for k in needed}
-        scalar = _Emitter(self.b, self.used, {}, wide=False)
+        """Constants, and what is prepared, in all lanes."""
         wide = _Emitter(self.b, self.used, {}, wide=True)
-        for e in order:
+        for e in ordered(self.program.results, [e.number for e in self.program.prepared]):
             if e.op == "const":
-                scalar.known[e.number], wide.known[e.number] = scalar.number(e.a), wide.number(e.a)
-            elif e.level == PARAMETER:
-                value = scalar.known[e.number] = scalar.value(e, {PARAMETERS: loaded})  # type: ignore[dict-item]
-                wide.known[e.number] = self.b.splat(value, LANES)
+                wide.known[e.number] = wide.number(e.a)
+        for k, e in enumerate(self.program.prepared):
+            value = self.b.load(self.b.gep(parameters, whole(k)))
+            wide.known[e.number] = self.b.splat(value, LANES)
         return wide.known
 
     def emitter(self) -> _Emitter:
@@ -293,7 +351,7 @@ class _Writer:
 
     def _load(self, name: str, size: int) -> list[Value]:
         """An input's entries, a vector each."""
-        base, stride = self.sources[name]
+        base, stride = self.pointers[name], self.strides[name]
         b = self.b
         rows = [b.mul(place, stride) for place in self.places]
         values = []
@@ -339,13 +397,11 @@ class _Writer:
         b.cbranch(b.icmp("slt", after, size), loop, done)
         b.go_to(done)
 
-    def write(self) -> str:
-        b, blocks, program = self.b, self.blocks, self.program
-        b.branch(blocks["head"])
-        b.go_to(blocks["head"])
-        i = b.load(self.index)
-        b.cbranch(b.icmp("slt", i, self.count), blocks["load"], blocks["tail"])
-        b.go_to(blocks["load"])
+    def _write(self) -> None:
+        """All samples of a machine."""
+        b, program = self.b, self.program
+        samples = _Counter(b, "samples", self.count, LANES)
+        i = samples.begin()
         # Lanes beyond the last sample compute it once more, and store the same again.
         last = b.sub(self.count, ONE)
         self.places = []
@@ -379,15 +435,12 @@ class _Writer:
         good = b.and_(good, finite)
         nothing = out.number(math.nan)
         for name in names:
-            self._save(self.targets[name], [b.select(good, v, nothing) for v in rows[name]])
-        self._save(self.status, [code, reached])
+            target = self.pointers[f"to {name}"]
+            self._save(target, [b.select(good, v, nothing) for v in rows[name]])
+        self._save(self.pointers[f"to {STATUS}"], [code, reached])
         bad = b.zext(self._any(self._not(good)), INT64)
         b.store(b.or_(b.load(self.flags), bad), self.flags)
-        b.store(b.add(i, whole(LANES)), self.index)
-        b.branch(blocks["head"])
-        b.go_to(blocks["tail"])
-        b.ret(b.load(self.flags))
-        return str(b)
+        samples.close()
 
     def _solve(self, values: Mapping[str, list[Value]]) -> tuple[list[Value], Value, Value]:
         """Newton's method in steps; the unknowns, the lanes that got there, and how far."""
@@ -404,6 +457,8 @@ class _Writer:
             for name in ("direct", "stepped", "step", "newton", "next", "solved")
         }
         n = self.emitter().number
+        known = self.emitter().run([*q.home, *q.origin], values)
+        home, origins = known[: len(q.home)], known[len(q.home) :]
         b.store(TRUE, alive)
         b.store(n(0.0), reached)
         b.store(ONE, step)
@@ -411,7 +466,6 @@ class _Writer:
         b.cbranch(once, block["direct"], block["stepped"])
 
         b.go_to(block["direct"])
-        home = [n(float(v)) for v in q.home]
         start = home if q.start is None else self.emitter().run(list(q.start), values)
         for place, value in zip(x, start, strict=True):
             b.store(value, place)
@@ -429,9 +483,9 @@ class _Writer:
         # As `progress` has it.
         part = b.fsub(unity, b.fmul(b.fmul(left, left), left))
         final = b.icmp("eq", k, self.steps)
-        for place, origin, value in zip(t, q.origin, values[q.target], strict=True):
-            way = b.fmul(b.splat(part, LANES), b.fsub(value, n(float(origin))))
-            b.store(b.select(final, value, b.fadd(n(float(origin)), way)), place)
+        for place, origin, value in zip(t, origins, values[q.target], strict=True):
+            way = b.fmul(b.splat(part, LANES), b.fsub(value, origin))
+            b.store(b.select(final, value, b.fadd(origin, way)), place)
         b.store(b.load(alive), moving)
         begun = real(q.before), real(1e300)
         b.store(b.splat(b.select(once, *begun), LANES), size)
@@ -482,14 +536,16 @@ class _Writer:
 
 
 def emit(program: Program) -> str:
-    """The program as text of LLVM's intermediate language: one function of one argument.
+    """The program as text of LLVM's intermediate language: two functions of one argument.
 
-    The argument points at words: number of samples, steps, pointer to the parameters; of each
-    input pointer and stride (0: one for all, else its size); pointers to the outputs, row after
-    row; pointer to the status, two numbers a sample: 0 good, 1 refused, 2 not finite; and the part
-    of the way that was reached. It returns 0 if all samples are good.
+    ``prepare``: see :func:`_preparation`. ``kernel``: the argument points at words: number of
+    machines, of samples of each, steps; pointer to what was prepared, and what it goes on by from a
+    machine to the next (doubles); of each input pointer, stride (0: one for all samples, else its
+    size) and what it goes on by; pointers to the outputs, row after row; pointer to the status, two
+    numbers a sample: 0 good, 1 refused, 2 not finite; and the part of the way that was reached. It
+    returns 0 if all samples are good.
     """
-    return _Writer(program).write()
+    return module(binding.get_default_triple(), [_preparation(program), _Writer(program).b])
 
 
 def compile_object(text: str) -> bytes:
@@ -505,14 +561,13 @@ def compile_object(text: str) -> bytes:
 _ENGINES: Final[list[Any]] = []
 
 
-def load_object(code: bytes) -> Any:
-    """The compiled function, to be called with the address of its words; it holds the GIL off."""
+def load_object(code: bytes) -> tuple[Any, Any]:
+    """Addresses of both functions, to be called with the address of their words."""
     engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    address = engine.get_function_address(SYMBOL)
     _ENGINES.append(engine)
-    return address
+    return tuple(engine.get_function_address(name) for name in (PREPARE, SYMBOL))
 
 
 def _machine() -> Any:

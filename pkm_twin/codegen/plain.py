@@ -26,6 +26,7 @@ from pkm_twin.codegen.program import (
     TURNS,
     UNKNOWNS,
     Program,
+    ahead,
     progress,
 )
 
@@ -49,11 +50,18 @@ _MANY: Final = {
 }  # fmt: skip
 
 
-def source(results: Sequence[Expression], inputs: Mapping[str, int]) -> str:
-    """A function of the inputs' sequences that returns a tuple of the results."""
+def source(
+    results: Sequence[Expression],
+    inputs: Mapping[str, int],
+    known: Mapping[int, str] | None = None,
+) -> str:
+    """A function of the inputs' sequences that returns a tuple of the results.
+
+    :param known: texts of expressions that are given.
+    """
     counts = uses(results)
-    order = ordered(results)
-    text: dict[int, str] = {}
+    text: dict[int, str] = dict(known or {})
+    order = ordered(results, text)
     lines = [f"def program({', '.join(inputs)}):"]
     read: dict[str, set[int]] = {}
     for e in order:
@@ -85,28 +93,46 @@ class PlainCode:
 
     def __init__(self, program: Program) -> None:
         self.program = program
-        names = {**program.inputs, PARAMETERS: program.parameters}
+        names = {**program.inputs, PARAMETERS: len(program.prepared)}
         equations = program.equations
         if equations is not None:
             names[UNKNOWNS] = len(equations.home)
         self._names = list(names)
+        prepared = [*program.prepared, program.missed]
+        given = {PARAMETERS: program.parameters}
+        self._prepare = self._compiled(prepared, given)[0]
+        self._known = {e.number: f"{PARAMETERS}[{k}]" for k, e in enumerate(program.prepared)}
         results = [e for row in program.outputs.values() for e in row]
         self._judged = 0
         if equations is not None:
             results += [equations.residual, *equations.branch]
             self._judged = 1 + len(equations.branch)
-        self._results = self._compiled(results, names)
-        self._correction = self._start = None
+        self._results = self._compiled(results, names, self._known)
+        self._correction = self._begun = self._start = None
         if equations is not None:
-            self._correction = self._compiled(equations.results, names)
+            self._correction = self._compiled(equations.results, names, self._known)
+            begun = [*equations.home, *equations.origin]
+            self._begun = self._compiled(begun, names, self._known)
             if equations.start is not None:
-                self._start = self._compiled(equations.start, names)
+                self._start = self._compiled(equations.start, names, self._known)
+
+    def prepare(self, p: Array) -> Array:
+        """What hangs on parameters alone, of machines (k, parameters): shape (k, prepared + 1)."""
+        rows = []
+        for row in p.tolist():
+            try:
+                rows.append(self._prepare(**{PARAMETERS: row}))
+            except (ZeroDivisionError, ValueError, OverflowError):
+                rows.append((math.nan,) * (len(self.program.prepared) + 1))
+        return np.array(rows, np.float64).reshape(len(p), -1)
 
     @staticmethod
     def _compiled(
-        results: Sequence[Expression], inputs: Mapping[str, int]
+        results: Sequence[Expression],
+        inputs: Mapping[str, int],
+        known: Mapping[int, str] | None = None,
     ) -> tuple[Callable[..., tuple[Any, ...]], Callable[..., tuple[Any, ...]]]:
-        code = compile(source(results, inputs), "<program>", "exec")
+        code = compile(source(results, inputs, known), "<program>", "exec")
         functions = []
         for library in (_ONE, _MANY):
             space: dict[str, Any] = dict(library)
@@ -166,12 +192,14 @@ class PlainCode:
         q = self.program.equations
         assert q is not None and self._correction is not None  # noqa: S101
         correction, goal = self._correction[0], named[q.target]
-        x: list[float] = list(q.home)
+        assert self._begun is not None  # noqa: S101
+        begun = list(self._begun[0](**{**named, UNKNOWNS: [0.0] * len(q.home)}))
+        x, origin = begun[: len(q.home)], begun[len(q.home) :]
         if steps == 1 and self._start is not None:
             x = list(self._start[0](**{**named, UNKNOWNS: x}))
         least = q.least if steps == 1 else STEPPED
         for k in range(1, steps + 1):
-            target = q.ahead(goal, k, steps)
+            target = ahead(origin, goal, k, steps)
             size, before = (q.before if steps == 1 else 1e300), 0.0
             for _ in range(TURNS):
                 *x, square, det = correction(**{**named, UNKNOWNS: x, q.target: target})
@@ -223,14 +251,15 @@ class PlainCode:
         q = self.program.equations
         assert q is not None and self._correction is not None  # noqa: S101
         correction, goal = self._correction[1], named[q.target]
-        x = np.repeat(np.array(q.home, float)[:, None], count, 1)
+        assert self._begun is not None  # noqa: S101
+        known = self._begun[1](**{**named, UNKNOWNS: [0.0] * len(q.home)})
+        x, origin = _table(known[: len(q.home)], count), known[len(q.home) :]
         if steps == 1 and self._start is not None:
-            begun = self._start[1](**{**named, UNKNOWNS: list(x)})
-            x = _table(begun, count)
+            x = _table(self._start[1](**{**named, UNKNOWNS: list(x)}), count)
         least = q.least if steps == 1 else STEPPED
         alive, reached = np.ones(count, bool), np.zeros(count)
         for k in range(1, steps + 1):
-            target = q.ahead(goal, k, steps)
+            target = ahead(origin, goal, k, steps)
             moving = alive.copy()
             size = np.full(count, q.before if steps == 1 else 1e300)
             before = np.zeros(count)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
-from pkm_twin.codegen.expressions import PARAMETERS, SAMPLE, Expression, ordered
+from pkm_twin.codegen.expressions import PARAMETER, PARAMETERS, SAMPLE, Expression, ordered
 from pkm_twin.errors import PkmTwinError
 
 UNKNOWNS: Final = "x"
@@ -35,6 +36,14 @@ RESIDUAL: Final = 1e-10
 """Largest residual of all equations, those that were not solved too, lengths over the size."""
 
 
+def ahead(origin: Sequence[Any], goal: Sequence[Any], k: int, steps: int) -> Sequence[Any]:
+    """The target of step ``k``, 1 to ``steps``, on the way from the origin to ``goal``."""
+    if k == steps:
+        return goal
+    part = progress(k / steps)
+    return [a + part * (b - a) for a, b in zip(origin, goal, strict=True)]
+
+
 def progress(share: float) -> float:
     """Part of the way after a share of the steps, 0 to 1.
 
@@ -56,8 +65,9 @@ class Equations:
     """
 
     target: str
-    home: Sequence[float]
-    origin: Sequence[float]
+    home: Sequence[Expression]
+    origin: Sequence[Expression]
+    """Unknowns and target of the known state: constants, or of parameters alone."""
     start: Sequence[Expression] | None
     corrected: Sequence[Expression]
     """The unknowns after one correction."""
@@ -85,13 +95,6 @@ class Equations:
         """Square of what the first correction of a single step has to contract from."""
         known = self.start is not None and not self.guessed
         return 1e300 if known else (FIRST / CONTRACTION) ** 2
-
-    def ahead(self, goal: Sequence[Any], k: int, steps: int) -> Sequence[Any]:
-        """The target of step ``k``, 1 to ``steps``, on the way from the origin to ``goal``."""
-        if k == steps:
-            return goal
-        part = progress(k / steps)
-        return [a + part * (b - a) for a, b in zip(self.origin, goal, strict=True)]
 
     @property
     def results(self) -> list[Expression]:
@@ -125,8 +128,27 @@ class Program:
         rows = [e for row in self.outputs.values() for e in row]
         q = self.equations
         if q is not None:
-            rows += [*(q.start or ()), *q.results, q.residual, *q.branch]
+            rows += [*q.home, *q.origin, *(q.start or ()), *q.results, q.residual, *q.branch]
         return rows
+
+    @cached_property
+    def prepared(self) -> list[Expression]:
+        """What hangs on parameters alone and samples read: computed once a machine, by
+        :attr:`Program.preparation`, and given to every call."""
+        edge = {e.number: e for e in self.results if e.level == PARAMETER}
+        for e in ordered(self.results):
+            if e.level == SAMPLE and e.op != "in":
+                edge |= {a.number: a for a in (e.a, e.b) if a is not None and a.level == PARAMETER}
+        return list(edge.values())
+
+    @property
+    def missed(self) -> Expression:
+        """By how much the parameters miss what the program takes for constant, squared."""
+        tape = self.results[0].tape
+        total: Any = 0.0
+        for e, target in tape.assumed:
+            total = total + (e - target) * (e - target)
+        return tape.lift(total)
 
     @property
     def operations(self) -> tuple[int, int]:
