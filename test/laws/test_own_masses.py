@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Machines of one geometry share their programs, but each has its own masses and rotors."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -32,3 +35,25 @@ def test_masses_are_those_of_the_file(variant, name, mass, rotor, heavy_first):
     assert np.array_equal(
         inverse_dynamics(geared, q, zero, zero), inverse_dynamics(light, q, zero, zero)
     )
+
+
+def longer(variant, length):
+    """A delta with forearms of a length of its own."""
+    robot, _ = variant("delta", geometry={"forearm_length": length})
+    return robot.engine
+
+
+def test_a_geometry_has_one_engine_however_many_others_were_loaded(variant):
+    """Also after engines that nothing holds have made room for others."""
+    first, second = longer(variant, 0.4015), longer(variant, 0.4025)
+    for k in range(100):
+        longer(variant, 0.41 + 1e-4 * k)
+    assert longer(variant, 0.4015) is first
+    assert longer(variant, 0.4025) is second
+
+
+def test_engines_that_no_machine_has_are_given_up(variant):
+    """A service that loads variants for days does not grow."""
+    made = [weakref.ref(longer(variant, 0.43 + 1e-4 * k)) for k in range(60)]
+    gc.collect()
+    assert sum(engine() is not None for engine in made) <= 20
