@@ -201,7 +201,7 @@ class Graph:
         joints = [
             (
                 j.name, j.kind, j.inner, j.outer, j.at.tolist(), j.axes.tolist(), j.actuated,
-                j.home, j.given, j.loaded,
+                j.home, j.given, j.loaded, [(d.body, d.vector.tolist()) for d in j.directions],
             )
             for j in self.joints.values()
         ]  # fmt: skip
