@@ -6,6 +6,7 @@ May import: numpy, pkm_twin's core, the standard library.
 
 from __future__ import annotations
 
+import operator
 from typing import Final
 
 import numpy as np
@@ -134,6 +135,7 @@ def directions_of(size: int, count: int) -> Array:
 
 def sphere_directions(count: int) -> Array:
     """Unit vectors spread evenly over the sphere (Fibonacci lattice), shape (count, 3)."""
+    count = operator.index(count)
     if count < 1:
         raise ValueError(f"count has to be at least 1, not {count}")
     i = np.arange(count) + 0.5

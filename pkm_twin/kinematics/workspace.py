@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
 from pkm_twin.machine.robot import Robot
@@ -80,7 +81,7 @@ def joint_angle_at(robot: Robot, pose: ArrayLike) -> Array:
 
 def within_limits(robot: Robot, q: ArrayLike) -> Mask:
     """Whether joint positions keep the limits of the actuators, shape (...); absent ones hold."""
-    values, limits = np.asarray(q, np.float64), robot.limits.position
+    values, limits = doubles(q), robot.limits.position
     if limits is None:
         return np.ones(values.shape[:-1], bool)
     return np.asarray(((values >= limits[:, 0]) & (values <= limits[:, 1])).all(-1))
@@ -96,9 +97,7 @@ def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Ma
     :param least_clearance: what :func:`clearance` has to be above, m; -inf lets limbs meet. It
         bounds no robot whose clearance is not known.
     """
-    poses = np.asarray(pose, np.float64)
-    if not np.isfinite(poses).all():
-        raise ValueError("a pose is not finite")
+    poses = vectors(pose, len(robot.pose_names), "the pose")
     q, inside = try_inverse(robot, poses)
     back, good = try_forward(robot, q)
     inside &= good & (np.abs(back - poses) < 1e-6 * (1.0 + np.abs(poses))).all(-1)
@@ -187,7 +186,7 @@ def regular_workspace(
         raise ParameterError(
             "mechanism", robot.mechanism, "a height and two tilts side by side (as upr_rpu)"
         )
-    heights = np.atleast_1d(np.asarray(z, np.float64))
+    heights = np.atleast_1d(doubles(z, "heights"))
     steps = math.ceil(math.pi / 2 / step) - 1
     radius = circle_radii(robot, heights, step, steps, directions)
     kept = (radius >= least_radius) & (radius > 0.0)
