@@ -482,7 +482,7 @@ def certify(
 
     Three engines compute the machine anew from its description alone, with no line of the twin's
     mechanics: bodies free in space with every joint as equations (needs nothing more), Pinocchio
-    and MuJoCo (`pip install pkm_twin[certificate]`), each as a tree with loops. Compared are
+    and MuJoCo (`pip install '.[certificate]'`), each as a tree with loops. Compared are
     torques with wrench, payload and friction, the platform's place and Jacobian, and the mass
     matrix, over random states inside the limits; and the twin's own round trip from joints to pose
     and back.
