@@ -94,7 +94,8 @@ def test_compliance_of_the_bars(name, rigid, solids):
 def test_the_rest_is_the_shear_factor(name, rigid, solids):
     better = rigid.changed(members={"shear_factor": round_bar(rigid)})
     found = difference(compliance(better, POSES[name]), solids(rigid, name)).worst
-    assert found < (told()[1] + 5e-5 if solids.mesh == MESH else 5e-4)
+    # Printed of a mesh that is finer still, by 3e-5.
+    assert found < (told()[1] + 8e-5 if solids.mesh == MESH else 5e-4)
 
 
 @needs_calculix
