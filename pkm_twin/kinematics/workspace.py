@@ -124,46 +124,6 @@ class RegularWorkspace:
     z: Array
     radius: Array
 
-    def polar_samples(self, step: float = math.radians(1.0), azimuths: int = 72) -> Array:
-        """Poses on rays from the axis, shape (m, 3): denser towards the axis.
-
-        The source's global factors (equation 39: a mean over N points) come out with these points.
-
-        :param step: distance of neighbouring points on a ray, rad.
-        :param azimuths: rays a circle; the axis itself stands once a ray.
-        """
-        turn = np.arange(azimuths) * (2 * np.pi / azimuths)
-        layers = []
-        for z, radius in zip(self.z.tolist(), self.radius.tolist(), strict=True):
-            rungs = step * np.arange(_count(radius, step) + 1)[:, None]
-            first, second = rungs * np.cos(turn), rungs * np.sin(turn)
-            layers.append(_layer(z, first.ravel(), second.ravel()))
-        return np.concatenate(layers) if layers else np.empty((0, 3))
-
-    def even_samples(self, step: float = math.radians(1.0)) -> Array:
-        """Poses on a square grid of tilts, shape (m, 3): a mean over the volume.
-
-        :param step: distance of neighbouring tilts, rad.
-        """
-        layers = []
-        for z, radius in zip(self.z.tolist(), self.radius.tolist(), strict=True):
-            n = _count(radius, step)
-            ticks = step * np.arange(-n, n + 1)
-            first, second = (t.ravel() for t in np.meshgrid(ticks, ticks, indexing="ij"))
-            inside = first**2 + second**2 <= radius**2 * (1 + 1e-12)
-            layers.append(_layer(z, first[inside], second[inside]))
-        return np.concatenate(layers) if layers else np.empty((0, 3))
-
-
-def _count(radius: float, step: float) -> int:
-    if not step > 0.0:
-        raise ValueError(f"step is {step}; it has to be above zero")
-    return math.floor(radius / step * (1 + 1e-12))
-
-
-def _layer(z: float, first: Array, second: Array) -> Array:
-    return np.column_stack((np.full(len(first), z), first, second))
-
 
 def regular_workspace(
     robot: Robot,

@@ -109,8 +109,6 @@ class Joint:
     directions: tuple[Direction, ...] = ()
     label: str = ""
     normal: str = "n"
-    limits: Array | None = None
-    compliance: Array | None = None
 
     @property
     def loaded(self) -> bool:

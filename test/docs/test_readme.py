@@ -15,6 +15,7 @@ from stiffness_monitor import strain_energy
 from stiffness_monitor.modes import modes, natural_frequencies
 from test.support.pages import assert_printed, numbers
 from test.support.robots import parameters_of
+from test.support.workspaces import even_samples, polar_samples
 from test.validation import test_delta_cu_paper as delta_cu
 from test.validation import test_upr_rpu_paper as upr_rpu
 
@@ -129,7 +130,7 @@ class TestTablesOfTheUprRpuPaper:
             r"workspace, within (\S+) on polar rays",
         )
         workspace = upr_rpu.regular_workspace(upr_rpu.ROBOT, upr_rpu.HEIGHTS)
-        even, rays = workspace.even_samples(), workspace.polar_samples()
+        even, rays = even_samples(workspace), polar_samples(workspace)
 
         def worst(name, poses):
             wrench, expected = upr_rpu.TABLE_2[name]
