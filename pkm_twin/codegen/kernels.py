@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen import cache
+from pkm_twin.codegen.arrays import doubles
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
 
@@ -38,6 +39,7 @@ NOT_FINITE: Final = 2.0
 _WRITERS: Final = ("codegen", "machine", "kinematics", "mechanisms", "streams")
 """Folders beside this one whose sources write programs."""
 _F8: Final = np.dtype(np.float64)
+_NO_GEOMETRY: Final = np.zeros(0)
 
 
 @remembered
@@ -107,10 +109,13 @@ def _caller(inputs: int) -> Callable[..., Any]:
     names = [f"a{k}" for k in range(inputs)]
     takers = ", ".join(f"t{k}" for k in range(inputs))
     lines = [
-        "def make(code, room):",
+        "def make(code, room, array):",
         "    free = []",
         "    take, give = free.pop, free.append",
         f"    def call({', '.join(names)}):",
+        # A masked array is no array here: its buffer tells nothing of the mask.
+        f"        if not ({' is '.join(['array', *(f'type({name})' for name in names)])}):",
+        "            raise TypeError",
         "        try:",
         "            place = take()",
         "        except IndexError:",
@@ -128,7 +133,7 @@ def _caller(inputs: int) -> Callable[..., Any]:
     return make
 
 
-class Kernel:
+class Code:
     """One program over batches, of one machine or of many.
 
     What hangs on parameters alone is prepared once a machine, see :meth:`prepare`.
@@ -194,9 +199,10 @@ class Kernel:
         prepare(words.ctypes.data)
         return result.reshape(*p.shape[:-1], -1)
 
-    def warm_up(self, prepared: Array) -> None:
-        """Compile, or load what is stored, before the first sample is due."""
-        self.run_one(prepared, [np.zeros(n) for n in self.sizes[0]])
+    @property
+    def parameters(self) -> int:
+        """How many parameters there are."""
+        return int(self._loaded[0]["parameters"])
 
     def run(self, prepared: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
         """Evaluate over leading batch axes.
@@ -206,7 +212,7 @@ class Kernel:
         :returns: outputs, shape (..., size) each, NaN in refused samples; and the status, None
             if all samples are good, else shape (..., 2): 0 good, 1 refused, 2 not finite; and the
             part of the way from home that was reached.
-        :raises ValueError: an input's last axis has another size.
+        :raises ValueError: an input that is no real numbers, or whose last axis has another size.
         """
         arrays = self._checked(inputs)
         if all(array.ndim == 1 for array in arrays):
@@ -215,14 +221,13 @@ class Kernel:
         count = math.prod(batch)
         if count == 0:
             return [np.empty((*batch, size)) for size in self.sizes[1]], None
-        rows = [
-            array.reshape(1, 1, -1)
-            if array.size == array.shape[-1]
-            else np.ascontiguousarray(np.broadcast_to(array, (*batch, array.shape[-1]))).reshape(
-                1, count, -1
-            )
-            for array in arrays
-        ]
+        rows = []
+        for array in arrays:
+            size = array.shape[-1]
+            one = array.size == size
+            whole = array.reshape(size) if one else np.broadcast_to(array, (*batch, size))
+            # The code reads doubles side by side, which a column of a table is not.
+            rows.append(np.ascontiguousarray(whole).reshape(1, 1 if one else count, size))
         outputs, status = self._solved(prepared.reshape(1, -1), rows, count)
         shaped = [output.reshape(*batch, output.shape[-1]) for output in outputs]
         return shaped, None if status is None else status.reshape(*batch, 2)
@@ -245,15 +250,13 @@ class Kernel:
         return shaped, None if status is None else status.reshape(machines, count, 2)
 
     def _checked(self, inputs: Sequence[ArrayLike]) -> list[Array]:
-        arrays = [np.asarray(value, _F8) for value in inputs]
+        arrays = [doubles(value) for value in inputs]
         for array, size in zip(arrays, self.sizes[0], strict=True):
             if array.ndim == 0 or array.shape[-1] != size:
                 raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
         return arrays
 
-    def run_one(
-        self, prepared: Array, inputs: Sequence[Any]
-    ) -> tuple[list[Array], Array | None]:
+    def run_one(self, prepared: Array, inputs: Sequence[Any]) -> tuple[list[Array], Array | None]:
         """One sample of checked shapes, (size,) each; results as those of :meth:`run`."""
         code = self._loaded[3]
         if code is None:
@@ -298,7 +301,7 @@ class Kernel:
             space.point_at(prepared)
             return (*space.takers, space.address, space.outputs[0].copy, space)
 
-        result: Callable[..., Array | None] = _caller(len(sizes[0]))(code, room)
+        result: Callable[..., Array | None] = _caller(len(sizes[0]))(code, room, np.ndarray)
         return result
 
     def _solved(
@@ -346,9 +349,7 @@ class Kernel:
         machines = len(prepared)
         if locked is None:
             parts = [
-                code.run(
-                    one, [row[k if len(row) > 1 else 0] for row in rows], count, steps
-                )
+                code.run(one, [row[k if len(row) > 1 else 0] for row in rows], count, steps)
                 for k, one in enumerate(prepared)
             ]
             status = np.concatenate([part[1] for part in parts])
@@ -369,45 +370,46 @@ class Kernel:
         return outputs, status if code(block.ctypes.data) else None
 
 
-class Bound:
-    """A kernel with the numbers of one machine's geometry: what hangs on them is prepared once."""
+class Kernel:
+    """A program with the numbers of one machine's geometry: what hangs on them is prepared once."""
 
-    def __init__(self, kernel: Kernel, geometry: Array) -> None:
-        self.kernel, self.geometry = kernel, geometry
+    def __init__(self, code: Code, geometry: Array = _NO_GEOMETRY) -> None:
+        self.code, self.geometry = code, geometry
         self._last: tuple[Array | None, Array] = None, geometry
 
     @property
     def program(self) -> Program:
         """The program itself."""
-        return self.kernel.program
+        return self.code.program
 
     @property
     def sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Sizes of inputs and outputs."""
-        return self.kernel.sizes
+        return self.code.sizes
 
     def prepared(self, p: Array) -> Array:
         """What samples need of the program's own parameters and the geometry."""
         last, prepared = self._last
         if last is not p:
-            prepared = self.kernel.prepare(np.concatenate([p, self.geometry]))
+            prepared = self.code.prepare(np.concatenate([p, self.geometry]))
             self._last = p, prepared
         return prepared
 
-    def warm_up(self, p: Array) -> None:
+    def warm_up(self) -> None:
         """Compile, or load what is stored, before the first sample is due."""
-        self.kernel.warm_up(self.prepared(p))
+        p = np.zeros(self.code.parameters - len(self.geometry))
+        self.code.run_one(self.prepared(p), [np.zeros(n) for n in self.sizes[0]])
 
     def __call__(self, p: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
-        """Evaluate over leading batch axes, see :meth:`Kernel.run`.
+        """Evaluate over leading batch axes, see :meth:`Code.run`.
 
         :param p: the program's own parameters, shape (k,); not changed afterwards.
         """
-        return self.kernel.run(self.prepared(p), *inputs)
+        return self.code.run(self.prepared(p), *inputs)
 
     def first_of_one(self, p: Array) -> Callable[..., Array | None]:
-        """The first output of one sample, see :meth:`Kernel.first_of_one`."""
-        return self.kernel.first_of_one(self.prepared(p))
+        """The first output of one sample, see :meth:`Code.first_of_one`."""
+        return self.code.first_of_one(self.prepared(p))
 
 
 def _header(program: Program) -> dict[str, Any]:

@@ -277,7 +277,8 @@ def _word(b: Function, k: int) -> Value:
 
 def _preparation(program: Program) -> Function:
     """What hangs on parameters alone, machine by machine; the words are machines, a pointer to
-    parameters and what they go on by, and a pointer to results."""
+    parameters and what they go on by, and a pointer to results.
+    """
     b = _function(PREPARE)
     count, stride = _word(b, 0), _word(b, 2)
     source, target = b.inttoptr(_word(b, 1), DOUBLE), b.inttoptr(_word(b, 3), DOUBLE)

@@ -134,7 +134,8 @@ class Program:
     @cached_property
     def prepared(self) -> list[Expression]:
         """What hangs on parameters alone and samples read: computed once a machine, by
-        :attr:`Program.preparation`, and given to every call."""
+        :attr:`Program.preparation`, and given to every call.
+        """
         edge = {e.number: e for e in self.results if e.level == PARAMETER}
         for e in ordered(self.results):
             if e.level == SAMPLE and e.op != "in":

@@ -12,16 +12,18 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, Final
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.expressions import Expression, Numbers, Objects, Tape
-from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.kernels import Code, Kernel
 from pkm_twin.codegen.lu import SparseLU, independent_rows
 from pkm_twin.codegen.program import UNKNOWNS, Equations, Program
 from pkm_twin.errors import ParameterError, SingularityError
@@ -128,7 +130,7 @@ class Engine:
     @cached_property
     def _samples(self) -> list[tuple[Array, Array]]:
         """States (x, q) at home and near it, found by the first engine of a geometry for all."""
-        first = _shared(self.graph.key).setdefault("engine", self)
+        first = _engines.setdefault(self.graph.key, self)
         return self._near_home() if first is self else first._samples
 
     def _near_home(self) -> list[tuple[Array, Array]]:
@@ -378,7 +380,7 @@ class Engine:
         """The compiled program of that name, the same object every time."""
         known = self._kernels.get(name)
         if known is None:
-            known = Kernel(lambda: write(Traced(self)), f"{name} {self.key}")
+            known = Kernel(Code(lambda: write(Traced(self)), f"{name} {self.key}"))
             self._kernels[name] = known
         return known
 
@@ -477,7 +479,7 @@ class Traced:
         guessed = engine._start is None
         start = self._along() if guessed else self._ordered(engine._start(self.q))  # type: ignore[misc]
         return Equations(
-            "q", tree.home, engine.graph.home.tolist(), self.lift(start),
+            "q", self.lift(tree.home), self.lift(engine.graph.home), self.lift(start),
             self.lift(self.motion.retracted(self.x, step)),
             self._square(step, tree.scales), self._determinant(self.lu),
             self._square([r.value for r in self.rows], [r.scale for r in self.rows]), guessed,
@@ -701,7 +703,7 @@ def _inverse(t: Traced) -> Program:
     sign, log = np.linalg.slogdet(home)
     inverse: Any = lu.inverse_determinant
     solved = Equations(
-        "pose", [*tree.home, *engine.graph.home.tolist()], engine.home_pose.tolist(), None,
+        "pose", t.lift([*tree.home, *engine.graph.home]), t.lift(engine.home_pose), None,
         t.lift(corrected), t._square(step, [*tree.scales, *drives]),
         tape.lift(float(np.exp(-log) * sign) / inverse),
         t._square(
@@ -712,9 +714,10 @@ def _inverse(t: Traced) -> Program:
     return Program({"pose": len(goal)}, 0, {"q": t.lift(t.q)}, solved)
 
 
-@lru_cache(maxsize=64)
-def _shared(key: str) -> dict[str, Engine]:
-    return {}
+_engines: Final[WeakValueDictionary[str, Engine]] = WeakValueDictionary()
+"""Engines that something still holds, by geometry: however many machines there are in between."""
+_recent: Final[deque[Engine]] = deque(maxlen=16)
+"""Held although no machine may: loading a file again takes no engine anew."""
 
 
 def engine_of(
@@ -728,10 +731,12 @@ def engine_of(
 
     :param mark: text that tells closed forms and branch rules from others.
     """
-    store = _shared(f"{graph.key} {coordinates!r} {mark}")
-    if "engine" not in store:
-        store["engine"] = Engine(graph, coordinates, start, branch)
-    return store["engine"]
+    key = f"{graph.key} {coordinates!r} {mark}"
+    engine = _engines.get(key)
+    if engine is None:
+        engine = _engines.setdefault(key, Engine(graph, coordinates, start, branch))
+        _recent.append(engine)
+    return engine
 
 
 __all__ = ["Engine", "Mobility", "NDArray", "Start", "Traced", "engine_of"]

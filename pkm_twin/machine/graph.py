@@ -85,8 +85,6 @@ class Joint:
     label: str = ""
     normal: str = "n"
     pitch: float = 0.0
-    limits: Array | None = None
-    compliance: Array | None = None
 
     @property
     def type(self) -> type[JointType]:
@@ -198,6 +196,7 @@ class Graph:
             (
                 j.name, j.kind, j.inner, j.outer, j.at.tolist(), j.axes.tolist(), j.actuated,
                 j.home, j.given, j.loaded, j.pitch,
+                [(d.body, d.vector.tolist()) for d in j.directions],
             )
             for j in self.joints.values()
         ]  # fmt: skip

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.expressions import Objects, Tape, sqrt
-from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.kernels import Code, Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.messages import SECOND
@@ -168,7 +168,7 @@ def _kernel(degree: int, joints: int, *, solved: bool) -> Kernel:
     derivative by s there, and the pivots of V V'.
     """
     name = f"polynomial fit {degree} {joints} {solved}"
-    return Kernel(lambda: _program(degree, joints, solved), name)
+    return Kernel(Code(lambda: _program(degree, joints, solved), name))
 
 
 def _program(degree: int, joints: int, solved: bool) -> Program:

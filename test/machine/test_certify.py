@@ -121,7 +121,8 @@ def test_an_engine_that_is_not_installed_is_told(echoes, monkeypatch):
     monkeypatch.delitem(sys.modules, ENGINES["mujoco"][0].split(":")[0], raising=False)
     twin = echoes()
     result = certify(twin, twin.description_data, states=1, engines=["maximal", "mujoco"])
-    assert result.missing == {"mujoco": "mujoco is not installed (pkm_twin[certificate])"}
+    assert list(result.missing) == ["mujoco"]
+    assert "mujoco is not installed; pip install '.[certificate]'" in result.missing["mujoco"]
     assert result.good
 
 
