@@ -208,7 +208,7 @@ def _loads(t: Traced) -> Program:
     n = t.joints
     t.set_rates(t.tape.inputs("qd", n))
     t.set_accelerations(t.tape.inputs("qdd", n), gravity)
-    motion, graph = t.motion, t.engine.graph
+    motion, graph = t.motion, t.graph
     forces = Forces(motion)
     # Rods stand for themselves here.
     forces.inertia(bodies, np.zeros(len(graph.rods), dtype=object))

@@ -173,7 +173,7 @@ def _columns(robot: Robot) -> list[tuple[str, str]]:
 def _regressor(t: Traced) -> Program:
     """The bodies' motion in their own axes at home; and columns of rods, passive joints, wrench."""
     t.solve()
-    graph, motion, n = t.engine.graph, t.motion, t.joints
+    graph, motion, n = t.graph, t.motion, t.joints
     gravity = t.tape.inputs(PARAMETERS, 3)
     qd, qdd, wrench = t.tape.inputs("qd", n), t.tape.inputs("qdd", n), t.tape.inputs("wrench", 6)
     twists = []

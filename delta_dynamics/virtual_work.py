@@ -294,7 +294,7 @@ def _torques(t: Traced) -> Program:
     forces = Forces(t.motion)
     forces.inertia(bodies, rods)
     forces.passive(passive)
-    graph = t.engine.graph
+    graph = t.graph
     forces.push(graph.platform, graph.origin, -wrench[:3])
     forces.moment[graph.platform] = forces.moment[graph.platform] - wrench[3:]
     unknown, driven = forces.generalised()
@@ -342,7 +342,7 @@ def _energy(t: Traced) -> Program:
     weighted: Any = np.zeros(3)
     for name, ten in zip(t.tree.links, bodies, strict=True):
         weighted = weighted + motion.origin[name] * ten[0] + motion.rotation[name] @ ten[1:4]
-    for mass, rod in zip(rods, t.engine.graph.rods.values(), strict=True):
+    for mass, rod in zip(rods, t.graph.rods.values(), strict=True):
         ends = motion.point(rod.inner, rod.ends[0]) + motion.point(rod.outer, rod.ends[1])
         weighted = weighted + ends * (mass * 0.5)
     outputs = {"energy": t.lift([double * 0.5, -(weighted @ gravity)])}

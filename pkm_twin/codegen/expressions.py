@@ -30,7 +30,9 @@ SAMPLE: Final = 2
 """What an expression hangs on: nothing, the parameters alone, or the sample."""
 
 PARAMETERS: Final = "p"
-"""Name of the input that is the same for all samples of a call."""
+GEOMETRY: Final = "g"
+"""Names of the inputs that are the same for all samples of a machine: those of a program's own, and
+the machine's geometry."""
 
 _COMMUTE: Final = frozenset(("add", "mul", "min", "max"))
 
@@ -38,8 +40,8 @@ _COMMUTE: Final = frozenset(("add", "mul", "min", "max"))
 class Tape:
     """The expressions of one program.
 
-    :param reference: values of the parameters in a known case: what hangs on parameters alone has a
-        value there, and :func:`snapped` may take it for a constant.
+    :param reference: values of the geometry in a known case: what hangs on it alone has a value
+        there, and :func:`snapped` may take it for a constant.
     """
 
     def __init__(self, reference: Sequence[float] = ()) -> None:
@@ -62,9 +64,9 @@ class Tape:
         """Entry ``index`` of the input ``name``."""
         key = ("in", name, index)
         level, value = SAMPLE, math.nan
-        if name == PARAMETERS:
+        if name in (PARAMETERS, GEOMETRY):
             level = PARAMETER
-            value = float(self.reference[index]) if index < len(self.reference) else math.nan
+            value = float(self.reference[index]) if name == GEOMETRY else math.nan
         return self._known.get(key) or self._new(key, "in", name, index, level, value)
 
     def inputs(self, name: str, size: int) -> Objects:
@@ -288,12 +290,42 @@ _PLAIN: Final[Mapping[str, Callable[..., float]]] = {
 """Every operation on two floats or one."""
 
 
+SNAP: Final = 1e-14
+"""How far rounding leaves a number from 0, 1 or -1 that it is."""
+
+
 def reference(value: Any) -> float:
     """A number, or an expression's value in its tape's known case."""
     return value.value if isinstance(value, Expression) else float(value)
 
 
-def snapped(value: Any, tolerance: float = 1e-14) -> Any:
+def plain(values: Any) -> NDArray[Any]:
+    """An array of floats where all are numbers, else of objects."""
+    objects = np.asarray(values, dtype=object)
+    if any(isinstance(value, Expression) for value in objects.ravel()):
+        return objects
+    return np.asarray(values, np.float64)
+
+
+def norm(vector: NDArray[Any]) -> Any:
+    """Length of a vector of numbers or expressions."""
+    if vector.dtype != object:
+        return float(np.linalg.norm(vector))
+    return sqrt(vector @ vector)
+
+
+def snapped_all(values: Any) -> NDArray[Any]:
+    """Every entry as :func:`snapped`."""
+    array = plain(values)
+    if array.dtype != object:
+        result = array.copy()
+        for target in (0.0, 1.0, -1.0):
+            result[np.abs(result - target) < SNAP] = target
+        return result
+    return plain(np.frompyfunc(snapped, 1, 1)(array))
+
+
+def snapped(value: Any) -> Any:
     """A number beside 0, 1 or -1 as that: rounding left it there, and it folds away so.
 
     An expression of parameters that is so in the known case is taken for the constant; the tape
@@ -301,7 +333,7 @@ def snapped(value: Any, tolerance: float = 1e-14) -> Any:
     """
     known = reference(value)
     for target in (0.0, 1.0, -1.0):
-        if abs(known - target) < tolerance:
+        if abs(known - target) < SNAP:
             if isinstance(value, Expression) and value.op != "const":
                 value.tape.assumed.append((value, target))
             return target

@@ -38,6 +38,8 @@ NOT_FINITE: Final = 2.0
 
 _WRITERS: Final = ("codegen", "machine", "kinematics", "mechanisms", "streams")
 """Folders beside this one whose sources write programs."""
+MISSED: Final = 1e-24
+"""Sum of squares by which a geometry may miss what a program takes for constant: rounding."""
 _F8: Final = np.dtype(np.float64)
 _NO_GEOMETRY: Final = np.zeros(0)
 
@@ -387,6 +389,12 @@ class Kernel:
         """Sizes of inputs and outputs."""
         return self.code.sizes
 
+    @property
+    def holds(self) -> bool:
+        """Whether the geometry is as the program takes it for constant."""
+        p = np.zeros(self.code.parameters - len(self.geometry))
+        return bool(self.code.prepare(np.concatenate([p, self.geometry]))[-1] <= MISSED)
+
     def prepared(self, p: Array) -> Array:
         """What samples need of the program's own parameters and the geometry."""
         last, prepared = self._last
@@ -416,7 +424,7 @@ def _header(program: Program) -> dict[str, Any]:
     return {
         "inputs": list(program.inputs.values()),
         "outputs": [len(row) for row in program.outputs.values()],
-        "parameters": program.parameters,
+        "parameters": program.parameters + program.geometry,
         "prepared": len(program.prepared),
         "stepped": program.equations is not None,
     }

@@ -32,7 +32,7 @@ from pkm_twin.codegen.assembly import (
     vector,
     whole,
 )
-from pkm_twin.codegen.expressions import PARAMETERS, SAMPLE, Expression, ordered, uses
+from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, SAMPLE, Expression, ordered, uses
 from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
@@ -287,10 +287,14 @@ def _preparation(program: Program) -> Function:
     index = machines.begin()
     here = b.gep(source, b.mul(index, stride))
     there = b.gep(target, b.mul(index, whole(len(results))))
-    needed = sorted({e.b for e in ordered(results) if e.op == "in"})
-    loaded = {k: b.load(b.gep(here, whole(k))) for k in needed}
+    # The geometry stands behind the program's own parameters.
+    first = {PARAMETERS: 0, GEOMETRY: program.parameters}
+    inputs: dict[str, dict[int, Value]] = {name: {} for name in first}
+    for e in ordered(results):
+        if e.op == "in":
+            inputs[e.a][e.b] = b.load(b.gep(here, whole(first[e.a] + e.b)))
     out = _Emitter(b, uses(results), {}, wide=False)
-    for k, value in enumerate(out.run(results, {PARAMETERS: loaded})):  # type: ignore[dict-item]
+    for k, value in enumerate(out.run(results, inputs)):  # type: ignore[arg-type]
         b.store(value, b.gep(there, whole(k)))
     machines.close()
     b.ret(ZERO)

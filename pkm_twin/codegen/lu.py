@@ -6,7 +6,7 @@ May import: numpy, this package, the standard library.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from pkm_twin.codegen.expressions import Objects
 from pkm_twin.errors import SingularityError
 
 Array = NDArray[np.float64]
+
+ZERO: Final = 1e-13
+"""Part of the largest entry below which one is zero in all states: rounding left it."""
 
 
 def independent_rows(matrices: Array, bound: float = 1e-9) -> list[int]:
@@ -40,50 +43,77 @@ def independent_rows(matrices: Array, bound: float = 1e-9) -> list[int]:
     return sorted(chosen)
 
 
-class SparseLU:
-    """Factors of a square matrix of expressions.
+Order = tuple[tuple[int, int], ...]
+"""Pivots, by row and column, in the order in which they are taken."""
 
-    Of the pivots that are large enough in every sample matrix the one with the least fill
-    is taken (Markowitz's rule with threshold pivoting; Duff, Erisman and Reid 1986).
 
-    :param matrix: shape (n, n), expressions or numbers.
-    :param samples: its values in some states, shape (k, n, n).
+def pivot_order(samples: Array, share: float = 0.1) -> Order:
+    """Pivots of matrices of one pattern.
+
+    Of those that are large enough in every sample the one with the least fill is taken (Markowitz's
+    rule with threshold pivoting; Duff, Erisman and Reid 1986). Where none holds in all samples, the
+    first alone decides.
+
+    :param samples: the matrix in some states, shape (k, n, n).
     :param share: least part of a row's and a column's largest entry that a pivot may have.
     :raises SingularityError: no pivot is left.
     """
+    numbers = np.array(samples, float)
+    scale = np.abs(numbers).max(initial=0.0)
+    rows, columns = list(range(numbers.shape[1])), list(range(numbers.shape[1]))
+    order: list[tuple[int, int]] = []
+    while rows:
+        block = np.abs(numbers[:, rows][:, :, columns])
+        there = (block > ZERO * scale).any(0)
+        large = np.maximum(block.max(2)[:, :, None], block.max(1)[:, None, :])
+        good = there & (block > np.maximum(share * large, 1e-12)).all(0)
+        if not good.any():
+            if len(samples) > 1:
+                return pivot_order(samples[:1], share)
+            raise SingularityError("the sample states", (), float(scale), share)
+        fill = np.multiply.outer(there.sum(1) - 1, there.sum(0) - 1)
+        strength = np.round((block / np.maximum(large, 1e-300)).min(0), 6)
+        # By fill, then strength, then place.
+        best = np.lexsort((-strength[good], fill[good]))[0]
+        i, j = (int(index[best]) for index in np.nonzero(good))
+        row, column = rows.pop(i), columns.pop(j)
+        order.append((row, column))
+        ratio = numbers[:, rows, column] / numbers[:, row, column][:, None]
+        numbers[:, rows] -= ratio[:, :, None] * numbers[:, row][:, None, :]
+    return tuple(order)
 
-    def __init__(self, matrix: Objects, samples: Array, share: float = 0.1) -> None:
+
+class SparseLU:
+    """Factors of a square matrix of expressions.
+
+    :param matrix: shape (n, n), expressions or numbers.
+    :param order: of pivots that are not zero, see :func:`pivot_order`.
+    """
+
+    def __init__(self, matrix: Objects, order: Order) -> None:
         n = self.size = len(matrix)
         rows: list[dict[int, Any]] = [
             {c: matrix[r][c] for c in range(n) if not is_zero(matrix[r][c])} for r in range(n)
         ]
-        numbers = np.array(samples, float)
-        open_rows, open_columns = set(range(n)), set(range(n))
+        open_rows, open_columns = list(range(n)), list(range(n))
         self._pivots: list[tuple[int, int, Any]] = []
         self._lower: list[dict[int, Any]] = []
         self._upper: list[dict[int, Any]] = []
         sign = 1.0
-        while open_rows:
-            row, column = self._choose(rows, numbers, open_rows, open_columns, share)
-            sign *= (
-                -1.0
-                if (sorted(open_rows).index(row) + sorted(open_columns).index(column)) % 2
-                else 1.0
-            )
+        for row, column in order:
+            sign *= -1.0 if (open_rows.index(row) + open_columns.index(column)) % 2 else 1.0
             inverse = 1.0 / rows[row][column]
             open_rows.remove(row)
-            upper = {c: rows[row][c] for c in rows[row] if c in open_columns and c != column}
             open_columns.remove(column)
+            upper = {c: rows[row][c] for c in rows[row] if c in open_columns}
             lower = {}
-            for r in sorted(open_rows):
+            for r in open_rows:
                 if column not in rows[r]:
                     continue
                 factor = lower[r] = rows[r].pop(column) * inverse
                 for c, value in upper.items():
                     product = factor * value
                     rows[r][c] = rows[r][c] - product if c in rows[r] else -product
-                ratio = numbers[:, r, column] / numbers[:, row, column]
-                numbers[:, r] -= ratio[:, None] * numbers[:, row]
             self._pivots.append((row, column, inverse))
             self._lower.append(lower)
             self._upper.append(upper)
@@ -91,40 +121,6 @@ class SparseLU:
         """Reciprocal of the determinant."""
         for _, _, inverse in self._pivots:
             self.inverse_determinant = inverse * self.inverse_determinant
-
-    @staticmethod
-    def _choose(
-        rows: list[dict[int, Any]],
-        numbers: Array,
-        open_rows: set[int],
-        open_columns: set[int],
-        share: float,
-    ) -> tuple[int, int]:
-        in_column = {c: sum(c in rows[r] for r in open_rows) for c in open_columns}
-        size = np.abs(numbers)
-        order, columns = sorted(open_rows), sorted(open_columns)
-        block = size[:, order][:, :, columns]
-        by_row, by_column = block.max(2), block.max(1)
-        best: tuple[float, float, int, int] | None = None
-        for i, r in enumerate(order):
-            entries = [c for c in rows[r] if c in open_columns]
-            for j, c in enumerate(columns):
-                if c not in rows[r]:
-                    continue
-                value = block[:, i, j]
-                large = np.maximum(by_row[:, i], by_column[:, j])
-                if not (value > np.maximum(share * large, 1e-12)).all():
-                    continue
-                key = (
-                    float((len(entries) - 1) * (in_column[c] - 1)),
-                    -float((value / large).min()),
-                    r,
-                    c,
-                )
-                best = key if best is None or key < best else best
-        if best is None:
-            raise SingularityError("the sample states", (), float(size.max(initial=0.0)), share)
-        return best[2], best[3]
 
     def solve(self, right: Any) -> Objects:
         """X of A x = right, shape (n,)."""

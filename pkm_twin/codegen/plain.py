@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.codegen.expressions import OPERATIONS, PARAMETERS, Expression, ordered, uses
+from pkm_twin.codegen.expressions import GEOMETRY, OPERATIONS, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
@@ -99,7 +99,7 @@ class PlainCode:
             names[UNKNOWNS] = len(equations.home)
         self._names = list(names)
         prepared = [*program.prepared, program.missed]
-        given = {PARAMETERS: program.parameters}
+        given = {PARAMETERS: program.parameters, GEOMETRY: program.geometry}
         self._prepare = self._compiled(prepared, given)[0]
         self._known = {e.number: f"{PARAMETERS}[{k}]" for k, e in enumerate(program.prepared)}
         results = [e for row in program.outputs.values() for e in row]
@@ -121,7 +121,8 @@ class PlainCode:
         rows = []
         for row in p.tolist():
             try:
-                rows.append(self._prepare(**{PARAMETERS: row}))
+                own, geometry = row[: self.program.parameters], row[self.program.parameters :]
+                rows.append(self._prepare(**{PARAMETERS: own, GEOMETRY: geometry}))
             except (ZeroDivisionError, ValueError, OverflowError):
                 rows.append((math.nan,) * (len(self.program.prepared) + 1))
         return np.array(rows, np.float64).reshape(len(p), -1)

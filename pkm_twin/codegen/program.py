@@ -11,7 +11,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
-from pkm_twin.codegen.expressions import PARAMETER, PARAMETERS, SAMPLE, Expression, ordered
+from pkm_twin.codegen.expressions import (
+    GEOMETRY,
+    PARAMETER,
+    PARAMETERS,
+    SAMPLE,
+    Expression,
+    Tape,
+    ordered,
+)
 from pkm_twin.errors import PkmTwinError
 
 UNKNOWNS: Final = "x"
@@ -115,12 +123,17 @@ class Program:
     equations: Equations | None = None
 
     def __post_init__(self) -> None:
-        known = {**self.inputs, PARAMETERS: self.parameters}
+        known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry}
         if self.equations is not None:
             known[UNKNOWNS] = len(self.equations.home)
         for e in ordered(self.results):
             if e.op == "in" and not e.b < known.get(e.a, 0):
                 raise PkmTwinError(f"the program reads {e.a}[{e.b}], which is no input")
+
+    @property
+    def geometry(self) -> int:
+        """How many numbers of the geometry it reads, behind its own parameters."""
+        return len(self.results[0].tape.reference) if self.results else 0
 
     @property
     def results(self) -> list[Expression]:
@@ -145,7 +158,7 @@ class Program:
     @property
     def missed(self) -> Expression:
         """By how much the parameters miss what the program takes for constant, squared."""
-        tape = self.results[0].tape
+        tape = self.results[0].tape if self.results else Tape()
         total: Any = 0.0
         for e, target in tape.assumed:
             total = total + (e - target) * (e - target)

@@ -10,7 +10,6 @@ May import: numpy, pkm_twin's machine and codegen, this package, the standard li
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -22,16 +21,17 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.codegen.expressions import Expression, Numbers, Objects, Tape
+from pkm_twin.codegen.expressions import GEOMETRY, Expression, Numbers, Objects, Tape, snapped_all
 from pkm_twin.codegen.kernels import Code, Kernel
-from pkm_twin.codegen.lu import SparseLU, independent_rows
+from pkm_twin.codegen.lu import Order, SparseLU, independent_rows, pivot_order
 from pkm_twin.codegen.program import UNKNOWNS, Equations, Program
-from pkm_twin.errors import ParameterError, SingularityError
+from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.machine.geometry import geometry_of, graph_on, pattern_of
 from pkm_twin.machine.graph import Array, Graph
-from pkm_twin.machine.tree import Tree, snapped
+from pkm_twin.machine.tree import Tree
 
 _NO_PARAMETERS: Final = np.zeros(0)
 RANK: Final = 1e-9
@@ -43,8 +43,17 @@ POSE_WEIGHT: Final = 100.0
 SAMPLES: Final = 6
 """States near home, beside it, in which pivots have to be good."""
 
-Start = Callable[[Objects], Mapping[str, Sequence[Any]]]
-"""A mechanism's closed form of passive tree joints by q, from inner to outer body, beside home."""
+
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """What a mechanism's closed forms hang on beside the graph.
+
+    ``numbers``: shape (k,). ``start``: where there is one, of such numbers and q to the values of
+    passive tree joints beside home, by name, from the inner to the outer body.
+    """
+
+    numbers: Array
+    start: Callable[[Numbers, Objects], Mapping[str, Sequence[Any]]] | None = None
 
 
 Branch = Callable[[Motion], Sequence[Any]]
@@ -74,15 +83,43 @@ class Engine:
         self,
         graph: Graph,
         coordinates: Sequence[Coordinate],
-        start: Start | None = None,
+        closed: Closed | None = None,
         branch: Branch | None = None,
+        mark: str = "",
     ) -> None:
         self.graph, self.coordinates = graph, tuple(coordinates)
         self.tree = Tree(graph)
-        self._start, self._branch = start, branch
+        self.closed, self._branch, self._mark = closed or Closed(np.zeros(0)), branch, mark
         self._kernels: dict[str, Kernel] = {}
-        text = repr((graph.key, self.coordinates, start is not None, branch is not None))
-        self.key = hashlib.sha256(text.encode()).hexdigest()
+
+    @cached_property
+    def geometry(self) -> Array:
+        """What programs take of the machine's geometry, shape (k,)."""
+        return np.concatenate([geometry_of(self.graph), self.closed.numbers])
+
+    @cached_property
+    def structure(self) -> str:
+        """Text of all that programs hang on: machines of one structure share them."""
+        return repr((
+            self._mark, self.graph.topology, pattern_of(self.tree), self.coordinates,
+            self.closed.start is not None, self._branch is not None, self.kept, self.pivots,
+        ))  # fmt: skip
+
+    @cached_property
+    def pivots(self) -> Order:
+        """Of the kept closures by the unknowns, good in states near home."""
+        return pivot_order(self._sampled[0][:, self.kept])
+
+    @cached_property
+    def inverse_pivots(self) -> Order:
+        """The same of kept closures and pose by the unknowns and q."""
+        samples = []
+        for x, q in self._samples:
+            there, closed = self.at(x, q)
+            position, rotation = (numbers(part) for part in there.platform())
+            here = [float(v) for v in poses.values(self.coordinates, position, rotation)]
+            samples.append(self._inverse_matrix(there, closed, here))
+        return pivot_order(np.array(samples))
 
     # On numbers.
 
@@ -234,9 +271,8 @@ class Engine:
     @cached_property
     def home_pose(self) -> Array:
         """Pose coordinates at home, shape (m,)."""
-        motion, _ = self.at(self.tree.home, self.graph.home)
-        position, rotation = (numbers(part) for part in motion.platform())
-        return np.array([float(v) for v in poses.values(self.coordinates, position, rotation)])
+        origin = self.graph.origin
+        return np.array([0.0 if c.axis is None else origin[c.axis] for c in self.coordinates])
 
     def _inverse_matrix(self, motion: Motion, rows: Sequence[Row], pose: Numbers) -> Array:
         """Scaled derivatives of kept closures and pose equations by u and qd."""
@@ -376,12 +412,19 @@ class Engine:
 
     # As programs.
 
-    def kernel(self, name: str, write: Callable[[Traced], Program]) -> Kernel:
-        """The compiled program of that name, the same object every time."""
+    def kernel(self, name: str, write: Callable[[Traced], Program], extra: str = "") -> Kernel:
+        """The compiled program of that name on this geometry, the same object every time.
+
+        :param extra: text of what the program hangs on beside the machine's structure.
+        """
         known = self._kernels.get(name)
         if known is None:
-            known = Kernel(Code(lambda: write(Traced(self)), f"{name} {self.key}"))
-            self._kernels[name] = known
+            key = f"{name} {extra} {self.structure}"
+            known = self._kernels[name] = Kernel(_code(key, self, write), self.geometry)
+            if not known.holds:
+                # It takes for constant what is none here: a program of this geometry's own.
+                exact = f"{key} {self.graph.key}"
+                known = self._kernels[name] = Kernel(_code(exact, self, write), self.geometry)
         return known
 
     @property
@@ -397,7 +440,7 @@ class Engine:
     @property
     def inverse(self) -> Kernel:
         """Pose to q, by Newton's method from home."""
-        return self.kernel("inverse", _inverse)
+        return self.kernel("inverse", _inverse, repr(self.inverse_pivots))
 
     @property
     def placement(self) -> Kernel:
@@ -449,54 +492,67 @@ def _reciprocal(matrix: Array) -> float:
 
 
 class Traced:
-    """A machine's motion on expressions: what programs are written with."""
+    """A machine's motion on expressions of its geometry: what programs are written with."""
 
     def __init__(self, engine: Engine) -> None:
-        self.engine, self.tape = engine, Tape()
-        self.tree, self.joints = engine.tree, engine.joints
+        self.engine = engine
+        self.tape = Tape(engine.geometry.tolist())
+        given = self.tape.inputs(GEOMETRY, len(engine.geometry))
+        own = len(given) - len(engine.closed.numbers)
+        self.graph = graph_on(engine.graph, given[:own])
+        self.closed = given[own:]
+        """Numbers of the mechanism's closed forms."""
+        self.tree, self.joints = Tree(self.graph), engine.joints
         self.x = self.tape.inputs(UNKNOWNS, len(self.tree.home))
         self.q = self.tape.inputs("q", self.joints)
 
-    def solve(self, target: str = "q") -> None:
-        """Take unknowns and closures of ``target``."""
-        engine = self.engine
+    def solve(self) -> None:
+        """Take unknowns and closures."""
         self.motion = Motion(self.tree, self.x, self.q)
         self.rows = self.motion.closures()
         self.ju, self.jq = matrices(self.tree, self.rows)
-        kept = engine.kept
-        samples = engine._sampled[0][:, kept]
-        try:
-            self.lu = SparseLU(self.ju[kept], samples)
-        except SingularityError:
-            # No pivots hold in all states: those of home.
-            self.lu = SparseLU(self.ju[kept], samples[:1])
+        self.lu = SparseLU(self.ju[self.engine.kept], self.engine.pivots)
+
+    @property
+    def drive_scales(self) -> list[Any]:
+        """What makes joint rates of unit one."""
+        joints = (self.graph.joints[name] for name in self.graph.actuated)
+        return [1.0 / self.tree.size if joint.slides else 1.0 for joint in joints]
+
+    @property
+    def pose_scales(self) -> list[Any]:
+        """What makes pose coordinates of unit one."""
+        size = self.tree.size
+        return [1.0 if c.axis is None else 1.0 / size for c in self.engine.coordinates]
 
     def equations(self) -> Equations:
         """Newton's method for the unknowns at q, from home or the mechanism's closed form."""
         engine, tree = self.engine, self.tree
-        kept = engine.kept
-        step = -self.lu.solve([self.rows[k].value for k in kept])
-        guessed = engine._start is None
-        start = self._along() if guessed else self._ordered(engine._start(self.q))  # type: ignore[misc]
+        step = -self.lu.solve([self.rows[k].value for k in engine.kept])
+        closed = engine.closed.start
+        start = self._along() if closed is None else self._ordered(closed(self.closed, self.q))
         return Equations(
-            "q", self.lift(tree.home), self.lift(engine.graph.home), self.lift(start),
+            "q", self.lift(tree.home), self.lift(self.graph.home), self.lift(start),
             self.lift(self.motion.retracted(self.x, step)),
-            self._square(step, tree.scales), self._determinant(self.lu),
-            self._square([r.value for r in self.rows], [r.scale for r in self.rows]), guessed,
+            self._square(step, tree.scales),
+            self.tape.lift(self._at_home[2].inverse_determinant / self.lu.inverse_determinant),
+            self._square([r.value for r in self.rows], [r.scale for r in self.rows]),
+            closed is None,
             () if engine._branch is None else self.lift(engine._branch(self.motion)),
         )  # fmt: skip
 
+    @cached_property
+    def _at_home(self) -> tuple[Motion, Objects, SparseLU]:
+        """At home: the motion, derivatives of the kept closures by qd, factors of those by u."""
+        motion = Motion(self.tree, self.tree.home, self.graph.home)
+        ju, jq = (snapped_all(m[self.engine.kept]) for m in matrices(self.tree, motion.closures()))
+        return motion, jq, SparseLU(ju, self.engine.pivots)
+
     def _along(self) -> list[Any]:
         """Unknowns along the tangent at home: nearer than home itself."""
-        engine, tree = self.engine, self.tree
-        motion, rows = engine.at(tree.home, engine.graph.home)
-        ju, jq = (numbers(m)[engine.kept] for m in matrices(tree, rows))
-        slopes = (
-            snapped(np.asarray(-np.linalg.solve(ju, jq), np.float64))
-            if engine.kept
-            else np.zeros((0, self.joints))
-        )
-        return motion.retracted(tree.home, slopes @ (self.q - engine.graph.home))
+        motion, jq, lu = self._at_home
+        away = self.q - self.graph.home
+        return motion.retracted(self.tree.home, -lu.solve(jq @ away))
 
     def _ordered(self, values: Mapping[str, Sequence[Any]]) -> list[Any]:
         """Unknowns of joints' values."""
@@ -521,14 +577,6 @@ class Traced:
             total = total + part * part
         return self.tape.lift(total)
 
-    def _determinant(self, lu: SparseLU) -> Expression:
-        """Of the matrix, over that at home."""
-        engine = self.engine
-        ju = numbers(matrices(self.tree, engine.at(self.tree.home, engine.graph.home)[1])[0])
-        sign, log = np.linalg.slogdet(ju[engine.kept]) if engine.kept else (1.0, 0.0)
-        inverse: Any = lu.inverse_determinant
-        return self.tape.lift(float(np.exp(-log) * sign) / inverse)
-
     def set_rates(self, qd: Numbers) -> Objects:
         """Rates of everything by qd; returns those of the unknowns."""
         kept = self.engine.kept
@@ -550,7 +598,7 @@ class Traced:
 
     def twists(self) -> list[tuple[Any, Any]]:
         """Velocity of the reference point and angular velocity of the platform per joint rate."""
-        motion, body = self.motion, self.engine.graph.platform
+        motion, body = self.motion, self.graph.platform
         position, _ = motion.platform()
         linear, angular = motion.point_columns(body, position), motion.turn_columns(body)
         result = []
@@ -600,8 +648,8 @@ def _pose_walk(t: Traced) -> Program:
     rows = motion.closures()
     equations = poses.rows(engine.coordinates, motion, goal)
     table = np.vstack([np.hstack(matrices(tree, rows)), engine._pose_rows(motion, goal)])
-    scales = [row.scale for row in rows] + [POSE_WEIGHT * scale for scale in engine._pose_scales]
-    columns = [*tree.scales, *(engine._drive_scale(name) for name in engine.graph.actuated)]
+    scales = [row.scale for row in rows] + [POSE_WEIGHT * scale for scale in t.pose_scales]
+    columns = [*tree.scales, *t.drive_scales]
     entries = [
         scale * entry / column
         for scale, line in zip(scales, table, strict=True)
@@ -646,7 +694,7 @@ def _jacobian(t: Traced) -> Program:
 def _placement(t: Traced) -> Program:
     t.solve()
     rows: list[Any] = []
-    for body in t.engine.graph.bodies:
+    for body in t.graph.bodies:
         rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
     return Program({"q": t.joints}, 0, {"bodies": t.lift(rows)}, t.equations())
 
@@ -656,7 +704,7 @@ def _acceleration(t: Traced) -> Program:
     qd, qdd = t.tape.inputs("qd", t.joints), t.tape.inputs("qdd", t.joints)
     t.set_rates(qd)
     t.set_accelerations(qdd)
-    motion, graph = t.motion, t.engine.graph
+    motion, graph = t.motion, t.graph
     body = graph.platform
     second = poses.accelerations(
         t.engine.coordinates, motion.turned(body), motion.omega[body],
@@ -668,54 +716,41 @@ def _acceleration(t: Traced) -> Program:
 
 def _inverse(t: Traced) -> Program:
     engine, tree, tape = t.engine, t.tree, t.tape
-    n, size = engine.joints, len(tree.home)
+    n, size, split = engine.joints, len(tree.home), tree.unknown_rates
     everything = tape.inputs(UNKNOWNS, size + n)
-    t.x, t.q = everything[:size], everything[size:]
     goal = tape.inputs("pose", len(engine.coordinates))
-    motion = Motion(tree, t.x, t.q)
-    rows = motion.closures()
-    ju, jq = matrices(tree, rows)
-    kept = engine.kept
-    equations = poses.rows(engine.coordinates, motion, goal)
-    matrix = np.vstack([np.hstack([ju, jq])[kept], engine._pose_rows(motion, goal)])
-    samples = []
-    for x, q in engine._samples:
-        there, closed = engine.at(x, q)
-        position, rotation = (numbers(part) for part in there.platform())
-        here = [float(v) for v in poses.values(engine.coordinates, position, rotation)]
-        samples.append(engine._inverse_matrix(there, closed, here))
-    try:
-        lu = SparseLU(matrix, np.array(samples))
-    except SingularityError:
-        lu = SparseLU(matrix, np.array(samples[:1]))
-    values = [rows[k].value for k in kept] + [value for value, _ in equations]
-    step = -lu.solve(values)
-    split = tree.unknown_rates
-    corrected = [*motion.retracted(t.x, step[:split]), *(t.q + step[split:])]
-    drives = [engine._drive_scale(name) for name in engine.graph.actuated]
-    there, closed = engine.at(tree.home, engine.graph.home)
-    home = np.vstack(
-        [
-            np.hstack([numbers(m) for m in matrices(tree, closed)])[kept],
-            numbers(engine._pose_rows(there, engine.home_pose.tolist())),
-        ]
-    )
-    sign, log = np.linalg.slogdet(home)
-    inverse: Any = lu.inverse_determinant
+    home = [*tree.home, *t.graph.home]
+    origin = [0.0 if c.axis is None else t.graph.origin[c.axis] for c in engine.coordinates]
+
+    def system(state: Numbers, pose: Numbers) -> tuple[Motion, list[Row], list[Any], SparseLU]:
+        """Closures, pose equations, and the factors of their derivatives."""
+        motion = Motion(tree, state[:size], state[size:])
+        rows = motion.closures()
+        table = np.hstack(matrices(tree, rows))[engine.kept]
+        matrix = np.vstack([table, engine._pose_rows(motion, pose)])
+        equations = [value for value, _ in poses.rows(engine.coordinates, motion, pose)]
+        return motion, rows, equations, SparseLU(matrix, engine.inverse_pivots)
+
+    motion, rows, equations, lu = system(everything, goal)
+    step = -lu.solve([rows[k].value for k in engine.kept] + equations)
+    joints = everything[size:] + step[split:]
+    moved = [*motion.retracted(everything[:size], step[:split]), *joints]
+    at_home = system(home, origin)[3]
     solved = Equations(
-        "pose", t.lift([*tree.home, *engine.graph.home]), t.lift(engine.home_pose), None,
-        t.lift(corrected), t._square(step, [*tree.scales, *drives]),
-        tape.lift(float(np.exp(-log) * sign) / inverse),
+        "pose", t.lift(home), t.lift(origin), None, t.lift(moved),
+        t._square(step, [*tree.scales, *t.drive_scales]),
+        tape.lift(at_home.inverse_determinant / lu.inverse_determinant),
         t._square(
-            [r.value for r in rows] + [v for v, _ in equations],
-            [r.scale for r in rows] + engine._pose_scales,
+            [r.value for r in rows] + equations, [r.scale for r in rows] + t.pose_scales
         ),
     )  # fmt: skip
-    return Program({"pose": len(goal)}, 0, {"q": t.lift(t.q)}, solved)
+    return Program({"pose": len(goal)}, 0, {"q": t.lift(everything[size:])}, solved)
 
 
 _engines: Final[WeakValueDictionary[str, Engine]] = WeakValueDictionary()
 """Engines that something still holds, by geometry: however many machines there are in between."""
+_codes: Final[WeakValueDictionary[str, Code]] = WeakValueDictionary()
+"""Programs that something still holds, by structure: machines of one structure share them."""
 _recent: Final[deque[Engine]] = deque(maxlen=16)
 """Held although no machine may: loading a file again takes no engine anew."""
 
@@ -723,7 +758,7 @@ _recent: Final[deque[Engine]] = deque(maxlen=16)
 def engine_of(
     graph: Graph,
     coordinates: Sequence[Coordinate],
-    start: Start | None = None,
+    closed: Closed | None = None,
     branch: Branch | None = None,
     mark: str = "",
 ) -> Engine:
@@ -734,9 +769,17 @@ def engine_of(
     key = f"{graph.key} {coordinates!r} {mark}"
     engine = _engines.get(key)
     if engine is None:
-        engine = _engines.setdefault(key, Engine(graph, coordinates, start, branch))
+        engine = _engines.setdefault(key, Engine(graph, coordinates, closed, branch, mark))
         _recent.append(engine)
     return engine
 
 
-__all__ = ["Engine", "Mobility", "NDArray", "Start", "Traced", "engine_of"]
+def _code(key: str, engine: Engine, write: Callable[[Traced], Program]) -> Code:
+    """The program of a key, written on an engine if nobody has it."""
+    code = _codes.get(key)
+    if code is None:
+        code = _codes.setdefault(key, Code(lambda: write(Traced(engine)), key))
+    return code
+
+
+__all__ = ["Closed", "Engine", "Mobility", "NDArray", "Traced", "engine_of"]

@@ -17,10 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.codegen.expressions import Numbers, Objects, cos, sin, sqrt
+from pkm_twin.codegen.expressions import (
+    Numbers,
+    Objects,
+    cos,
+    sin,
+    snapped,
+    snapped_all,
+    sqrt,
+)
 from pkm_twin.machine.graph import BASE, Array, Direction, Joint, Rod
 from pkm_twin.machine.joints import UNITS, Constraint, across, unit
-from pkm_twin.machine.tree import Link, Step, Tree, snapped
+from pkm_twin.machine.tree import Link, Step, Tree
 
 Columns = dict[tuple[str, int], Any]
 """By rate ("u" or "q", index): a vector, or a number."""
@@ -114,7 +122,7 @@ class Motion:
     @staticmethod
     def _value(step: Step, x: Numbers, q: Numbers, origin: Array, offset: float = 0.0) -> Any:
         k = step.position
-        value = q[k] - (float(origin[k]) - step.sign * offset) if step.actuated else x[k]
+        value = q[k] - (origin[k] - step.sign * offset) if step.actuated else x[k]
         return -value if step.sign < 0.0 else value
 
     # Points and directions that are fixed in a body, given at home.
@@ -122,7 +130,7 @@ class Motion:
     def arm(self, body: str, point: Array) -> Any:
         """From the body's origin to a point of it."""
         tree = self.tree
-        return self.rotation[body] @ snapped(tree.axes[body].T @ (point - tree.at[body]))
+        return self.rotation[body] @ snapped_all(tree.axes[body].T @ (point - tree.at[body]))
 
     def point(self, body: str, point: Array) -> Any:
         """Where a point of a body is."""
@@ -130,7 +138,7 @@ class Motion:
 
     def direction(self, body: str, vector: Array) -> Any:
         """Where a vector of a body points."""
-        return self.rotation[body] @ snapped(self.tree.axes[body].T @ vector)
+        return self.rotation[body] @ snapped_all(self.tree.axes[body].T @ vector)
 
     def turned(self, body: str) -> Any:
         """Rotation of a body relative to home, shape (3, 3)."""
@@ -229,7 +237,7 @@ class Motion:
 
         return [
             Row(
-                joint.name, ea @ ub - float(held.inner @ held.outer),
+                joint.name, ea @ ub - snapped(held.inner @ held.outer),
                 {k: c @ normal for k, c in columns.items()}, bias,
                 1.0, a, b, self.point(b, joint.at), np.zeros(3), normal, angle=True,
             )
@@ -269,7 +277,7 @@ class Motion:
         xa, xb = self.point(a, start), self.point(b, end)
         apart = xb - xa
         columns = difference(self.point_columns(b, xb), self.point_columns(a, xa))
-        square = float((end - start) @ (end - start))
+        square = (end - start) @ (end - start)
 
         def bias() -> Any:
             speed = self.velocity(b, end) - self.velocity(a, start)
@@ -278,7 +286,7 @@ class Motion:
 
         return Row(
             rod.name, 0.5 * (apart @ apart - square), {k: c @ apart for k, c in columns.items()},
-            bias, 1.0 / (self.tree.size * square**0.5), a, b, xb, apart, np.zeros(3),
+            bias, 1.0 / (self.tree.size * sqrt(square)), a, b, xb, apart, np.zeros(3),
         )  # fmt: skip
 
     # Velocities and accelerations.

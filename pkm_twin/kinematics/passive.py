@@ -117,7 +117,7 @@ def passive_program(t: Traced) -> Program:
             value = t.q[step.position] - home if step.actuated else t.x[step.position]
             values += [] if step.actuated else [value + home]
             values += [step.slide * value] if step.turns and step.slide else []
-    for rod in t.engine.graph.rods.values():
+    for rod in t.graph.rods.values():
         span = motion.turned(rod.inner).T @ _across_ends(t, rod)
         b, a, x = _rod_sides(rod, span)
         values += [atan2(a, x), atan2(b, sqrt(x * x + a * a))]
@@ -145,7 +145,7 @@ def passive_rates_program(t: Traced) -> Program:
             rate = (qd if step.actuated else u)[step.rate]
             rates += [] if step.actuated else [rate]
             rates += [step.slide * rate] if step.turns and step.slide else []
-    for rod in t.engine.graph.rods.values():
+    for rod in t.graph.rods.values():
         inner, apart = motion.turned(rod.inner), _across_ends(t, rod)
         ends = [
             motion.velocity(body, end)

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.cholesky import traces_over
-from pkm_twin.codegen.expressions import Objects, maximum, minimum, sqrt
+from pkm_twin.codegen.expressions import Objects, maximum, minimum, norm, plain, sqrt
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine, Traced
@@ -86,7 +86,7 @@ class Placed(Motion):
         """Both rods of a pair keep their lengths: no turn about their plane's normal, t x w."""
         a, b, (start, end) = rod.inner, rod.outer, rod.ends
         xa, xb = self.point(a, start), self.point(b, end)
-        length = float(np.linalg.norm(end - start))
+        length = norm(plain(end - start))
         normal = cross(self.direction(b, np.asarray(rod.pair)), (xb - xa) * (1.0 / length))
         columns = difference(self.turn_columns(b), self.turn_columns(a))
 
@@ -123,7 +123,7 @@ def _held(t: Traced) -> Any:
     ]
     bodies = []
     for name in placed.graph.bodies:
-        middle, reach = _frame(placed.graph, name)
+        middle, reach = placed.graph.frame(name)
         linear = placed.point_columns(name, placed.point(name, middle))
         turning = placed.turn_columns(name)
         bodies += [{k: v[i] for k, v in linear.items()} for i in range(3)]
@@ -133,12 +133,12 @@ def _held(t: Traced) -> Any:
 
 
 def _moved(t: Traced) -> Any:
-    n, graph = t.joints, t.engine.graph
+    n, graph = t.joints, t.graph
     table: dict[str, list[Columns]] = {name: [{} for _ in range(6)] for name in graph.bodies}
     for j, u in enumerate(t.rate_columns()):
         t.motion.set_rates(u, np.eye(n)[j])
         for name, rows in table.items():
-            middle, reach = _frame(graph, name)
+            middle, reach = graph.frame(name)
             parts = [*t.motion.velocity(name, middle), *(reach * t.motion.omega[name])]
             for row, part in zip(rows, parts, strict=True):
                 row["u", j] = part
@@ -148,15 +148,6 @@ def _moved(t: Traced) -> Any:
     for response in responses:
         farthest = maximum(farthest, response)
     return sqrt(n / farthest)
-
-
-def _frame(graph: Graph, body: str) -> tuple[Array, float]:
-    """The point of a body at home whose velocity counts, and the length of its turning, m."""
-    if body == graph.platform:
-        return graph.origin, graph.rim
-    points = np.array(graph.joint_points(body))
-    middle = points.mean(0)
-    return middle, max(graph.rim, float(np.linalg.norm(points - middle, axis=-1).max()))
 
 
 def _gram(rows: list[Columns], size: int) -> Objects:

@@ -6,14 +6,14 @@ May import: numpy, pkm_twin's errors, joint types, the standard library.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.expressions import cos, plain, sin
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joints import TYPES, Constraint, Freedom, JointType
 
@@ -31,8 +31,8 @@ _PARALLEL: Final = 1e-3
 
 
 def array(values: ArrayLike) -> Array:
-    """A read-only array of floats."""
-    result = np.array(values, np.float64)
+    """A read-only array of floats, or of expressions and floats."""
+    result = plain(values).copy()
     result.setflags(write=False)
     return result
 
@@ -181,6 +181,18 @@ class Graph:
         far = max((float(np.linalg.norm(p - self.origin)) for p in points), default=0.0)
         return far if far > 1e-6 * self.size else 0.1 * self.size
 
+    def frame(self, body: str) -> tuple[Array, float]:
+        """The point of a body at home whose velocity counts, and the length of its turning, m.
+
+        Of the platform its reference point and rim, else the middle of its joints and how far the
+        farthest of them is from it.
+        """
+        if body == self.platform:
+            return self.origin, self.rim
+        points = np.array(self.joint_points(body))
+        middle = points.mean(0)
+        return middle, max(self.rim, float(np.linalg.norm(points - middle, axis=-1).max()))
+
     def joint_points(self, body: str) -> list[Array]:
         """Where joints and rods meet a body at home, m."""
         points = [j.at for j in self.joints.values() if body in (j.inner, j.outer)]
@@ -188,6 +200,19 @@ class Graph:
             bodies = (rod.inner, rod.outer)
             points += [e for e, b in zip(rod.ends, bodies, strict=True) if b == body]
         return points
+
+    @property
+    def topology(self) -> str:
+        """Text of what bodies, joints and rods there are, and how they meet: no number."""
+        joints = [
+            (
+                j.name, j.kind, j.inner, j.outer, j.actuated, j.given, j.loaded,
+                [d.body for d in j.directions],
+            )
+            for j in self.joints.values()
+        ]  # fmt: skip
+        rods = [(r.name, r.inner, r.outer, r.pair is not None) for r in self.rods.values()]
+        return repr((list(self.bodies), joints, rods, self.platform))
 
     @property
     def key(self) -> str:
@@ -268,7 +293,7 @@ class Graph:
                 )
 
 
-def rotation_about_z(angle: float) -> Array:
+def rotation_about_z(angle: Any) -> Array:
     """Rotation by an angle (rad) about base z, shape (3, 3)."""
-    c, s = math.cos(angle), math.sin(angle)
+    c, s = cos(angle), sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -67,6 +67,13 @@ def _numbers(mass: float, first: Array, about: Array) -> Array:
     )
 
 
+def _turned(ten: Objects, axes: Objects) -> Objects:
+    """Ten numbers in other axes, given as columns in the old ones."""
+    about = axes.T @ matrix_of(ten) @ axes
+    upper = [about[i][k] for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    return np.array([ten[0], *(axes.T @ ten[1:4]), *upper])
+
+
 def loaded_joints(graph: Graph) -> tuple[Joint, ...]:
     """Passive joints with friction or a rotor."""
     return tuple(joint for joint in graph.joints.values() if joint.loaded)
@@ -90,7 +97,10 @@ class Coefficients(Protocol):
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each run-time input stands; the sizes of its parts."""
+    """Where each run-time input stands; the sizes of its parts.
+
+    A body's ten numbers are about its link's origin (``tree.at``), in base axes at home.
+    """
 
     tree: Tree
 
@@ -135,9 +145,10 @@ class Layout:
         return slice(k, k + 10)
 
     def split(self, p: Objects) -> list[Objects]:
-        """The parts of an input vector; bodies with shape (bodies, 10)."""
+        """The parts of an input vector; bodies in their links' axes, shape (bodies, 10)."""
         parts = [p[self.part(k)] for k in range(len(PARTS))]
-        parts[0] = parts[0].reshape(-1, 10)
+        bodies = zip(parts[0].reshape(-1, 10), self.tree.links.values(), strict=True)
+        parts[0] = np.array([_turned(ten, link.axes) for ten, link in bodies])
         return parts
 
     def pack(self, graph: Graph, gravity: Array, friction: Coefficients) -> Array:
@@ -146,14 +157,10 @@ class Layout:
         :param graph: of this tree's geometry; the tree's own may be of a machine with other masses.
         :param friction: of the actuated joints; that of passive ones stands in the graph.
         """
-        tree = self.tree
         bodies = []
-        for link in tree.links.values():
+        for link in self.tree.links.values():
             body = graph.bodies[link.body]
-            axes = link.axes
-            bodies.append(
-                ten_numbers(body.mass, axes.T @ (body.com - link.at), axes.T @ body.inertia @ axes)
-            )
+            bodies.append(ten_numbers(body.mass, body.com - link.at, body.inertia))
         drives = [graph.joints[name] for name in graph.actuated]
         return np.concatenate(
             [
@@ -177,8 +184,6 @@ class Layout:
         graph = self.tree.graph
         link = self.tree.links[graph.platform]
         result = np.zeros(self.size)
-        lever = link.axes.T @ (graph.origin + com - link.at)
-        result[self.body(graph.platform)] = ten_numbers(
-            mass, lever, link.axes.T @ inertia @ link.axes
-        )
+        lever = graph.origin + com - link.at
+        result[self.body(graph.platform)] = ten_numbers(mass, lever, inertia)
         return result

@@ -4,7 +4,7 @@
 Everything else follows: the steps of the tree, the closures of a cut joint, the loads that a joint
 transmits, what it releases in an elastic frame, units and passive coordinates.
 
-May import: numpy, the standard library.
+May import: numpy, pkm_twin's codegen, the standard library.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.expressions import norm, plain, reference
+
 Array = NDArray[np.float64]
 
 UNITS: Final = np.eye(3)
@@ -24,15 +26,15 @@ UNITS: Final = np.eye(3)
 
 def unit(vector: ArrayLike) -> Array:
     """The vector at length one."""
-    values = np.asarray(vector, np.float64)
-    return np.asarray(values / np.linalg.norm(values), np.float64)
+    values = plain(vector)
+    return np.asarray(values / norm(values))
 
 
 def across(axis: Array) -> tuple[Array, Array]:
     """Two unit vectors across an axis and each other, right-handed with it."""
     first = np.zeros(3)
     # Rounded: where two components are equal, the last bit must not choose.
-    first[int(np.argmin(np.round(np.abs(axis), 9)))] = 1.0
+    first[int(np.argmin(np.round([abs(reference(value)) for value in axis], 9)))] = 1.0
     first = unit(np.cross(axis, first))
     return first, np.cross(axis, first)
 

@@ -19,11 +19,11 @@ from typing import Any, ClassVar, Final, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.expressions import Objects
+from pkm_twin.codegen.expressions import Numbers, Objects
 from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
-from pkm_twin.kinematics.engine import Engine, Traced, engine_of
+from pkm_twin.kinematics.engine import Closed, Engine, Traced, engine_of
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.passive import (
     passive_names,
@@ -287,10 +287,11 @@ class Robot:
     @cached_property
     def engine(self) -> Engine:
         """The engine of the robot's geometry, shared by all robots that have the same."""
-        start = self.start if self.has_start else None
+        start = (lambda numbers, q: self.on(numbers).start(q)) if self.has_start else None
+        closed = Closed(np.array(self.closed_numbers, np.float64), start)
         branch = self.branch if self.has_branch else None
         mark = f"{self.mechanism} {self.closed_key}"
-        return engine_of(self.graph, self.coordinates, start, branch, mark)
+        return engine_of(self.graph, self.coordinates, closed, branch, mark)
 
     @cached_property
     def factors(self) -> tuple[Factor, ...]:
@@ -456,17 +457,36 @@ class Robot:
 
         def write(t: Traced) -> Program:
             m = len(self.coordinates)
-            result = self.solved(t.tape.inputs("pose", m))
+            result = self.on(t.closed).solved(t.tape.inputs("pose", m))
             measure = 1.0 if result.measure is None else result.measure
             outputs = {"q": t.lift(result.q), "faults": t.lift([*result.misses, measure])}
             return Program({"pose": m}, 0, outputs)
 
-        return self.engine.kernel(f"{self.mechanism} inverse {self.closed_key}", write)
+        return self.engine.kernel("closed inverse", write)
 
     @property
     def closed_key(self) -> str:
-        """Text of what closed forms hang on, beside the graph."""
+        """Text of what closed forms and branch rules hang on and no number tells."""
         return ""
+
+    @property
+    def closed_numbers(self) -> Sequence[float]:
+        """Numbers of the geometry that closed forms hang on."""
+        return ()
+
+    def on(self: R, numbers: Numbers) -> R:
+        """The robot for its closed forms alone, on other numbers or expressions of them.
+
+        :param numbers: as :attr:`closed_numbers`.
+        """
+        del numbers
+        return self
+
+    def _with(self: R, **values: Any) -> R:
+        """A copy with other fields, or other values that are derived; nothing is checked."""
+        made = object.__new__(type(self))
+        vars(made).update(self.__getstate__() | values)
+        return made
 
     def _inverse(self, pose: ArrayLike) -> tuple[Array, Array | None]:
         """Joints; and None or codes (1 unreachable, 2 not finite, BEYOND), limb, amount.

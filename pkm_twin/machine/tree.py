@@ -6,7 +6,7 @@ that only rods hold hangs free on the base. Revolute and prismatic joints have o
 a spherical joint's body and a free one have a unit quaternion of their absolute orientation, with
 the angular velocity in base axes as its rate: no chart, and nothing of the parents' turning.
 
-May import: numpy, this package's graph, the standard library.
+May import: numpy, pkm_twin's codegen, this package's graph, the standard library.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.expressions import atan2, norm, plain, reference, snapped, snapped_all
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import BASE, Graph, rotation_about_z
 from pkm_twin.machine.joints import Freedom, across, unit
@@ -28,24 +29,20 @@ Array = NDArray[np.float64]
 BALL: Final = (1.0, 0.0, 0.0, 0.0)
 FREE: Final = (*BALL, 0.0, 0.0, 0.0)
 """Unknowns at home of a ball, and of a body that hangs free: a quaternion, and a place."""
-_SNAP: Final = 1e-14
 PARALLEL: Final = 1e-6
 """Sine of an angle, or part of the machine's size, that counts as zero for a choice of axes."""
 
 
-def snapped(values: Array) -> Array:
-    """Numbers that rounding left beside 0 and 1 are those: else the programs lose their zeros."""
-    result = np.array(values, float)
-    for target in (0.0, 1.0, -1.0):
-        result[np.abs(result - target) < _SNAP] = target
-    return result
+def is_parallel(first: Array, second: Array) -> bool:
+    """Whether two unit vectors are, for a choice of axes."""
+    return reference(norm(plain(np.cross(first, second)))) <= PARALLEL
 
 
 def axes_with_z(z: Array, hint: Array) -> Array:
     """Axes whose z is given and whose x points towards a hint, as columns."""
     x = hint - (hint @ z) * z
-    size = float(np.linalg.norm(x))
-    x = x / size if size > PARALLEL else across(z)[0]
+    size = norm(x)
+    x = x / size if reference(size) > PARALLEL else across(z)[0]
     return np.array([x, np.cross(z, x), z]).T
 
 
@@ -195,14 +192,14 @@ class Tree:
         turns = [freedom.axis for freedom in freedoms if freedom.turns]
         for freedom in freedoms:
             axis = unit(freedom.axis)
-            before, local, offset = np.eye(3), snapped(frame.T @ axis), 0.0
+            before, local, offset = np.eye(3), snapped_all(frame.T @ axis), 0.0
             if freedom.turns:
                 turns = turns[1:]
                 hint = turns[0] if turns else self._next_axis(body, name, axis)
                 turned = axes_with_z(axis, frame[:, 0] if hint is None else hint)
                 if actuated and hint is None:
                     offset = self._tilt(body, turned, at)
-                before, frame = snapped(frame.T @ turned), turned @ rotation_about_z(offset)
+                before, frame = snapped_all(frame.T @ turned), turned @ rotation_about_z(offset)
             if actuated:
                 position = rate = graph.actuated.index(str(name))
             else:
@@ -215,7 +212,7 @@ class Tree:
                 )
             )  # fmt: skip
         self.axes[body], self.at[body] = frame, at
-        arm = snapped(self.axes[parent].T @ (at - self.at[parent]))
+        arm = snapped_all(self.axes[parent].T @ (at - self.at[parent]))
         self.links[body] = Link(body, parent, name, tuple(steps), at, frame, arm)
 
     def _claim(self, start: Sequence[float], owner: str, rates: int) -> tuple[int, int]:
@@ -225,16 +222,18 @@ class Tree:
         self.owners += [owner] * rates
         return position, rate
 
-    def _tilt(self, body: str, frame: Array, at: Array) -> float:
+    def _tilt(self, body: str, frame: Array, at: Array) -> Any:
         """Angle about z by which axes x or y of a frame lie along the body's first lever, rad.
 
         Told by the joint's angle, it leaves a lever one number and the frame before it simple.
         """
+        size = reference(self.graph.size)
         for point in self.graph.joint_points(body):
             x, y, _ = frame.T @ (point - at)
-            if math.hypot(x, y) > PARALLEL * self.graph.size:
-                tilt = math.remainder(math.atan2(y, x), math.pi / 2)
-                return tilt if abs(tilt) > _SNAP else 0.0
+            if math.hypot(reference(x), reference(y)) > PARALLEL * size:
+                angle = atan2(y, x)
+                quarters = round(reference(angle) / (math.pi / 2))
+                return snapped(angle - quarters * (math.pi / 2))
         return 0.0
 
     def _next_axis(self, body: str, name: str | None, axis: Array) -> Array | None:
@@ -244,6 +243,5 @@ class Tree:
         """
         for joint in self.graph.joints.values():
             if joint.name != name and body in (joint.inner, joint.outer) and len(joint.axes):
-                parallel = np.linalg.norm(np.cross(axis, joint.axes[0])) <= PARALLEL
-                return None if parallel else np.asarray(joint.axes[0], np.float64)
+                return None if is_parallel(axis, joint.axes[0]) else joint.axes[0]
         return None

@@ -19,14 +19,26 @@ Source: Delta-CU paper (table 1; closure, velocity and acceleration equations).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.codegen.expressions import Objects, absolute, atan2, cos, maximum, minimum, sin, sqrt
+from pkm_twin.codegen.expressions import (
+    Numbers,
+    Objects,
+    absolute,
+    atan2,
+    cos,
+    maximum,
+    minimum,
+    plain,
+    sin,
+    sqrt,
+)
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
@@ -136,10 +148,25 @@ class Delta(Robot):
 
     @property
     def closed_key(self) -> str:
-        """The geometry that the closed forms hang on."""
-        g = self.geometry
+        """The closures."""
+        return repr(self.geometry.closures)
+
+    @property
+    def closed_numbers(self) -> Sequence[float]:
+        """Lengths and azimuths, then the arms and the platform at home."""
+        g, (q, platform) = self.geometry, self._home
         lengths = (g.base_radius, g.platform_radius, g.arm_length, g.forearm_length)
-        return repr((lengths, g.azimuths.tolist(), g.closures))
+        return *lengths, *g.azimuths, *q, *platform
+
+    def on(self, numbers: Numbers) -> Delta:
+        """The same on other numbers."""
+        parts = (plain(numbers[k:n]) for k, n in pairwise((0, 4, 7, 10, 13)))
+        lengths, azimuths, q, platform = parts
+        words = ("base_radius", "platform_radius", "arm_length", "forearm_length")
+        geometry = replace(
+            self.geometry, azimuths=azimuths, **dict(zip(words, lengths, strict=True))
+        )
+        return self._with(geometry=geometry, _home=(q, platform))
 
     @cached_property
     def _directions(self) -> list[tuple[Array, Array]]:
@@ -235,7 +262,7 @@ class Delta(Robot):
                 continue
             _, along = self._directions[i]
             span = self._forearm(i, q[i], x)
-            before = np.asarray(self._forearm(i, home[i], platform), float)
+            before = self._forearm(i, home[i], platform)
             # The forearm is turned with the arm first.
             c, s = cos(q[i] - home[i]), sin(q[i] - home[i])
             carried = before * c + np.cross(along, before) * s

@@ -30,14 +30,25 @@ paper has each link's mass at its slider joint, which ``link_com: 0`` gives.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.codegen.expressions import Objects, absolute, cos, maximum, minimum, sin, sqrt
+from pkm_twin.codegen.expressions import (
+    Numbers,
+    Objects,
+    absolute,
+    cos,
+    maximum,
+    minimum,
+    plain,
+    sin,
+    snapped,
+    sqrt,
+)
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
@@ -154,10 +165,23 @@ class Prru(Robot):
 
     @property
     def closed_key(self) -> str:
-        """The geometry that the closed forms hang on."""
+        """The branch."""
+        return self.geometry.branch
+
+    @property
+    def closed_numbers(self) -> Sequence[float]:
+        """Lengths and azimuths."""
         g = self.geometry
-        lengths = (g.base_radius, g.platform_radius, g.limb_length)
-        return repr((lengths, g.azimuths.tolist(), g.branch))
+        return g.base_radius, g.platform_radius, g.limb_length, *g.azimuths
+
+    def on(self, numbers: Numbers) -> Prru:
+        """The same on other numbers."""
+        base, platform, limb, *azimuths = numbers
+        geometry = replace(
+            self.geometry, base_radius=base, platform_radius=platform, limb_length=limb,
+            azimuths=plain(azimuths),
+        )  # fmt: skip
+        return self._with(geometry=geometry)
 
     def _directions(self, i: int) -> tuple[Array, Array]:
         """E and t of limb i."""
@@ -187,10 +211,11 @@ class Prru(Robot):
         g = self.geometry
         phi, r = g.azimuths, g.platform_radius
         c, s = np.cos(phi), np.sin(phi)
-        weights = np.linalg.inv([np.ones(3), -r * c, -r * s])[:, 0]
+        weights = np.array([c[k - 2] * s[k - 1] - c[k - 1] * s[k - 2] for k in range(3)])
+        weights = weights * (1.0 / weights.sum())
         ca, sa, cb, sb = cos(pose[1]), sin(pose[1]), cos(pose[2]), sin(pose[2])
         n = sa * sb
-        sine, cosine = float(weights @ np.sin(2 * phi)), float(weights @ np.cos(2 * phi))
+        sine, cosine = snapped(weights @ np.sin(2 * phi)), snapped(weights @ np.cos(2 * phi))
         a = (ca - cb) * sine + n * (cosine + 1.0)
         b = (ca - cb) * cosine - n * sine + ca + cb
         norm = sqrt(a * a + b * b)
@@ -199,9 +224,11 @@ class Prru(Robot):
         x = np.array([cb * cg, n * cg + ca * sg, sa * sg - ca * sb * cg], dtype=object)
         y = np.array([-cb * sg, ca * cg - n * sg, sa * cg + ca * sb * sg], dtype=object)
         arms = [-r * (x * c[i] + y * s[i]) for i in range(3)]
-        planes = np.linalg.pinv(np.array([self._directions(i)[1][:2] for i in range(3)]))
-        off = [-(self._directions(i)[1] @ arms[i]) for i in range(3)]
-        centre = [planes[k] @ np.array(off, dtype=object) for k in range(2)]
+        planes = np.array([self._directions(i)[1][:2] for i in range(3)])
+        (xx, xy), (_, yy) = planes.T @ planes
+        off = planes.T @ np.array([-(self._directions(i)[1] @ arms[i]) for i in range(3)])
+        inverse = 1.0 / (xx * yy - xy * xy)
+        centre = [(yy * off[0] - xy * off[1]) * inverse, (xx * off[1] - xy * off[0]) * inverse]
         return [np.array([*centre, pose[0]], dtype=object) + arm for arm in arms], norm
 
     def branch(self, motion: Motion) -> Sequence[Any]:
@@ -253,7 +280,7 @@ class Prru(Robot):
         determinant = before[0] * before[1] * before[2] - after[0] * after[1] * after[2]
         sides = [np.cos(g.azimuths[k] - g.azimuths[(k + 1) % 3]) for k in range(3)]
         scale = np.sqrt(np.prod([2 * g.platform_radius**2 * (1 - side) for side in sides]))
-        measure = determinant * float(-sign / (2 * l**3 * scale))
+        measure = determinant * (-sign / (2.0 * l**3 * scale))
         return Inverse(q, misses, measure * told)
 
     def grid(self) -> PoseGrid:

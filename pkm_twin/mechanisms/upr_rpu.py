@@ -26,14 +26,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.expressions import Objects, absolute, atan2, cos, maximum, minimum, sin, sqrt
+from pkm_twin.codegen.expressions import (
+    Numbers,
+    Objects,
+    absolute,
+    atan2,
+    cos,
+    maximum,
+    minimum,
+    sin,
+    sqrt,
+)
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
@@ -199,9 +209,16 @@ class UprRpu(Robot):
         return self.geometry.platform_radius
 
     @property
-    def closed_key(self) -> str:
-        """The geometry that the closed forms hang on."""
-        return repr((self.geometry.base_radius, self.geometry.platform_radius))
+    def closed_numbers(self) -> Sequence[float]:
+        """Radii, and the limbs' length at home."""
+        g = self.geometry
+        return g.base_radius, g.platform_radius, self._limb_at_home
+
+    def on(self, numbers: Numbers) -> UprRpu:
+        """The same on other numbers."""
+        base, platform, limb = numbers
+        geometry = replace(self.geometry, base_radius=base, platform_radius=platform)
+        return self._with(geometry=geometry, home_joint=limb)
 
     @property
     def _radii(self) -> tuple[float, float]:
@@ -218,11 +235,15 @@ class UprRpu(Robot):
         return math.hypot(aside, 1.5 * max(self._radii))
 
     @property
-    def _height(self) -> float:
+    def _limb_at_home(self) -> float:
+        return self.chosen_home() if self.home_joint is None else self.home_joint
+
+    @property
+    def _height(self) -> Any:
         """The platform's height at home, level, where all limbs have one length."""
         a, b = self._radii
-        limb = self.chosen_home() if self.home_joint is None else self.home_joint
-        return -math.sqrt((limb - abs(b - a)) * (limb + abs(b - a)))
+        limb = self._limb_at_home
+        return -sqrt((limb - absolute(b - a)) * (limb + absolute(b - a)))
 
     def massive(self) -> Engine:
         """The engine of a robot with masses.

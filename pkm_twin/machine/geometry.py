@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of a graph's geometry in a row, and the same graph on other numbers or expressions.
+
+Masses and friction are apart, see ``machine.inertia``.
+
+May import: numpy, pkm_twin's codegen, this package's graph, tree and joint types.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pkm_twin.codegen.expressions import Numbers, plain, snapped
+from pkm_twin.machine.graph import Array, Graph, array
+from pkm_twin.machine.tree import Tree
+
+
+@dataclass(frozen=True, eq=False)
+class SizedGraph(Graph):
+    """A graph whose lengths that only scale equations are given, and not computed."""
+
+    given: Sequence[Any] = field(default=())
+
+    @property
+    def size(self) -> Any:
+        """As given."""
+        return self.given[0]
+
+    @property
+    def rim(self) -> Any:
+        """As given."""
+        return self.given[1]
+
+    def frame(self, body: str) -> tuple[Array, Any]:
+        """As given."""
+        k = 2 + 4 * list(self.bodies).index(body)
+        return plain(self.given[k : k + 3]), self.given[k + 3]
+
+
+def scales_of(graph: Graph) -> list[float]:
+    """Lengths that only scale equations: size, rim, and every body's frame."""
+    frames = [graph.frame(body) for body in graph.bodies]
+    return [graph.size, graph.rim, *(v for middle, reach in frames for v in (*middle, reach))]
+
+
+def geometry_of(graph: Graph) -> Array:
+    """All numbers of a graph's geometry, shape (k,), lengths that only scale equations last."""
+    values = [*_walk(graph), *graph.origin, *scales_of(graph)]
+    return array(np.array(values, np.float64))
+
+
+def _walk(graph: Graph) -> Iterator[float]:
+    for joint in graph.joints.values():
+        yield from (*joint.at, *joint.axes.ravel(), joint.home)
+        if joint.type.threaded():
+            yield joint.pitch
+        for direction in joint.directions:
+            yield from direction.vector
+    for rod in graph.rods.values():
+        yield from (*rod.ends.ravel(), *(() if rod.pair is None else rod.pair))
+
+
+def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
+    """The graph with other numbers, in the order of :func:`geometry_of`.
+
+    What is 0, 1 or -1 in the known case of expressions is taken for that, see
+    :func:`pkm_twin.codegen.expressions.snapped`; lengths that only scale are not.
+    """
+    left = iter(numbers)
+
+    def take(like: Array) -> Array:
+        values = np.empty(like.size, dtype=object)
+        values[:] = [snapped(next(left)) for _ in range(like.size)]
+        return plain(values.reshape(like.shape))
+
+    joints = {}
+    for name, joint in graph.joints.items():
+        at, axes, home = take(joint.at), take(joint.axes), snapped(next(left))
+        pitch = next(left) if joint.type.threaded() else 0.0
+        directions = tuple(replace(d, vector=take(d.vector)) for d in joint.directions)
+        joints[name] = replace(
+            joint, at=at, axes=axes, home=home, pitch=pitch, directions=directions
+        )
+    rods = {}
+    for name, rod in graph.rods.items():
+        ends = take(rod.ends)
+        rods[name] = replace(rod, ends=ends, pair=None if rod.pair is None else take(rod.pair))
+    origin = take(graph.origin)
+    return SizedGraph(graph.bodies, joints, rods, graph.platform, origin, list(left))
+
+
+def pattern_of(tree: Tree) -> str:
+    """Text of what programs take for constant, and of how a tree's frames were chosen.
+
+    Two graphs of one topology and one pattern have the same programs, on their own numbers.
+    """
+    graph = tree.graph
+    parts: list[Any] = [_marks([*_walk(graph), *graph.origin])]
+    for body, link in tree.links.items():
+        # The signs and zeros of a frame in base axes tell which way its axes were chosen.
+        parts += [link.parent, _marks(link.arm), _marks(link.axes)]
+        parts += [(_marks(s.before), _marks(s.local), _marks([s.offset])) for s in link.steps]
+        for vector in _vectors(graph, body):
+            parts.append(_marks(link.axes.T @ vector))
+        parts += [_marks(link.axes.T @ (point - link.at)) for point in _points(graph, body)]
+    for joint in graph.joints.values():
+        for held in joint.constraints:
+            parts.append(_marks([held.inner @ held.outer]))
+    return repr(parts)
+
+
+def _points(graph: Graph, body: str) -> list[Array]:
+    own = [graph.origin] if body == graph.platform else []
+    return [*graph.joint_points(body), *own]
+
+
+def _vectors(graph: Graph, body: str) -> Iterator[Array]:
+    for joint in graph.joints.values():
+        if body in (joint.inner, joint.outer):
+            for held in joint.constraints:
+                yield held.inner if body == joint.inner else held.outer
+            yield from joint.axes
+        yield from (d.vector for d in joint.directions if d.body == body)
+    for rod in graph.rods.values():
+        if rod.pair is not None and rod.outer == body:
+            yield rod.pair
+
+
+def _marks(values: Any) -> str:
+    """A character a number: what it is taken for."""
+    marks = {0.0: "0", 1.0: "1", -1.0: "-"}
+    return "".join(marks.get(float(snapped(v)), ".") for v in np.ravel(values))
