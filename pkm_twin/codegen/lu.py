@@ -43,6 +43,9 @@ def independent_rows(matrices: Array, bound: float = 1e-9) -> list[int]:
     return sorted(chosen)
 
 
+STRONG: Final = 0.3
+"""Part of a row's and a column's largest entry from which on pivots are as good as others."""
+
 Order = tuple[tuple[int, int], ...]
 """Pivots, by row and column, in the order in which they are taken."""
 
@@ -72,9 +75,9 @@ def pivot_order(samples: Array, share: float = 0.1) -> Order:
                 return pivot_order(samples[:1], share)
             raise SingularityError("the sample states", (), float(scale), share)
         fill = np.multiply.outer(there.sum(1) - 1, there.sum(0) - 1)
-        strength = np.round((block / np.maximum(large, 1e-300)).min(0), 6)
-        # By fill, then strength, then place.
-        best = np.lexsort((-strength[good], fill[good]))[0]
+        # The first of the best: a finer choice would differ from machine to machine.
+        strong = ((block / np.maximum(large, 1e-300)).min(0) > STRONG)[good]
+        best = int((fill[good] + 0.5 * ~strong).argmin())
         i, j = (int(index[best]) for index in np.nonzero(good))
         row, column = rows.pop(i), columns.pop(j)
         order.append((row, column))

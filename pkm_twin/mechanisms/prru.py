@@ -235,7 +235,8 @@ class Prru(Robot):
         """Height of every platform joint over its slider, on the branch's side."""
         rises = []
         for limb in LIMBS:
-            foot, head = (self.graph.joints[f"{w} joint {limb}"].at for w in ("slider", "platform"))
+            joints = motion.graph.joints
+            foot, head = (joints[f"{w} joint {limb}"].at for w in ("slider", "platform"))
             upper = f"upper link {limb}"
             rises.append((motion.point(upper, head) - motion.point(upper, foot))[2] * self._sign)
         return rises
