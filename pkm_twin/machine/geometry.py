@@ -49,8 +49,7 @@ def scales_of(graph: Graph) -> list[float]:
 
 def geometry_of(graph: Graph) -> Array:
     """All numbers of a graph's geometry, shape (k,), lengths that only scale equations last."""
-    values = [*_walk(graph), *graph.origin, *scales_of(graph)]
-    return array(np.array(values, np.float64))
+    return array([*_walk(graph), *graph.origin, *scales_of(graph)])
 
 
 def _walk(graph: Graph) -> Iterator[float]:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.expressions import cos, plain, sin
+from pkm_twin.codegen.expressions import cos, maximum, minimum, norm, plain, reference, sin
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joints import TYPES, Constraint, Freedom, JointType
 
@@ -171,15 +172,16 @@ class Graph:
         points = [joint.at for joint in self.joints.values()]
         points += [end for rod in self.rods.values() for end in rod.ends]
         points.append(self.origin)
-        extent = float(np.ptp(np.array(points), axis=0).max())
-        return extent if extent >= MIN_LENGTH else 1.0
+        places = np.array(points).T
+        extent = reduce(maximum, [reduce(maximum, row) - reduce(minimum, row) for row in places])
+        return extent if reference(extent) >= MIN_LENGTH else 1.0
 
     @property
     def rim(self) -> float:
         """Greatest distance of a joint on the platform from its reference point, m."""
         points = self.joint_points(self.platform)
-        far = max((float(np.linalg.norm(p - self.origin)) for p in points), default=0.0)
-        return far if far > 1e-6 * self.size else 0.1 * self.size
+        far = reduce(maximum, [norm(plain(p - self.origin)) for p in points], 0.0)
+        return far if reference(far) > 1e-6 * reference(self.size) else 0.1 * self.size
 
     def frame(self, body: str) -> tuple[Array, float]:
         """The point of a body at home whose velocity counts, and the length of its turning, m.
@@ -190,8 +192,8 @@ class Graph:
         if body == self.platform:
             return self.origin, self.rim
         points = np.array(self.joint_points(body))
-        middle = points.mean(0)
-        return middle, max(self.rim, float(np.linalg.norm(points - middle, axis=-1).max()))
+        middle = plain(points.sum(0) / len(points))
+        return middle, reduce(maximum, [norm(plain(p - middle)) for p in points], self.rim)
 
     def joint_points(self, body: str) -> list[Array]:
         """Where joints and rods meet a body at home, m."""

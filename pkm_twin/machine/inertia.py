@@ -14,6 +14,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.expressions import plain
 from pkm_twin.machine.graph import Array, Graph, Joint
 from pkm_twin.machine.tree import Tree
 
@@ -62,9 +63,7 @@ def matrix_of(ten: Array) -> Array:
 
 def _numbers(mass: float, first: Array, about: Array) -> Array:
     i = about
-    return np.array(
-        [mass, *first, i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]], dtype=np.float64
-    )
+    return plain([mass, *first, i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]])
 
 
 def _turned(ten: Objects, axes: Objects) -> Objects:
@@ -162,28 +161,30 @@ class Layout:
             body = graph.bodies[link.body]
             bodies.append(ten_numbers(body.mass, body.com - link.at, body.inertia))
         drives = [graph.joints[name] for name in graph.actuated]
-        return np.concatenate(
-            [
-                *bodies,
-                [rod.mass for rod in graph.rods.values()],
-                gravity,
-                friction.viscous,
-                friction.coulomb,
-                friction.offset,
-                [j.rotor_inertia for j in drives],
+        return plain(
+            np.concatenate(
                 [
-                    value
-                    for j in loaded_joints(graph)
-                    for value in (j.viscous, j.coulomb, j.rotor_inertia)
-                ],
-            ]
+                    *bodies,
+                    [rod.mass for rod in graph.rods.values()],
+                    gravity,
+                    friction.viscous,
+                    friction.coulomb,
+                    friction.offset,
+                    [j.rotor_inertia for j in drives],
+                    [
+                        value
+                        for j in loaded_joints(graph)
+                        for value in (j.viscous, j.coulomb, j.rotor_inertia)
+                    ],
+                ]
+            )
         )
 
     def payload(self, mass: float, com: Array, inertia: Array) -> Array:
         """What a body fixed to the platform adds; com from its reference point, home axes."""
         graph = self.tree.graph
         link = self.tree.links[graph.platform]
-        result = np.zeros(self.size)
+        result = np.zeros(self.size, dtype=object)
         lever = graph.origin + com - link.at
         result[self.body(graph.platform)] = ten_numbers(mass, lever, inertia)
-        return result
+        return plain(result)

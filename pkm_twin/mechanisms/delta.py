@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.expressions import (
+    Expression,
     Numbers,
     Objects,
     absolute,
@@ -36,6 +37,7 @@ from pkm_twin.codegen.expressions import (
     maximum,
     minimum,
     plain,
+    reference,
     sin,
     sqrt,
 )
@@ -45,6 +47,7 @@ from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, Rod, array
 from pkm_twin.machine.inertia import ten_numbers
+from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import Inverse, Robot
@@ -56,6 +59,7 @@ Array = NDArray[np.float64]
 LIMBS: Final = ("I", "II", "III")
 UP: Final = array([0.0, 0.0, 1.0])
 PLATFORM: Final = "platform"
+MAX_ITERATIONS: Final = 12
 EVEN: Final = 0.02
 """Least of :meth:`Delta._evenness` at home, of 1."""
 
@@ -188,7 +192,7 @@ class Delta(Robot):
     @cached_property
     def _home(self) -> tuple[Array, Array]:
         """Joints and platform at home."""
-        q = np.full(3, self.chosen_home() if self.home_joint is None else self.home_joint)
+        q = array(np.full(3, self.chosen_home() if self.home_joint is None else self.home_joint))
         platform = self._assemble(q)
         if platform is None:
             g = self.geometry
@@ -220,18 +224,24 @@ class Delta(Robot):
         return measure
 
     def _assemble(self, q: Array) -> Array | None:
-        """Platform centre below the elbows, on numbers."""
-        x = np.asarray(self._below(q), float)
-        for _ in range(20):
-            rows = np.array([self._forearm(i, q[i], x) for i in range(3)], float)
-            value = (np.sum(rows * rows, -1) - self.geometry.forearm_length**2) / 2
-            if not abs(np.linalg.det(rows)) > 1e-9 * self.geometry.forearm_length**3:
+        """Platform centre below the elbows; None where there is none in a known case."""
+        x, length = self._below(q), self.geometry.forearm_length
+        for _ in range(MAX_ITERATIONS):
+            rows = [self._forearm(i, q[i], x) for i in range(3)]
+            value = [(row @ row - length * length) * 0.5 for row in rows]
+            # Columns of the inverse, by Cramer's rule.
+            pairs = [cross(rows[i - 2], rows[i - 1]) for i in range(3)]
+            determinant = rows[0] @ pairs[0]
+            if not abs(reference(determinant)) > 1e-9 * reference(length) ** 3:
                 return None
-            step = np.linalg.solve(rows, value)
+            step = sum(v * pair for v, pair in zip(value, pairs, strict=True)) / determinant
             x = x - step
-            if np.abs(step).max() < 1e-13 * self.geometry.forearm_length:
-                return x
-        return None
+            # An expression's other cases take the steps that they may need.
+            if x.dtype != object or not any(isinstance(v, Expression) for v in x):
+                x = np.asarray(x, np.float64)
+                if np.abs(np.asarray(step, float)).max() < 1e-13 * length:
+                    return x
+        return None if x.dtype != object else x
 
     def _below(self, q: Any) -> Any:
         """Where spheres about the elbows (the platform moved to one point) meet, the lower place.
@@ -344,7 +354,7 @@ class Delta(Robot):
             out, along = self._directions[i]
             arm, forearm = f"arm {limb}", f"forearm {limb}"
             pivot = array(g.base_radius * out)
-            lever = np.asarray(self._elbow(i, q[i]), float) - pivot
+            lever = plain(self._elbow(i, q[i])) - pivot
             about = m.arm_mass * g.arm_length**2 / 12 if m.arm_inertia is None else m.arm_inertia
             bodies[arm] = Body(
                 arm, m.arm_mass, array(pivot + m.arm_com * lever), _thin(about, lever)
@@ -354,11 +364,11 @@ class Delta(Robot):
             )
             joints[self.joints[i]] = Joint(
                 self.joints[i], "revolute", BASE, arm, pivot, array([along]), actuated=True,
-                home=float(q[i]), rotor_inertia=m.rotor_inertia, directions=fixed,
+                home=q[i], rotor_inertia=m.rotor_inertia, directions=fixed,
                 label=f"base joint {limb}",
             )  # fmt: skip
             corner = array(platform + g.platform_radius * out)
-            span = np.asarray(self._forearm(i, q[i], platform), float)
+            span = plain(self._forearm(i, q[i], platform))
             foot = array(corner - span)
             names = f"elbow {limb}", f"platform joint {limb}"
             if g.closures[i] == "rod":
@@ -452,13 +462,13 @@ class Delta(Robot):
             out, along = self._directions[i]
             arm, forearm = f"arm {limb}", f"forearm {limb}"
             pivot = g.base_radius * out
-            tip = np.asarray(self._elbow(i, q[i]), float)
+            tip = plain(self._elbow(i, q[i]))
             beams.append(
                 Beam(arm, arm, i, (arm, pivot), (arm, tip), (arm,), members.arm.outer_diameter / 2)
             )
             corner = platform + g.platform_radius * out
             if g.closures[i] == "rcu":
-                foot = corner - np.asarray(self._forearm(i, q[i], platform), float)
+                foot = corner - plain(self._forearm(i, q[i], platform))
                 radius = members.rcu_forearm.outer_diameter / 2  # type: ignore[union-attr]
                 ends = (forearm, foot), (forearm, corner)
                 beams.append(Beam(forearm, forearm, i, *ends, (forearm,), radius))
@@ -504,5 +514,5 @@ class Delta(Robot):
 
 def _thin(across: float, along: Array) -> Array:
     """Inertia of a thin bar, ``across`` about every axis across it."""
-    e = along / np.linalg.norm(along)
+    e = unit(along)
     return array(across * (np.eye(3) - np.outer(e, e)))

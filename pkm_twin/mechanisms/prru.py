@@ -194,11 +194,11 @@ class Prru(Robot):
         return 1.0 if self.geometry.branch == "below" else -1.0
 
     @cached_property
-    def _rise(self) -> float:
+    def _rise(self) -> Any:
         """Height of the level platform over the sliders."""
         g = self.geometry
         aside = g.base_radius - g.platform_radius
-        return self._sign * float(np.sqrt(g.limb_length**2 - aside**2))
+        return self._sign * sqrt(g.limb_length**2 - aside**2)
 
     def _corners(self, pose: Objects) -> tuple[Any, Any]:
         """Platform joints U_i of a pose, (3, 3), and the norm that gamma is told by.

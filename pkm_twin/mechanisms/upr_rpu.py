@@ -41,6 +41,8 @@ from pkm_twin.codegen.expressions import (
     cos,
     maximum,
     minimum,
+    norm,
+    reference,
     sin,
     sqrt,
 )
@@ -224,18 +226,20 @@ class UprRpu(Robot):
     def _radii(self) -> tuple[float, float]:
         return self.geometry.platform_radius, self.geometry.base_radius
 
-    def chosen_home(self) -> float:
+    def chosen_home(self) -> Any:
         """Length of the limbs at home, m: the middle of their limits, if the platform hangs then.
 
         Else that at 1.5 times the greater radius below the base.
         """
-        aside, middle = abs(np.subtract(*self._radii)), shared_middle(self.limits.position)
-        if middle is not None and middle > aside * (1.0 + LEVEL):
+        a, b = self._radii
+        aside, middle = absolute(a - b), shared_middle(self.limits.position)
+        if middle is not None and middle > reference(aside) * (1.0 + LEVEL):
             return middle
-        return math.hypot(aside, 1.5 * max(self._radii))
+        deep = 1.5 * maximum(a, b)
+        return sqrt(aside * aside + deep * deep)
 
     @property
-    def _limb_at_home(self) -> float:
+    def _limb_at_home(self) -> Any:
         return self.chosen_home() if self.home_joint is None else self.home_joint
 
     @property
@@ -418,7 +422,7 @@ class UprRpu(Robot):
         inertia = self.inertia
         for i, limb in enumerate("123"):
             foot, head = array(b * _PATTERN[i]), array(origin + a * _PATTERN[i])
-            reach = float(np.linalg.norm(head - foot))
+            reach = norm(head - foot)
             d = (head - foot) / reach
             low, high = f"lower tube {limb}", f"upper tube {limb}"
             for name, at in ((low, foot + 0.25 * reach * d), (high, head - 0.25 * reach * d)):
@@ -489,7 +493,7 @@ class UprRpu(Robot):
         """A round bar of half the limb."""
         if self.inertia is None:
             return Body(name, 0.0, array(com))
-        radius = float(self.members.diameter[i]) / 2
+        radius = self.members.diameter[i] / 2
         weight = self.inertia.density * math.pi * radius**2 * reach
         across, axial = weight * (reach**2 / 12 + radius**2 / 4), weight * radius**2 / 2
         inertia = across * np.eye(3) + (axial - across) * np.outer(d, d)
