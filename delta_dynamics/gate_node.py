@@ -103,8 +103,7 @@ class CommandGate(health.TwinNode):
 
     def farewell(self) -> None:
         """As deactivated; and the controller has it before the process ends."""
-        if self.active:
-            self.deactivated()
+        super().farewell()
         self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     def reset_stop(self) -> str:
@@ -247,7 +246,7 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
 
 def main() -> None:
     """Entry point of ``ros2 run pkm_twin command_gate``."""
-    sys.exit(run(CommandGate, farewell=True))
+    sys.exit(run(CommandGate))
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import sys
 
 from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.arguments import answer
+from pkm_twin.ros.signals import leave_at_once
 
 MODULES = {
     "delta_dynamics": "delta_dynamics.node",
@@ -51,6 +52,7 @@ def machine_sim() -> None:
 
 
 def _run(name: str) -> None:
+    leave_at_once()
     open_standard_streams()
     answer(name, SUMMARIES[name], sys.argv[1:])
     try:

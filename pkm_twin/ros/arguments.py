@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 
 USAGE = """usage: {name} [--help] [--version] [--ros-args -p PARAMETER:=VALUE -r FROM:=TO ...]
 
@@ -40,6 +39,8 @@ def answer(name: str, summary: str, arguments: Sequence[str]) -> None:
 
 
 def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version("pkm_twin")
     except PackageNotFoundError:

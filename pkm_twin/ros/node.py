@@ -24,7 +24,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.qos import (
     QoSCompatibility,
@@ -179,7 +178,13 @@ class TwinNode(ParameterNode):
         self.time_jumped_backward()
 
     def farewell(self) -> None:
-        """The last thing to do while the topics are still there; see ``ros.run``."""
+        """The end: nothing is answered from here on, while the topics are still there."""
+        self._quit()
+
+    @property
+    def parting(self) -> bool:
+        """Whether something of the end still waits for turns of the executor."""
+        return False
 
     def stream_broken(self, where: str) -> None:
         """A callback failed: whatever it feeds cannot be trusted now."""
@@ -417,12 +422,7 @@ class TwinNode(ParameterNode):
             self._tasks.popleft()
 
     def caught(self, where: str, error: Exception) -> None:
-        """An exception in a callback: the node lives; one traceback a kind.
-
-        :raises ExternalShutdownException: it came from a signal in the middle of the callback.
-        """
-        if not self.context.ok():
-            raise ExternalShutdownException from error
+        """An exception in a callback: the node lives; one traceback a kind."""
         self._seen["exceptions"] += 1
         self._last_kind = _cut(f"{where}: {type(error).__name__}: {error}")
         text = traceback.format_exc()
@@ -465,8 +465,6 @@ class TwinNode(ParameterNode):
                     return response
                 return callback(request, response)
             except Exception as error:
-                if not self.context.ok():
-                    raise ExternalShutdownException from error
                 self._seen["requests refused"] += 1
                 text = _cut(f"{type(error).__name__}: {error}")
                 self.log_throttled("request", f"{kind.__name__}: refused, {text}")
