@@ -1,16 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The twin of one robot: its nodes, in one namespace. Every argument has a default."""
+"""The twin of one robot: its nodes, in one namespace. Every argument has a default.
 
+A node that ends is started again. One that rejects its configuration would reject it again: it is
+tried a few times only, with growing pauses.
+"""
+
+import re
+import time
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
+import yaml
+from launch.actions import (
+    DeclareLaunchArgument,
+    LogInfo,
+    OpaqueFunction,
+    SetEnvironmentVariable,
+    TimerAction,
+)
+from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
+from launch.launch_description_entity import LaunchDescriptionEntity
 from launch_ros.actions import Node
 
+from delta_dynamics.feedforward import Settings
+from delta_dynamics.gate import GateSettings
 from launch import LaunchDescription
+from pkm_twin import load
+from pkm_twin.errors import PkmTwinError
 
 ROBOT = "delta_cu"
 RESPAWN_DELAY = 1.0
+REJECTED = 1
+"""Exit code of a node that rejects its configuration."""
+RETRIES = 3
+"""How often such a node is started again, after RESPAWN_DELAY, twice and four times as long."""
+SETTLED = 30.0
+"""A node that ran for so long had a good configuration, s."""
 
 ARGUMENTS = {
     "robot": ("", f"robot of all nodes, a name or a path; default: params_file's, else {ROBOT}"),
@@ -74,10 +99,62 @@ def nodes(context: LaunchContext) -> list[Node]:
     file = given["params_file"]
     if file and not Path(file).is_file():
         raise RuntimeError(f"params_file: {file!r} is no file")
-    return [_node(name, given) for name in PARAMETERS if _flag(given, name)]
+    if given["robot"]:
+        try:
+            load(given["robot"])
+        except PkmTwinError as error:
+            raise RuntimeError(f"robot: {error}") from None
+    chosen = [name for name in PARAMETERS if _flag(given, name)]
+    _check_deadline(given, chosen)
+    return [_node(name, given) for name in chosen]
 
 
-def _node(name: str, given: dict[str, str]) -> Node:
+def _check_deadline(given: dict[str, str], chosen: list[str]) -> None:
+    """Torques that may come later than the gate demands never reach it: the middleware stops them.
+
+    :raises RuntimeError: they may.
+    """
+    if not {"delta_dynamics", "command_gate"} <= set(chosen):
+        return
+    stale_after = _parameter(given, "delta_dynamics", "stale_after", Settings().stale_after)
+    deadline = _parameter(given, "command_gate", "deadline", GateSettings().deadline)
+    if stale_after > deadline:
+        raise RuntimeError(
+            f"params_file: delta_dynamics has stale_after {stale_after:g} s and command_gate has "
+            f"deadline {deadline:g} s: no torque would reach the gate; stale_after has to be at "
+            "most the deadline"
+        )
+
+
+def _parameter(given: dict[str, str], node: str, name: str, default: float) -> float:
+    """A parameter of a node by the file, whose later sections go before its earlier ones."""
+    file = given["params_file"]
+    if not file:
+        return default
+    full = "/".join(["", *given["namespace"].strip("/").split("/"), node]).replace("//", "/")
+    found = default
+
+    def look(section: object, path: str) -> None:
+        nonlocal found
+        for key, value in section.items() if isinstance(section, dict) else ():
+            if key != "ros__parameters":
+                look(value, f"{path}/{str(key).strip('/')}")
+            elif re.fullmatch(_pattern(path), full) and isinstance(value, dict):
+                found = value.get(name, found)
+
+    try:
+        look(yaml.safe_load(Path(file).read_text(encoding="utf-8")), "")
+        return float(found)
+    except (OSError, yaml.YAMLError, TypeError, ValueError) as error:
+        raise RuntimeError(f"params_file: {file!r}: {' '.join(str(error).split())}") from None
+
+
+def _pattern(path: str) -> str:
+    """The middleware's ** stands for any names, none included; its * for one."""
+    return re.escape(path).replace(r"/\*\*", "(/.*)?").replace(r"\*", "[^/]*")
+
+
+def _node(name: str, given: dict[str, str], tries: int = 0) -> Node:
     # A file may name the robot; an argument that is given goes before the file's.
     default = [] if given["robot"] else [{"mechanism": ROBOT}]
     file = [given["params_file"]] if given["params_file"] else []
@@ -92,11 +169,35 @@ def _node(name: str, given: dict[str, str]) -> Node:
         parameters=[*default, *file, {**chosen, "use_sim_time": _flag(given, "use_sim_time")}],
         remappings=[(topic, given[topic.removeprefix("~/")]) for topic in TOPICS[name]],
         ros_arguments=["--log-level", given["log_level"]],
-        respawn=name == "command_gate" or _flag(given, "respawn"),
-        # The gate's absence is the time that a controller holds the last torque.
-        respawn_delay=0.0 if name == "command_gate" else RESPAWN_DELAY,
+        on_exit=_Again(name, given, tries),
         output="screen",
     )
+
+
+class _Again:
+    """What follows the end of a node: its next start, or a line that says that there is none."""
+
+    def __init__(self, name: str, given: dict[str, str], tries: int) -> None:
+        self._name, self._given, self._tries = name, given, tries
+        self._began = time.monotonic()
+
+    def __call__(
+        self, event: ProcessExited, context: LaunchContext
+    ) -> list[LaunchDescriptionEntity]:
+        name, given = self._name, self._given
+        gate = name == "command_gate"
+        if context.is_shutdown or not (gate or _flag(given, "respawn")):
+            return []
+        if event.returncode != REJECTED or time.monotonic() - self._began > SETTLED:
+            # The gate's absence is the time that a controller holds the last torque.
+            again = _node(name, given)
+            return [again] if gate else [TimerAction(period=RESPAWN_DELAY, actions=[again])]
+        if self._tries == RETRIES:
+            text = f"{name} rejects its configuration; not started again"
+            return [LogInfo(msg=text)]
+        pause = RESPAWN_DELAY * 2**self._tries
+        again = _node(name, given, self._tries + 1)
+        return [TimerAction(period=pause, actions=[again])]
 
 
 def _flag(given: dict[str, str], name: str) -> bool:

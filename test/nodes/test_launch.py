@@ -387,6 +387,8 @@ class TestRunning:
         ("name", "argument", "said"),
         [
             ("twin", "params_file:=/no/such.yaml", "params_file: '/no/such.yaml' is no file"),
+            ("twin", "robot:=nope", "nope"),
+            ("cell", "machines:=a=nope", "nope"),
             ("twin", "respawn:=maybe", "respawn: 'maybe' is neither true nor false"),
             ("cell", "machines:=a", "machines: 'a' is not NAMESPACE=ROBOT"),
             ("cell", "machines:=a=delta,a=prru", "two share a namespace"),
@@ -396,6 +398,27 @@ class TestRunning:
         process = launched(name, argument)
         assert process.wait() == 1
         assert said in process.output
+
+    @pytest.mark.parametrize("key", ["/**", "/left/delta_dynamics", "left"])
+    def test_torques_that_the_gate_would_never_get_are_refused(self, launched, tmp_path, key):
+        """The middleware connects nobody to a topic whose deadline is longer than demanded."""
+        file = tmp_path / "parameters.yaml"
+        parameters = {"ros__parameters": {"stale_after": 0.2}}
+        section = {"delta_dynamics": parameters} if key == "left" else parameters
+        file.write_text(yaml.safe_dump({key: section}))
+        arguments = ["namespace:=left", f"params_file:={file}", "stiffness_monitor:=false"]
+        process = launched("twin", *arguments, "command_gate:=true")
+        assert process.wait() == 1
+        assert "stale_after 0.2 s" in process.output and "deadline 0.1 s" in process.output
+
+    def test_a_node_that_refuses_its_configuration_is_not_started_for_ever(
+        self, launched, peer, tmp_path
+    ):
+        file = tmp_path / "parameters.yaml"
+        file.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"stale_aftr": 0.2}}}))
+        process = launched("twin", f"params_file:={file}", "stiffness_monitor:=false")
+        peer.until(lambda: "not started again" in process.output)
+        assert len(process.started("delta_dynamics")) == 4
 
     def test_ctrl_c_ends_all_of_it_cleanly(self, launched, peer):
         process = launched("twin", "command_gate:=true", "machine_state:=true")
