@@ -69,7 +69,12 @@ class MachineStateNode(health.TwinNode):
         self._pose = self.create_guarded_publisher(PoseStamped, "~/pose")
         self._twist = self.create_guarded_publisher(TwistStamped, "~/twist")
         self._description = self.create_guarded_publisher(String, "robot_description", latched=True)
-        self._urdf = robot_urdf(robot)
+        # Hardware only where it is asked for: a controller_manager beside would load and move it.
+        hardware = self.declare(
+            "hardware_plugin", "", "of the ros2_control element in robot_description; empty: no "
+            "such element", read_only=True,
+        )  # fmt: skip
+        self._urdf = robot_urdf(robot, hardware)
         self._transforms = self._create_transforms()
         self._transforms_due = 0
         self._drawn = 0

@@ -83,8 +83,11 @@ def running(other: Peer, trials: int) -> int:
             pass
         process.signal(signal.SIGINT)
         other.until(lambda p=process: not p.alive(), "the gate's end")
-        # What is on its way arrives.
-        other.spin(0.2)
+        # What is on its way arrives, however busy the machine is.
+        count = -1
+        while count != len(commands):
+            count = len(commands)
+            other.spin(0.5)
         last = list(commands[-1].data)
         code, said = process.process.returncode, process.output
         verdict = [f"exit code {code}"]
