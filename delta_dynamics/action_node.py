@@ -358,8 +358,9 @@ class EffortAction:
             if status == GoalStatus.STATUS_SUCCEEDED:
                 handle.succeed()
             elif handle.is_cancel_requested:
-                # By the controller's cancelling it, or by the hold point that took its place.
                 handle.canceled()
+                # The controller calls a goal invalid that the hold point has replaced.
+                return Result() if goal.held else result
             else:
                 handle.abort()
             return result

@@ -92,18 +92,19 @@ def _hearing() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
-def node(name: str, *, parameters: Iterable[str] = (), remap: Iterable[str] = ()) -> Process:
-    """A node of the suite, with NAME:=VALUE parameters and FROM:=TO names."""
+def node(*names: str, parameters: Iterable[str] = (), remap: Iterable[str] = ()) -> Process:
+    """A node of the suite, or several in one process, with NAME:=VALUE and FROM:=TO."""
     words = [word for p in parameters for word in ("-p", p)]
     words += [word for r in remap for word in ("-r", r)]
-    return Process(executable(name), *(["--ros-args", *words] if words else []))
+    program = [executable(names[0])] if len(names) == 1 else [executable("composed"), *names]
+    return Process(*program, *(["--ros-args", *words] if words else []))
 
 
 class Peer:
     """The other side of the topics."""
 
     def __init__(self, name: str = "trial") -> None:
-        rclpy.init()
+        rclpy.init(args=[])
         self.node = rclpy.create_node(name)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
