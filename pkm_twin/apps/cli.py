@@ -14,6 +14,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.apps import export
 from pkm_twin.apps.calibrate import calibrate_command
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
@@ -530,6 +531,7 @@ def certify(
 
 
 app.add_typer(atlases.app, name="atlas")
+app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
 app.command()(guard_check)
 app.command()(view)
