@@ -575,6 +575,10 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
     return robot.changed(**sections)
 
 
+NODE = DeltaDynamics
+"""What a process of several nodes makes."""
+
+
 def main() -> None:
     """Run the node until a signal ends it."""
     sys.exit(run(DeltaDynamics))

@@ -94,7 +94,11 @@ class TwinNode(ParameterNode):
     active takes no message.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, executor: str = "single") -> None:
+        """Declare what all nodes have.
+
+        :param executor: the default of the parameter of that name.
+        """
         self._logged: dict[str, float] = {}
         self._seen = dict.fromkeys(
             ("messages", "exceptions", "requests refused", "clock messages refused"), 0
@@ -119,7 +123,7 @@ class TwinNode(ParameterNode):
         )
         self.executor_kind: str = self.declare(
             "executor",
-            "single",
+            executor,
             "rclpy's executor: single (SingleThreadedExecutor) or events (EventsExecutor)",
             choices=("single", "events"),
             read_only=True,

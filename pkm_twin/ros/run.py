@@ -29,40 +29,43 @@ PARTING: Final = 1.0
 
 
 class _Executor:
-    """One of rclpy's, by the node's choice, a turn at a time."""
+    """One of rclpy's for all nodes of a process, by their choice, a turn at a time."""
 
-    def __init__(self, node: TwinNode) -> None:
-        events = node.executor_kind == "events"
-        self._node = node
+    def __init__(self, nodes: Sequence[TwinNode]) -> None:
+        events = all(node.executor_kind == "events" for node in nodes)
+        self._nodes = nodes
         self._executor = EventsExecutor() if events else SingleThreadedExecutor()
-        self._executor.add_node(node)
+        for node in nodes:
+            self._executor.add_node(node)
         # Without a bound the one waits for ever; with one the other makes a timer a message.
         self._patience = LOOK if events else None
 
     def spin(self, ended: Callable[[], bool]) -> None:
         """Run callbacks, and between them a step of what waits, until the end is asked for."""
-        node, turn, patience = self._node, self._executor.spin_once, self._patience
-        going = node.context.ok
+        nodes, turn, patience = self._nodes, self._executor.spin_once, self._patience
+        going = nodes[0].context.ok
         while going() and not ended():
             try:
-                turn(0.0 if node.busy else patience)
-                node.turned()
+                turn(0.0 if any(node.busy for node in nodes) else patience)
+                for node in nodes:
+                    node.turned()
             except (KeyboardInterrupt, ExternalShutdownException):
                 raise
             except Exception as error:
                 # The last line of defence: rclpy's own code, on the way to a callback or back.
-                node.caught("rclpy", error)
+                for node in nodes:
+                    node.caught("rclpy", error)
 
 
-def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None) -> int:
-    """Run a node until SIGINT, SIGTERM or SIGHUP.
+def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = None) -> int:
+    """Run a node, or several in one executor, until SIGINT, SIGTERM or SIGHUP.
 
     Signals are not the middleware's, which would close the topics at once: a signal ends the
     spinning at its next event, and :meth:`TwinNode.farewell` is called while the topics are there.
 
-    :returns: 0 after a signal, 1 where the node refuses its configuration.
+    :returns: 0 after a signal, 1 where a node refuses its configuration.
     """
-    node: TwinNode | None = None
+    nodes: list[TwinNode] = []
     executor: _Executor | None = None
     signals = NodeSignals()
     try:
@@ -74,19 +77,20 @@ def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None)
                 args=middleware_arguments(sys.argv if arguments is None else arguments),
                 signal_handler_options=SignalHandlerOptions.NO,
             )
-            node = factory()
+            for factory in factories:
+                nodes.append(factory())
             one_blas_thread()
             # What is loaded by now stays: the collector need not look at it again.
             gc.collect()
             gc.freeze()
         finally:
             signals.raises = False
-        executor = _Executor(node)
+        executor = _Executor(nodes)
         executor.spin(lambda: signals.came)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (PkmTwinError, ParameterException, RuntimeError) as error:
-        if node is not None:
+        if len(nodes) == len(factories):
             raise
         if signals.came:
             return 0  # Where the interrupt was in an import, say, it may come out as another error.
@@ -97,11 +101,12 @@ def run(factory: Callable[[], TwinNode], arguments: Sequence[str] | None = None)
         return 1
     finally:
         ignore_signals()
-        if node is not None:
+        for node in nodes:
             node.farewell()
-            end = time.monotonic() + PARTING
-            if executor is not None:
-                executor.spin(lambda: not node.parting or time.monotonic() > end)
+        end = time.monotonic() + PARTING
+        if executor is not None:
+            executor.spin(lambda: not any([n.parting for n in nodes]) or time.monotonic() > end)
+        for node in nodes:
             node.destroy_node()
         rclpy.get_default_context().try_shutdown()
     return 0

@@ -33,7 +33,7 @@ class Node:
         pass
 
 class Executor:
-    def __init__(self, node):
+    def __init__(self, nodes):
         pass
     def spin(self, ended):
         if not ended():
@@ -46,7 +46,7 @@ run.gc = run.rclpy = SimpleNamespace(
 )
 run.one_blas_thread = lambda: None
 nodes.MODULES["command_gate"] = "gate"
-sys.modules["gate"] = SimpleNamespace(main=lambda: sys.exit(run.run(Node, [])))
+sys.modules["gate"] = SimpleNamespace(main=lambda: sys.exit(run.run(Node, arguments=[])))
 sys.argv = ["command_gate"]
 lines = 0
 
