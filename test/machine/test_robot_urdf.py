@@ -7,7 +7,6 @@ import re
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from delta_dynamics import inverse_dynamics
@@ -17,6 +16,10 @@ from pkm_twin.machine.robot_urdf import robot_description, robot_urdf
 from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.mechanisms.machine import Machine
 from test.support.robots import load
+
+pytest.importorskip("pinocchio")
+
+import pinocchio as pin
 
 from .sketches import closure_rows
 
