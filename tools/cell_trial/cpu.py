@@ -99,7 +99,9 @@ def measured(process: Process, names: tuple[str, ...], given: argparse.Namespace
             wrenches.publish(wrench)
         share = (process.usage() - used) / (time.monotonic() - began)
         rate = "" if own else f", {sent / (time.monotonic() - began):.0f} Hz sent"
-        print(f"{'+'.join(names)} {given.robot}: {100 * share:.1f} % of a core{rate}", flush=True)
+        memory = f"{process.memory():.0f} MB"
+        text = f"{100 * share:.1f} % of a core, {memory}{rate}"
+        print(f"{'+'.join(names)} {given.robot}: {text}", flush=True)
 
 
 if __name__ == "__main__":
