@@ -21,6 +21,8 @@ from types import SimpleNamespace
 from pkm_twin.apps import nodes
 from pkm_twin.ros import run, signals
 
+# Where the tests run under nohup nodes leave it alone.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 TRACED = {m.__file__ for m in (nodes, run, signals)}
 
 class Node:
@@ -107,6 +109,11 @@ def test_no_line_is_one_at_which_a_signal_takes_the_last_words():
     assert sum("zeros" in said[0] for said in ends) > 50
 
 
+def hearing():
+    end_with_parent()
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("loaded", ["_multiarray_umath", "_rclpy_pybind11"])
 def test_a_signal_in_an_import_ends_a_node_quietly(domain, loaded, number):
@@ -117,7 +124,7 @@ def test_a_signal_in_an_import_ends_a_node_quietly(domain, loaded, number):
         stderr=subprocess.STDOUT,
         text=True,
         env=domain.environment(),
-        preexec_fn=end_with_parent,
+        preexec_fn=hearing,
     )
     try:
         maps = Path(f"/proc/{process.pid}/maps")
