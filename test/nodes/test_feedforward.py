@@ -112,6 +112,16 @@ class TestTrajectories:
         # The velocities' second-order ends are exact, so the accelerations are.
         assert np.allclose(efforts, inverse_dynamics(ROBOT, q, qd, qdd), atol=1e-10)
 
+    def test_accelerations_are_exact_for_linear_ones(self, make):
+        """At the ends too, which a difference to one side alone would miss."""
+        times = np.array([0.0, 0.1, 0.25, 0.3, 0.5])
+        slope, t = np.array([1.0, -1.0, 2.0]), times[:, None]
+        q = 0.1 + t**3 * slope
+        qd, qdd = 3 * t**2 * slope, 6 * t * slope
+        message = make.trajectory(NAMES, [round(s * SECOND) for s in times], q, qd)
+        efforts = core(differentiate=True).trajectory(message, NOW)
+        assert np.allclose(efforts, inverse_dynamics(ROBOT, q, qd, qdd), atol=1e-10)
+
     @pytest.mark.parametrize(
         ("options", "reason"),
         [
@@ -477,6 +487,8 @@ class TestRefusedSamples:
             {"position": UNREACHABLE},
             {"velocity": (1e9, 0.0, 0.0)},
             {"velocity": (14.0, -14.0, 14.0), "ahead": 1},
+            # As far as a joint may move, but not there and back.
+            {"position": motion(0.009)[0] + 0.09, "velocity": (14.0, -14.0, 14.0), "ahead": 1},
             {"position": (0.4, 0.4, 0.4), "ahead": 1},
         ],
     )
