@@ -127,7 +127,11 @@ class Engine:
     def _samples(self) -> list[tuple[Array, Array]]:
         """States (x, q) at home and near it, found by the first engine of a geometry for all."""
         first = _engines.setdefault(self.graph.key, self)
-        return self._near_home() if first is self else first._samples
+        if first is not self:
+            return first._samples
+        # The one that chooses pose coordinates is followed by the one that has them.
+        _hold(self)
+        return self._near_home()
 
     def _near_home(self) -> list[tuple[Array, Array]]:
         """The same in every run."""
@@ -712,6 +716,11 @@ _recent: Final[deque[Engine]] = deque(maxlen=16)
 """Held although no machine may: loading a file again takes no engine anew."""
 
 
+def _hold(engine: Engine) -> None:
+    if engine not in _recent:
+        _recent.append(engine)
+
+
 def engine_of(
     graph: Graph,
     coordinates: Sequence[Coordinate],
@@ -727,7 +736,7 @@ def engine_of(
     engine = _engines.get(key)
     if engine is None:
         engine = _engines.setdefault(key, Engine(graph, coordinates, start, branch))
-        _recent.append(engine)
+        _hold(engine)
     return engine
 
 
