@@ -33,7 +33,7 @@ from delta_dynamics.virtual_work import (
     inverse_dynamics,
     mass_matrix,
 )
-from pkm_twin.kinematics.tracking import sphere_directions
+from pkm_twin.kinematics.directions import sphere_directions
 
 __all__ = [
     "BaseParameters",

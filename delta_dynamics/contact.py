@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from delta_dynamics.noise import Noise
 from delta_dynamics.observer import MomentumObserver, platform_wrench
 from delta_dynamics.uncertainty import torque_deviation
+from pkm_twin.codegen.arrays import one_vector
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -81,8 +82,11 @@ class ContactMonitor:
         :param motion: q, qd and qdd, shape (n,) each; qdd counts for the model's deviation alone.
         :param effort: measured, shape (n,).
         :param wrench: on the platform, known otherwise, base axes at its reference point, (6,).
+        :raises ValueError: a sample that is not later than the last one, has another shape or is
+            not finite; it moves nothing.
         """
-        q, qd, qdd = motion
+        n = self.robot.joints_count
+        q, qd, qdd, effort = (one_vector(v, n, "a sample") for v in (*motion, effort))
         external = self.observer.push(time, q, qd, effort, wrench)
         step, self._last = time - self._last, time
         self._greatest = np.maximum(self._greatest, np.abs(effort))

@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, install
 
 Array = NDArray[np.float64]
 Cones = Sequence[tuple[slice, Array]]
@@ -212,7 +212,7 @@ def _nearest(
     except ImportError:
         raise PkmTwinError(
             "the data want a mass or an inertia that no body has, and the nearest possible one "
-            "needs cvxpy: pip install 'pkm_twin[fit]'"
+            f"needs cvxpy: {install('fit')}"
         ) from None
     # In deviations from the solution: each counts alike, however much the data know of it.
     moved = scales[:, None] * vectors / np.sqrt(information)

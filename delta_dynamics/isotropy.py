@@ -26,6 +26,7 @@ from delta_dynamics.cones import largest
 from delta_dynamics.least_form import least_direction
 from delta_dynamics.terms import frictionless
 from delta_dynamics.virtual_work import body_mass_matrix, mass_matrix
+from pkm_twin.codegen.arrays import doubles, finite, vectors
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.pose_grid import zero_torsion
 from pkm_twin.machine.robot import Robot
@@ -74,11 +75,12 @@ def joint_motion(
     :raises UnreachableError: a pose out of reach, by limb, sample and miss.
     :raises SingularityError: the Jacobian has no inverse.
     """
-    q, inverse = _inverse_jacobian(robot, np.asarray(pose, np.float64))
-    qd = np.einsum("...ij,...j->...i", inverse, np.asarray(rates, np.float64))
+    q, inverse = _inverse_jacobian(robot, pose)
+    m = len(robot.pose_names)
+    qd = np.einsum("...ij,...j->...i", inverse, vectors(rates, m, "pose rates"))
     bias = robot.pose_acceleration(q, qd, np.zeros(robot.joints_count))
-    rest = np.asarray(accelerations, np.float64) - bias
-    qdd = np.einsum("...ij,...j->...i", inverse, rest)
+    qdd = np.einsum("...ij,...j->...i", inverse, _accelerations(accelerations, m) - bias)
+    finite(qdd, "an acceleration")
     q, qd, qdd = np.broadcast_arrays(q, qd, qdd)
     return JointMotion(q.copy(), qd.copy(), qdd)
 
@@ -91,7 +93,7 @@ def energy_matrices(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
     :param pose: shape (..., m).
     :returns: platform with payload, and all bodies; shape (..., m, m) each.
     """
-    q, inverse = _inverse_jacobian(robot, np.asarray(pose, np.float64))
+    q, inverse = _inverse_jacobian(robot, pose)
     platform = body_mass_matrix(robot, q, robot.graph.platform)
     pair = np.stack([platform, mass_matrix(robot, q)], -3)
     turn = inverse[..., None, :, :]
@@ -166,7 +168,7 @@ def max_driving_force_range(
     :param acceleration: Xddot, a number or shape (..., m).
     :raises SearchError: more than three pose coordinates, and forms that take too long.
     """
-    where = np.asarray(pose, np.float64)
+    where = doubles(pose, "poses")
     platform, _ = energy_matrices(robot, where)
     back = np.sqrt(2 * _energy(energy)) * _inverse_root(robot, platform)
     size = where.shape[-1]
@@ -203,7 +205,7 @@ def max_driving_force_range(
 
 def spread(values: ArrayLike) -> Array:
     """Greatest less least over the last axis, shape (...): of an index on a sphere's directions."""
-    return np.asarray(np.ptp(np.asarray(values, np.float64), axis=-1), np.float64)
+    return np.asarray(np.ptp(finite(doubles(values), "a value"), axis=-1), np.float64)
 
 
 def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array:
@@ -211,11 +213,18 @@ def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array
 
     The platform's axis leans by ``tilt`` towards ``azimuth`` (rad), as on the paper's atlas.
     """
-    z, a, t = np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (height, azimuth, tilt)))
+    given = (finite(doubles(v), "a height or an angle") for v in (height, azimuth, tilt))
+    z, a, t = np.broadcast_arrays(*given)
     return np.stack([z, *zero_torsion(t, a)], -1)
 
 
-def _inverse_jacobian(robot: Robot, pose: Array) -> tuple[Array, Array]:
+def _accelerations(values: ArrayLike, size: int) -> Array:
+    """Xddot: vectors, or one number for all coordinates."""
+    array = doubles(values, "pose accelerations")
+    return vectors(np.broadcast_to(array, size) if array.ndim == 0 else array, size, "Xddot")
+
+
+def _inverse_jacobian(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
     """Joint positions and joint rates per pose rate, shapes (..., n) and (..., n, m)."""
     q = robot.inverse(pose)
     u, s, vt = np.linalg.svd(robot.jacobian(q))
@@ -250,12 +259,12 @@ def _form(matrix: Array, x: Array) -> Array:
     return np.asarray(np.einsum("...i,...ij,...j->...", x, matrix, x), np.float64)
 
 
-def _directions(vectors: ArrayLike, size: int | None = None) -> Array:
+def _directions(directions: ArrayLike, size: int | None = None) -> Array:
     """Unit vectors.
 
     :raises ValueError: a vector of length zero or not finite, or a wrong last axis.
     """
-    x = np.asarray(vectors, np.float64)
+    x = doubles(directions, "directions")
     if size is not None and x.shape[-1:] != (size,):
         raise ValueError(f"the last axis of a direction must be {size}, the shape is {x.shape}")
     norm = np.linalg.norm(x, axis=-1, keepdims=True)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
+from pkm_twin.codegen.arrays import finite, later, one_vector, vectors
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -63,10 +64,18 @@ class MomentumObserver:
         :param wrench: on the platform, known otherwise, base axes at its reference point, (6,).
         :raises UnreachableError: a joint state without an assembly.
         :raises SingularityError: the Jacobian of the closure has no inverse.
+        :raises ValueError: a sample that is not later than the last one, has another shape or is
+            not finite; it moves nothing.
         """
+        n, last = self.robot.joints_count, self._last
+        time = later(time, None if last is None else last[0])
+        q, qd, effort = (
+            one_vector(values, n, what)
+            for values, what in ((q, "joint positions"), (qd, "joint rates"), (effort, "efforts"))
+        )
         mass = mass_matrix(self.robot, q)
         driving = effort - inverse_dynamics(self.robot, q, qd, self._still, wrench)
-        last, self._last = self._last, (time, qd, mass, driving)
+        self._last = (time, qd.copy(), mass, driving)
         if last is None:
             return None
         before, qd_before, mass_before, driving_before = last
@@ -75,7 +84,7 @@ class MomentumObserver:
         change -= 0.5 * step * (driving + driving_before)
         gain = self.bandwidth
         self._estimate = (self._estimate + gain * change) / (1.0 + gain * step)
-        return self._estimate
+        return self._estimate.copy()
 
 
 def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
@@ -92,5 +101,7 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
     jacobian = robot.platform_jacobian(q) * lever[:, None]
     inverse = np.linalg.pinv(np.swapaxes(jacobian, -1, -2), rcond=RANK)
-    least = (inverse @ np.asarray(external, np.float64)[..., None])[..., 0]
-    return np.asarray(least * lever, np.float64)
+    efforts = vectors(external, robot.joints_count, "efforts")
+    with np.errstate(over="ignore", invalid="ignore"):
+        least = (inverse @ efforts[..., None])[..., 0] * lever
+    return finite(least, "an effort")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from delta_dynamics.noise import Noise
 from delta_dynamics.regressor import PAYLOAD, parameter_names, regressor
 from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.codegen.arrays import later, one_vector
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -108,13 +109,19 @@ class PayloadEstimator:
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), with rates, accelerations and measured efforts (n,).
         :param wrench: on the platform at its reference point, base axes, (6,), where it is known.
+        :raises ValueError: a sample that is not later than the last one, has another shape or is
+            not finite; it moves nothing, nor does one without an assembly.
         """
-        last, self._last = self._last, time
+        n, last = self.robot.joints_count, self._last
+        time = later(time, last)
+        effort = one_vector(effort, n, "efforts")
+        columns = regressor(self.robot, *(one_vector(v, n, "a motion") for v in (q, qd, qdd)))
+        columns = columns[:, self._columns]
+        computed = inverse_dynamics(self.robot, q, qd, qdd, wrench)
+        self._last = time
         if last is None:
             return None
         step = time - last
-        columns = regressor(self.robot, q, qd, qdd)[:, self._columns]
-        computed = inverse_dynamics(self.robot, q, qd, qdd, wrench)
         target = effort - computed + columns @ self._own
         left = target - columns @ self._solution()
         if self._jumped(left, step):

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.virtual_work import Forces
+from pkm_twin.codegen.arrays import finite, vectors
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
@@ -129,9 +130,7 @@ def least_norm_reactions(
     a real machine elasticity and tolerances decide; this is one of many possible answers.
     """
     engine = robot.massive()
-    load = np.zeros(6) if wrench is None else np.asarray(wrench, np.float64)
-    if load.shape[-1:] != (6,) or not np.isfinite(load).all():
-        raise ValueError(f"wrench has to be finite with a last axis of 6, shape {load.shape}")
+    load = np.zeros(6) if wrench is None else vectors(wrench, 6, "the wrench")
     (bodies, rods, places, platform), status = engine.kernel("loads", _loads)(
         robot.inertial, q, qd, qdd
     )
@@ -156,7 +155,9 @@ def least_norm_reactions(
     a = _transmission(joints, names, origin, batch)
     b = np.concatenate([needed[body] for body in origin], -1)
     moment = _moments(joints, names)
-    value, null, residual = _solve(a, b, moment, size)
+    with np.errstate(over="ignore", invalid="ignore"):
+        value, null, residual = _solve(a, b, moment, size)
+    finite(value, "the motion or the wrench")
 
     spread = np.stack([_columns(joint, names, batch) for joint in joints], -3)
     # Moments and forces of the null space in one unit again, so that one bound holds.

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.virtual_work import torques
+from pkm_twin.codegen.arrays import vectors
 from pkm_twin.machine.inertia import GRAVITY, Layout
 from pkm_twin.machine.robot import Robot
 
@@ -87,12 +88,14 @@ def dynamics_terms(
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
     kernel = torques(robot)
-    load = np.zeros(6) if wrench is None else np.asarray(wrench, np.float64)
-    arrays = [np.asarray(value, np.float64) for value in (q, qd, qdd)]
+    load = np.zeros(6) if wrench is None else vectors(wrench, 6, "the wrench")
+    n = robot.joints_count
+    given = (q, "joint positions"), (qd, "joint rates"), (qdd, "joint accelerations")
+    arrays = [vectors(values, n, what) for values, what in given]
     # The batch of all inputs together, so that every term has it.
     shape = np.broadcast_shapes(*(a.shape[:-1] for a in arrays), load.shape[:-1])
     place, rate, change = (np.broadcast_to(a, (*shape, *a.shape[-1:])) for a in arrays)
-    still = np.zeros(robot.joints_count)
+    still = np.zeros(n)
     none = np.zeros(6)
 
     def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.arrays import finite, vectors
 from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, sign
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -102,11 +103,15 @@ def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
 def forward_dynamics(
     robot: Robot, q: ArrayLike, qd: ArrayLike, tau: ArrayLike, wrench: ArrayLike | None = None
 ) -> Array:
-    """Joint accelerations that the efforts ``tau`` cause, shape (..., n)."""
-    still = np.zeros(robot.joints_count)
-    rest = np.asarray(tau, np.float64) - inverse_dynamics(robot, q, qd, still, wrench)
-    qdd = np.linalg.solve(mass_matrix(robot, q), rest[..., None])[..., 0]
-    return np.asarray(qdd, np.float64)
+    """Joint accelerations that efforts cause, shape (..., n): the inverse of inverse_dynamics.
+
+    :param tau: what the actuators apply, shape (..., n), N m or N; errors and the others as there.
+    """
+    n = robot.joints_count
+    rest = vectors(tau, n, "efforts") - inverse_dynamics(robot, q, qd, np.zeros(n), wrench)
+    with np.errstate(over="ignore", invalid="ignore"):
+        qdd = np.linalg.solve(mass_matrix(robot, q), rest[..., None])[..., 0]
+    return finite(qdd, "an effort")
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,11 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from trajectory_client import reaches
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
+from pkm_twin.errors import PkmTwinError
 
 SECOND = 1e9
 
@@ -37,8 +39,7 @@ class Controller(Node):
         self.options = options
         self.errors, self.stopped, self.done = [], "", False
         self._first = self._last = None
-        low, high = self.robot.limits.position.T
-        self._reach = options.reach * (high - low)
+        self._reach = reaches(self.robot, options.reach)
         # Compiled before the first joint state is due.
         rest = np.zeros(self.robot.joints_count)
         inverse_dynamics(self.robot, self.robot.inverse(self.robot.home()), rest, rest)
@@ -149,7 +150,12 @@ def main():
     options = parser.parse_args(rclpy.utilities.remove_ros_args()[1:])
     # Ctrl-C must leave the topics open for the zeros.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    controller = Controller(options)
+    try:
+        controller = Controller(options)
+    except PkmTwinError as error:
+        print(f"failed: {error}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return 1
     try:
         while not (controller.stopped or controller.done):
             rclpy.spin_once(controller, timeout_sec=0.1)

@@ -19,6 +19,7 @@ import rclpy
 from trajectory_client import Client, blend, positions, trajectory
 
 from pkm_twin import load
+from pkm_twin.errors import PkmTwinError
 from stiffness_monitor import compliance
 
 
@@ -38,7 +39,10 @@ def feeds(softness, places, feed, tolerance, force_per_feed, acceleration):
 
 
 def cut(robot, start, end, options):
-    """Times, joint motion and feeds of the cut between two poses, with the deflections."""
+    """Times, joint motion and feeds of the cut between two poses, with the deflections.
+
+    :raises PkmTwinError: a pose out of reach, or a robot without elastic members.
+    """
     places = np.linspace(0.0, 1.0, 201)
     poses = start + places[:, None] * (end - start)
     points = robot.platform(robot.inverse(poses))[0]
@@ -70,9 +74,15 @@ def main():
     parser.add_argument("--force", type=float, default=50.0, help="N per m/s of feed")
     parser.add_argument("--acceleration", type=float, default=1.0, help="m/s2 along the cut")
     options = parser.parse_args(rclpy.utilities.remove_ros_args()[1:])
-    robot = load(options.robot)
-    start = robot.home()
-    times, q, qd, qdd, v, bent = cut(robot, start, start + np.array(options.by), options)
+    try:
+        robot = load(options.robot)
+        start, by = robot.home(), np.array(options.by)
+        if by.shape != start.shape or not by.any():
+            parser.error(f"--by is {options.by}, not a cut in {', '.join(robot.pose_names)}")
+        times, q, qd, qdd, v, bent = cut(robot, start, start + by, options)
+    except PkmTwinError as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
     rclpy.init()
     client = Client()
     try:

@@ -22,6 +22,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pkm_twin import load
+from pkm_twin.errors import PkmTwinError
 
 
 def blend(points=101, seconds=1.0):
@@ -110,6 +111,15 @@ def positions(state, names):
     return np.array([state.position[state.name.index(name)] for name in names])
 
 
+def reaches(robot, share):
+    """A share of every joint's range; of one without limits, of 1 rad or of the platform's size."""
+    whole = np.where([unit == "m" for unit in robot.joint_units], robot.size, 1.0)
+    if robot.limits.position is not None:
+        low, high = robot.limits.position.T
+        whole = np.where(np.isfinite(high - low), high - low, whole)
+    return share * whole
+
+
 def main():
     """Go a part of every joint's range, from where the machine stands at the start."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -118,18 +128,17 @@ def main():
     parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--reach", type=float, default=0.1, help="part of the joints' range")
     options = parser.parse_args(rclpy.utilities.remove_ros_args()[1:])
-    robot = load(options.robot)
     rclpy.init()
     client = Client(options.controller)
     try:
+        robot = load(options.robot)
         client.until(lambda: client.states, 60.0, "joint_states")
         start = positions(client.states[-1], robot.joint_names)
-        low, high = robot.limits.position.T
         times, ways = blend(seconds=options.seconds)
-        rows = [np.outer(way, options.reach * (high - low)) for way in ways]
+        rows = [np.outer(way, reaches(robot, options.reach)) for way in ways]
         message = trajectory(robot.joint_names, times, start + rows[0], *rows[1:])
         states, efforts = client.go(message)
-    except (TimeoutError, RuntimeError) as error:
+    except (TimeoutError, RuntimeError, PkmTwinError) as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
     finally:

@@ -90,10 +90,21 @@ def print_json(data: Any) -> None:
     typer.echo(json.dumps(data, indent=2, allow_nan=False))
 
 
+def file_name(option: typer.CallbackParam, path: Path | None) -> Path | None:
+    """Callback of an option that names a file to write: neither a folder nor nothing.
+
+    :raises PkmTwinError: by the option's name.
+    """
+    if path is not None and path.name in ("", ".."):
+        raise PkmTwinError(f"{option.opts[-1]}: a file's name is needed, {str(path)!r} is a folder")
+    return path
+
+
 def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:
     """Refuse a target that is there, a dangling link too, unless it may be replaced.
 
-    What is read from is never replaced, nor is a FIFO, a device or a folder.
+    What is read from is never replaced, nor is a FIFO, a device or a folder; and a folder that is
+    not there is told before the work, not after it.
 
     :raises PkmTwinError: such a target.
     """
@@ -101,6 +112,8 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
         raise PkmTwinError(f"{path}: the target is the source itself")
     if os.path.lexists(path) and not overwrite:
         raise PkmTwinError(f"{path} exists; give --overwrite to replace it")
+    if not path.parent.is_dir():
+        raise PkmTwinError(f"{path} cannot be written: there is no folder {path.parent}")
     try:
         require_replaceable(path)
     except OSError as error:

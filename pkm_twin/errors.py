@@ -158,3 +158,8 @@ def short(value: object, limit: int = 80) -> str:
     """A value as an error shows it, its end cut."""
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def install(extra: str) -> str:
+    """What to type for an extra: from a clone, as no package index has pkm_twin."""
+    return f"pip install '.[{extra}]' in a clone of pkm_twin"

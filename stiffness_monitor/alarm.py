@@ -23,6 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import one_vector
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.uncertainty import STEP, Factor
@@ -211,7 +212,12 @@ class StiffnessAlarm:
         self._samples.clear()
 
     def push(self, time: float, pose: Array, wrench: Array, deflection: Array) -> None:
-        """Take a sample: pose (m,), wrench and deflection (6,) in base axes."""
+        """Take a sample: pose (m,), wrench and deflection (6,) in base axes.
+
+        :raises ValueError: a sample of another shape or that is not finite; it moves nothing.
+        """
+        wrench = one_vector(wrench, 6, "the wrench")
+        deflection = one_vector(deflection, 6, "the deflection").copy()
         if not self.names:
             self._prepare(pose)
         response = element_response(self.robot, pose)

@@ -17,6 +17,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.arrays import finite, vectors
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import SingularityError
 from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
@@ -156,17 +157,16 @@ def kernels(robot: Robot) -> tuple[Kernel, ...]:
 
 def _frame_strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> StrainEnergy:
     """The same of a frame. Solved for a wrench of size 1, so that no square leaves the numbers."""
-    loads = np.asarray(wrench, np.float64)
+    loads = vectors(wrench, 6, "the wrench")
     size = np.abs(loads).max(-1, keepdims=True)
-    with np.errstate(invalid="ignore"):
-        unit = loads / np.where(size == 0.0, 1.0, size)
+    unit = loads / np.where(size == 0.0, 1.0, size)
     names, deflection, energies = frame_energies(robot, pose, unit)
     whole = energies.sum(-1, keepdims=True)
     factors = energies / np.where(whole == 0.0, 1.0, whole)
     with np.errstate(over="ignore"):
         deflection, energies, whole = deflection * size, energies * size**2, whole * size**2
-    if not (np.isfinite(deflection).all() and np.isfinite(whole).all()):
-        raise ValueError("wrench, or its energy, is not finite, or leads to a result that is not")
+    for part in (deflection, whole):
+        finite(part, "the wrench")
     return _answer(names, factors, energies, whole[..., 0].copy(), deflection)
 
 

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.arrays import doubles, finite, vectors
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import skew
 
@@ -60,14 +61,12 @@ def setpoint_correction(
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises ValueError: a wrong last axis, a value that is not finite, or a bound below zero.
     """
-    limit = np.asarray(bound, np.float64)
-    if not (limit >= 0.0).all():
-        raise ValueError(f"bound is {limit.min():g}, allowed 0 and above")
-    moved = np.asarray(deflection, np.float64)
-    if moved.shape[-1:] != (6,) or not np.isfinite(moved).all():
-        raise ValueError("deflection is not six finite numbers")
+    limit = doubles(bound, "the bound")
+    if limit.shape not in ((), (robot.joints_count,)) or not (limit >= 0.0).all():
+        raise ValueError(f"bound is {limit.tolist()}, allowed 0 and above, one or one a joint")
+    moved = vectors(deflection, 6, "the deflection")
     _, rotation = robot.platform(q)
-    lever = skew((rotation @ np.asarray(tool, np.float64)[..., None])[..., 0])
+    lever = skew((rotation @ vectors(tool, 3, "the tool point")[..., None])[..., 0])
     twist = robot.platform_jacobian(q) / robot.joint_scales
     place, turn = twist[..., :3, :] - lever @ twist[..., 3:, :], twist[..., 3:, :]
     there = moved[..., :3] - _times(lever, moved[..., 3:])
@@ -80,11 +79,10 @@ def setpoint_correction(
         excess = np.where(given == 0.0, 0.0, np.abs(given) / limit).max(-1)
     share = 1.0 / np.maximum(excess, 1.0)
     both = np.concatenate((place, turn), -2)
+    left = before + _times(both, offset * share[..., None])
+    cause = "the deflection or the tool point"
     return Correction(
-        given * share[..., None],
-        before,
-        before + _times(both, offset * share[..., None]),
-        excess > 1.0,
+        finite(given * share[..., None], cause), before, finite(left, cause), excess > 1.0
     )
 
 
@@ -96,7 +94,7 @@ def _least(matrix: Array, target: Array, best: Array) -> tuple[Array, Array]:
     u, values, vt = np.linalg.svd(matrix, full_matrices=False)
     greatest = np.linalg.svd(best, compute_uv=False)[..., :1]
     held = values > REACH * greatest
-    along = np.divide(_times(u.swapaxes(-1, -2), target), values, where=held, out=0.0 * values)
+    along = np.where(held, _times(u.swapaxes(-1, -2), target) / np.where(held, values, 1.0), 0.0)
     kept = np.where(held[..., None], vt, 0.0)
     spare = np.eye(matrix.shape[-1]) - kept.swapaxes(-1, -2) @ kept
     return _times(vt.swapaxes(-1, -2), along), spare

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular  # type: ignore[import-untyped]
 
+from pkm_twin.codegen.arrays import doubles, one_vector, vectors
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.beams import System, assemble
 from stiffness_monitor.compliance import compliance
@@ -52,10 +53,23 @@ class ElementResponse:
 
     def columns(self, factors: ArrayLike) -> tuple[Any, Any]:
         """S as a vector (r,), and Z as its transpose (..., 6, r); complex factors are allowed."""
-        change = (np.asarray(factors) - 1.0)[self.owner]
+        change = (self._checked(factors) - 1.0)[self.owner]
         matrix = np.eye(len(self.owner)) + self.rest * change
         columns = np.linalg.solve(matrix, np.swapaxes(self.reach, -1, -2))
         return change, np.swapaxes(columns, -1, -2)
+
+    def _checked(self, factors: ArrayLike) -> Any:
+        """Factors, shape (elements,); complex ones as they are, for derivatives by a complex step.
+
+        :raises ValueError: another shape, or a factor that is not finite.
+        """
+        size = len(self.names)
+        if not np.iscomplexobj(factors):
+            return one_vector(factors, size, "factors")
+        array = np.asarray(factors, np.complex128)
+        for part in (array.real, array.imag):
+            one_vector(part, size, "factors")
+        return array
 
     def compliance_at(self, factors: ArrayLike) -> Any:
         """Compliance with factors (elements,), shape (..., 6, 6)."""
@@ -78,7 +92,7 @@ class ElementResponse:
 
         :returns: and its derivatives by the factors, shape (..., 6, elements).
         """
-        loads = np.asarray(wrench, np.float64)[..., None]
+        loads = vectors(wrench, 6, "the wrench")[..., None]
         change, columns = self.columns(factors)
         amounts = np.swapaxes(columns, -1, -2) @ loads
         moved = self.compliance @ loads + self.reach @ (change[:, None] * amounts)
@@ -94,11 +108,13 @@ def element_response(robot: Robot, pose: ArrayLike) -> ElementResponse:
     :raises UnreachableError: a pose that is none of the mechanism's.
     :raises SingularityError: a compliance that is not positive definite.
     """
-    poses = np.asarray(pose, np.float64)
+    poses = doubles(pose, "the pose")
     if robot.element_names:
         return _of_limbs(robot, poses)
     poses = checked_poses(robot, poses)
     batch = poses.shape[:-1]
+    if not np.prod(batch, dtype=int):
+        raise ValueError("elements of no pose")
     found = [
         _of_frame(assemble(structural_model(robot, poses[index]), 1), index)
         for index in np.ndindex(*batch)

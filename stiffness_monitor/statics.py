@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky, solve_triangular  # type: ignore[import-untyped]
 
+from pkm_twin.codegen.arrays import one_vector, vectors
 from pkm_twin.errors import SingularityError
 from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 from stiffness_monitor.beams import System, assemble
@@ -60,11 +61,7 @@ def frame_energies(
         (..., 6), m and rad, energies (..., elements), J.
     """
     poses = checked_poses(robot, pose)
-    loads = np.asarray(wrench, np.float64)
-    if loads.ndim == 0 or loads.shape[-1] != 6:
-        raise ValueError(f"a wrench has 6 entries; the shape is {loads.shape}")
-    if not np.isfinite(loads).all():
-        raise ValueError("wrench is not finite")
+    loads = vectors(wrench, 6, "the wrench")
     batch = np.broadcast_shapes(poses.shape[:-1], loads.shape[:-1])
     poses, loads = (
         np.broadcast_to(poses, (*batch, poses.shape[-1])),
@@ -99,7 +96,7 @@ def frame_deflections(
     model = structural_model(robot, poses)
     system = assemble(model, elements)
     root = stiffness_root(system, ())
-    shape = _loaded_shape(root, _platform_columns(root), np.asarray(wrench, np.float64))
+    shape = _loaded_shape(root, _platform_columns(root), one_vector(wrench, 6, "the wrench"))
     # The platform's node comes first, then those of each member.
     moved = system.displacements(shape)[1:, :3]
     points = system.positions[1:]
@@ -111,10 +108,7 @@ def frame_deflections(
 def checked_poses(robot: Robot, pose: ArrayLike) -> Array:
     """Poses of a robot with elastic members, refused by sample where they are none."""
     _ = robot.elastic
-    poses = np.asarray(pose, np.float64)
-    count = len(robot.pose_names)
-    if poses.ndim == 0 or poses.shape[-1] != count:
-        raise ValueError(f"a pose has {count} parameters; the shape is {poses.shape}")
+    poses = vectors(pose, len(robot.pose_names), "the pose")
     robot.inverse(poses)
     return poses
 

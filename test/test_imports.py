@@ -1,118 +1,81 @@
 # SPDX-License-Identifier: Apache-2.0
 """The arrows between the packages: who may import whom, read from the sources."""
 
-import ast
-from pathlib import Path
+import re
+from graphlib import TopologicalSorter
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
-SOURCES = sorted(p for name in PACKAGES for p in (ROOT / name).rglob("*.py"))
-CORE = {
-    "pkm_twin.machine", "pkm_twin.mechanisms", "pkm_twin.codegen", "pkm_twin.kinematics",
-    "pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads",
-}  # fmt: skip
-MESSAGES = {"pkm_twin.ros.messages"}
-"""Messages to arrays: reads attributes alone, without ROS."""
+from test.support.sources import PURE, arrows, imports, room, sources, within
+
+OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads"}
+"""Modules without a folder that all may import."""
+CORE = {"pkm_twin.codegen", "pkm_twin.machine", "pkm_twin.kinematics"}
+STREAMS = CORE | {PURE, "pkm_twin.streams"}
+NODE = STREAMS | {"pkm_twin", "pkm_twin.bags", "pkm_twin.ros"}
+TWINS = {"delta_dynamics", "stiffness_monitor"}
 MAY = {
-    "pkm_twin.codegen": {"pkm_twin.errors"},
-    "pkm_twin.bags": {"pkm_twin.errors", "pkm_twin.files"},
+    "pkm_twin": {"pkm_twin.machine"},
+    "pkm_twin.errors": set(),
+    "pkm_twin.files": set(),
+    "pkm_twin.threads": set(),
+    "pkm_twin.console": set(),
+    "pkm_twin.codegen": set(),
+    "pkm_twin.bags": set(),
     "pkm_twin.machine": CORE,
-    "pkm_twin.mechanisms": CORE,
     "pkm_twin.kinematics": CORE,
+    "pkm_twin.mechanisms": CORE,
     "pkm_twin.export": CORE,
-    "pkm_twin.streams": CORE | MESSAGES,
-    "pkm_twin.state": CORE | MESSAGES | {"pkm_twin.streams"},
-    "delta_dynamics": CORE | MESSAGES | {"pkm_twin.streams"},
-    "stiffness_monitor": CORE | MESSAGES | {"pkm_twin.streams"},
+    PURE: {"pkm_twin.machine"},
+    "pkm_twin.streams": CORE | {PURE},
+    "pkm_twin.state": STREAMS,
+    "delta_dynamics": STREAMS,
+    "stiffness_monitor": STREAMS,
+    "pkm_twin.ros": STREAMS | {"pkm_twin.bags"},
+    "delta_dynamics.node": NODE | {"delta_dynamics"},
+    "stiffness_monitor.node": NODE | {"stiffness_monitor"},
+    "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
+    "pkm_twin.atlas": NODE | TWINS | {"pkm_twin.console"},
+    "pkm_twin.apps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.atlas"},
 }
-"""Of the project, beside themselves; nodes and cores of nodes may import streams and ros."""
-NODES = {
-    "delta_dynamics.node",
-    "delta_dynamics.action_node",
-    "delta_dynamics.estimates_node",
-    "stiffness_monitor.alarm_node",
-    "stiffness_monitor.correction_node",
-    "delta_dynamics.gate_node",
-    "delta_dynamics.sim_node",
-    "stiffness_monitor.node",
-    "pkm_twin.state.node",
-}
+"""Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
+CIRCLES = {frozenset({"pkm_twin.machine", "pkm_twin.kinematics"})}
+"""Rooms that import each other."""
+ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
+WITHOUT_ROS = {f"pkm_twin.ros.{name}" for name in ("arguments", "intake", "messages", "signals")}
+"""Of the folder that is about ROS."""
 APPS_WITH_ROS = {
-    "pkm_twin.apps.demo",
-    "pkm_twin.apps.demo_recorder",
-    "pkm_twin.apps.demo_tracking",
-    "pkm_twin.apps.guard_check",
+    f"pkm_twin.apps.{name}" for name in ("demo", "demo_recorder", "demo_tracking", "guard_check")
 }
-WITH_ROS = {"rclpy", "rcl_interfaces", "lifecycle_msgs"}
 
 
-def module_of(path):
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+def test_every_room_has_its_row():
+    assert {room(module) for module in sources()} == set(MAY)
 
 
-def imports(path):
-    """Every module that a source imports when it runs, wherever in it; types alone do not."""
-    found = set()
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    named = {
-        id(inner) for node in ast.walk(tree)
-        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
-        for inner in ast.walk(node)
-    }  # fmt: skip
-    for node in ast.walk(tree):
-        if id(node) in named:
-            continue
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: a relative import"
-            found.add(node.module)
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+@pytest.mark.parametrize("importing", MAY)
+def test_packages_import_only_what_they_stand_on(importing):
+    found = {there for here, there in arrows() if here == importing}
+    assert found <= MAY[importing] | OWN
+    if importing in ("pkm_twin.codegen", "pkm_twin.bags"):
+        assert found <= {"pkm_twin.errors", "pkm_twin.files"}
 
 
-def within(module, package):
-    return module == package or module.startswith(package + ".")
-
-
-@pytest.mark.parametrize("package", MAY)
-def test_packages_import_only_what_they_stand_on(package):
-    allowed = MAY[package] | {package}
-    for path in SOURCES:
-        module = module_of(path)
-        if not within(module, package) or module in NODES:
-            continue
-        for name in imports(path):
-            if name.split(".")[0] in PACKAGES and name not in PACKAGES:
-                assert any(within(name, a) for a in allowed), f"{module} imports {name}"
-
-
-def test_nobody_but_apps_atlas_and_nodes_imports_dynamics_and_elasticity():
-    for path in SOURCES:
-        module = module_of(path)
-        if within(module, "pkm_twin.apps") or within(module, "pkm_twin.atlas") or module in NODES:
-            continue
-        own = module.split(".")[0]
-        for name in imports(path):
-            for package in ("delta_dynamics", "stiffness_monitor"):
-                assert own == package or not within(name, package), f"{module} imports {name}"
-
-
-def test_nobody_imports_apps():
-    for path in SOURCES:
-        module = module_of(path)
-        if not within(module, "pkm_twin.apps"):
-            for name in imports(path):
-                assert not within(name, "pkm_twin.apps"), f"{module} imports {name}"
+def test_nobody_imports_in_a_circle():
+    """But those that are known."""
+    beside = {here: set(there) for here, there in MAY.items()}
+    for pair in CIRCLES:
+        first, second = pair
+        beside[first] -= pair
+        beside[second] -= pair
+    for here, there in beside.items():
+        there.discard(here)
+    assert list(TopologicalSorter(beside).static_order())
 
 
 def test_only_nodes_and_the_ros_package_import_ros():
-    for path in SOURCES:
-        module = module_of(path)
-        if module.endswith("node") or within(module, "pkm_twin.ros") or module in APPS_WITH_ROS:
-            continue
-        for name in imports(path):
-            assert name.split(".")[0] not in WITH_ROS, f"{module} imports {name}"
+    for module in sources():
+        own = within(module, "pkm_twin.ros") and module not in WITHOUT_ROS
+        if not (module.endswith("node") or own or module in APPS_WITH_ROS):
+            for name in imports(module):
+                assert not ROS.fullmatch(name.split(".")[0]), f"{module} imports {name}"

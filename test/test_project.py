@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What holds for the whole tree: where ROS may be imported, and that the README is true."""
+"""What holds for the whole tree: licences, sizes, and that the README is true."""
 
-import ast
 import re
 import shlex
 import subprocess
@@ -13,33 +12,6 @@ import pytest
 from pkm_twin import robot_names
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
-ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")
-MAY_IMPORT_ROS = {
-    "delta_dynamics/action_node.py",
-    "delta_dynamics/estimates_node.py",
-    "delta_dynamics/gate_node.py",
-    "delta_dynamics/node.py",
-    "delta_dynamics/sim_node.py",
-    "stiffness_monitor/alarm_node.py",
-    "stiffness_monitor/correction_node.py",
-    "stiffness_monitor/node.py",
-    "pkm_twin/ros/changes.py",
-    "pkm_twin/ros/context.py",
-    "pkm_twin/ros/listener.py",
-    "pkm_twin/ros/node.py",
-    "pkm_twin/ros/parameters.py",
-    "pkm_twin/ros/qos.py",
-    "pkm_twin/ros/run.py",
-    "pkm_twin/ros/outputs.py",
-    "pkm_twin/ros/player.py",
-    "pkm_twin/ros/transforms.py",
-    "pkm_twin/state/node.py",
-    "pkm_twin/apps/demo.py",
-    "pkm_twin/apps/demo_recorder.py",
-    "pkm_twin/apps/demo_tracking.py",
-    "pkm_twin/apps/guard_check.py",
-}
 README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 
 
@@ -54,30 +26,6 @@ def files():
         pytest.skip("not a git checkout")
     names = [Path(name) for name in listed.decode().split("\0") if name]
     return [name for name in names if (REPOSITORY / name).is_file()]
-
-
-def imports(path):
-    """Top-level names that a file imports, wherever in it."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            yield from (alias.name.split(".")[0] for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            yield node.module.split(".")[0]
-
-
-def test_only_nodes_player_and_demonstration_import_ros():
-    sources = [path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py")]
-    found = {
-        path.relative_to(REPOSITORY).as_posix()
-        for path in sources
-        if any(ROS.fullmatch(name) for name in imports(path))
-    }
-    assert found == MAY_IMPORT_ROS
-
-
-def test_dynamics_does_not_stand_on_stiffness():
-    for path in (REPOSITORY / "delta_dynamics").rglob("*.py"):
-        assert "stiffness_monitor" not in set(imports(path)), path
 
 
 def test_files_are_small_and_name_no_machines_folder():

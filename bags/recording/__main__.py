@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from bags.recording import (
     record_collision,
     record_delta_cu,
+    record_poses,
     record_prru,
     record_soft_joint,
     record_upr_rpu,
@@ -27,9 +28,12 @@ RECORDERS: Final[dict[str, Callable[..., None]]] = {
         record_prru,
         record_upr_rpu,
         record_soft_joint,
+        record_poses,
     )
 }
-"""Recorders by the name of the bag they write."""
+"""Recorders by the name of the file they write."""
+ENDINGS: Final = {record_poses.NAME: ".csv"}
+"""Of those that are no bags."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with Progress(*columns) as bars:
         tasks = {name: bars.add_task(name, total=1.0) for name in options.names or RECORDERS}
         for name, task in tasks.items():
-            path = options.out / f"{name}.mcap"
+            path = options.out / (name + ENDINGS.get(name, ".mcap"))
             RECORDERS[name](
                 path, progress=lambda done, task=task: bars.update(task, completed=done)
             )

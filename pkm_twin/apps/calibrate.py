@@ -27,7 +27,7 @@ from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
 from pkm_twin.apps.options import BeyondLimits, Json, RobotName
-from pkm_twin.console import print_json, progress, refuse_existing, table_console
+from pkm_twin.console import file_name, print_json, progress, refuse_existing, table_console
 from pkm_twin.errors import ParameterError, UnknownNameError, one_line
 from pkm_twin.machine.edited import Fitted, edited_yaml, write_edited
 from pkm_twin.machine.robot import Robot
@@ -97,9 +97,9 @@ def calibrate_command(
             show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option(help="the calibrated robot, a YAML")] = Path(
-        "calibrated.yaml"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="the calibrated robot, a YAML", callback=file_name)
+    ] = Path("calibrated.yaml"),
     only: Annotated[
         list[str], typer.Option(help="fit only numbers whose path begins so; may be repeated")
     ] = [],  # noqa: B006  typer copies it

@@ -21,7 +21,7 @@ from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.apps.certificate.description import UnfitError
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import States, random_states
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, install
 from pkm_twin.machine.robot_urdf import robot_description
 
 Array = NDArray[np.float64]
@@ -167,7 +167,9 @@ def certify(
         except ImportError as error:
             if error.name is None or error.name.startswith("pkm_twin"):
                 raise
-            missing[name] = f"{ENGINES[name][1]} is not installed (pkm_twin[certificate])"
+            missing[name] = (
+                f"{ENGINES[name][1]} is not installed; {install('certificate')} brings it"
+            )
         except UnfitError as error:
             missing[name] = str(error)
     items = [*_own(robot, drawn), *_compared(robot, judges, drawn, progress)]

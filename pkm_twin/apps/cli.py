@@ -34,6 +34,7 @@ from pkm_twin.apps.options import (
 from pkm_twin.apps.view.command import view
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
+    file_name,
     flush_output,
     numbers,
     print_json,
@@ -144,7 +145,9 @@ def info(
     as_json: Json = False,
     picture: Annotated[
         Optional[Path],  # noqa: UP045  typer reads it
-        typer.Option(help="draw the robot at home into this file, .png or .svg"),
+        typer.Option(
+            help="draw the robot at home into this file, .png or .svg", callback=file_name
+        ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the picture")] = False,
 ) -> None:
@@ -231,7 +234,10 @@ def torques(
         Path, typer.Argument(help="a bag, or a CSV with a header row", show_default=False)
     ],
     out: Annotated[
-        Path, typer.Option(help="table to write, .csv or .parquet; the picture goes beside it")
+        Path,
+        typer.Option(
+            help="table to write, .csv or .parquet; the picture goes beside it", callback=file_name
+        ),
     ] = Path("torques.csv"),
     picture: Annotated[bool, typer.Option(help="draw efforts and terms as a PNG")] = True,
     topic: BagTopics = [],  # noqa: B006  typer copies it
@@ -453,7 +459,7 @@ def check(
 @app.command()
 def recover(
     bag: BagPath,
-    out: Annotated[Path, typer.Argument(help="the new bag")],
+    out: Annotated[Path, typer.Argument(help="the new bag", callback=file_name)],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the target")] = False,
     as_json: Json = False,
 ) -> None:
@@ -495,7 +501,7 @@ def certify(
 
     Three engines compute the machine anew from its description alone, with no line of the twin's
     mechanics: bodies free in space with every joint as equations (needs nothing more), Pinocchio
-    and MuJoCo (`pip install pkm_twin[certificate]`), each as a tree with loops. Compared are
+    and MuJoCo (`pip install '.[certificate]'`), each as a tree with loops. Compared are
     torques with wrench, payload and friction, the platform's place and Jacobian, and the mass
     matrix, over random states inside the limits; and the twin's own round trip from joints to pose
     and back.

@@ -156,7 +156,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console()
     if not console.is_terminal:
         console = Console(width=120)
-    options.out.mkdir(parents=True, exist_ok=True)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        console.print(f"[red]demo failed:[/red] {options.out}: {error.strerror}")
+        return 1
     try:
         # The children too have to end with this process.
         with first_signal(KeyboardInterrupt):

@@ -48,6 +48,7 @@ def describe(robot: Robot) -> dict[str, Any]:
         "closures": robot.engine.mobility.closures,
         "rank": robot.engine.mobility.rank,
         "redundant_closures": robot.engine.mobility.redundant,
+        "assumed_joints": [joint.name for joint in robot.graph.joints.values() if joint.given],
         "singularity_at_home": float(robot.singularity(q)),
         "parameters": robot.parameter_sections(),
         "parameter_units": robot.parameter_units(),
@@ -74,11 +75,7 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
         ("robot", f"{data['name']}: {data['description']}"),
         ("mobility", data["mobility"]),
         ("bodies and rods", ", ".join(data["bodies"])),
-        (
-            "closures",
-            f"{data['closures']} equations of rank {data['rank']}, "
-            f"{data['redundant_closures']} redundant",
-        ),
+        ("closures", _closures(data)),
         ("pose", pose),
         ("actuated joints", ", ".join(f"{name} ({unit})" for name, unit in joint_units.items())),
         ("home pose", _pairs(data["home_pose"], data["pose"])),
@@ -95,6 +92,19 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
         ):
             rows += _rows(section, value, data["parameter_units"].get(section, ""))
     return rows
+
+
+def _closures(data: dict[str, Any]) -> str:
+    """How many equations the loops have, and whether redundant ones are the machine's own.
+
+    A joint that stands for what several limbs hold together repeats what one of them holds alone.
+    """
+    redundant = data["redundant_closures"]
+    text = f"{data['closures']} equations of rank {data['rank']}, {redundant} redundant"
+    if redundant and data["assumed_joints"] and not data["overconstrained"]:
+        joints = ", ".join(data["assumed_joints"])
+        text += f" in the model only: its joint {joints} repeats what the limbs constrain"
+    return text
 
 
 def _rows(name: str, value: Any, unit: Any) -> list[tuple[str, str]]:

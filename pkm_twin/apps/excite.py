@@ -12,7 +12,7 @@ import typer
 from numpy.typing import NDArray
 
 from pkm_twin.apps.options import Json, RobotName
-from pkm_twin.console import print_json, progress, refuse_existing
+from pkm_twin.console import file_name, print_json, progress, refuse_existing
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError
 
 Array = NDArray[np.float64]
@@ -47,9 +47,9 @@ def excite(
     what: Annotated[
         str, typer.Option(help="of friction, rotor, payload, inertia, commas between")
     ] = "friction,rotor,payload,inertia",
-    out: Annotated[Path, typer.Option(help="MCAP to write; the same as CSV goes beside it")] = Path(
-        "excite.mcap"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="MCAP to write; the same as CSV goes beside it", callback=file_name)
+    ] = Path("excite.mcap"),
     beside: Annotated[
         Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
         typer.Option(help="a bag whose condition number is told beside", show_default=False),

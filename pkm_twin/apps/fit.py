@@ -16,7 +16,7 @@ from rich.table import Table
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
 from pkm_twin.apps.options import BagTopics, BeyondLimits, Json, LoadTimes, Payload, load_of
-from pkm_twin.console import print_json, progress, refuse_existing, table_console
+from pkm_twin.console import file_name, print_json, progress, refuse_existing, table_console
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.machine.catalogue import robot_of_data
@@ -43,7 +43,8 @@ def fit(
         typer.Option(help="of friction, rotor, payload, inertia, commas between; or compliance"),
     ] = "friction,rotor,payload,inertia",
     out: Annotated[
-        Path, typer.Option(help="YAML to write; the report goes beside it as HTML")
+        Path,
+        typer.Option(help="YAML to write; the report goes beside it as HTML", callback=file_name),
     ] = Path("fitted.yaml"),
     report: Annotated[bool, typer.Option(help="write the report with pictures")] = True,
     per_copy: Annotated[

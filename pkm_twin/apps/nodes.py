@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 import sys
 
+from pkm_twin.errors import install
 from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.arguments import answer
 from pkm_twin.ros.signals import leave_at_once
@@ -86,8 +87,8 @@ def _require_ros(name: str) -> None:
         importlib.import_module("rclpy")
     except ImportError as error:
         print(
-            f"refused to start: {name} needs ROS 2: source its setup, or pip install "
-            f"'pkm_twin[jazzy]' ({error})",
+            f"refused to start: {name} needs ROS 2: source its setup, or {install('jazzy')} "
+            f"({error})",
             file=sys.stderr,
         )
         sys.exit(1)

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from typer.core import TyperGroup
 
-from pkm_twin.console import numbers, progress
+from pkm_twin.console import file_name, numbers, progress
 from pkm_twin.errors import UnknownNameError
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
 from pkm_twin.threads import one_blas_thread
@@ -77,7 +77,10 @@ def atlas(
 def show(
     file: Annotated[Path, typer.Argument(help="a file that `pkm-twin atlas` wrote")],
     out: Annotated[
-        _File, typer.Option(help="stem of the PNGs; default the file's", show_default=False)
+        _File,
+        typer.Option(
+            help="stem of the PNGs; default the file's", show_default=False, callback=file_name
+        ),
     ] = None,
     html: Html = False,
 ) -> None:
@@ -128,7 +131,10 @@ def _compute(
         _Number, typer.Option(max=MOST, help="samples, about; default: the kind's own grid")
     ] = None,
     out: Annotated[
-        _File, typer.Option(help="file to write; default ROBOT_KIND.nc", show_default=False)
+        _File,
+        typer.Option(
+            help="file to write; default ROBOT_KIND.nc", show_default=False, callback=file_name
+        ),
     ] = None,
     workers: Annotated[
         _Number, typer.Option(help="processes on this machine; default one a core")

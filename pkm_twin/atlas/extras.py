@@ -6,14 +6,14 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, install
 
 
 class MissingExtraError(PkmTwinError, ImportError):
     """A package that is not installed; ``extra`` is the extra of pkm_twin that brings it."""
 
     def __init__(self, package: str, extra: str) -> None:
-        super().__init__(f"{package} is not installed; pip install 'pkm_twin[{extra}]' brings it")
+        super().__init__(f"{package} is not installed; {install(extra)} brings it")
         self.package = package
         self.extra = extra
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen import cache
+from pkm_twin.codegen.arrays import doubles
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
 
@@ -106,10 +107,13 @@ def _caller(inputs: int) -> Callable[..., Any]:
     names = [f"a{k}" for k in range(inputs)]
     takers = ", ".join(f"t{k}" for k in range(inputs))
     lines = [
-        "def make(code, room):",
+        "def make(code, room, array):",
         "    free = []",
         "    take, give = free.pop, free.append",
         f"    def call({', '.join(names)}):",
+        # A masked array is no array here: its buffer tells nothing of the mask.
+        f"        if not ({' is '.join(['array', *(f'type({name})' for name in names)])}):",
+        "            raise TypeError",
         "        try:",
         "            place = take()",
         "        except IndexError:",
@@ -183,9 +187,9 @@ class Kernel:
         :returns: outputs, shape (..., size) each, NaN in refused samples; and the status, None
             if all samples are good, else shape (..., 2): 0 good, 1 refused, 2 not finite; and the
             part of the way from home that was reached.
-        :raises ValueError: an input's last axis has another size.
+        :raises ValueError: an input that is no real numbers, or whose last axis has another size.
         """
-        arrays = [np.asarray(value, _F8) for value in inputs]
+        arrays = [doubles(value) for value in inputs]
         for array, size in zip(arrays, self.sizes[0], strict=True):
             if array.ndim == 0 or array.shape[-1] != size:
                 raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
@@ -195,14 +199,13 @@ class Kernel:
         count = int(np.prod(batch, dtype=np.int64))
         if count == 0:
             return [np.empty((*batch, size)) for size in self.sizes[1]], None
-        rows = [
-            array.reshape(1, -1)
-            if array.size == array.shape[-1]
-            else np.ascontiguousarray(np.broadcast_to(array, (*batch, array.shape[-1]))).reshape(
-                count, -1
-            )
-            for array in arrays
-        ]
+        rows = []
+        for array in arrays:
+            size = array.shape[-1]
+            one = array.size == size
+            whole = array.reshape(size) if one else np.broadcast_to(array, (*batch, size))
+            # The code reads doubles side by side, which a column of a table is not.
+            rows.append(np.ascontiguousarray(whole).reshape(1 if one else count, size))
         outputs, status = self._run(p, rows, count, 1)
         if status is not None and self._stepped:
             self._try_again(p, rows, outputs, status)
@@ -256,7 +259,7 @@ class Kernel:
             space.point_at(p)
             return (*space.takers, space.address, space.outputs[0].copy, space)
 
-        result: Callable[..., Array | None] = _caller(len(sizes[0]))(code, room)
+        result: Callable[..., Array | None] = _caller(len(sizes[0]))(code, room, np.ndarray)
         return result
 
     def _try_again(

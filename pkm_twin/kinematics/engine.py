@@ -12,10 +12,12 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, Final
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,8 +130,12 @@ class Engine:
     @cached_property
     def _samples(self) -> list[tuple[Array, Array]]:
         """States (x, q) at home and near it, found by the first engine of a geometry for all."""
-        first = _shared(self.graph.key).setdefault("engine", self)
-        return self._near_home() if first is self else first._samples
+        first = _engines.setdefault(self.graph.key, self)
+        if first is not self:
+            return first._samples
+        # The one that chooses pose coordinates is followed by the one that has them.
+        _hold(self)
+        return self._near_home()
 
     def _near_home(self) -> list[tuple[Array, Array]]:
         """The same in every run."""
@@ -712,9 +718,15 @@ def _inverse(t: Traced) -> Program:
     return Program({"pose": len(goal)}, 0, {"q": t.lift(t.q)}, solved)
 
 
-@lru_cache(maxsize=64)
-def _shared(key: str) -> dict[str, Engine]:
-    return {}
+_engines: Final[WeakValueDictionary[str, Engine]] = WeakValueDictionary()
+"""Engines that something still holds, by geometry: however many machines there are in between."""
+_recent: Final[deque[Engine]] = deque(maxlen=16)
+"""Held although no machine may: loading a file again takes no engine anew."""
+
+
+def _hold(engine: Engine) -> None:
+    if engine not in _recent:
+        _recent.append(engine)
 
 
 def engine_of(
@@ -728,10 +740,12 @@ def engine_of(
 
     :param mark: text that tells closed forms and branch rules from others.
     """
-    store = _shared(f"{graph.key} {coordinates!r} {mark}")
-    if "engine" not in store:
-        store["engine"] = Engine(graph, coordinates, start, branch)
-    return store["engine"]
+    key = f"{graph.key} {coordinates!r} {mark}"
+    engine = _engines.get(key)
+    if engine is None:
+        engine = _engines.setdefault(key, Engine(graph, coordinates, start, branch))
+        _hold(engine)
+    return engine
 
 
 __all__ = ["Engine", "Mobility", "NDArray", "Start", "Traced", "engine_of"]

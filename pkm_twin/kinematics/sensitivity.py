@@ -12,37 +12,26 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pkm_twin.kinematics.maximal import Equations, GraphChange, Placement
 from pkm_twin.machine.graph import Array, Graph
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import skew
 
 OPEN: Final = 1e-6
 """Part of a change's equations that no motion of the bodies makes up for: it cannot be."""
 
 
-def platform_change(robot: Robot, q: ArrayLike, changes: Sequence[GraphChange]) -> Array:
-    """Displacement of the platform by numbers of the geometry, actuated joints held.
-
-    :param q: joint positions, shape (..., n), rad or m.
-    :returns: translation of the reference point and rotation, base axes, by number, shape
-        (..., 6, changes). Where an overconstrained machine cannot be assembled with a change,
-        the displacement that misses least.
-    :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
-    """
-    states = np.asarray(q, np.float64)
-    return platform_twists(robot.graph, states, Placement.of(robot, states), changes)[0]
-
-
 def platform_twists(
     graph: Graph, q: Array, placement: Placement, changes: Sequence[GraphChange]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """The same of a placement of the graph at q, (..., 6, changes); and which changes can be.
+    """Displacement of the platform by numbers of the geometry, actuated joints held.
 
-    A change can be where it leaves all closures closed to first order, in all states: those of an
-    overconstrained machine need not.
+    :param q: joint positions, shape (..., n), rad or m; ``placement``: of the graph there.
+    :returns: translation of the reference point and rotation, base axes, by number, shape
+        (..., 6, changes): where an overconstrained machine cannot be assembled with a change, the
+        displacement that misses least. And which changes can be: those that leave all closures
+        closed to first order, in all states.
     """
     equations = Equations(graph, q, placement, changes)
     twists, missed = equations.twists()

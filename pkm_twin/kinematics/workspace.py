@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
 from pkm_twin.machine.robot import Robot
@@ -80,7 +81,7 @@ def joint_angle_at(robot: Robot, pose: ArrayLike) -> Array:
 
 def within_limits(robot: Robot, q: ArrayLike) -> Mask:
     """Whether joint positions keep the limits of the actuators, shape (...); absent ones hold."""
-    values, limits = np.asarray(q, np.float64), robot.limits.position
+    values, limits = doubles(q), robot.limits.position
     if limits is None:
         return np.ones(values.shape[:-1], bool)
     return np.asarray(((values >= limits[:, 0]) & (values <= limits[:, 1])).all(-1))
@@ -95,9 +96,7 @@ def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Ma
     :param least_clearance: what :func:`clearance` has to be above, m; -inf lets limbs meet. It
         bounds no robot whose clearance is not known.
     """
-    poses = np.asarray(pose, np.float64)
-    if not np.isfinite(poses).all():
-        raise ValueError("a pose is not finite")
+    poses = vectors(pose, len(robot.pose_names), "the pose")
     q, inside = try_inverse(robot, poses)
     inside &= within_limits(robot, q)
     bound = getattr(robot.limits, "joint_angle", None)
@@ -122,46 +121,6 @@ class RegularWorkspace:
     z: Array
     radius: Array
 
-    def polar_samples(self, step: float = math.radians(1.0), azimuths: int = 72) -> Array:
-        """Poses on rays from the axis, shape (m, 3): denser towards the axis.
-
-        The source's global factors (equation 39: a mean over N points) come out with these points.
-
-        :param step: distance of neighbouring points on a ray, rad.
-        :param azimuths: rays a circle; the axis itself stands once a ray.
-        """
-        turn = np.arange(azimuths) * (2 * np.pi / azimuths)
-        layers = []
-        for z, radius in zip(self.z.tolist(), self.radius.tolist(), strict=True):
-            rungs = step * np.arange(_count(radius, step) + 1)[:, None]
-            first, second = rungs * np.cos(turn), rungs * np.sin(turn)
-            layers.append(_layer(z, first.ravel(), second.ravel()))
-        return np.concatenate(layers) if layers else np.empty((0, 3))
-
-    def even_samples(self, step: float = math.radians(1.0)) -> Array:
-        """Poses on a square grid of tilts, shape (m, 3): a mean over the volume.
-
-        :param step: distance of neighbouring tilts, rad.
-        """
-        layers = []
-        for z, radius in zip(self.z.tolist(), self.radius.tolist(), strict=True):
-            n = _count(radius, step)
-            ticks = step * np.arange(-n, n + 1)
-            first, second = (t.ravel() for t in np.meshgrid(ticks, ticks, indexing="ij"))
-            inside = first**2 + second**2 <= radius**2 * (1 + 1e-12)
-            layers.append(_layer(z, first[inside], second[inside]))
-        return np.concatenate(layers) if layers else np.empty((0, 3))
-
-
-def _count(radius: float, step: float) -> int:
-    if not step > 0.0:
-        raise ValueError(f"step is {step}; it has to be above zero")
-    return math.floor(radius / step * (1 + 1e-12))
-
-
-def _layer(z: float, first: Array, second: Array) -> Array:
-    return np.column_stack((np.full(len(first), z), first, second))
-
 
 def regular_workspace(
     robot: Robot,
@@ -184,7 +143,7 @@ def regular_workspace(
         raise ParameterError(
             "mechanism", robot.mechanism, "a height and two tilts side by side (as upr_rpu)"
         )
-    heights = np.atleast_1d(np.asarray(z, np.float64))
+    heights = np.atleast_1d(doubles(z, "heights"))
     steps = math.ceil(math.pi / 2 / step) - 1
     radius = circle_radii(robot, heights, step, steps, directions)
     kept = (radius >= least_radius) & (radius > 0.0)

@@ -109,8 +109,6 @@ class Joint:
     directions: tuple[Direction, ...] = ()
     label: str = ""
     normal: str = "n"
-    limits: Array | None = None
-    compliance: Array | None = None
 
     @property
     def loaded(self) -> bool:
@@ -201,7 +199,7 @@ class Graph:
         joints = [
             (
                 j.name, j.kind, j.inner, j.outer, j.at.tolist(), j.axes.tolist(), j.actuated,
-                j.home, j.given, j.loaded,
+                j.home, j.given, j.loaded, [(d.body, d.vector.tolist()) for d in j.directions],
             )
             for j in self.joints.values()
         ]  # fmt: skip

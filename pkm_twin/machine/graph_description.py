@@ -63,8 +63,6 @@ def _joint(joint: Joint) -> dict[str, Any]:
         data["rotor_inertia"] = joint.rotor_inertia
     if joint.viscous or joint.coulomb:
         data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
-    if joint.compliance is not None:
-        data["compliance"] = _numbers(joint.compliance)
     return data
 
 

@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, install
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.rotations import about, from_quaternion
 from pkm_twin.machine.urdf_file import Joint, Link, Urdf
@@ -47,7 +47,7 @@ def read(path: Path) -> Urdf:
         import mujoco
     except ImportError:
         raise ParameterError(
-            str(path), "an MJCF file without the mujoco package", "pip install 'pkm_twin[mjcf]'"
+            str(path), "an MJCF file without the mujoco package", install("mjcf")
         ) from None
     _require_bounded(path)
     try:

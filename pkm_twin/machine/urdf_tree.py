@@ -59,8 +59,7 @@ def urdf_tree(
         joint = graph.joints.get(axis.joint) if counts[axis.joint] == 1 else None
         drive = UrdfDrive()
         if joint is not None:
-            position = None if joint.limits is None else (joint.limits[0], joint.limits[1])
-            drive = UrdfDrive(position, None, None, joint.viscous, joint.coulomb)
+            drive = UrdfDrive(None, None, None, joint.viscous, joint.coulomb)
             drive = (drives or {}).get(joint.name, drive)
         singles.append(
             UrdfJoint(

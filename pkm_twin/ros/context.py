@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, install
 
 
 def middleware_arguments(arguments: Sequence[str]) -> list[str]:
@@ -54,7 +54,7 @@ def own_node(
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
         raise PkmTwinError(
-            f"{needs} needs ROS 2: source its setup, or pip install pkm_twin[jazzy] ({error})"
+            f"{needs} needs ROS 2: source its setup, or {install('jazzy')} ({error})"
         ) from error
     context = rclpy.Context()
     rclpy.init(

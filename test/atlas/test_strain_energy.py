@@ -20,6 +20,7 @@ from pkm_twin.atlas.strain_energy.sweep import (
 from pkm_twin.errors import ParameterError
 from stiffness_monitor import regular_workspace, strain_energy
 from test.support.robots import load, partly_long
+from test.support.workspaces import even_samples, polar_samples
 
 ROBOT = load("upr_rpu")
 
@@ -35,7 +36,7 @@ def test_global_factors_are_the_direct_mean(strain):
     """Against points that stiffness_monitor makes itself, and against a plain mean of the file."""
     sweep, path = strain
     workspace = regular_workspace(ROBOT, sweep.heights)
-    poses = workspace.polar_samples()
+    poses = polar_samples(workspace)
     assert len(poses) == sweep.points
     direct = strain_energy(ROBOT, poses, WRENCHES["P1"]).factors.mean(0)
     with open_atlas(path) as data:
@@ -49,7 +50,7 @@ def test_global_factors_are_the_direct_mean(strain):
 
 
 def test_volume_factors_are_those_of_an_even_grid(strain):
-    even = regular_workspace(ROBOT, strain[0].heights).even_samples()
+    even = even_samples(regular_workspace(ROBOT, strain[0].heights))
     direct = strain_energy(ROBOT, even, WRENCHES["P1"]).factors.mean(0)
     with open_atlas(strain[1]) as data:
         assert data.volume_factor.values == pytest.approx(direct, abs=0.005)

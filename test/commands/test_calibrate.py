@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from bags.recording.capture import machine_parameters
+from bags.recording.record_poses import NOISE, OFFSETS, SHIFTS, TURNS, record
 from pkm_twin import Robot
 from pkm_twin.apps.calibrate import read_poses
 from pkm_twin.apps.calibration import calibrate, geometric
@@ -26,30 +26,13 @@ from test.support.robots import load, random_joints
 
 Array = NDArray[np.float64]
 
-NOISE = 2e-5
-OFFSETS = np.array([0.01, -0.015, 0.008])
-SHIFTS = {"base_radius": 1.2e-3, "arm_length": 9e-4, "forearm_length": -1.1e-3}
 DELTA_LENGTHS = [f"geometry.{name}" for name in SHIFTS]
-TURNS = (0.004, -0.003, 0.002)
 
 
 def measured(path: Path, noise: float = NOISE, count: int = 60) -> None:
     """Poses of a Delta-CU that is not built as drawn, by Pinocchio's closed loops."""
-    models = pytest.importorskip("bags.recording.pinocchio_models")
-    parameters = machine_parameters("delta_cu")
-    geometry = parameters["geometry"]
-    for name, shift in SHIFTS.items():
-        geometry[name] += shift
-    geometry["azimuths"] = [a + t for a, t in zip(geometry["azimuths"], TURNS, strict=True)]
-    engine = models.DeltaEngine(parameters)
-    rng = np.random.default_rng(0)
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow([*(f"arm_{k}.position" for k in (1, 2, 3)), "x", "y", "z"])
-        for _ in range(count):
-            q = rng.uniform(-0.6, 1.0, 3)
-            place = engine.platform_placement(engine.assemble(q)).translation
-            writer.writerow([*(q + OFFSETS), *(place + noise * rng.normal(size=3))])
+    pytest.importorskip("pinocchio")
+    record(path, noise=noise, count=count)
 
 
 def run(*arguments: str) -> Any:

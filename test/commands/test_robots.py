@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from pkm_twin import load, robot_names
+from pkm_twin.apps.describe import describe, lines
 from stiffness_monitor import compliance, strain_energy
 from test.commands.conftest import REPOSITORY
+from test.support.robots import every_robot
 
 POSE = (-0.6, 0.1, -0.05)
 WRENCH = (30.0, -50.0, -40.0, 10.0, -20.0, 50.0)
@@ -110,6 +112,19 @@ class TestInfo:
 def test_overconstraint_is_named(twin):
     assert "moment along" in twin("info", "upr_rpu").out
     assert "│ no:" in twin("info", "delta_cu").out
+
+
+@every_robot
+def test_closures_that_are_redundant_make_a_machine_overconstrained(name):
+    """Or the table says which joint of the model repeats what the limbs hold."""
+    data = describe(load(name))
+    shown = dict(lines(data))
+    redundant, open_reactions = data["redundant_closures"], data["overconstrained"]
+    repeats = f" in the model only: its joint {'+'.join(data['assumed_joints'])} repeats"
+    assert (repeats in shown["closures"]) == bool(redundant and not open_reactions)
+    assert bool(redundant) == bool(open_reactions or repeats in shown["closures"])
+    # The Delta-CU's is the one that has both: its third limb holds the turn about the vertical.
+    assert (repeats in shown["closures"]) == (name == "delta_cu")
 
 
 class TestCompliance:
@@ -244,7 +259,7 @@ class TestEnds:
 
 def test_a_picture_that_cannot_be_written_is_one_line(twin, tmp_path):
     for path, why in (
-        (tmp_path / "none" / "a.png", "No such file"),
+        (tmp_path / "none" / "a.png", "there is no folder"),
         (tmp_path / "a", ".png or .svg"),
     ):
         result = twin("info", "five_bar", "--picture", str(path))

@@ -66,6 +66,39 @@ def test_only_files_are_replaced(capsys, tmp_path, deflections, ending, kind):
     assert {p.name for p in tmp_path.iterdir()} == {target.name, deflections.name}
 
 
+@pytest.mark.parametrize("name", ["", ".", "/", "..", "folder/.."])
+def test_a_folder_or_nothing_is_no_files_name(twin, tmp_path, monkeypatch, deflections, name):
+    """Every command that writes refuses it before it works, and before it opens what it reads."""
+    monkeypatch.chdir(tmp_path)
+    tried = 0
+    for line in commands(deflections, tmp_path / "target").values():
+        where = next(k for k, word in enumerate(line) if str(word).startswith(f"{tmp_path}/target"))
+        done = twin(*line[:where], name, *line[where + 1 :], "--overwrite")
+        assert done.code == 1 and "Traceback" not in done.err
+        option = line[where - 1] if str(line[where - 1]).startswith("--") else "out"
+        assert done.one_line_error().startswith(f"pkm-twin: {option}: ")
+        tried += 1
+    for line in (("torques", "five_bar", "none.csv", "--out"), ("show", "none.nc", "--out")):
+        assert twin(*line, name).one_line_error().startswith("pkm-twin: --out: ")
+    assert tried == 8
+    assert [p.name for p in tmp_path.iterdir()] == [deflections.name]
+
+
+def test_a_folder_that_is_not_there_is_told_before_the_work(twin, tmp_path, monkeypatch):
+    """Before the recording is read, which is not there either."""
+    monkeypatch.chdir(tmp_path)
+    for line in (
+        ("torques", "five_bar", "none.csv", "--out", "none/a.csv"),
+        ("fit", "five_bar", "none.csv", "--out", "none/a.yaml"),
+        ("calibrate", "five_bar", "none.csv", "--out", "none/a.yaml"),
+        ("excite", "five_bar", "--out", "none/a.mcap"),
+        ("info", "five_bar", "--picture", "none/a.png"),
+    ):
+        error = twin(*line).one_line_error()
+        assert line[-1] in error and "no folder none" in error
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_name_as_long_as_the_file_system_takes(capsys, tmp_path, deflections):
     longest = "n" * 250
     for arguments in (

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import ast
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-TOPS = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
+from test.support import sources
+
 CORE = "pkm_twin"
 """Name of the modules beside pkm_twin's folders: errors and the like, that all may import."""
 PLACES = {
@@ -31,63 +30,21 @@ PLACES = {
     "codegen": (2.0, 0.0),
 }
 """Where each folder stands; arrows go down, but between machine and kinematics."""
-PURE = "pkm_twin.ros.messages"
-"""Messages to arrays, without ROS: stands apart from the folder that it is in."""
 
 
-def part(module):
-    """The folder of a module, a node's modules apart; None: not one of the package's."""
-    names = module.split(".")
-    if names[0] not in TOPS:
-        return None
-    if names[:3] == PURE.split("."):
-        return "ros.messages"
-    if names[0] != CORE:
-        node = len(names) > 1 and names[1].endswith("node")
-        return f"{names[0]}.node" if node else names[0]
-    inside = len(names) > 1 and (ROOT / CORE / names[1]).is_dir()
-    if not inside:
-        return CORE
-    # The base class of nodes is in ros.
-    return ".".join(names[1:]) if names[2:] == ["node"] and names[1] != "ros" else names[1]
-
-
-def is_module(name):
-    """Whether a dotted name is a folder or a file of the package."""
-    path = ROOT / Path(*name.split("."))
-    return path.is_dir() or path.with_suffix(".py").is_file()
-
-
-def running(tree):
-    """Nodes of a source without those that stand for types alone."""
-    todo = [tree]
-    while todo:
-        node = todo.pop()
-        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
-            continue
-        yield node
-        todo += ast.iter_child_nodes(node)
+def name_of(room):
+    """As the picture has it."""
+    return room.removeprefix(f"{CORE}.")
 
 
 def arrows():
     """Pairs of folders, who imports and what, without those to the core's own modules."""
-    found = set()
-    for top in TOPS:
-        for path in sorted((ROOT / top).rglob("*.py")):
-            here = part(".".join(path.relative_to(ROOT).with_suffix("").parts))
-            for node in running(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Import):
-                    modules = [alias.name for alias in node.names]
-                elif isinstance(node, ast.ImportFrom) and node.module:
-                    # What is imported may be a module of a folder, or a name in a module.
-                    whole = [f"{node.module}.{alias.name}" for alias in node.names]
-                    modules = [m if is_module(m) else node.module for m in whole]
-                else:
-                    continue
-                for there in map(part, modules):
-                    if CORE not in (here, there) and there not in (None, here):
-                        found.add((here, there))
-    return sorted(found)
+    rooms = {f"{CORE}.{name}" for name in PLACES} | set(PLACES)
+    return sorted(
+        (name_of(here), name_of(there))
+        for here, there in sources.arrows()
+        if {here, there} <= rooms
+    )
 
 
 def draw(path):

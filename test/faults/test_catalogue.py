@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every fault has its tests, and the page on faults is that of the catalogue."""
 
+import re
+
 import pytest
 
 from test.faults.catalogue import TESTS, names_in, rows
@@ -22,12 +24,11 @@ def test_numbers_are_given_once():
     assert len(set(numbers)) == len(numbers)
 
 
-def test_the_page_has_every_row_and_none_that_failed():
-    lines = PAGE.read_text(encoding="utf-8").splitlines()
-    for row in ROWS:
-        (line,) = [line for line in lines if line.startswith(f"| {row.number} | ")]
-        assert line.startswith(f"| {row.number} | {row.fault} | {row.answer} | ")
-        assert line.endswith("| pass |"), line
+def test_the_page_has_the_rows_of_the_catalogue():
+    """Whether each passes say its tests; `make faults` prints it."""
+    text = PAGE.read_text(encoding="utf-8")
+    found = re.findall(r"^\| (\d+) \| (.*) \| (.*) \| \d+ \| [^|]+ \|$", text, re.MULTILINE)
+    assert found == [(str(row.number), row.fault, row.answer) for row in ROWS]
 
 
 def test_a_part_of_the_page_is_replaced_alone(tmp_path):

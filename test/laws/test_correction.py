@@ -63,13 +63,13 @@ def test_no_other_offset_brings_the_tool_point_nearer(name: str) -> None:
     best = np.linalg.norm(found.left[:, :3], axis=1)
     twist = robot.platform_jacobian(q)
     place = twist[:, :3] - skew(robot.platform(q)[1] @ TOOL) @ twist[:, 3:]
-    reach = np.linalg.cond(place / robot.joint_scales) < 50.0
+    assert np.linalg.cond(place / robot.joint_scales).max() < 50.0
     for _ in range(20):
         other = found.offset + rng.normal(size=found.offset.shape) * np.abs(found.offset).mean()
         moved = found.before[:, :3] + (place @ other[..., None])[..., 0]
-        assert np.all(np.linalg.norm(moved, axis=1)[reach] >= best[reach] * (1.0 - 1e-9))
+        assert np.all(np.linalg.norm(moved, axis=1) >= best * (1.0 - 1e-9))
     if robot.joints_count == 6:
-        np.testing.assert_allclose(found.left[reach], 0.0, atol=1e-16)
+        np.testing.assert_allclose(found.left, 0.0, atol=1e-16)
 
 
 @every_robot
@@ -118,16 +118,19 @@ def test_the_recorded_tool_deflects_less_by_far() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
+    "change",
     [
-        ({"bound": -1.0}, "bound is -1, allowed 0 and above"),
-        ({"bound": np.nan}, "bound is nan, allowed 0 and above"),
-        ({"deflection": np.zeros(5)}, "deflection is not six finite numbers"),
-        ({"deflection": np.full(6, np.nan)}, "deflection is not six finite numbers"),
+        {"bound": -1.0},
+        {"bound": np.nan},
+        {"bound": [1.0, 1.0]},
+        {"deflection": np.zeros(5)},
+        {"deflection": np.full(6, np.nan)},
+        {"tool": np.zeros(2)},
     ],
+    ids=str,
 )
-def test_what_cannot_be_corrected_is_refused(change: dict[str, object], text: str) -> None:
+def test_what_cannot_be_corrected_is_refused(change: dict[str, object]) -> None:
     robot = load("upr_rpu")
     arguments = {"deflection": np.zeros(6), **change}
-    with pytest.raises(ValueError, match=text):
+    with pytest.raises(ValueError, match=next(iter(change))):
         setpoint_correction(robot, robot.inverse(robot.home()), **arguments)  # type: ignore[arg-type]

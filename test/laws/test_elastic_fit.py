@@ -59,10 +59,18 @@ def test_an_instruments_zero_is_found_and_a_direction_may_be_missing():
     partial[:, 3:] = np.nan
     recording = dataclasses.replace(clean, deflection=partial)
     result = fit_elements(ROBOT, [clean, recording])
-    np.testing.assert_allclose(result.zeros[1, :3], zero[:3], atol=1e-9)
+    np.testing.assert_allclose(result.zeros[1, :3], zero[:3], atol=1e-12)
     assert result.measured.tolist() == [[True] * 6, [True] * 3 + [False] * 3]
-    assert within(result, TRUTH) or max(n.deviation for n in result.numbers) < 1e-4
-    assert {n.key[-1]: n for n in result.numbers}["3U"].after == pytest.approx(3.0, rel=1e-3)
+    for number in result.numbers:
+        assert number.after == pytest.approx(TRUTH[number.key[-1]], rel=1e-6)
+    both = [
+        noisy(one, np.random.default_rng(k), SENSORS) for k, one in enumerate((clean, recording))
+    ]
+    result = fit_elements(ROBOT, both)
+    np.testing.assert_allclose(result.zeros[1, :3], zero[:3], atol=5e-8)
+    assert within(result, TRUTH)
+    # Nor is it so sure of nothing that all is within.
+    assert max(n.deviation for n in result.numbers if n.key[-1].endswith("B")) < 0.02
 
 
 def test_what_noise_hides_is_named_as_a_combination():

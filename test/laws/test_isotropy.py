@@ -3,7 +3,6 @@
 
 import numpy as np
 import pytest
-from support import robots
 
 from delta_dynamics import (
     cones,
@@ -24,6 +23,7 @@ from delta_dynamics import (
 from delta_dynamics.cones import largest
 from delta_dynamics.least_form import _descended, least_direction
 from pkm_twin.errors import ParameterError, SearchError, SingularityError
+from test.support import robots
 from test.support.robots import load, loaded, loaded_like, random_joints
 
 MASSIVE = [name for name in robots.MASSIVE if len(robots.SHIPPED[name].joint_names) == 3]
@@ -217,20 +217,16 @@ def scaled_forms(seed, size, count=None):
     return (forms + forms.swapaxes(-1, -2)) * scales[:, None, None]
 
 
-@pytest.mark.parametrize(("size", "seeds"), [(4, range(3)), (5, range(1)), (6, range(1))])
-def test_the_least_direction_of_forms_of_several_scales(size, seeds):
-    """Not above what descents from other places find; in some that is twice as high."""
-    higher = 0
-    for seed in seeds:
-        forms = scaled_forms(seed, size)
-        value = largest(forms, least_direction(forms))
-        start = np.random.default_rng(seed).normal(size=(500, size))
-        start /= np.linalg.norm(start, axis=-1, keepdims=True)
-        best = np.argsort(largest(forms, start))[:6]
-        others = min(float(largest(forms, _descended(forms, y))) for y in start[best])
-        assert value <= others * (1 + cones.RESOLUTION)
-        higher += others > 1.5 * value
-    assert higher or size > 4
+@pytest.mark.parametrize(("size", "seed", "times"), [(4, 9, 3.0), (5, 3, 35.0), (6, 4, 33.0)])
+def test_the_least_direction_of_forms_of_several_scales(size, seed, times):
+    """Far below what descents from six other places find, the best of 500."""
+    forms = scaled_forms(seed, size)
+    value = largest(forms, least_direction(forms))
+    start = np.random.default_rng(seed).normal(size=(500, size))
+    start /= np.linalg.norm(start, axis=-1, keepdims=True)
+    best = np.argsort(largest(forms, start))[:6]
+    others = min(float(largest(forms, _descended(forms, y))) for y in start[best])
+    assert times * value < others
 
 
 def test_no_cone_is_ruled_out_that_holds_a_lower_value(rng):

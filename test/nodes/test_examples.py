@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The examples, run as they are against machine_sim in processes of their own."""
 
+import importlib
 import re
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -12,7 +14,7 @@ from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics import inverse_dynamics
 from test.nodes.harness import REPOSITORY
-from test.support.robots import load
+from test.support.robots import load, parameters_of
 
 EXAMPLES = REPOSITORY / "examples"
 SIM = "delta_dynamics.sim_node"
@@ -36,6 +38,28 @@ def twin_and_machine(launch):
         launch(SIM, "clock:=simulated", "real_time_factor:=5.0"),
         launch("delta_dynamics.node"),
     )
+
+
+def test_a_robot_without_limits_has_a_way_to_go_too(tmp_path, monkeypatch):
+    """Limits are optional in a file, joint by joint."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    client = importlib.import_module("trajectory_client")
+    np.testing.assert_allclose(client.reaches(ROBOT, 0.1), 0.22)
+    data = parameters_of("five_bar")
+    _, (low, high) = load("five_bar").limits.position
+    for expected in ([1.0, high - low], [1.0, 1.0]):
+        joint = next(joint for joint in data["joints"].values() if "limits" in joint)
+        del joint["limits"]
+        path = tmp_path / "free.yaml"
+        path.write_text(yaml.safe_dump(data, sort_keys=False))
+        np.testing.assert_allclose(client.reaches(load(path), 0.1), 0.1 * np.array(expected))
+
+
+@pytest.mark.parametrize("name", ["trajectory_client.py", "computed_torque.py", "feed_rate.py"])
+def test_what_an_example_cannot_go_with_is_one_line(launch, name):
+    process = example(launch, name, "--robot", "none")
+    assert process.wait(PATIENCE) == 1
+    assert "Traceback" not in process.output and "none" in process.output.splitlines()[-1]
 
 
 class TestComputedTorque:

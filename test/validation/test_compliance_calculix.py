@@ -38,6 +38,7 @@ from test.certificate.links import (
     rigid_joints,
     round_bar,
 )
+from test.support.pages import numbers
 from test.support.robots import partly_long
 from test.validation.calculix import ABSENT, CCX, Mesh, disc_mesh, section_motion, solid_compliance
 
@@ -65,7 +66,14 @@ def solids(request, tmp_path_factory):
             known[name] = solid_compliance(frame, tmp_path_factory.mktemp("solids"), request.param)
         return known[name]
 
+    make.mesh = request.param
     return make
+
+
+def told():
+    """What the README says: worst entries with the paper's and with a round bar's shear factor."""
+    pattern = r"within (\S+) % of every entry, (\S+) % with a round bar's shear factor"
+    return [float(number) / 100 for number in numbers("README.md", pattern)]
 
 
 @needs_calculix
@@ -73,8 +81,8 @@ def solids(request, tmp_path_factory):
 def test_compliance_of_the_bars(name, rigid, solids):
     theirs = solids(rigid, name)
     found = difference(compliance(rigid, POSES[name]), theirs)
-    # Seen: at most 0.15 %, the twin the stiffer; the bound of the certificate is 1 %.
-    assert found.worst < 0.0025 < BOUND
+    # The twin is the stiffer; the bound of the certificate is 1 %.
+    assert found.worst < told()[0] + 5e-5 < BOUND
     assert (found.diagonal < 0.0).all()
     # Each against itself: the least is 2 nm.
     assert found.deflection == pytest.approx(0.0, abs=BOUND)
@@ -85,7 +93,9 @@ def test_compliance_of_the_bars(name, rigid, solids):
 @pytest.mark.parametrize("name", partly_long(POSES, "configuration 2"))
 def test_the_rest_is_the_shear_factor(name, rigid, solids):
     better = rigid.changed(members={"shear_factor": round_bar(rigid)})
-    assert difference(compliance(better, POSES[name]), solids(rigid, name)).worst < 0.0005
+    found = difference(compliance(better, POSES[name]), solids(rigid, name)).worst
+    # Printed of a mesh that is finer still, by 3e-5.
+    assert found < (told()[1] + 8e-5 if solids.mesh == MESH else 5e-4)
 
 
 @needs_calculix

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables 2 to 6 of the Delta-CU paper, decoded, within their printing accuracy.
 
+Digits of the source that are wrong: docs/errata.md.
 Two numbers of the worked example are not in the paper and were inferred by a fit to its tables: the
 home angle 0.22 rad and a platform load of 25 N along z, away from the base. The paper writes
 the rod closure for all three limbs; z points towards the platform, so z and the load turn round.
@@ -23,7 +24,7 @@ VELOCITY = [
     [0, 0, 0],
     [-79.2, 43.2, 92.3],
     [-209, 122, 49.5],
-    [-181, 105, -110.8],
+    [-181, 105, -110.8],  # the source has -10.80, a digit lost (docs/errata.md)
     [-69.7, 37.8, -86.7],
     [0, 0, 0],
 ]  # table 2, mm/s
@@ -32,7 +33,7 @@ ACCELERATION = [
     [-111, 67.4, 55.4],
     [-101, 59.9, -159],
     [126, -75.4, -66.6],
-    [83.6, -50.2, 71.2],
+    [83.6, -50.2, 71.2],  # the source has 17.20, two digits exchanged
     [67.6, -23.5, 95.6],
 ]  # table 3, mm/s2
 TORQUES = [

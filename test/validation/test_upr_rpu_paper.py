@@ -15,6 +15,7 @@ from stiffness_monitor import (
     strain_energy,
 )
 from test.support.robots import load
+from test.support.workspaces import even_samples, polar_samples
 
 ROBOT = load("upr_rpu")
 
@@ -90,7 +91,7 @@ def test_table_1_does_not_hang_on_the_lost_entry(last):
 def test_table_2_over_points_on_rays(workspace, load_name, tolerance):
     """The paper averages over N points of a search; on rays from the axis all three come out."""
     wrench, expected = TABLE_2[load_name]
-    mean = strain_energy(ROBOT, workspace.polar_samples(), wrench).factors.mean(axis=0)
+    mean = strain_energy(ROBOT, polar_samples(workspace), wrench).factors.mean(axis=0)
     assert mean == pytest.approx(np.array(expected), abs=tolerance)
 
 
@@ -98,7 +99,7 @@ def test_table_2_over_points_on_rays(workspace, load_name, tolerance):
 def test_table_2_over_the_volume(workspace, load_name, tolerance):
     """An even mean over the volume: P1 hangs on how the workspace is sampled."""
     wrench, expected = TABLE_2[load_name]
-    mean = strain_energy(ROBOT, workspace.even_samples(), wrench).factors.mean(axis=0)
+    mean = strain_energy(ROBOT, even_samples(workspace), wrench).factors.mean(axis=0)
     assert mean == pytest.approx(np.array(expected), abs=tolerance)
 
 
@@ -161,7 +162,7 @@ def test_vertical_load_at_home():
 
 def test_stated_maxima_at_z_600():
     """Figures 7 and 8, load P1: maxima 0.08 and 0.25 of the UPR's R and U, 0.02 and 0.07 of RPU."""
-    poses = regular_workspace(ROBOT, [-0.6]).even_samples()
+    poses = even_samples(regular_workspace(ROBOT, [-0.6]))
     energy = strain_energy(ROBOT, poses, P1)
     top = dict(zip(energy.elements, energy.factors.max(axis=0), strict=True))
     for name, value in {"1R": 0.08, "1U": 0.25, "3R": 0.02, "3U": 0.07}.items():
@@ -174,7 +175,7 @@ def test_stated_maxima_at_z_600():
 
 def test_distributions_symmetric_about_gamma_zero(workspace):
     """Figures 6 and 7: with P1, energy and factors are even in gamma, limbs 1 and 2 exchanged."""
-    poses = workspace.even_samples(math.radians(2))
+    poses = even_samples(workspace, math.radians(2))
     one, other = (strain_energy(ROBOT, p, P1) for p in (poses, poses * [1, 1, -1]))
     swapped = other.factors[:, [3, 4, 5, 0, 1, 2, 6, 7, 8]]
     assert one.total == pytest.approx(other.total, rel=1e-11)
@@ -183,7 +184,7 @@ def test_distributions_symmetric_about_gamma_zero(workspace):
 
 def test_order_of_elements_under_vertical_load(workspace):
     """Section 4: bars store most, then the UPR's universal joints, then its revolute joints."""
-    mean = strain_energy(ROBOT, workspace.polar_samples(), P1).factors.mean(axis=0)
+    mean = strain_energy(ROBOT, polar_samples(workspace), P1).factors.mean(axis=0)
     r, b, u = mean[:3]
     assert b > u > r
     # "80 % of the energy is in the UPR's U joints and bars."

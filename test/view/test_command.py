@@ -29,7 +29,7 @@ needs_viser = pytest.mark.usefixtures("viser")
 
 @pytest.fixture
 def viser():
-    return pytest.importorskip("viser", reason="viser is not installed: pkm_twin[view]")
+    return pytest.importorskip("viser", reason="viser is not installed: the extra view")
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_without_viser_the_line_says_what_brings_it(twin, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     result = twin("view", "delta_cu")
     assert result.code == 1
-    assert "viser is not installed; pip install 'pkm_twin[view]'" in result.one_line_error()
+    assert "viser is not installed; pip install '.[view]'" in result.one_line_error()
 
 
 @contextlib.contextmanager

@@ -22,7 +22,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any, Final
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
-from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.errors import ParameterError, PkmTwinError, install
 
 LEAST_TOKEN: Final = 16
 """Characters of a token: fewer could be guessed."""
@@ -183,7 +183,7 @@ def behind(door: Door, listening: socket.socket) -> Iterator[None]:
     finally:
         library.serve = plain  # type: ignore[misc]
     if made != [port]:
-        raise PkmTwinError("this version of viser is not known here: pip install 'pkm_twin[view]'")
+        raise PkmTwinError(f"this version of viser is not known here: {install('view')}")
 
 
 def _cookie(port: int) -> str:

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers that a caller gives, as arrays of doubles: whatever else it gives is an error.
+
+numpy converts more than can be meant: it drops the mask of a masked array and the imaginary part
+of a complex one, reads text and dates as numbers, and makes NaN of None.
+
+May import: numpy, the standard library.
+"""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal
+from numbers import Real
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_F8: Final = np.dtype(np.float64)
+
+
+def doubles(values: ArrayLike, what: str = "values") -> Array:
+    """Real numbers as float64; the array itself where it is one already.
+
+    :param what: name of the values, for errors.
+    :raises ValueError: anything but real numbers, or masked ones.
+    """
+    if type(values) is np.ndarray and values.dtype is _F8:
+        return values
+    if isinstance(values, np.ma.MaskedArray):
+        if np.ma.getmaskarray(values).any():
+            raise ValueError(f"{what} contain masked entries")
+        values = values.data
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise ValueError(f"{what} are not an array: rows of different lengths") from None
+    if array.dtype.kind == "O" and all(map(_is_real, array.flat)):
+        # Fractions, decimals, integers beyond 64 bits; too large a one is infinite.
+        array = np.array([_double(value) for value in array.flat]).reshape(array.shape)
+    if array.dtype.kind not in "fiu":
+        kind = type(values).__name__ if array.dtype.kind == "O" else array.dtype.name
+        raise ValueError(f"{what} have to be real numbers, not {kind}")
+    with np.errstate(over="ignore"):
+        return array.astype(_F8, copy=False)
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, (Real, Decimal)) and not isinstance(value, (bool, np.bool_))
+
+
+def _double(value: Any) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf")
+
+
+def vectors(values: ArrayLike, size: int, what: str) -> Array:
+    """Finite vectors of a length, shape (..., size).
+
+    :raises ValueError: as :func:`doubles`; another last axis; a value that is not finite, by
+        sample.
+    """
+    array = doubles(values, what)
+    if array.shape[-1:] != (size,):
+        raise ValueError(f"the last axis of {what} has to be {size}, the shape is {array.shape}")
+    good = np.isfinite(array).all(-1)
+    if not good.all():
+        index = tuple(int(i) for i in np.argwhere(~good)[0])
+        raise ValueError(f"{what}{f' at sample {index}' if index else ''} is not finite")
+    return array
+
+
+def finite(result: NDArray[Any], cause: str) -> Array:
+    """A result that is finite.
+
+    :param cause: what may be too large, or not finite itself.
+    :raises ValueError: it is not.
+    """
+    if not np.isfinite(result).all():
+        raise ValueError(f"{cause} is not finite, or leads to a result that is not")
+    return np.asarray(result, np.float64)
+
+
+def one_vector(values: ArrayLike, size: int, what: str) -> Array:
+    """One finite vector, shape (size,); errors as :func:`vectors`."""
+    array = vectors(values, size, what)
+    if array.ndim != 1:
+        raise ValueError(f"{what} have to be those of one sample, the shape is {array.shape}")
+    return array
+
+
+def later(time: float, last: float | None) -> float:
+    """The time of a sample, s.
+
+    :raises ValueError: it is not finite, or not later than the last one's.
+    """
+    if not math.isfinite(time):
+        raise ValueError(f"the time of a sample is {time}")
+    if last is not None and not time > last:
+        raise ValueError(f"the time of a sample is {time:.9g} s, not later than {last:.9g} s")
+    return time

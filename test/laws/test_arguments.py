@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every function of numbers takes real ones in any layout, and refuses all else by a ValueError."""
+
+from __future__ import annotations
+
+import dataclasses
+from decimal import Decimal
+
+import numpy as np
+import pytest
+
+import delta_dynamics as dynamics
+import stiffness_monitor as elasticity
+from pkm_twin.codegen.arrays import doubles, later
+from stiffness_monitor.modes import natural_frequencies
+from test.support.robots import load
+
+ROBOTS = ("delta_cu", "upr_rpu")
+"""With elastic members: as a frame, and in closed form."""
+WRENCH = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+
+
+def functions(robot):
+    """Functions of a robot by name, each with arrays that it takes."""
+    n = len(robot.joint_names)
+    pose, count = robot.home(), np.arange(1.0, n + 1)
+    q, qd, qdd = robot.inverse(pose), 0.1 * count, -0.3 * count
+    tau = dynamics.inverse_dynamics(robot, q, qd, qdd, WRENCH)
+    moved = 1e-5 * WRENCH
+    response = elasticity.element_response(robot, pose)
+    factors = np.linspace(1.0, 2.0, len(response.names))
+
+    def bound(function):
+        return lambda *arrays: function(robot, *arrays)
+
+    motion = [q, qd, qdd, WRENCH]
+    table = {
+        name: (getattr(robot, name), [q])
+        for name in (
+            "forward", "platform", "placements", "jacobian", "platform_jacobian", "singularity",
+            "passive", "try_forward", "try_jacobian", "try_singularity",
+        )
+    }  # fmt: skip
+    table |= {name: (getattr(robot, name), [pose]) for name in ("inverse", "try_inverse")}
+    table |= {
+        "pose_acceleration": (robot.pose_acceleration, [q, qd, qdd]),
+        "passive_rates": (robot.passive_rates, [q, qd]),
+        "sphere_force": (
+            lambda p, x, a: dynamics.max_driving_force(robot, p, x, 10.0, a), [pose, count, count],
+        ),
+        "forces_range": (
+            lambda p, a: dynamics.max_driving_force_range(robot, p, 10.0, a), [pose, count],
+        ),
+        "spread": (dynamics.spread, [count]),
+        "tilted_pose": (dynamics.tilted_pose, [count, count, count]),
+        "tool": (lambda t: elasticity.setpoint_correction(robot, q, moved, tool=t), [moved[:3]]),
+        "bound": (lambda b: elasticity.setpoint_correction(robot, q, moved, bound=b), [count]),
+        "frequencies": (lambda p: natural_frequencies(robot, p, 2), [pose]),
+        "compliance_at": (response.compliance_at, [factors]),
+        "deflection": (response.deflection, [WRENCH, factors]),
+    }  # fmt: skip
+    for name in (
+        "inverse_dynamics", "dynamics_terms", "least_norm_reactions", "regressor",
+        "torque_deviation",
+    ):  # fmt: skip
+        table[name] = (bound(getattr(dynamics, name)), motion)
+    for name, arrays in {
+        "mass_matrix": [q], "forward_dynamics": [q, qd, tau, WRENCH], "energy": [q, qd],
+        "platform_wrench": [q, tau], "joint_motion": [pose, count, count],
+        "energy_matrices": [pose], "energy_transfer": [pose, count],
+        "energy_transfer_range": [pose],
+    }.items():  # fmt: skip
+        table[name] = (bound(getattr(dynamics, name)), arrays)
+    for name, arrays in {
+        "compliance": [pose], "stiffness": [pose], "strain_energy": [pose, WRENCH],
+        "compliance_deviation": [pose], "clearance": [pose], "reachable": [pose],
+        "setpoint_correction": [q, moved], "element_response": [pose],
+    }.items():  # fmt: skip
+        table[name] = (bound(getattr(elasticity, name)), arrays)
+    return table
+
+
+def flat(result):
+    """All numbers of a result side by side."""
+    if dataclasses.is_dataclass(result):
+        result = [getattr(result, field.name) for field in dataclasses.fields(result)]
+    if isinstance(result, dict):
+        result = list(result.values())
+    if isinstance(result, list | tuple):
+        return np.concatenate([np.zeros(0), *map(flat, result)])
+    array = np.asarray(result)
+    return np.ravel(array).astype(float) if array.dtype.kind in "fiub" else np.zeros(0)
+
+
+def assert_same(found, right, name):
+    """But for the last bits: another layout may be summed in another order."""
+    np.testing.assert_allclose(found, right, 1e-11, 1e-13 * np.abs(right).max(), err_msg=name)
+
+
+def wrong_ones(array):
+    """What is no array of these numbers, by what is wrong with it."""
+    n = len(array)
+    text = [str(value) for value in array]
+    first = np.arange(n) == 0
+    return {
+        "None": None if n != 6 else [None] * 6,
+        "one None": [None, *array.tolist()[1:]],
+        "an object that is None": np.array([None, *array.tolist()[1:]], object),
+        "masked": np.ma.array(array, mask=first),
+        "masked in a batch": np.ma.array([array, array], mask=[first & False, first]),
+        "complex": array + 1j,
+        "text": text,
+        "bytes": np.array(text).astype(bytes),
+        "an object that is text": np.array([text[0], *array.tolist()[1:]], object),
+        "truth": first,
+        "dates": np.zeros(n, "datetime64[s]"),
+        "named": {"a": array},
+        "ragged": [[0.1], [0.1, 0.2]],
+        "nothing": np.zeros(0),
+    }
+
+
+SHAPELESS = {
+    "spread": {"nothing"},  # of any number of values
+    "tilted_pose": {"nothing"},  # of any shape
+    "compliance_at": {"complex"},  # a complex step
+    "deflection": {"complex"},
+}
+"""What is right in some of the functions."""
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_what_is_no_real_number_is_refused(name):
+    refused = 0
+    for function, (ask, arrays) in functions(load(name)).items():
+        for k, array in enumerate(arrays):
+            for what, wrong in wrong_ones(array).items():
+                if what in SHAPELESS.get(function, ()):
+                    continue
+                given = [*arrays[:k], wrong, *arrays[k + 1 :]]
+                with pytest.raises(ValueError, match=r"\w") as caught:
+                    print(f"{function}, argument {k}, {what}:", ask(*given))
+                assert "\n" not in str(caught.value), (function, k, what)
+                refused += 1
+    assert refused > 800
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_what_is_not_finite_or_of_another_length_is_refused(name):
+    for function, (ask, arrays) in functions(load(name)).items():
+        for k, array in enumerate(arrays):
+            wrongs = []
+            for place, bad in ((0, np.nan), (-1, np.inf), (0, -np.inf)):
+                wrongs.append(array.copy())
+                wrongs[-1][place] = bad
+            if function not in ("spread", "tilted_pose"):
+                wrongs += [array[:-1], np.append(array, 0.1), array[:, None]]
+            for wrong in wrongs:
+                given = [*arrays[:k], wrong, *arrays[k + 1 :]]
+                if function.startswith("try_") and wrong.shape == array.shape:
+                    assert not ask(*given)[1].any()
+                    continue
+                if function == "bound" and np.inf in wrong:
+                    continue  # no bound
+                with pytest.raises(ValueError, match=r"\w"):
+                    print(f"{function}, argument {k}, {wrong}:", ask(*given))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_results_beyond_what_a_double_holds_are_refused(name):
+    """Finite or refused, however large the numbers."""
+    for ask, arrays in functions(load(name)).values():
+        for k, array in enumerate(arrays):
+            for huge in (1e308, -1e308):
+                try:
+                    found = ask(*arrays[:k], np.full(len(array), huge), *arrays[k + 1 :])
+                except ValueError:
+                    continue
+                if not isinstance(found, tuple) or found[-1] is not False:
+                    shown = flat(found)
+                    assert np.isfinite(shown).all() or not flat(found[1]).any()
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_real_numbers_of_any_kind_and_layout_are_those_numbers(name):
+    """Also where one sample stands beside a batch: as a column of a table, backwards, of bytes."""
+    for function, (ask, arrays) in functions(load(name)).items():
+        right = flat(ask(*arrays))
+        for k, array in enumerate(arrays):
+            for other in (
+                array.tolist(), np.ma.array(array), array.astype(object),
+                np.array([Decimal(float(v)) for v in array]), array.astype(">f8"),
+                np.repeat(array, 2)[::2], array[::-1].copy()[::-1],
+                np.lib.stride_tricks.as_strided(array, array.shape, array.strides),
+            ):  # fmt: skip
+                given = [*arrays[:k], other, *arrays[k + 1 :]]
+                assert_same(flat(ask(*given)), right, function)
+        if len(arrays) < 2 or function in ("deflection", "tilted_pose"):
+            continue
+        for k, array in enumerate(arrays):
+            batch = [np.tile(a, (3, 1)) for a in arrays]
+            whole = flat(ask(*batch))
+            for other in (np.repeat(array, 3)[::3], array[::-1].copy()[::-1], array[None]):
+                given = [*batch[:k], other, *batch[k + 1 :]]
+                assert_same(flat(ask(*given)), whole, function)
+
+
+def test_kinds_of_numbers():
+    for right in ([1, 2], np.array([1, 2], np.uint8), np.float32([1, 2]), (1.0, 2)):
+        found = doubles(right)
+        assert found.dtype == np.float64 and found.tolist() == [1.0, 2.0]
+    kept = np.array([1.0])
+    assert doubles(kept) is kept
+    assert doubles([10**400]).tolist() == [np.inf]
+    with pytest.raises(ValueError, match="rows of different lengths"):
+        doubles([[1.0], [1.0, 2.0]])
+    for wrong in (True, "1", b"1", 1j, None, {1.0}, np.timedelta64(1, "s"), [np.bool_(True)]):
+        with pytest.raises(ValueError, match="real numbers"):
+            doubles(wrong)
+
+
+class TestEstimators:
+    """A sample that is refused moves nothing that a good one is judged by."""
+
+    robot = load("delta_cu")
+    q = robot.inverse(robot.home())
+    motion = (q, 0.1 * q, 0.2 * q)
+    effort = np.array([0.3, 0.2, 0.1])
+
+    def pushed(self, kind, *times):
+        made = getattr(dynamics, kind)(self.robot)
+        for time in times:
+            self.push(made, time, self.motion, self.effort)
+        return made
+
+    def push(self, made, time, motion, effort, wrench=None):
+        if isinstance(made, dynamics.MomentumObserver):
+            return made.push(time, *motion[:2], effort, wrench)
+        if isinstance(made, dynamics.ContactMonitor):
+            return made.push(time, motion, effort, wrench)
+        return made.push(time, *motion, effort, wrench)
+
+    @pytest.mark.parametrize("kind", ["MomentumObserver", "ContactMonitor", "PayloadEstimator"])
+    def test_a_refused_sample_moves_nothing(self, kind):
+        times = np.arange(0.0, 0.4, 0.02)
+        disturbed, quiet = self.pushed(kind, *times), self.pushed(kind, *times)
+        q, qd, qdd = self.motion
+        nothing, far = np.full(3, np.nan), np.array([0.8, -1.4, -2.8])
+        wrongs = [
+            (np.nan, self.motion, self.effort), (np.inf, self.motion, self.effort),
+            (times[-1], self.motion, self.effort), (0.0, self.motion, self.effort),
+            (0.5, (nothing, qd, qdd), self.effort), (0.5, (q, nothing, qdd), self.effort),
+            (0.5, (far, qd, qdd), self.effort), (0.5, (q[:2], qd, qdd), self.effort),
+            (0.5, (q, np.tile(qd, (2, 1)), qdd), self.effort),
+            (0.5, self.motion, nothing), (0.5, self.motion, self.effort[:1]),
+            (0.5, self.motion, np.ma.array(self.effort, mask=[1, 0, 0])),
+            (0.5, self.motion, self.effort, np.full(6, np.nan)),
+        ]  # fmt: skip
+        if kind != "MomentumObserver":
+            wrongs.append((0.5, (q, qd, nothing), self.effort))
+        for wrong in wrongs:
+            with pytest.raises(ValueError, match=r"\w"):
+                print(kind, wrong, self.push(disturbed, *wrong))
+        found = [
+            flat(self.push(made, 0.4, self.motion, self.effort)) for made in (disturbed, quiet)
+        ]
+        assert len(found[0])
+        np.testing.assert_array_equal(*found)
+
+    @pytest.mark.parametrize("kind", ["MomentumObserver", "ContactMonitor", "PayloadEstimator"])
+    def test_arrays_may_be_used_again_by_the_caller(self, kind):
+        """A reader of a stream fills the same arrays sample by sample."""
+        rng = np.random.default_rng(1)
+        rows = [tuple(self.q + 0.01 * rng.normal(size=3) for _ in range(4)) for _ in range(30)]
+        fresh, used = (getattr(dynamics, kind)(self.robot) for _ in range(2))
+        room = [np.zeros(3) for _ in range(4)]
+        for k, row in enumerate(rows):
+            for place, value in zip(room, row, strict=True):
+                place[:] = value
+            pair = [
+                self.push(made, 0.02 * k, arrays[:3], arrays[3])
+                for made, arrays in ((fresh, row), (used, room))
+            ]
+        np.testing.assert_array_equal(*map(flat, pair))
+
+    def test_an_alarm_takes_no_sample_that_is_not_finite(self):
+        alarm = elasticity.StiffnessAlarm(load("upr_rpu"))
+        pose = load("upr_rpu").home()
+        for wrench, deflection in (
+            (np.full(6, np.nan), np.zeros(6)), (WRENCH, np.full(6, np.inf)), (WRENCH, np.zeros(3)),
+        ):  # fmt: skip
+            with pytest.raises(ValueError, match=r"\w"):
+                alarm.push(0.0, pose, wrench, deflection)
+        assert alarm.count == 0
+
+
+def test_times_of_samples():
+    assert later(1.0, None) == 1.0 and later(1.0, 0.5) == 1.0
+    for time, last in ((np.nan, None), (np.inf, 1.0), (1.0, 1.0), (0.5, 1.0), (np.nan, 1.0)):
+        with pytest.raises(ValueError, match="time of a sample"):
+            later(time, last)

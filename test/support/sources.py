@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The package's sources, and which of its modules each imports when it runs."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("pkm_twin", "delta_dynamics", "stiffness_monitor")
+
+
+@cache
+def sources() -> dict[str, Path]:
+    """Every module by its dotted name."""
+    paths = (path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py")))
+    return {_module(path): path for path in paths}
+
+
+def _module(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@cache
+def imports(module: str) -> frozenset[str]:
+    """What a module imports, wherever in it: modules, also where a name of one is imported.
+
+    Imports for types alone are left out.
+    """
+    found = set()
+    for node in _running(ast.parse(sources()[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0 and node.module, f"{module}: a relative import"
+            whole = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if name in sources() else node.module for name in whole}
+    return frozenset(found)
+
+
+def _running(tree: ast.AST) -> Iterator[ast.AST]:
+    """Nodes of a source without those that stand for types alone."""
+    todo = [tree]
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
+            continue
+        yield node
+        todo += ast.iter_child_nodes(node)
+
+
+def within(module: str, package: str) -> bool:
+    """Whether a module is a package or in it."""
+    return module == package or module.startswith(package + ".")
+
+
+PURE = "pkm_twin.ros.messages"
+"""Messages to arrays, without ROS: a room of its own in the folder that it is in."""
+
+
+def room(module: str) -> str:
+    """The folder that a module belongs to; nodes apart from theirs, as pkm_twin's own modules."""
+    first, *rest = module.split(".")
+    if module == PURE:
+        return module
+    if first != "pkm_twin":
+        return f"{first}.node" if rest and rest[0].endswith("node") else first
+    if not rest or not (ROOT / first / rest[0]).is_dir():
+        return module
+    folder = f"{first}.{rest[0]}"
+    # The base class of nodes is in ros.
+    return f"{folder}.node" if rest[1:] == ["node"] and rest[0] != "ros" else folder
+
+
+@cache
+def arrows() -> frozenset[tuple[str, str]]:
+    """Pairs of rooms: who imports, and what."""
+    return frozenset(
+        (room(module), room(name))
+        for module in sources()
+        for name in imports(module)
+        if name in sources() and room(name) != room(module)
+    )
