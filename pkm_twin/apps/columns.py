@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.files import open_regular
+from pkm_twin.files import decimal, open_regular
 
 Array = NDArray[np.float64]
 MAX_CSV_BYTES = 1024**3
@@ -83,7 +83,7 @@ def _parse_columns(path: Path, rows: Iterator[list[str]]) -> dict[str, Array]:
         if len(row) != len(header):
             raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
         try:
-            values = [float(cell) for cell in row]
+            values = [decimal(cell) for cell in row]
         except ValueError as error:
             raise ParameterError(f"{path}: line {number}", str(error), "numbers") from None
         if not all(map(math.isfinite, values)):

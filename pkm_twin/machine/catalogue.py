@@ -39,8 +39,14 @@ def robot_path(robot: str | Path) -> Path:
     """The file of a robot's name or path.
 
     :raises UnknownNameError: no such name; the closest one is named.
+    :raises ParameterError: a xacro file, which is a program that writes a URDF.
     """
     text = str(robot)
+    if text.endswith(".xacro"):
+        written = Path(text.removesuffix(".xacro")).with_suffix(".urdf").name
+        raise ParameterError(
+            text, "a xacro file", f"a URDF: run `xacro {Path(text).name} > {written}` and give that"
+        )
     if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
         return Path(robot)
     if text in robot_names():

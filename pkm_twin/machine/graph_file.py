@@ -280,9 +280,13 @@ def written_out(
                 for name, entry in entries.items():
                     full = f"{name}_{number}"
                     if full in result[kind]:
+                        other = sources[kind, full].path
+                        where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in other)
                         raise ParameterError(
-                            f"{path}{kind}.{name}", full, "a name that is not taken"
-                        )
+                            f"{path}{kind}.{name}", full,
+                            f"a name of its own for each copy: {full} stands for {where[1:]} "
+                            f"already, so rename one of the two, for example {name}_b",
+                        )  # fmt: skip
                     copy = entry[number - 1]
                     result[kind][full] = _turned(copy, float(azimuth), own, number)
                     sources[kind, full] = Source(

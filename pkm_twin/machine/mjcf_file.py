@@ -11,6 +11,7 @@ May import: mujoco, numpy, the URDF file's parts.
 from __future__ import annotations
 
 import math
+import re
 import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -28,6 +29,9 @@ from pkm_twin.machine.urdf_xml import Pose
 
 Array = NDArray[np.float64]
 
+_ENDLESS: Final = re.compile(
+    r"(?:^|\s)[-+]?(?:nan(?:\(\S*\))?|inf|infinity)(?:\s|$)", re.IGNORECASE
+)
 WORLD: Final = "world"
 """The root's name."""
 MAX_INCLUDES: Final = 8
@@ -66,11 +70,16 @@ def _require_bounded(path: Path, depth: int = 0) -> None:
     top = urdf_xml.elements(path)
     if depth > MAX_INCLUDES:
         raise ParameterError(str(path), "nested includes", f"a nesting of at most {MAX_INCLUDES}")
+    names = {element.get("name") for element in top.iter()}
     folders = [path.parent]
     for compiler in top.iter("compiler"):
         folders += [path.parent / value for key, value in compiler.items() if key.endswith("dir")]
     pairs = [(element, key, text) for element in top.iter() for key, text in element.items()]
     for element, key, text in pairs:
+        # MuJoCo takes these for numbers; a part may be called so.
+        if _ENDLESS.search(text) and key != "name" and text not in names:
+            where = ".".join(filter(None, (element.tag, element.get("name"), key)))
+            raise ParameterError(where, text, "finite numbers")
         places = [folder / text for folder in folders] if key.startswith("file") else []
         for place in places:
             if place.exists() and not place.is_file():
