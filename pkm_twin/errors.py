@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Typed errors: each carries the value and the bound, as text and as attributes."""
+"""Typed errors: each carries the value and the bound, as text and as attributes; and warnings."""
 
 from __future__ import annotations
 
 import difflib
+import sys
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 
 class PkmTwinError(Exception):
@@ -66,6 +68,27 @@ def warn(path: str | Path, text: str) -> None:
     """Warn of something in a robot's file, by the file and not by a line of the program."""
     known = _warned.setdefault(str(path), {})
     warnings.warn_explicit(text, RobotWarning, str(path), 0, registry=known)
+
+
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Warnings of a robot's file are a line on stderr, without a line of the program."""
+    usual = warnings.showwarning
+
+    def show(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int,
+        file: TextIO | None = None, line: str | None = None,
+    ) -> None:  # fmt: skip
+        if issubclass(category, RobotWarning):
+            print(one_line(f"warning: {filename}: {message}", 2000), file=file or sys.stderr)
+        else:
+            usual(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = usual
 
 
 class UnreachableError(PkmTwinError, ValueError):

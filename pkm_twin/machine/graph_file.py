@@ -142,7 +142,7 @@ class JointSpec:
     axis: Array | None = schema.vector(3, default=None)
     axes: Array | None = schema.matrix(2, 3, default=None)
     actuated: bool = schema.flag(default=False)
-    home: float = schema.number(unit="{joint}", default=0.0)
+    home: float | None = schema.number(unit="{joint}", default=None)
     limits: LimitSpec | None = schema.section(LimitSpec, default=None)
     friction: FrictionSpec | None = schema.section(FrictionSpec, default=None)
     rotor_inertia: float = schema.number(at_least=0.0, unit="{rotor}", default=0.0)
@@ -180,7 +180,7 @@ class JointSpec:
                     f"{path}.{key}", self.type, "a revolute or prismatic joint, of one freedom"
                 )
         if steps == "R":
-            check_angles(self.home, f"{path}.home")
+            check_angles(self.home or 0.0, f"{path}.home")
 
     def joint(self, name: str, path: str) -> Joint:
         """As a joint of the graph."""
@@ -195,7 +195,7 @@ class JointSpec:
         inner, outer = self.between
         at = np.zeros(3) if self.at is None else self.at
         return Joint(
-            name, self.type, inner, outer, array(at), array(axes), self.actuated, self.home,
+            name, self.type, inner, outer, array(at), array(axes), self.actuated, self.home or 0.0,
             rub.viscous, rub.coulomb, rotor,
         )  # fmt: skip
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.rotations import about, from_quaternion
 from pkm_twin.machine.urdf_file import Joint, Link, Urdf
@@ -200,7 +199,7 @@ class _Reader:
         if m.jnt_actfrclimited[joint]:
             limits["effort"] = float(np.abs(m.jnt_actfrcrange[joint]).max())
         if m.jnt_stiffness[joint]:
-            warnings.warn(f"{self.path}: the spring of joint {name} is left out", stacklevel=6)
+            warn(self.path, f"the spring of joint {name} is left out")
         dof = m.jnt_dofadr[joint]
         return {
             "axes": axis[None],

@@ -6,7 +6,7 @@ May import: numpy, the standard library, the parameter files' reader.
 
 from __future__ import annotations
 
-import warnings
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import schema, urdf_loops, urdf_xml
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import UNLIMITED, Pose
@@ -114,7 +114,7 @@ def read(path: Path, robot: ET.Element) -> Urdf:
     closures = urdf_loops.closures(
         robot, beside, links, {name: joint.child for name, joint in joints.items()}
     )
-    _warn_of_units(joints, closures)
+    _warn_of_units(path, robot, joints, closures)
     actuated = _actuated(path, robot, beside, joints)
     idle = [j.name for j in joints.values() if j.type != "fixed" and j.name not in actuated]
     if not closures and idle:
@@ -363,7 +363,9 @@ def _decimals(word: str) -> int:
     return min(max(places, 0), 18)
 
 
-def _warn_of_units(joints: dict[str, Joint], closures: dict[str, Closure]) -> None:
+def _warn_of_units(
+    path: Path, robot: ET.Element, joints: dict[str, Joint], closures: dict[str, Closure]
+) -> None:
     offsets = {f"joint.{n}.origin": j.origin for n, j in joints.items()}
     offsets |= {f"{n}.{i}": f for n, c in closures.items() for i, f in enumerate(c.frames)}
     where, pose = max(
@@ -373,7 +375,16 @@ def _warn_of_units(joints: dict[str, Joint], closures: dict[str, Closure]) -> No
     )
     size = float(np.abs(pose.position).max())
     if size > LARGE:
-        warnings.warn(
+        warn(
+            path,
             f"{where}: an offset of {size:g} m; a URDF is in metres, does it say millimetres?",
-            stacklevel=4,
         )
+    for top in robot:
+        angles = [word for e in top.iter() for word in e.get("rpy", "").split()]
+        largest = max((abs(urdf_xml.number(word, "rpy")) for word in angles), default=0.0)
+        if largest > 2.0 * math.pi + 1e-6:
+            warn(
+                path,
+                f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF is in radians, does it "
+                "say degrees?",
+            )

@@ -225,8 +225,8 @@ def _joint(
         data["axis"] = _snapped(axes[0])
         if actuated:
             data["actuated"] = True
-        value = round(home, 14)
-        if value != 0.0:
+        value = round(home, 14) + 0.0
+        if value != 0.0 or (actuated and joint.type == "prismatic"):
             data["home"] = value
     if actuated and joint.limits:
         data["limits"] = joint.limits

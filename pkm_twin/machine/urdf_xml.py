@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import stat
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Container
 from dataclasses import dataclass, field
@@ -171,11 +170,6 @@ def origin(element: ET.Element | None, where: str) -> Pose:
         skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         return Pose(np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew, position)
     angles = vector(element.get("rpy", "0 0 0"), f"{where}.rpy", 3)
-    if float(np.abs(angles).max()) > 2.0 * math.pi + 1e-6:
-        warnings.warn(
-            f"{where}.rpy: {angles.tolist()}; a URDF is in radians, does it say degrees?",
-            stacklevel=5,
-        )
     return Pose(from_rpy(angles), position)
 
 

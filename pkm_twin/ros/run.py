@@ -15,7 +15,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.signals import SignalHandlerGuardCondition, SignalHandlerOptions
 
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, plain_warnings
 from pkm_twin.ros.context import middleware_arguments
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.parameters import UnknownParametersError
@@ -97,7 +97,8 @@ def run(
                 signal_handler_options=SignalHandlerOptions.NO if farewell else None,
             )
             begun = True
-            node = factory()
+            with plain_warnings():
+                node = factory()
             one_blas_thread()
             # What is loaded by now stays: the collector need not look at it again.
             gc.collect()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 
 import numpy as np
@@ -265,6 +266,19 @@ REFUSED = {
     "floating": ('"revolute"', '"floating"', "joint.motor.type: 'floating'"),
     "unknown type": ('"revolute"', '"revolut"', "did you mean 'revolute'"),
     "unknown link": ('<child link="crank"/>', '<child link="crnk"/>', "did you mean 'crank'"),
+    "two inertials": (
+        '<link name="bob"><inertial>',
+        '<link name="bob"><inertial><mass value="9"/></inertial><inertial>',
+        "link.bob.inertial: '2 <inertial> elements'",
+    ),
+    "two masses": ('<mass value="3"/>', '<mass value="3"/><mass value="4"/>', "inertial.mass"),
+    "two limits": ("<axis", '<limit lower="0" upper="9"/><axis', "joint.motor.limit: '2 <limit>"),
+    "two axes": ("<axis", '<axis xyz="1 0 0"/><axis', "joint.motor.axis: '2 <axis>"),
+    "two origins": ("<origin", '<origin xyz="1 1 1"/><origin', "origin: '2 <origin>"),
+    "two children": ('<child link="crank"/>', '<child link="crank"/><child link="bob"/>', "child"),
+    "underscores": ('<mass value="3"/>', '<mass value="1_0"/>', "link.bob.inertial.mass: '1_0'"),
+    "other digits": ('<mass value="3"/>', '<mass value="\u0663"/>', "link.bob.inertial.mass"),
+    "underscore in a limit": ('effort="3"', 'effort="1_0"', "joint.motor.limit.effort: '1_0'"),
     "no parent": ('<parent link="bob"/>', "", "joint.tip.parent"),
     "name twice": ('<link name="tool"/>', '<link name="tool"/><link name="tool"/>', "stands once"),
     "no name": ('<link name="tool"/>', '<link name="tool"/><link/>', "with a name"),
@@ -352,6 +366,44 @@ BESIDE = {
 def test_a_yaml_file_beside_it_is_refused_by_name(content, tmp_path):
     with pytest.raises(ParameterError, match=BESIDE[content]):
         read_urdf(small(tmp_path, beside=content))
+
+
+def chain(folder, count):
+    """A crank on a motor, and so many links that fixed joints hang one on another."""
+    links = "".join(
+        f'<link name="l{k}"/><joint name="j{k}" type="fixed"><parent link="{parent}"/>'
+        f'<child link="l{k}"/></joint>'
+        for k, parent in enumerate(["crank", *(f"l{k}" for k in range(count - 1))])
+    )
+    path = small(folder)
+    path.write_text(path.read_text().replace("</robot>", links + "</robot>"))
+    return path
+
+
+def test_long_chains_of_fixed_links_take_time_in_proportion(tmp_path):
+    seconds = []
+    for count in (1500, 12000):
+        path = chain(tmp_path, count)
+        begin = time.process_time()
+        data = read_urdf(path, platform=f"l{count - 1}")
+        seconds.append(time.process_time() - begin)
+        assert list(data["bodies"]) == [f"l{count - 1}"]
+    # Eight times the links: in squares it would be 64 times the time.
+    assert seconds[1] < 25 * seconds[0]
+
+
+def test_more_joints_than_can_be_assembled_are_rejected(tmp_path):
+    path = chain(tmp_path, 1001)
+    path.write_text(path.read_text().replace('type="fixed"', 'type="continuous"'))
+    with pytest.raises(ParameterError, match="at most 1000"):
+        read_urdf(path)
+
+
+@pytest.mark.parametrize("name", ["robot.xacro", "robot.urdf.xacro"])
+def test_a_xacro_file_says_what_to_do(name, tmp_path):
+    (tmp_path / name).write_text(SMALL)
+    with pytest.raises(ParameterError, match=f"run `xacro {name} > robot.urdf`"):
+        load(tmp_path / name)
 
 
 def test_unknown_platform_and_base_are_refused(tmp_path):
