@@ -108,11 +108,11 @@ def _loose(engine: Engine) -> list[str]:
     free = null(ju, _NONE)
     if not free.shape[1]:
         return []
-    spinning = idle_bodies(engine.graph, motion, free)
-    joints = engine.graph.joints.values()
+    graph = engine.graph
+    spinning = [s for s in idle_bodies(graph, motion, free) if graph.platform not in s[0]]
     texts = []
     for bodies, _, _ in spinning:
-        at = [j.name for j in joints if (j.inner in bodies) != (j.outer in bodies)]
+        at = [j.name for j in graph.joints.values() if (j.inner in bodies) != (j.outer in bodies)]
         texts.append(f"{' with '.join(bodies)} can turn alone, at {' and '.join(at)}")
     ways = np.array([way for _, _, way in spinning]).reshape(-1, free.shape[1])
     names = _owners(engine, free @ null(ways, _NONE))
@@ -140,7 +140,8 @@ def _locked(engine: Engine) -> list[str]:
 
 
 def _owners(engine: Engine, motions: Array) -> list[str]:
-    """Joints and free bodies that take part in motions, shape (unknown rates, count)."""
+    """Joints, and bodies that only rods hold, in motions of shape (unknown rates, count)."""
     parts = np.abs(motions).max(1, initial=0.0) > _NONE
     owners: Sequence[str] = engine.tree.owners
-    return list(dict.fromkeys(o for o, part in zip(owners, parts, strict=True) if part))
+    found = dict.fromkeys(o for o, part in zip(owners, parts, strict=True) if part)
+    return [name.removeprefix("free body ") for name in found]

@@ -129,11 +129,12 @@ class JointSpec:
     """A joint between an inner and an outer body, through the point ``at`` (m) at home.
 
     Its number is the motion of the outer body against the inner one, along or about ``axis``, and
-    ``home`` at home. ``axes``: of a universal joint, the first fixed in the inner body, the second
-    in the outer one. A ``translation`` is three slides along base axes. ``limits`` are those of
-    actuated joints. ``rotor_inertia``: of the drive, reflected to the joint, inertia without
-    weight; or ``drive``, which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a
-    screw's or belt's ``lead`` (joints that slide). ``compliance``: in the joint's own axes.
+    ``home`` at home (0 where left out). ``axes``: of a universal joint, the first fixed in the
+    inner body, the second in the outer one. A ``translation`` is three slides along base axes.
+    ``limits`` are those of actuated joints. ``rotor_inertia``: of the drive, reflected to the
+    joint, inertia without weight; or ``drive``, which reflects the rotor's by a gear's ``ratio``
+    (joints that turn) or a screw's or belt's ``lead`` (joints that slide). ``compliance``: in the
+    joint's own axes.
     """
 
     type: str = schema.choice(*FREEDOMS)
