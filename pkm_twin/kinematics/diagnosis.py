@@ -21,7 +21,7 @@ from pkm_twin.kinematics.engine import RANK, Engine
 from pkm_twin.kinematics.spins import idle_bodies, null
 from pkm_twin.machine.graph import Array, Graph
 
-TOLERANCES: Final = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2)
+TOLERANCES: Final = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 1e-2)
 """Deviations up to which conditions are made to hold, rad and parts of the machine's size."""
 MOST: Final = 5
 """Most causes that an error names."""
@@ -35,7 +35,9 @@ _CLEAR: Final = 1e-5
 
 def mobility_error(engine: Engine) -> MobilityError:
     """The error of a machine whose actuated joints do not determine it, with the causes."""
-    causes = near_conditions(engine.graph)
+    # What nearly holds takes freedoms away; where there are too many, none is lost.
+    lost = engine.mobility.freedoms < engine.joints
+    causes = near_conditions(engine.graph) if lost else []
     texts = [c.text for c in causes[:MOST]]
     if len(causes) > MOST:
         texts.append(f"and {len(causes) - MOST} deviations more")

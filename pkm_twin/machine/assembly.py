@@ -36,8 +36,10 @@ FAR: Final = 1e-2
 """A miss that no choice of directions makes good, m or rad."""
 EXACT: Final = 1e-9
 """Loops that miss by less are closed for all purposes, m or rad."""
-CLOSED: Final = 1e-5
-"""A loop that misses by more is open, m or rad; exporters write six digits."""
+CLOSED: Final = (1e-5, 1e-4)
+"""A loop that misses by more is open, m or rad: at least the one, at most the other."""
+ROUNDED: Final = 20.0
+"""In between, so many times the file's last digit: a loop is a chain of rounded places."""
 
 
 class Assembly:
@@ -49,6 +51,9 @@ class Assembly:
 
     def __init__(self, urdf: Urdf) -> None:
         self.urdf = urdf
+        least, most = CLOSED
+        self.closed = min(most, max(least, ROUNDED * urdf.accuracy))
+        """A loop that misses by more is open, m or rad."""
         self.order = _order(urdf)
         self.steps: list[str] = []
         self._kinds: list[str] = []
@@ -209,7 +214,7 @@ class Assembly:
         values, miss = self.close(np.zeros(len(self.steps)))
         rng = np.random.default_rng(0)
         for spread in (0.05, 0.1, 0.2, 0.4, 0.8) * 2:
-            if miss <= CLOSED:
+            if miss <= self.closed:
                 break
             # Zero may be a place from which no small step helps.
             start = rng.uniform(-spread, spread, len(self.steps))
@@ -217,7 +222,7 @@ class Assembly:
             if less < miss:
                 values, miss = other, less
         self.place(values)
-        if miss > CLOSED:
+        if miss > self.closed:
             raise self._open()
         for _ in range(ROUNDS):
             _, rates = self.residuals()
@@ -249,7 +254,7 @@ class Assembly:
             what += f" and {turned:.3g} rad"
         return ParameterError(
             worst, f"open by {what} between {closure.links[0]} and {closure.links[1]}",
-            f"loops that close within {CLOSED:g} (m or rad)",
+            f"loops that close within {self.closed:g} (m or rad)",
         )  # fmt: skip
 
     def _extent(self) -> float:

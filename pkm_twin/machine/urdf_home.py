@@ -22,7 +22,7 @@ from pkm_twin.kinematics.conditions import Conditions
 from pkm_twin.kinematics.diagnosis import is_clear, is_right
 from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.kinematics.spins import hold, without_spins
-from pkm_twin.machine.assembly import CLOSED, EXACT, Array, Assembly
+from pkm_twin.machine.assembly import EXACT, Array, Assembly
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.graph_file import graph_of_entries, written_out
 
@@ -82,7 +82,6 @@ class HomeSearch:
 
     def __init__(self, assembly: Assembly, describe: Callable[[], dict[str, Any]]) -> None:
         self.assembly, self.describe = assembly, describe
-        self.accuracy = assembly.urdf.accuracy
         urdf = assembly.urdf
         steps = assembly.steps
         self.held = np.array([name in urdf.actuated for name in steps], bool)
@@ -133,7 +132,7 @@ class HomeSearch:
         miss = self.assembly.miss()
         if miss > EXACT:
             values, miss = self.assembly.close(values, self.held)
-        if miss > CLOSED:
+        if miss > self.assembly.closed:
             return None
         far = float((np.abs(values) / self.units)[~self.held].max(initial=0.0))
         return self._home(values, miss, "drawn" if far <= DRAWN else "wanted")
@@ -146,7 +145,7 @@ class HomeSearch:
             reach = np.where(self.turns, math.pi, 0.5 * self.assembly.size)
             start = np.where(self.held, self.wanted, rng.uniform(-reach, reach))
             values, miss = self.assembly.close(start, self.held)
-            if miss > CLOSED:
+            if miss > self.assembly.closed:
                 continue
             places = self._places(values)
             if all(float(np.abs(places - other).max()) > 1e-4 for other in known):
@@ -189,9 +188,9 @@ class HomeSearch:
                              ((self.low, -math.inf), (self.high, math.inf)))  # fmt: skip
                 start = np.minimum(np.maximum(start, low), high)
                 values, miss = self.assembly.close(start, self.held)
-                if miss > CLOSED:
+                if miss > self.assembly.closed:
                     values, miss = self.assembly.close(values)
-                if miss > CLOSED:
+                if miss > self.assembly.closed:
                     continue
                 home = self._home(self._wrapped(values), miss, "near")
                 tried += 1
@@ -211,7 +210,9 @@ class HomeSearch:
         try:
             data = self.describe()
             graph = graph_of_entries(data, written_out(data)[0])
-            settled = self._settle(graph, max(ROUNDED[2], 10 * miss, 10 * self.accuracy))
+            settled = self._settle(
+                graph, max(ROUNDED[2], 10 * miss, 20 * self.assembly.urdf.accuracy)
+            )
             index = 0.0 if settled is None else singularity_at_home(settled[0])
         except (ParameterError, SingularityError, np.linalg.LinAlgError):
             # The description is looked at again by whoever makes a robot of it.
@@ -226,7 +227,8 @@ class HomeSearch:
             sound = hold(graph, self._hinges)
             if is_right(sound) and is_clear(sound):
                 return sound, self._hinges, 0.0
-        for tolerance in (0.0, *(t for t in ROUNDED if t <= most)):
+        most = min(most, ROUNDED[-1])
+        for tolerance in (0.0, *(t for t in ROUNDED if t < most), most):
             ideal: Graph | None = graph
             rounding = 0.0
             if tolerance:
