@@ -28,8 +28,8 @@ SMALLEST: Final = 2e-3
 """Extent below which its lengths look like kilometres, or like nothing known, m."""
 GYRATION: Final = 2.0
 """A body's radius of gyration at most, in parts of the machine's extent."""
-DENSEST: Final = 2000.0
-"""All masses over the cube of the extent at most, kg/m3; a solid cube of aluminium has 2700."""
+DENSEST: Final = 4000.0
+"""All masses over the cube of the extent at most, kg/m3: between solid aluminium and steel."""
 LIGHTEST: Final = 0.01
 """The same at least, kg/m3."""
 FAR: Final = 2.0
@@ -192,7 +192,7 @@ def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
 
 def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
     total = _total(graph) + robot.payload.mass
-    positions, home = robot.limits.position, _home_joints(robot, graph)
+    positions, home = robot.limits.position, graph.home.tolist()
     for k, name in enumerate(graph.actuated):
         joint = graph.joints[name]
         turns = FREEDOMS[joint.kind] == "R"
@@ -240,14 +240,6 @@ def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
                 "kg",
                 "an inertia in kg mm2 or g cm2?",
             )
-
-
-def _home_joints(robot: Robot, graph: Graph) -> list[float]:
-    """Positions of the actuated joints at home; a mechanism's own home may be another's."""
-    home, limits = graph.home, robot.limits.position
-    if limits is not None and ((home < limits[:, 0]) | (home > limits[:, 1])).any():
-        home = robot.inverse(robot.home())
-    return [float(v) for v in home]
 
 
 def _gravity(robot: Robot) -> Iterator[Finding]:
