@@ -212,7 +212,7 @@ class Conditions:
         for (m, (a, x)), (n, (b, y)) in combinations(enumerate(events), 2):
             if set(a) & set(b) and np.linalg.norm(x - y) < 3 * self._length / _APART:
                 groups.join(m, n)
-        for number, members in enumerate(groups.members(alone=True)):
+        for number, members in enumerate(groups.members()):
             elements = list(dict.fromkeys(i for m in members for i in events[m][0]))
             gaps = {
                 m: [self._gap(events[m][1], i, lines, balls) for i in elements] for m in members
@@ -394,12 +394,12 @@ class _Groups:
     def join(self, i: int, j: int) -> None:
         self._parent[self._lead(i)] = self._lead(j)
 
-    def members(self, alone: bool = True) -> list[list[int]]:
+    def members(self) -> list[list[int]]:
         """The groups, each in order."""
         found: dict[int, list[int]] = {}
         for i in range(len(self._parent)):
             found.setdefault(self._lead(i), []).append(i)
-        return [group for group in found.values() if alone or len(group) > 1]
+        return list(found.values())
 
 
 def merged(graph: Graph) -> dict[str, str]:
