@@ -44,7 +44,7 @@ from pkm_twin.console import (
     system_error,
     table_console,
 )
-from pkm_twin.errors import ParameterError, PkmTwinError, one_line
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line, plain_warnings
 from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
@@ -565,7 +565,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point: errors are one line on stderr and exit code 1, Ctrl-C is code 130."""
     open_standard_streams()
     try:
-        with first_signal(lambda: SystemExit(INTERRUPTED)):
+        with first_signal(lambda: SystemExit(INTERRUPTED)), plain_warnings():
             app(arguments, prog_name="pkm-twin")
     except SystemExit:
         failed = flush_output()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
 from pkm_twin import load
 from pkm_twin.apps.check import motion
-from pkm_twin.apps.columns import read_columns, times_of
+from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.apps.loads import Load, by_load
 from pkm_twin.apps.recorded import read_recording
@@ -130,6 +130,7 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
     time = columns["time"]
     times_of(path, time)
     qd, qdd = stack("velocity"), stack("acceleration")
+    check_motion_times(path, time, q, qd)
     if (qd is None or qdd is None) and len(time) < 3:
         raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
     rates = _differentiated(q, time) if qd is None else qd

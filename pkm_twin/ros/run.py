@@ -15,7 +15,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, plain_warnings
 from pkm_twin.ros.context import middleware_arguments
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.parameters import UnknownParametersError
@@ -77,8 +77,9 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
                 args=middleware_arguments(sys.argv if arguments is None else arguments),
                 signal_handler_options=SignalHandlerOptions.NO,
             )
-            for factory in factories:
-                nodes.append(factory())
+            with plain_warnings():
+                for factory in factories:
+                    nodes.append(factory())
             one_blas_thread()
             # What is loaded by now stays: the collector need not look at it again.
             gc.collect()
