@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import InertiaStamped, WrenchStamped
 from rclpy.time import Time
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
@@ -21,6 +20,7 @@ from delta_dynamics.feedforward import Torques
 from delta_dynamics.payload import PayloadEstimator
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
+from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.messages import SECOND
 
 PAYLOAD_PERIOD = 4_000_000
@@ -101,7 +101,7 @@ class Estimates:
         if not wanted:
             return None
         self._wrench = node.create_guarded_publisher(WrenchStamped, "~/external_wrench")
-        self._effort = node.create_guarded_publisher(JointState, "~/external_effort")
+        self._effort = JointPublisher(node, robot, "~/external_effort")
         self._event = node.create_guarded_publisher(Bool, "~/contact", latched=True)
         return ContactMonitor(robot, bandwidth, sigmas)
 
@@ -156,11 +156,8 @@ class Estimates:
         force, torque = message.wrench.force, message.wrench.torque
         force.x, force.y, force.z, torque.x, torque.y, torque.z = found.wrench.tolist()
         self._wrench.publish(message)
-        controller = self._robot().controller
-        efforts = JointState(name=list(controller.names))
-        efforts.header.stamp = stamp
-        efforts.effort = controller.controller_efforts(found.external).tolist()
-        self._effort.publish(efforts)
+        own = self._robot().controller
+        self._effort.publish(torques.stamp, own.controller_efforts(found.external))
         if found.touching != self.touching:
             self.touching = found.touching
             self.contacts += found.touching

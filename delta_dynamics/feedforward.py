@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import (
     SECOND,
@@ -173,8 +174,8 @@ class Feedforward:
         """Distance of the last answered state from a singularity, 0 in one, 1 at best."""
         return None if self._last_good is None else float(self.robot.singularity(self._last_good))
 
-    def trajectory(self, message: Any, now: int) -> Array:
-        """Efforts for every point, shape (points, n), in the message's joint order.
+    def trajectory(self, message: Any, now: int) -> ControllerNumbers:
+        """The controller's efforts for every point, (points, n), in the message's joint order.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -183,9 +184,9 @@ class Feedforward:
             try:
                 next(steps)
             except StopIteration as end:
-                return cast(Array, end.value)
+                return cast(ControllerNumbers, end.value)
 
-    def trajectory_steps(self, message: Any, now: int) -> Generator[None, None, Array]:
+    def trajectory_steps(self, message: Any, now: int) -> Generator[None, None, ControllerNumbers]:
         """As :meth:`trajectory`, some points at a time: it yields between them.
 
         The robot and the settings are those of the beginning.
@@ -254,7 +255,7 @@ class Feedforward:
             return zero
         return inverse_dynamics(self.robot, self._last_good, zero, zero)
 
-    def _trajectory_steps(self, message: Any, now: int) -> Generator[None, None, Array]:
+    def _trajectory_steps(self, message: Any, now: int) -> Generator[None, None, ControllerNumbers]:
         robot, settings, reader = self.robot, self.settings, self._reader
         t = reader.trajectory(message, now)
         yield
@@ -273,14 +274,14 @@ class Feedforward:
         self.saturations += saturated
         return self._for_joints(efforts, t.columns)
 
-    def sent(self, effort: Array) -> Array:
+    def sent(self, effort: Array) -> ControllerNumbers:
         """Efforts of the model, shape (..., n), in the controller's numbers."""
         return self.robot.controller.controller_efforts(effort)
 
-    def _for_joints(self, efforts: Array, columns: Sequence[int]) -> Array:
+    def _for_joints(self, efforts: Array, columns: Sequence[int]) -> ControllerNumbers:
         """Efforts (p, n) in a message's order, zero for joints that the model lacks."""
         padded = np.hstack([self.sent(efforts), np.zeros((len(efforts), 1))])
-        return np.ascontiguousarray(padded[:, columns])
+        return ControllerNumbers(np.ascontiguousarray(padded[:, columns]))
 
     def _check_singularity(self, measures: Array, first: int) -> None:
         """Points of a trajectory from ``first`` on, shape (points,)."""

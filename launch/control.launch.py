@@ -126,7 +126,7 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, object]:
     """The settings with the robot's joints, each section under its node's full name."""
     path = Path(given["controllers"] or HERE / "controllers.yaml")
     sections = yaml.safe_load(path.read_text(encoding="utf-8"))
-    joints = list(load(given["robot"]).joint_names)
+    joints = list(load(given["robot"]).controller.names)
     for name, section in sections.items():
         parameters = section["ros__parameters"]
         if name not in ("controller_manager", "joint_state_broadcaster"):

@@ -37,6 +37,8 @@ ENDINGS = (".csv", ".parquet")
 WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
+MAPPED = "tables have the model's numbers of the joints; joint_map is for messages and bags"
+"""Said of a robot that has a map."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ def motion_of_bag(
             str(r.topics),
             f"payload: {r.load or 'the robot file alone'}",
             *([f"left out as a node does: {refused}; first: {r.first_reject}"] if refused else []),
+            *([] if r.robot.controller.plain else [MAPPED]),
         ),
     )
 
@@ -134,6 +137,7 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
         raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
     rates = _differentiated(q, time) if qd is None else qd
     wrench = [columns.get(name, np.zeros(len(time))) for name in WRENCH_AXES]
+    notes = [] if carried is None else [f"payload: {carried}"]
     return Motion(
         machine,
         time,
@@ -142,7 +146,7 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
         _differentiated(rates, time) if qdd is None else qdd,
         np.stack(wrench, -1),
         load=carried,
-        notes=() if carried is None else (f"payload: {carried}",),
+        notes=tuple(notes if machine.controller.plain else [*notes, MAPPED]),
     )
 
 
