@@ -114,6 +114,30 @@ def test_a_fault_is_bad_and_named(twin, tmp_path, change, what, value):
     assert what in shown.out.splitlines()[-1]
 
 
+@pytest.mark.parametrize("effort", [0.0, 0.1])
+def test_drives_that_are_off_or_braked_are_left_out(twin, tmp_path, effort):
+    """The machine stands for 0.41 s; a part of it without efforts, then all that is judged."""
+
+    def braked(topic, message, time):
+        if topic == JOINTS and time < 0.3:
+            message.effort = [effort] * 3
+        return message
+
+    result = twin("check", rewrite(DELTA, tmp_path / "braked.mcap", braked), "--json")
+    assert (result.code, result.err) == (0, "")
+    items = items_of(result)
+    item = items["drives off or braked"]
+    assert item["verdict"] == "good"
+    assert 0.28 < float(item["value"].split()[0]) < 0.45
+    assert sum("torque residual of" in what for what in items) == 3
+    bag = rewrite(DELTA, tmp_path / "off.mcap", braked, seconds=0.29)
+    result = twin("check", bag, "--json")
+    assert (result.code, result.err) == (0, "")
+    items = items_of(result)
+    assert items["drives off or braked"]["verdict"] == "unknown"
+    assert not any("torque residual" in what for what in items)
+
+
 def test_only_the_contradicted_joint_is_bad(twin, tmp_path):
     items = items_of(
         twin("check", rewrite(DELTA, tmp_path / "b.mcap", one_effort_reversed), "--json")
