@@ -105,6 +105,9 @@ class DeltaDynamics(health.TwinNode):
         self._estimates = Estimates(
             self, lambda: self._feedforward.robot, (self._base_frame, "platform")
         )
+        self._feedforward.doubted = self._estimates.wanted
+        if self._estimates.warning():
+            self.get_logger().warning(self._estimates.warning())
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         # Long messages must not lose their parts.
         self.create_guarded_subscription(
@@ -193,8 +196,10 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
         values |= self._estimates.diagnose()
-        if self._estimates.touching and level == health.OK:
-            level, message = health.WARN, "something pushes: an external effort is beyond its bound"
+        if self._estimates.idle and level == health.OK:
+            message = "the drives are off or braked: their efforts are left out"
+        elif self._estimates.touching and level == health.OK:
+            level, message = health.WARN, "contact detected: an external effort is beyond its bound"
         if core.wrenches is not None:
             taken = core.wrenches.stream
             values["wrenches taken"] = taken.accepted
