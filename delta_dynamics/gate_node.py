@@ -5,23 +5,23 @@ from __future__ import annotations
 
 import sys
 import time
-from array import array
 from typing import Any
 
 import numpy as np
 from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics.gate import Gate, GateSettings, effort_limits
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
+from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
+from pkm_twin.ros.joints import CommandPublisher, JointPublisher
 from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.run import run
 
@@ -49,9 +49,9 @@ class CommandGate(health.TwinNode):
         settings = self._declare_settings()
         self._gate = Gate(robot, settings)
         self._closed = True
-        self._commands = self.create_guarded_publisher(Float64MultiArray, "~/commands")
+        self._commands = CommandPublisher(self, robot, "~/commands")
         # The same with names and a stamp, for recordings and plots.
-        self._stamped = self.create_guarded_publisher(JointState, "~/commands_stamped")
+        self._stamped = JointPublisher(self, robot, "~/commands_stamped")
         self._declare_robot(settings)
         # A stranger's message of any size takes no time of the torques.
         definition = message_definition("sensor_msgs/msg/JointState")
@@ -108,7 +108,7 @@ class CommandGate(health.TwinNode):
     def farewell(self) -> None:
         """As deactivated; and the controller has it before the process ends."""
         super().farewell()
-        self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
+        self._commands.publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     def reset_stop(self) -> str:
         """Open without waiting for good torques."""
@@ -128,7 +128,7 @@ class CommandGate(health.TwinNode):
             "robot": self._gate.robot.name,
             "open": not stream.stopped,
             "torques forwarded": stream.accepted,
-            "controllers": self._commands.get_subscription_count(),
+            "controllers": self._commands.publisher.get_subscription_count(),
         }
         values |= {f"torques rejected: {k}": v for k, v in stream.rejected.items()}
         values |= {f"joint states rejected: {k}": v for k, v in self._gate.states.rejected.items()}
@@ -241,12 +241,9 @@ class CommandGate(health.TwinNode):
         else:
             self.get_logger().info("open: torques are forwarded")
 
-    def _send(self, command: np.ndarray[Any, Any]) -> None:
-        values = array("d", command.tobytes())
-        self._commands.publish(Float64MultiArray(data=values))
-        told = JointState(name=list(self._gate.robot.controller.names), effort=values)
-        told.header.stamp = self.get_clock().now().to_msg()
-        self._stamped.publish(told)
+    def _send(self, command: ControllerNumbers) -> None:
+        self._commands.publish(command)
+        self._stamped.publish(self.now(), command)
 
 
 def _changed(robot: Robot, values: dict[str, Any]) -> Robot:

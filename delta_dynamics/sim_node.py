@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import sys
 import time
-from array import array
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -18,7 +17,6 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
@@ -38,6 +36,7 @@ from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.variation import KINDS, MAX_SPREAD, Variation, varied
 from pkm_twin.ros import node as health
 from pkm_twin.ros.intake import RawTrajectory
+from pkm_twin.ros.joints import FIELDS, JointPublisher
 from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.run import run
 
@@ -254,7 +253,7 @@ class MachineSim(health.TwinNode):
         return np.broadcast_to(values, default.shape).copy()
 
     def _create_topics(self) -> None:
-        self._states = self.create_guarded_publisher(JointState, "joint_states")
+        self._states = JointPublisher(self, self._simulation.robot, "joint_states", FIELDS)
         self._wrenches = self.create_guarded_publisher(WrenchStamped, "wrench")
         kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._drawn = self.create_publisher(DiagnosticArray, "~/drawn", kept)
@@ -332,15 +331,15 @@ class MachineSim(health.TwinNode):
             self._clock_due = measured.stamp + CLOCK_PERIOD
             self._clock_topic.publish(Clock(clock=stamp))
         self._wrenches.publish(self._wrench(measured, stamp))
-        robot = self._simulation.robot.controller
-        state = JointState(name=list(robot.names))
-        state.header.stamp = stamp
-        state.position = _numbers(robot.offsets + robot.factors * measured.q)
-        state.velocity = _numbers(robot.factors * measured.qd)
-        state.effort = _numbers(robot.controller_efforts(measured.effort))
+        own = self._simulation.robot.controller
         self._flying += 1
         # Last: who answers it has all else.
-        self._states.publish(state)
+        self._states.publish(
+            measured.stamp,
+            own.controller_positions(measured.q),
+            own.controller_rates(measured.qd),
+            own.controller_efforts(measured.effort),
+        )
 
     def _wrench(self, measured: Measured, stamp: Any) -> WrenchStamped:
         message = WrenchStamped()
@@ -369,10 +368,6 @@ def _refuse_sim_time(changes: Sequence[Parameter]) -> SetParametersResult:
     good = not any(change.name == "use_sim_time" and change.value for change in changes)
     reason = "" if good else str(ParameterError("use_sim_time", True, OWN_CLOCK))
     return SetParametersResult(successful=good, reason=reason)
-
-
-def _numbers(values: Array) -> array[float]:
-    return array("d", values.tobytes())
 
 
 NODE = MachineSim
