@@ -91,8 +91,8 @@ class Plant:
             law = self._resistance.law(here, effort, load)
             taken = left
             if at_once > 2 * len(law.pull) or (part > CHANGES and part % 4 == 0):
-                taken, at_once, crawled = min(left, crawled), 0, 4.0 * crawled
-                here = _lessened(here, self._resistance.crawl(here, law, taken), law)
+                here, taken = self._crawl(here, law, min(left, crawled))
+                at_once, crawled = 0, 4.0 * crawled
             elif not law.stands:
                 here, taken = self._follow(here, law, left, step * RESOLVED)
             self._here, self.q, self.qd = here, here.q.copy(), here.qd.copy()
@@ -100,6 +100,16 @@ class Plant:
             if left <= 0.0:
                 return
             at_once = 0 if taken else at_once + 1
+
+    def _crawl(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
+        """Go on implicitly, for no longer than loses energy; the time that this took."""
+        for _ in range(HALVINGS):
+            end = self._resistance.crawl(here, law, span)
+            growth = _growth(here, end, law, 0.0)
+            if growth <= end.kinetic + _rounding(here, end, law):
+                break
+            span *= 0.5
+        return _lessened(here, end, law), span
 
     def _follow(self, here: Terms, law: Law, left: float, instant: float) -> tuple[Terms, float]:
         """Go on under a law, until it changes or for what is left; the time that this took.
