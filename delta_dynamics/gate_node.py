@@ -22,6 +22,7 @@ from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
+from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.run import run
 
 PAYLOAD = {
@@ -29,6 +30,9 @@ PAYLOAD = {
     "payload.com": ("com", "m, from the platform's origin"),
 }
 """What of the payload may change while the gate runs: the part that has a weight."""
+TORQUES = "delta_dynamics/joint_torques"
+MAX_DEADLINE = 3600.0
+"""Longest deadline that a node of the suite promises, s; the middleware's "none" is longer."""
 LAST_WORD = 0.5
 """How long the end waits for the controller to acknowledge the last command, s."""
 
@@ -55,7 +59,7 @@ class CommandGate(health.TwinNode):
         self._decode_state = JointStateDecoder(definition)
         self.create_guarded_subscription(
             JointState,
-            "delta_dynamics/joint_torques",
+            TORQUES,
             self._on_torques,
             raw=True,
             awaited=True,
@@ -103,8 +107,7 @@ class CommandGate(health.TwinNode):
 
     def farewell(self) -> None:
         """As deactivated; and the controller has it before the process ends."""
-        if self.active:
-            self.deactivated()
+        super().farewell()
         self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     def reset_stop(self) -> str:
@@ -119,7 +122,8 @@ class CommandGate(health.TwinNode):
         if self._gate.last_reject:
             level, message = health.WARN, f"last reject: {self._gate.last_reject}"
         if stream.stopped:
-            level, message = health.ERROR, f"closed: {stream.reason}: {stream.text}"
+            late = self._promised_too_late()
+            level, message = health.ERROR, f"closed: {late or f'{stream.reason}: {stream.text}'}"
         values: dict[str, object] = {
             "robot": self._gate.robot.name,
             "open": not stream.stopped,
@@ -130,6 +134,20 @@ class CommandGate(health.TwinNode):
         values |= {f"joint states rejected: {k}": v for k, v in self._gate.states.rejected.items()}
         values |= {f"closed: {k}": v for k, v in stream.stops.items()}
         return level, message, values
+
+    def _promised_too_late(self) -> str:
+        """Whose torques the middleware keeps from the gate, as they promise a longer deadline."""
+        deadline = self._gate.settings.deadline
+        for publisher in self.get_publishers_info_by_topic(self.resolve_topic_name(TORQUES)):
+            promised = publisher.qos_profile.deadline.nanoseconds / SECOND
+            if promised > deadline:
+                name = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+                bound = f"{promised:g} s" if promised < MAX_DEADLINE else "none"
+                return (
+                    f"{name} promises torques with deadline {bound}, the gate demands "
+                    f"{deadline:g} s, so none arrive: stale_after has to be that or less"
+                )
+        return ""
 
     def _declare_settings(self) -> GateSettings:
         d = GateSettings()
@@ -247,7 +265,7 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
 
 def main() -> None:
     """Entry point of ``ros2 run pkm_twin command_gate``."""
-    sys.exit(run(CommandGate, farewell=True))
+    sys.exit(run(CommandGate))
 
 
 if __name__ == "__main__":

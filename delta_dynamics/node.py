@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
+from rclpy.duration import Duration
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -34,6 +35,8 @@ from pkm_twin.ros.wrench import SECONDS, declare_mounts, declare_wrench
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.wrench import WrenchReader
 
+LAST_WORD: Final = 0.5
+"""How long the end waits for the controller to acknowledge the last command, s."""
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 NUMBERS: Final = "std_msgs/msg/Float64MultiArray"
 CHANGES = {
@@ -137,6 +140,8 @@ class DeltaDynamics(health.TwinNode):
         self._action = self._create_action()
         follow_changes(self, [*CHANGES, *SETTINGS], self._prepare, self._take)
         self._last_heard = 0
+        self._measured: Any = None
+        """The newest joint state that was taken."""
         self._watchdog: Any = None
         self._watch_every(stale_after)
         # A step after which no stamp that was good before is good now.
@@ -174,6 +179,19 @@ class DeltaDynamics(health.TwinNode):
             self._action.deactivated()
         if self._last_heard:
             self._stop("inactive", "the node was deactivated")
+
+    def farewell(self) -> None:
+        """What has to be the last: goals are ended, the machine held, a stop's torque sent."""
+        if self._action is not None:
+            self._action.farewell()
+        super().farewell()
+        if self._commands is not None:
+            self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
+
+    @property
+    def parting(self) -> bool:
+        """Whether the ends of goals still wait for turns of the executor."""
+        return self._action is not None and self._action.parting
 
     def reset_stop(self) -> str:
         """End a stop without waiting for good samples."""
@@ -229,6 +247,14 @@ class DeltaDynamics(health.TwinNode):
             "forwards to; empty: none",
             read_only=True,
         )
+        hold = self.declare(
+            "on_cancel",
+            "hold",
+            "what a goal that ends early leaves to its controller: a hold point with the effort "
+            "of the machine's weight, or what the controller does itself",
+            choices=("hold", "controller"),
+            read_only=True,
+        )
         if not controller:
             return None
         try:
@@ -241,7 +267,17 @@ class DeltaDynamics(health.TwinNode):
             self,
             controller,
             lambda trajectory: self._feedforward.trajectory_steps(trajectory, self.now()),
+            self._place,
+            hold == "hold",
         )
+
+    def _place(self) -> dict[str, float] | None:
+        """Where the joints are, by the controller's names and numbers; None where not measured."""
+        silent = (time.monotonic_ns() - self._last_heard) / SECOND
+        state = self._measured
+        if state is None or silent > self._feedforward.settings.stale_after:
+            return None
+        return dict(zip(state.name, map(float, state.position), strict=True))
 
     def _create_wrenches(self, settings: Settings) -> WrenchWindow | None:
         """The measured wrench, where the parameter asks for it."""
@@ -434,6 +470,7 @@ class DeltaDynamics(health.TwinNode):
                 core.refuse_joint_state(error)
                 raise
             torques = core.joint_state(message, self.now())
+            self._measured = message
             if torques is None:
                 return
             # The process may have stood still since.
@@ -536,6 +573,10 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
         else:
             sections[section] = plain
     return robot.changed(**sections)
+
+
+NODE = DeltaDynamics
+"""What a process of several nodes makes."""
 
 
 def main() -> None:

@@ -29,6 +29,8 @@ from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+SMALL: Final = 1e-6
+"""Part of the machine's size below which joints stand in one point."""
 RANK_BOUND: Final = SINGULARITY_BOUND
 """Singular values of the balance below this part of the largest count as zero."""
 CLEAR_RANK: Final = 1e-6
@@ -144,6 +146,8 @@ def least_norm_reactions(
     points = np.stack([joint.point for joint in joints], -2)
     centred = points - points.mean(-2, keepdims=True)
     size = np.sqrt(np.mean(np.sum(centred**2, -1), -1))
+    # Of joints that are all in one point the machine's own size is left.
+    size = np.where(size > SMALL * engine.graph.size, size, engine.graph.size)
 
     origin, needed = _needs(engine.graph, list(engine.tree.links), bodies, rods)
     moving = engine.graph.platform

@@ -46,6 +46,9 @@ Array = NDArray[np.float64]
 BEGIN: Final = SECOND
 """Simulated time at the start, ns: a stamp of zero would be none."""
 TICK: Final = 1e-3
+"""Shortest period of the clock, s."""
+EARLY: Final = 0.75
+"""The part of a period after which the next one may begin."""
 BUDGET: Final = 5e-3
 """How long one tick of the clock may simulate, s: messages are taken between."""
 BEHIND: Final = 0.1
@@ -88,7 +91,9 @@ class MachineSim(health.TwinNode):
         if self._lockstep:
             self.create_guarded_timer(LOOK, self._go_alone)
         else:
-            self.create_guarded_timer(TICK, self._catch_up)
+            step = settings.period / self._factor if self._factor else 0.0
+            # One turn of the executor a period: with more it would cost more than the machine.
+            self.create_guarded_timer(max(TICK, step), self._catch_up)
         self.start()
         self._publish_drawn()
 
@@ -289,7 +294,8 @@ class MachineSim(health.TwinNode):
         if self._factor == 0.0:
             self._due = begun - BUDGET
         step = period / self._factor if self._factor else 0.0
-        while self._due + step <= (now := time.monotonic()):
+        # The timer that is a little early does not wait for its next turn.
+        while self._due + EARLY * step <= (now := time.monotonic()):
             if now - begun > BUDGET:
                 break
             self._due += step
@@ -367,6 +373,10 @@ def _refuse_sim_time(changes: Sequence[Parameter]) -> SetParametersResult:
 
 def _numbers(values: Array) -> array[float]:
     return array("d", values.tobytes())
+
+
+NODE = MachineSim
+"""What a process of several nodes makes."""
 
 
 def main() -> None:

@@ -69,7 +69,8 @@ class SingularityError(PkmTwinError, ValueError):
     """A pose in which the Jacobian has no usable inverse.
 
     ``measure`` is the reciprocal condition number, lengths scaled out; ``bound`` the least allowed;
-    ``reached`` the part of the straight way from home at which it stands, None at the place itself.
+    ``reached`` the part of the straight path from home at which the singularity is met, None at the
+    place itself; ``beyond`` whether the place is on the far side of one.
     """
 
     def __init__(
@@ -79,17 +80,20 @@ class SingularityError(PkmTwinError, ValueError):
         measure: float,
         bound: float,
         reached: float | None = None,
+        beyond: bool = False,
     ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
-        if reached is None:
+        if beyond:
+            text = "lies beyond a singularity: its joint positions assemble the machine elsewhere"
+        elif reached is None:
             text = f"is singular: reciprocal condition {measure:.3g} is below {bound:.3g}"
         else:
             text = (
-                f"lies behind a singularity, at {100 * reached:.3g} % of the way from home: "
-                f"reciprocal condition {measure:.3g} there"
+                "lies beyond a singularity, which the straight path from home meets at "
+                f"{100 * reached:.3g} %"
             )
         super().__init__(f"{what}{where} {text}")
-        self.reached = reached
+        self.reached, self.beyond = reached, beyond
         self.index = index
         self.measure = measure
         self.bound = bound

@@ -21,6 +21,7 @@ MAY = {
     "pkm_twin.machine": CORE,
     "pkm_twin.mechanisms": CORE,
     "pkm_twin.kinematics": CORE,
+    "pkm_twin.export": CORE,
     "pkm_twin.streams": CORE | MESSAGES,
     "pkm_twin.state": CORE | MESSAGES | {"pkm_twin.streams"},
     "delta_dynamics": CORE | MESSAGES | {"pkm_twin.streams"},

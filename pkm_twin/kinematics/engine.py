@@ -34,6 +34,10 @@ from pkm_twin.machine.tree import Tree, snapped
 _NO_PARAMETERS: Final = np.zeros(0)
 RANK: Final = 1e-9
 """Part of a matrix's largest singular value below which one counts as zero."""
+MET: Final = 1e-9
+"""Largest miss of a closure that holds, over the machine's size."""
+POSE_WEIGHT: Final = 100.0
+"""What the pose weighs against closures where not all can be met: so a closure falls short."""
 SAMPLES: Final = 6
 """States near home, beside it, in which pivots have to be good."""
 
@@ -315,7 +319,7 @@ class Engine:
         _, x, least = self.reach(q, max(reached, 1e-12) + 1 / 8)
         part, miss = self._shortest(x, q)
         # Where nothing falls short there is an assembly, but the way does not lead to it.
-        return part, miss, least if miss < 1e-9 * self.tree.size else None
+        return part, miss, least if miss < MET * self.tree.size else None
 
     def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
         """Sign of the determinant of the kept closures, and their reciprocal condition."""
@@ -341,10 +345,11 @@ class Engine:
         """The joint or rod of every closure."""
         return [row.part for row in self.at(self.tree.home, self.graph.home)[1]]
 
-    def shortest_pose(self, pose: Array) -> tuple[str, float]:
+    def shortest_pose(self, pose: Array) -> tuple[str, float, bool]:
         """The closure that misses the most where the platform is held in a pose.
 
-        :returns: its joint or rod, and by how much it misses, m.
+        :returns: its joint or rod, by how much it misses, m, and whether all closures are met in
+            the pose: then a singularity ends the path from home to it.
         """
         walk = self.kernel("pose walk", _pose_walk)
         x = np.array([*self.tree.home, *self.graph.home], float)
@@ -353,15 +358,19 @@ class Engine:
         names = self._parts
         for _ in range(40):
             if not (np.isfinite(values).all() and np.isfinite(flat).all()):
-                return names[0], math.inf
+                return self.graph.platform, math.inf, False
             table = flat.reshape(len(values), -1)
             damped = table.T @ table + 1e-6 * np.eye(table.shape[1])
             step = np.asarray(np.linalg.solve(damped, -table.T @ values), np.float64)
             step *= min(1.0, 0.2 / max(float(np.abs(step).max(initial=0.0)), 1e-300))
             (_, _, x), _ = walk(_NO_PARAMETERS, x, pose, step)
             (values, flat, _), _ = walk(_NO_PARAMETERS, x, pose, still)
-        misses = np.abs(values[: len(names)])
-        return names[int(misses.argmax())], float(misses.max()) * self.tree.size
+        misses = np.abs(values)
+        if not names:
+            # A serial chain: what falls short is the platform itself.
+            return self.graph.platform, float(misses.max()) * self.tree.size / POSE_WEIGHT, False
+        worst = int(misses[: len(names)].argmax())
+        return names[worst], float(misses[worst]) * self.tree.size, float(misses.max()) < MET
 
     # As programs.
 
@@ -589,8 +598,7 @@ def _pose_walk(t: Traced) -> Program:
     rows = motion.closures()
     equations = poses.rows(engine.coordinates, motion, goal)
     table = np.vstack([np.hstack(matrices(tree, rows)), engine._pose_rows(motion, goal)])
-    # The pose weighs more, so that what falls short is a closure.
-    scales = [row.scale for row in rows] + [100.0 * scale for scale in engine._pose_scales]
+    scales = [row.scale for row in rows] + [POSE_WEIGHT * scale for scale in engine._pose_scales]
     columns = [*tree.scales, *(engine._drive_scale(name) for name in engine.graph.actuated)]
     entries = [
         scale * entry / column

@@ -111,7 +111,7 @@ class Motion:
     @staticmethod
     def _value(step: Step, x: Numbers, q: Numbers, origin: Array) -> Any:
         k = step.position
-        value = q[k] - float(origin[k]) if step.actuated else x[k]
+        value = q[k] - (float(origin[k]) - step.sign * step.offset) if step.actuated else x[k]
         return -value if step.sign < 0.0 else value
 
     # Points and directions that are fixed in a body, given at home.

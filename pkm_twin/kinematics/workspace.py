@@ -89,8 +89,7 @@ def within_limits(robot: Robot, q: ArrayLike) -> Mask:
 def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Mask:
     """Whether poses keep the limits of actuators and passive joints and limbs apart, shape (...).
 
-    A pose also has to be on the branch that ``forward`` gives. Limits that are absent hold
-    everywhere; a pose that is not finite raises.
+    Limits that are absent hold everywhere; a pose that is not finite raises.
 
     :param pose: shape (..., m), in the robot's pose coordinates, m and rad.
     :param least_clearance: what :func:`clearance` has to be above, m; -inf lets limbs meet. It
@@ -100,8 +99,6 @@ def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Ma
     if not np.isfinite(poses).all():
         raise ValueError("a pose is not finite")
     q, inside = try_inverse(robot, poses)
-    back, good = try_forward(robot, q)
-    inside &= good & (np.abs(back - poses) < 1e-6 * (1.0 + np.abs(poses))).all(-1)
     inside &= within_limits(robot, q)
     bound = getattr(robot.limits, "joint_angle", None)
     if bound is not None and has_joint_angles(robot):

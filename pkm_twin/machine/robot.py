@@ -54,6 +54,11 @@ R = TypeVar("R", bound="Robot")
 
 SINGULARITY_BOUND: Final = 1e-9
 """Least singularity measure (0 singular, 1 best) at which a Jacobian is inverted."""
+SAME_POSE: Final = 1e-7
+"""Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
+assembly is farther away unless a singularity is nearer than that."""
+BEYOND: Final = 3.0
+"""Code of a pose beyond a singularity, after those of programs."""
 
 _NONE: Final = np.zeros(0)
 
@@ -101,6 +106,9 @@ class Robot:
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
     element_compliance: Mapping[str, float] = schema.numbers(at_least=1e-6, at_most=1e6, default={})
     """Factors on the compliance of elastic elements, by name; 1 where left out."""
+    home_joint: float | None = None
+    """Value of every actuated joint at home, where a mechanism chooses it: kept by copies, so that
+    other limits do not move the home."""
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
     changeable: ClassVar[tuple[str, ...]] = (
@@ -116,7 +124,8 @@ class Robot:
 
         :raises ParameterError: by the field.
         """
-        robot = dataclasses.replace(schema.build(cls, data), name=name)
+        robot = schema.build(cls, data)
+        robot = dataclasses.replace(robot, name=name, home_joint=robot.chosen_home())
         _ = robot.controller
         check_uncertainty(robot)
         robot.check_elements()
@@ -151,6 +160,14 @@ class Robot:
     def limb_names(self) -> tuple[str, ...]:
         """Names of the limbs, one an actuated joint."""
         raise NotImplementedError
+
+    def chosen_home(self) -> float | None:
+        """Value of every actuated joint at home, of a mechanism whose file does not give it.
+
+        The middle of the range that the limits of all joints share, where the mechanism can be
+        assembled there; else the mechanism's own choice.
+        """
+        return None
 
     def make_graph(self) -> Graph:
         """Bodies, joints and rods at home."""
@@ -418,10 +435,10 @@ class Robot:
         return (*self.graph.bodies, *self.graph.rods, "payload")
 
     def inverse(self, pose: ArrayLike) -> Array:
-        """Joint positions q of a pose, shape (..., n).
+        """Joint positions q of a pose, shape (..., n); ``forward`` of them is the pose.
 
         :raises UnreachableError: naming limb, sample and miss.
-        :raises SingularityError: a pose on the far side of a singularity.
+        :raises SingularityError: a pose beyond a singularity, or in one.
         """
         q, codes = self._inverse(pose)
         if codes is not None:
@@ -454,7 +471,42 @@ class Robot:
         return ""
 
     def _inverse(self, pose: ArrayLike) -> tuple[Array, Array | None]:
-        """Joints; and None or codes (1 unreachable, 2 not finite, 3 singular), limb, amount."""
+        """Joints; and None or codes (1 unreachable, 2 not finite, BEYOND), limb, amount.
+
+        The joints of a pose may belong to another assembly too: ``forward`` decides.
+        """
+        q, codes = self._candidates(pose)
+        tried = q
+        if codes is not None:
+            tried = np.where(codes[..., :1] == 0.0, q, self.graph.home)
+        (found, _, _), _ = self.engine.forward(_NONE, tried)
+        # What is infinite or NaN is no pose.
+        with np.errstate(invalid="ignore"):
+            apart = found - np.asarray(pose, np.float64)
+            if self._turn_mask.any():
+                turned = np.remainder(apart + math.pi, math.tau) - math.pi
+                apart = np.where(self._turn_mask, turned, apart)
+            same = (np.abs(apart) * self._pose_units <= SAME_POSE).all(-1)
+        if codes is None:
+            if same.all():
+                return q, None
+            codes = np.zeros((*q.shape[:-1], 3))
+        other = (codes[..., 0] == 0.0) & ~same
+        codes[other] = BEYOND, 0.0, 0.0
+        return q, codes
+
+    @cached_property
+    def _turn_mask(self) -> Mask:
+        """Which pose coordinates are turns, that a full one does not change, shape (m,)."""
+        return np.array([len(c.entries) == 2 for c in self.coordinates])
+
+    @cached_property
+    def _pose_units(self) -> Array:
+        """What makes pose coordinates of unit one, shape (m,)."""
+        return np.array([1.0 if c.entries else 1.0 / self.graph.size for c in self.coordinates])
+
+    def _candidates(self, pose: ArrayLike) -> tuple[Array, Array | None]:
+        """Joints that reach the pose in some assembly; and codes as :meth:`_inverse`."""
         outputs, status = self._inverse_kernel(_NONE, pose)
         q = outputs[0]
         if len(outputs) == 1:
@@ -470,8 +522,8 @@ class Robot:
             return q, None
         limb = missed.argmax(-1)
         amount = np.take_along_axis(faults[..., :-1], limb[..., None], -1)[..., 0]
-        code = np.where(missed.any(-1), 1.0, np.where(singular, 3.0, 0.0))
-        amount = np.where(code == 3.0, faults[..., -1], amount)
+        code = np.where(missed.any(-1), 1.0, np.where(singular, BEYOND, 0.0))
+        amount = np.where(code == BEYOND, faults[..., -1], amount)
         if status is not None:
             code = np.where(status[..., 0] != 0.0, status[..., 0], code)
         return q, np.stack([code, limb.astype(float), amount], -1)
@@ -484,11 +536,13 @@ class Robot:
         one = np.broadcast_to(np.asarray(pose, float), (*codes.shape[:-1], len(self.coordinates)))
         if code == NOT_FINITE or not np.isfinite(one[index]).all():
             raise _not_finite("pose", index)
-        if code == 3.0:
-            raise SingularityError("pose", index, amount, SINGULARITY_BOUND)
+        if code == BEYOND:
+            raise SingularityError("pose", index, max(amount, 0.0), SINGULARITY_BOUND, beyond=True)
         if self.has_inverse:
             raise UnreachableError("pose", self.limb_names[int(limb)], index, amount)
-        part, miss = self.engine.shortest_pose(one[index])
+        part, miss, met = self.engine.shortest_pose(one[index])
+        if met:
+            raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, amount)
         raise UnreachableError("pose", part, index, miss, amount)
 
     def forward(self, q: ArrayLike) -> Array:
@@ -546,9 +600,8 @@ class Robot:
         return self.platform(self.inverse(pose))[1]
 
     def home(self) -> Array:
-        """The pose in the middle of the actuated joints' limits, shape (m,)."""
-        limits = self.limits.position
-        return self.engine.home_pose.copy() if limits is None else self.forward(limits.mean(1))
+        """The pose at home, shape (m,): that of the graph, which all vectors of it belong to."""
+        return self.engine.home_pose.copy()
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Pose rates per joint rate, shape (..., m, n)."""

@@ -44,6 +44,17 @@ def check_azimuths(azimuths: Array, path: str) -> None:
             raise ParameterError(path, azimuths.tolist(), "limbs at least 0.001 rad apart")
 
 
+def shared_middle(limits: Array | None) -> float | None:
+    """Middle of the range that the limits of all joints share, shape (n, 2); None: there is none.
+
+    Infinite ends have no middle.
+    """
+    if limits is None:
+        return None
+    low, high = float(limits[:, 0].max()), float(limits[:, 1].min())
+    return 0.5 * (low + high) if low <= high and math.isfinite(high - low) else None
+
+
 @dataclass(frozen=True, eq=False)
 class Payload:
     """A body fixed to the platform: com from its reference point, inertia about the com."""

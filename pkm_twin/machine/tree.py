@@ -11,6 +11,7 @@ May import: numpy, this package's graph, the standard library.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import BASE, FREEDOMS, Graph, across, unit
+from pkm_twin.machine.graph import BASE, FREEDOMS, Graph, across, rotation_about_z, unit
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,8 @@ RATES: Final = {"R": 1, "P": 1, "S": 3, "F": 6}
 """Rates of a step; S a ball, F a free body."""
 _START: Final = {"R": (0.0,), "P": (0.0,), "S": (1.0, 0, 0, 0), "F": (1.0, 0, 0, 0, 0, 0, 0)}
 _SNAP: Final = 1e-14
+PARALLEL: Final = 1e-6
+"""Sine of an angle, or part of the machine's size, that counts as zero for a choice of axes."""
 
 
 def snapped(values: Array) -> Array:
@@ -40,7 +43,7 @@ def axes_with_z(z: Array, hint: Array) -> Array:
     """Axes whose z is given and whose x points towards a hint, as columns."""
     x = hint - (hint @ z) * z
     size = float(np.linalg.norm(x))
-    x = x / size if size > 1e-6 else across(z)[0]
+    x = x / size if size > PARALLEL else across(z)[0]
     return np.array([x, np.cross(z, x), z]).T
 
 
@@ -51,7 +54,8 @@ class Step:
     ``axis``: at home, base axes. ``sign``: -1 where the tree goes from the outer body to the inner
     one. ``position``, ``rate``: first index among the unknowns, or of an actuated joint among q.
     ``before``: constant rotation from the body frame before the step to the step's own (R only).
-    ``local``: the axis in the body frame before the step.
+    ``local``: the axis in the body frame before the step. ``offset``: of an actuated turn, its
+    angle from ``before`` to the body's frame at home, rad.
     """
 
     kind: str
@@ -63,6 +67,7 @@ class Step:
     before: Array
     local: Array
     joint: str
+    offset: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,12 +177,14 @@ class Tree:
         turns = [k for k, kind in enumerate(kinds) if kind == "R"]
         for k, kind in enumerate(kinds):
             axis = unit(axes[k]) if kind in "RP" else np.zeros(3)
-            before, local = np.eye(3), snapped(frame.T @ axis)
+            before, local, offset = np.eye(3), snapped(frame.T @ axis), 0.0
             if kind == "R":
                 following = [axes[i] for i in turns if i > k]
-                hint = following[0] if following else self._next_axis(body, name, frame)
-                turned = axes_with_z(axis, hint)
-                before, frame = snapped(frame.T @ turned), turned
+                hint = following[0] if following else self._next_axis(body, name, axis)
+                turned = axes_with_z(axis, frame[:, 0] if hint is None else hint)
+                if actuated and hint is None:
+                    offset = self._tilt(body, turned, at)
+                before, frame = snapped(frame.T @ turned), turned @ rotation_about_z(offset)
             if actuated:
                 position = rate = graph.actuated.index(str(name))
             else:
@@ -190,7 +197,9 @@ class Tree:
                 )
             sign = -1.0 if backwards else 1.0
             steps.append(
-                Step(kind, axis, actuated, position, rate, sign, before, local, name or body)
+                Step(
+                    kind, axis, actuated, position, rate, sign, before, local, name or body, offset
+                )
             )
         if kinds in ("S", "F"):
             frame = np.eye(3)
@@ -198,9 +207,25 @@ class Tree:
         arm = snapped(self.axes[parent].T @ (at - self.at[parent]))
         self.links[body] = Link(body, parent, name, tuple(steps), at, frame, arm)
 
-    def _next_axis(self, body: str, name: str | None, frame: Array) -> Array:
-        """Axis of another joint of the body: with it most constant rotations become simple."""
+    def _tilt(self, body: str, frame: Array, at: Array) -> float:
+        """Angle about z by which axes x or y of a frame lie along the body's first lever, rad.
+
+        Told by the joint's angle, it leaves a lever one number and the frame before it simple.
+        """
+        for point in self.graph.joint_points(body):
+            x, y, _ = frame.T @ (point - at)
+            if math.hypot(x, y) > PARALLEL * self.graph.size:
+                tilt = math.remainder(math.atan2(y, x), math.pi / 2)
+                return tilt if abs(tilt) > _SNAP else 0.0
+        return 0.0
+
+    def _next_axis(self, body: str, name: str | None, axis: Array) -> Array | None:
+        """Axis of another joint of the body: with it most constant rotations become simple.
+
+        None where there is none, or the first is parallel to this one.
+        """
         for joint in self.graph.joints.values():
             if joint.name != name and body in (joint.inner, joint.outer) and len(joint.axes):
-                return np.asarray(joint.axes[0], np.float64)
-        return np.asarray(frame[:, 0], np.float64)
+                parallel = np.linalg.norm(np.cross(axis, joint.axes[0])) <= PARALLEL
+                return None if parallel else np.asarray(joint.axes[0], np.float64)
+        return None

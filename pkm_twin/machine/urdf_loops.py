@@ -141,10 +141,9 @@ def _pairs(
         if str(kind).lower() not in types:
             raise UnknownNameError(f"type[{i}]", kind, types)
         # A joint's frame moves with its child, so that the child link's frame is the same.
-        for name in pair:
-            if name not in joints and name not in links:
-                raise UnknownNameError(f"closed_loop[{i}]", name, [*links, *joints])
-        ends = [joints.get(name, name) for name in pair]
+        known = [*links, *joints]
+        found = [urdf_xml.known_link(f"closed_loop[{i}]", name, known) for name in pair]
+        ends = [joints.get(name, name) for name in found]
         closures.append(
             _closure("_".join(pair), types[str(kind).lower()], ends, (Pose(), Pose()), None)
         )

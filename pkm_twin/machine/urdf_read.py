@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError
 from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.urdf_file import Joint, Urdf
@@ -60,8 +60,7 @@ def read_urdf(
     urdf = mjcf_file.read(path) if top.tag == "mujoco" else urdf_file.read(path, top)
     tool = _platform(urdf, platform)
     ground = urdf.root if base is None else base
-    if ground not in urdf.links:
-        raise UnknownNameError("base", ground, urdf.links)
+    ground = urdf_xml.known_link("base", ground, urdf.links)
     assembly = Assembly(urdf)
     bodies = _bodies(urdf, assembly.order, tool, ground)
     values, miss = assembly.nearest()
@@ -109,9 +108,7 @@ def read_urdf(
 
 def _platform(urdf: Urdf, asked: str | None) -> str:
     if asked is not None:
-        if asked not in urdf.links:
-            raise UnknownNameError("platform", asked, urdf.links)
-        return asked
+        return urdf_xml.known_link("platform", asked, urdf.links)
     lower = {name.lower(): name for name in urdf.links}
     for name in PLATFORMS:
         if name in lower:

@@ -7,6 +7,7 @@ May import: numpy, the standard library, the parameter files' bounds.
 from __future__ import annotations
 
 import math
+import re
 import stat
 import warnings
 import xml.etree.ElementTree as ET
@@ -29,6 +30,7 @@ MAX_FILE_SIZE: Final = 4 * 1024 * 1024
 """Largest URDF that is read, bytes."""
 MAX_DEPTH: Final = 64
 """Deepest nesting of elements that is read."""
+ROMAN: Final = {"I": "1", "II": "2", "III": "3", "IV": "4", "V": "5", "VI": "6"}
 UNLIMITED: Final = {
     "revolute": 2.0 * math.pi - 1e-6,
     "prismatic": 10.0,
@@ -121,6 +123,23 @@ def only(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
     for child in element if element is not None else ():
         if child.tag not in tags and ":" not in child.tag:
             raise UnknownNameError(where, child.tag, tags)
+
+
+def plain_name(name: str) -> str:
+    """A link's name that takes no quoting anywhere: ``arm I`` is ``arm_1``."""
+    words = re.sub(r" (I{1,3}|IV|VI?)(?![A-Za-z0-9])", lambda found: "_" + ROMAN[found[1]], name)
+    return re.sub(r"\s", "_", words)
+
+
+def known_link(where: str, name: str, links: Collection[str]) -> str:
+    """A link by its name, or by the name of a robot's part that it is written out for.
+
+    :raises UnknownNameError: there is none.
+    """
+    for known in (name, plain_name(name)):
+        if known in links:
+            return known
+    raise UnknownNameError(where, name, links)
 
 
 def reference(element: ET.Element | None, where: str, links: Iterable[str]) -> str:

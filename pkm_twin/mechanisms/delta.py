@@ -22,7 +22,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Final
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,7 @@ from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import Inverse, Robot
-from pkm_twin.machine.sections import check_azimuths, length, mass
+from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.machine.shared import Key, Shared, above_zero, bar, point_mass, shared_number
 
 Array = NDArray[np.float64]
@@ -45,6 +44,8 @@ Array = NDArray[np.float64]
 LIMBS: Final = ("I", "II", "III")
 UP: Final = array([0.0, 0.0, 1.0])
 PLATFORM: Final = "platform"
+EVEN: Final = 0.02
+"""Least of :meth:`Delta._evenness` at home, of 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +64,6 @@ class Geometry:
         if self.closures.count("rcu") > 1:
             raise ParameterError(f"{path}.closures", list(self.closures), "at most one rcu limb")
         check_azimuths(self.azimuths, f"{path}.azimuths")
-
-
-_HOMES: WeakKeyDictionary[Geometry, tuple[Array, Array]] = WeakKeyDictionary()
-"""Found once a geometry: a mass that is changed while a stream runs leaves it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,33 +160,37 @@ class Delta(Robot):
 
     @cached_property
     def _home(self) -> tuple[Array, Array]:
-        """Joints and platform at home: equal angles, as far from singularities as they can be."""
-        if self.geometry not in _HOMES:
-            _HOMES[self.geometry] = self._find_home()
-        return _HOMES[self.geometry]
-
-    def _find_home(self) -> tuple[Array, Array]:
-        best: tuple[float, Array, Array] | None = None
-        for angle in np.linspace(-1.5, 1.5, 61):
-            q = np.full(3, angle)
-            platform = self._assemble(q)
-            if platform is None:
-                continue
-            rows = np.array([self._forearm(i, angle, platform) for i in range(3)], float)
-            rows /= self.geometry.forearm_length
-            # How well forearms hold the platform, and how well each arm moves its own.
-            measure = float(abs(np.linalg.det(rows)))
-            for i in range(3):
-                lever = -np.sin(angle) * self._directions[i][0] - np.cos(angle) * UP
-                measure = min(measure, float(abs(rows[i] @ lever)))
-            if best is None or measure > best[0]:
-                best = measure, q, platform
-        if best is None:
+        """Joints and platform at home."""
+        q = np.full(3, self.chosen_home() if self.home_joint is None else self.home_joint)
+        platform = self._assemble(q)
+        if platform is None:
             g = self.geometry
             raise ParameterError(
                 "geometry.forearm_length", g.forearm_length, "one with which limbs can be assembled"
             )
-        return best[1], best[2]
+        return q, platform
+
+    def chosen_home(self) -> float:
+        """Angle of the arms at home, rad: the middle of their limits, if it is regular.
+
+        Else the one that is farthest from singularities.
+        """
+        middle = shared_middle(self.limits.position)
+        if middle is not None and self._evenness(middle) > EVEN:
+            return middle
+        return float(max(np.linspace(-1.5, 1.5, 61), key=self._evenness))
+
+    def _evenness(self, angle: float) -> float:
+        """How well forearms hold the platform, and each arm moves its own; 0: no assembly."""
+        platform = self._assemble(np.full(3, angle))
+        if platform is None:
+            return 0.0
+        rows = np.array([self._forearm(i, angle, platform) for i in range(3)], float)
+        rows /= self.geometry.forearm_length
+        measure = float(abs(np.linalg.det(rows)))
+        for row, (out, _) in zip(rows, self._directions, strict=True):
+            measure = min(measure, float(abs(row @ (np.sin(angle) * out + np.cos(angle) * UP))))
+        return measure
 
     def _assemble(self, q: Array) -> Array | None:
         """Platform centre below the elbows, on numbers."""

@@ -47,7 +47,7 @@ from pkm_twin.machine.inertia import transport
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import SINGULARITY_BOUND, Inverse, Robot
-from pkm_twin.machine.sections import check_azimuths, length, mass
+from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.machine.shared import (
     Key,
     Shared,
@@ -171,7 +171,7 @@ class Prru(Robot):
 
     @cached_property
     def _rise(self) -> float:
-        """Height of the level platform over the sliders, which stand at zero at home."""
+        """Height of the level platform over the sliders."""
         g = self.geometry
         aside = g.base_radius - g.platform_radius
         return self._sign * float(np.sqrt(g.limb_length**2 - aside**2))
@@ -274,19 +274,24 @@ class Prru(Robot):
         z = float(travel.min()) - reach, float(travel.max()) + reach
         return np.array([z, (-right, right), (-right, right)])
 
+    def chosen_home(self) -> float:
+        """Height of the sliders at home, m: the middle of their limits, else zero."""
+        return shared_middle(self.limits.position) or 0.0
+
     def make_graph(self) -> Graph:
         """Sliders, links and platform, level."""
         g, m = self.geometry, self.inertia
+        height = self.chosen_home() if self.home_joint is None else self.home_joint
         l = g.limb_length  # noqa: E741
         thin = np.array([l**2 / 12, 0.0])
         lower = m.lower_link_mass * thin if m.lower_link_inertia is None else m.lower_link_inertia
         upper = m.upper_link_mass * thin if m.upper_link_inertia is None else m.upper_link_inertia
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
-        origin = array([0.0, 0.0, self._rise])
+        origin = array([0.0, 0.0, height + self._rise])
         for i, limb in enumerate(LIMBS):
             e, t = self._directions(i)
-            foot = array(-g.base_radius * e)
+            foot = array(height * UP - g.base_radius * e)
             head = array(origin - g.platform_radius * e)
             d = (head - foot) / l
             slider, low, high = (f"{b} {limb}" for b in ("slider", "lower link", "upper link"))
@@ -298,7 +303,7 @@ class Prru(Robot):
             along = _named(low, **{"d": d, "t": t, "t x d": np.cross(t, d)})
             name = self.joints[i]
             joints[name] = Joint(
-                name, "prismatic", BASE, slider, foot, array([UP]), actuated=True,
+                name, "prismatic", BASE, slider, foot, array([UP]), actuated=True, home=height,
                 rotor_inertia=m.rotor_inertia, directions=fixed, label=f"guide {limb}",
             )  # fmt: skip
             for label, kind, pair, at, axes in (

@@ -16,8 +16,7 @@ tau = X x y, with o = (0, 0, rho), rho = z / cos(beta), and
 
 Branch: ``forward`` gives the assembly that is connected to the home pose without a singularity:
 z < 0, rho^2 cos gamma > a b sin^2 gamma (limbs 1 and 2), z + a sin beta < 0 (A3 below the base).
-``inverse`` takes any pose with z < 0 and |beta| below 90 degrees; within the branch the two are
-each other's inverses.
+``inverse`` takes the poses of that branch.
 
 Source: 2UPR-RPU paper (geometry of table 1; equations 1 to 37). Its sign conventions are kept;
 they matter only in the product of a limb's couple with its bending.
@@ -44,7 +43,7 @@ from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Section, Structure, compliances, disc, modulus
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.robot import Inverse, LimbElements, Robot
-from pkm_twin.machine.sections import length, mass
+from pkm_twin.machine.sections import length, mass, shared_middle
 from pkm_twin.machine.shared import Shared, shared_body, shared_number
 
 Array = NDArray[np.float64]
@@ -52,6 +51,8 @@ Array = NDArray[np.float64]
 PLATFORM: Final = "platform"
 FAR: Final = 1e5
 """Longest limb over the machine's size; beyond, rounding would lose the pose, or overflow."""
+LEVEL: Final = 1e-2
+"""Least that a limb at home is longer than it is wide, as a part: else limbs lie in the base."""
 FREE: Final = {
     "upr_revolute": (4,),
     "upr_universal": (3, 4),
@@ -119,8 +120,9 @@ class JointsCompliance:
 class Inertia:
     """Density of the bars (kg/m3), and the platform with what it carries.
 
-    As rigid bodies a limb is two equal round bars, each half as long as the limb at home: the
-    lower from B, the upper from A; they meet at home. For modes it is one bar from B to A.
+    As rigid bodies a limb is two equal round bars, each half as long as the limb at home, which is
+    the middle of ``limits.limb_length``: the lower from B, the upper from A; they meet at home. For
+    modes it is one bar from B to A.
     ``rotor_inertia``: of the drives, reflected to the limbs, kg, inertia without weight.
     ``platform_com`` (m) and ``platform_inertia`` (about the com, kg m2) in platform axes; default
     a thin disc of the platform's radius about its origin.
@@ -201,11 +203,22 @@ class UprRpu(Robot):
     def _radii(self) -> tuple[float, float]:
         return self.geometry.platform_radius, self.geometry.base_radius
 
+    def chosen_home(self) -> float:
+        """Length of the limbs at home, m: the middle of their limits, if the platform hangs then.
+
+        Else that at 1.5 times the greater radius below the base.
+        """
+        aside, middle = abs(np.subtract(*self._radii)), shared_middle(self.limits.position)
+        if middle is not None and middle > aside * (1.0 + LEVEL):
+            return middle
+        return math.hypot(aside, 1.5 * max(self._radii))
+
     @property
     def _height(self) -> float:
-        """The platform's height at home, where limb 3 and the others are 1.5 b or more."""
+        """The platform's height at home, level, where all limbs have one length."""
         a, b = self._radii
-        return -math.sqrt((1.5 * b) ** 2 + 1e-12) if a <= b else -1.5 * a
+        limb = self.chosen_home() if self.home_joint is None else self.home_joint
+        return -math.sqrt((limb - abs(b - a)) * (limb + abs(b - a)))
 
     def massive(self) -> Engine:
         """The engine of a robot with masses.

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.stream import stream_kernel
-from pkm_twin.kinematics.tracking import MAX_MOVE
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import SECOND
 
 Array = NDArray[np.float64]
 
+MAX_MOVE: Final = 0.25
+"""Largest move between two samples, in platform radii: beyond it, another assembly is likely."""
 JUMP_FACTOR: Final = 2.0
 JUMP_SLACK: Final = 5e-3
 """How far a joint may move between two samples: so many times what its velocity limit allows,

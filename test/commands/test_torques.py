@@ -194,7 +194,7 @@ class TestBeyondLimits:
 
     def test_a_motion_is_refused_or_marked(self, twin, tmp_path):
         columns = motion("delta")
-        columns["arm_2.position"] = columns["arm_2.position"] + 1.1
+        columns["arm_2.position"] = columns["arm_2.position"] + 1.095
         low, high = load("delta").limits.position[1]
         outside = (columns["arm_2.position"] > high) | (columns["arm_2.position"] < low)
         assert 0 < outside.sum() < len(outside)

@@ -267,10 +267,15 @@ def test_lengths_that_are_none(q):
 def test_jacobian_at_a_singularity():
     """A3 in the base plane: limb 3 cannot turn the platform."""
     beta = 0.5
-    z = -ROBOT.geometry.platform_radius * math.sin(beta)
-    q = ROBOT.inverse([z, beta, 0.0])
+    a, b = ROBOT.geometry.platform_radius, ROBOT.geometry.base_radius
+    z = -a * math.sin(beta)
+    with pytest.raises(SingularityError):
+        ROBOT.inverse([z, beta, 0.0])
+    rho = z / math.cos(beta)
+    limbs = math.hypot(a - b, rho)
+    third = math.hypot(b * math.cos(beta) - a, b * math.sin(beta) + rho)
     with pytest.raises((SingularityError, UnreachableError)):
-        ROBOT.jacobian(q)
+        ROBOT.jacobian([limbs, limbs, third])
 
 
 def test_passive_angles():

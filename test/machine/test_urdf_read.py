@@ -6,7 +6,6 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from delta_dynamics import inverse_dynamics
@@ -14,6 +13,10 @@ from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.mechanisms.machine import Machine
 from test.support.robots import load
+
+pytest.importorskip("pinocchio")
+
+import pinocchio as pin
 
 from .sketches import SKETCHES, Z, closure_rows, five_bar
 

@@ -9,13 +9,16 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.machine.assembly import Assembly
 from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.machine.urdf_write import write_urdf
+
+pytest.importorskip("pinocchio")
+
+import pinocchio as pin
 
 from .descriptions import DESCRIPTIONS, five_bar, rod_delta, tree_of
 

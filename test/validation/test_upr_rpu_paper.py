@@ -136,7 +136,7 @@ def test_reachable_symmetric_about_gamma_zero():
 def test_limits_bound_the_reachable_workspace():
     """Equation 40, entry by entry: each limit refuses something that the others let pass."""
     poses = np.random.default_rng(5).uniform((-1.1, -0.9, -0.9), (-0.1, 0.9, 0.9), (20_000, 3))
-    lengths = ROBOT.inverse(poses)
+    lengths, _ = ROBOT.try_inverse(poses)
     kept = reachable(ROBOT, poses)
     assert lengths[kept].min() >= 0.3
     assert lengths[kept].max() <= 1.0
