@@ -26,6 +26,7 @@ setup(
         "pkm_twin.bags",
         "pkm_twin.codegen",
         "pkm_twin.config",
+        "pkm_twin.export",
         "pkm_twin.kinematics",
         "pkm_twin.machine",
         "pkm_twin.mechanisms",
@@ -46,6 +47,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/bags", sorted(glob("bags/*.mcap") + glob("bags/*.md"))),
         (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
         (f"share/{NAME}/examples", sorted(glob("examples/*.py") + glob("examples/*.md"))),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py") + glob("launch/*.yaml"))),
@@ -122,6 +124,7 @@ setup(
             "stiffness_monitor = pkm_twin.apps.nodes:stiffness_monitor",
             "machine_state = pkm_twin.apps.nodes:machine_state",
             "machine_sim = pkm_twin.apps.nodes:machine_sim",
+            "composed = pkm_twin.apps.nodes:composed",
             "pkm-twin = pkm_twin.apps.cli:main",
         ],
     },

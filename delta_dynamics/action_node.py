@@ -7,25 +7,60 @@ Motion planners send this action, not the trajectory's topic. Needs control_msgs
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+import os
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
+from action_msgs.srv import CancelGoal
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics.feedforward import SLICE
 from pkm_twin.errors import MessageError
 from pkm_twin.ros import node as health
 
 Efforts = Callable[[Any], Generator[None, None, "np.ndarray[Any, Any]"]]
+Place = Callable[[], "Mapping[str, float] | None"]
+Result = FollowJointTrajectory.Result
 
 NAME = "~/follow_joint_trajectory"
-LOOK = 0.5
-"""How often it is looked whether the controller of goals that are under way is still there, s."""
-MISSING = 4
-"""How often in a row it has to be missing: what is discovered anew may flicker."""
+LOOK = 0.1
+"""How often goals that are under way are looked at, s."""
+PING = 5
+GONE = 18
+"""Looks without a sign of life after which the controller is asked for one, and is gone."""
+MATCHING = 5.0
+"""How long a goal waits for the controller's action to be found, s."""
+SETTLING = 3.0
+"""How long after a stop the machine may move before it rests, s."""
+REST = 1e-3
+"""Joint velocity below which the machine rests, rad/s or m/s."""
+APART = 1e-4
+"""How far from the hold point it may rest without another one, rad or m."""
+TURNS = 5
+"""Turns of the executor that the last results take on their way."""
+
+
+@dataclass(eq=False)
+class _Goal:
+    """A goal of a client, and what has become of it at the controller."""
+
+    handle: Any
+    """The server's."""
+    filled: float | None = None
+    """When its efforts were ready, on the steady clock, s."""
+    sent: bool = False
+    controller: Any = None
+    """The client's handle of it, once the controller has accepted it."""
+    actual: dict[str, float] = field(default_factory=dict)
+    """Joint positions of the newest feedback, by name."""
+    held: bool = False
+    asked: bool = False
 
 
 class EffortAction:
@@ -33,23 +68,37 @@ class EffortAction:
 
     Feedback, cancelling and the result pass through. A goal stays accepted until the controller's
     result is there: rclpy polls whatever awaits in an executing goal without a pause.
+
+    A controller that ends a goal early holds the place with the effort of another one, or none. It
+    gets a hold point instead: where the machine is, with the effort that bears the weight there.
     """
 
-    def __init__(self, node: health.TwinNode, controller: str, efforts: Efforts) -> None:
+    def __init__(
+        self, node: health.TwinNode, controller: str, efforts: Efforts, place: Place, hold: bool
+    ) -> None:
         """Serve ``~/follow_joint_trajectory``.
 
         :param controller: the controller's action, by its name.
         :param efforts: efforts of a JointTrajectory in its own joint order, shape (points, n), in
             steps; raises MessageError.
+        :param place: where the joints are now, by name, in the controller's numbers; None where
+            that is not known.
+        :param hold: whether hold points are sent.
         """
         self._node, self._controller, self._efforts = node, controller, efforts
+        self._place, self._hold = place, hold
         self._client = ActionClient(node, FollowJointTrajectory, controller)
-        self._handles: dict[bytes, Any] = {}
-        self._waiting: dict[bytes, Any] = {}
-        self._sent: dict[bytes, Any] = {}
-        """Goals that the controller has, whether it has answered or not."""
-        self._missing = 0
-        node.create_guarded_timer(LOOK, self._watch)
+        self._ping = node.create_client(CancelGoal, f"{controller}/_action/cancel_goal")
+        self._goals: dict[bytes, _Goal] = {}
+        self._ending: set[bytes] = set()
+        self._holding = 0
+        """Hold points that the controller has not answered yet."""
+        self._turns = 0
+        self._silent = 0
+        """Looks since the controller's last sign of life."""
+        self._resting: tuple[float, list[str], list[float], list[float]] | None = None
+        """After a hold point: until when, the joints, the point, the last look's positions."""
+        node.create_guarded_timer(LOOK, self._look)
         self._server = ActionServer(
             node,
             FollowJointTrajectory,
@@ -65,19 +114,64 @@ class EffortAction:
 
         What the controller has already is the controller's.
         """
-        for goal in list(self._waiting.values()):
-            self._abort(goal, "the node was deactivated")
+        for goal in list(self._goals.values()):
+            if not goal.sent:
+                self._abort(goal, "the node was deactivated")
 
-    def _watch(self) -> None:
-        """A controller that was killed ends no goal: its goals are aborted here."""
-        gone = bool(self._sent) and not self._client.server_is_ready()
-        self._missing = self._missing + 1 if gone else 0
-        if self._missing >= MISSING:
-            for goal in list(self._sent.values()):
+    def farewell(self) -> None:
+        """The node ends, and with it every goal: the machine is stopped where it is."""
+        moving = [goal for goal in self._goals.values() if goal.sent]
+        if moving:
+            self._stop(moving[-1])
+        for goal in list(self._goals.values()):
+            self._abort(goal, "the twin has ended")
+
+    @property
+    def parting(self) -> bool:
+        """Whether clients or the controller still wait for what :meth:`farewell` has sent."""
+        if self._ending or self._holding:
+            self._turns = TURNS
+        else:
+            self._turns -= 1
+        return self._turns > 0
+
+    def _look(self) -> None:
+        self._send_filled()
+        for goal in list(self._goals.values()):
+            if goal.filled is None or goal.sent:
+                continue
+            if goal.handle.is_cancel_requested:
+                self._finish(goal, GoalStatus.STATUS_CANCELED, Result())
+            elif time.monotonic() - goal.filled > MATCHING:
+                self._abort(goal, f"no controller serves {self._controller}")
+        self._look_for_life()
+        self._look_for_rest()
+
+    def _look_for_life(self) -> None:
+        """A controller that was killed ends no goal, and the middleware keeps it for long."""
+        sent = [goal for goal in self._goals.values() if goal.sent]
+        self._silent = self._silent + 1 if sent else 0
+        if self._silent >= GONE:
+            for goal in sent:
+                if goal.controller is not None:
+                    goal.controller.cancel_goal_async()
                 self._abort(goal, f"{self._controller} has gone with the goal")
+        elif self._silent and self._silent % PING == 0:
+            # Nobody's goal: cancelling it changes nothing, and whoever serves the action answers.
+            request = CancelGoal.Request()
+            request.goal_info.goal_id.uuid = np.frombuffer(os.urandom(16), np.uint8)
+            self._ping.call_async(request).add_done_callback(self._lives)
+            for goal in sent:
+                if goal.controller is not None and not goal.asked:
+                    # One that was started again lives, and answers that it knows no such goal.
+                    goal.asked = True
+                    self._await_result(goal)
 
-    def _accepted(self, goal: Any) -> None:
-        self._waiting[_key(goal)] = goal
+    def _lives(self, _: Any = None) -> None:
+        self._silent = 0
+
+    def _accepted(self, handle: Any) -> None:
+        goal = self._goals[_key(handle)] = _Goal(handle)
 
         def refused(error: MessageError) -> None:
             self._abort(goal, f"the twin refused the trajectory, {error.reason}: {error}")
@@ -94,25 +188,46 @@ class EffortAction:
         except MessageError as error:
             refused(error)
 
-    def _fill(self, goal: Any) -> health.Task:
-        trajectory = goal.request.trajectory
+    def _fill(self, goal: _Goal) -> health.Task:
+        trajectory = goal.handle.request.trajectory
         efforts = yield from self._efforts(trajectory)
         for k, (point, effort) in enumerate(zip(trajectory.points, efforts.tolist(), strict=True)):
             point.effort = effort
             if k % SLICE == SLICE - 1:
                 yield
-        if goal.is_cancel_requested:
-            self._finish(goal, GoalStatus.STATUS_CANCELED, FollowJointTrajectory.Result())
-        elif not self._client.server_is_ready():
-            self._abort(goal, f"no controller serves {self._controller}")
-        else:
-            self._sent[_key(goal)] = self._waiting.pop(_key(goal))
-            self._client.send_goal_async(
-                goal.request, feedback_callback=lambda m: goal.publish_feedback(m.feedback)
-            ).add_done_callback(lambda future: self._answered(goal, future.result()))
+        goal.filled = time.monotonic()
+        if goal.handle.is_cancel_requested:
+            self._finish(goal, GoalStatus.STATUS_CANCELED, Result())
+        self._send_filled()
 
-    def _answered(self, goal: Any, handle: Any) -> None:
-        if _key(goal) not in self._sent:
+    def _send_filled(self) -> None:
+        """What waits for the controller goes to it, in the order in which it came."""
+        waiting = [g for g in self._goals.values() if g.filled is not None and not g.sent]
+        if waiting and self._client.server_is_ready():
+            for goal in waiting:
+                self._send(goal)
+
+    def _send(self, goal: _Goal) -> None:
+        goal.sent = True
+        self._resting = None
+        self._lives()
+
+        def feedback(message: Any) -> None:
+            self._lives()
+            told = message.feedback
+            goal.actual = dict(zip(told.joint_names, told.actual.positions, strict=False))
+            if _key(goal.handle) in self._goals:
+                goal.handle.publish_feedback(told)
+
+        self._client.send_goal_async(
+            goal.handle.request, feedback_callback=feedback
+        ).add_done_callback(lambda future: self._answered(goal, future.result()))
+
+    def _answered(self, goal: _Goal, handle: Any) -> None:
+        self._lives()
+        if _key(goal.handle) not in self._goals:
+            if handle.accepted:
+                handle.cancel_goal_async()
             return
         if not handle.accepted:
             self._abort(
@@ -121,48 +236,149 @@ class EffortAction:
                 "command interface it takes no efforts)",
             )
             return
-        self._handles[_key(goal)] = handle
-        if goal.is_cancel_requested:
-            handle.cancel_goal_async()
-        handle.get_result_async().add_done_callback(
-            lambda future: self._finish(goal, future.result().status, future.result().result)
+        goal.controller = handle
+        if goal.handle.is_cancel_requested:
+            self._stop(goal)
+        self._await_result(goal)
+
+    def _await_result(self, goal: _Goal) -> None:
+        goal.controller.get_result_async().add_done_callback(
+            lambda future: self._ended(goal, future.result())
         )
 
-    def _cancel(self, goal: Any) -> CancelResponse:
-        handle = self._handles.get(_key(goal))
-        if handle is not None:
-            handle.cancel_goal_async()
+    def _ended(self, goal: _Goal, end: Any) -> None:
+        self._lives()
+        if _key(goal.handle) not in self._goals:
+            return
+        if end.status == GoalStatus.STATUS_UNKNOWN:
+            self._abort(goal, f"{self._controller} was started again and has lost the goal")
+            return
+        last = goal.handle.request.trajectory.points[-1]
+        if end.status == GoalStatus.STATUS_SUCCEEDED:
+            # The controller keeps the last point's effort, also that of an acceleration.
+            stopped = any([*last.velocities, *last.accelerations])
+        else:
+            # What another trajectory has replaced is no stop.
+            stopped = end.result.error_code != Result.INVALID_GOAL
+        if stopped and not goal.held and self._newest(goal):
+            self._send_hold(goal)
+        self._finish(goal, end.status, end.result)
+
+    def _newest(self, goal: _Goal) -> bool:
+        """Whether the controller has got no goal after this one."""
+        return [g for g in self._goals.values() if g.sent][-1:] == [goal]
+
+    def _cancel(self, handle: Any) -> CancelResponse:
+        goal = self._goals.get(_key(handle))
+        if goal is not None and goal.controller is not None:
+            self._stop(goal)
         return CancelResponse.ACCEPT
 
-    def _abort(self, goal: Any, text: str) -> None:
+    def _stop(self, goal: _Goal) -> None:
+        """Cancel at the controller; a hold point comes first, so that no effort is missing."""
+
+        def cancel(_: Any = None) -> None:
+            if goal.controller is not None:
+                goal.controller.cancel_goal_async()
+
+        if not (self._newest(goal) and self._send_hold(goal, cancel)):
+            cancel()
+
+    def _send_hold(self, goal: _Goal, then: Callable[[Any], None] = lambda _: None) -> bool:
+        """Have the controller hold the place where the machine is, with the effort of its weight.
+
+        :param then: called with the controller's answer.
+        :returns: whether the place is known and the model has an effort for it.
+        """
+        names = list(goal.handle.request.trajectory.joint_names)
+        goal.held = True
+        return self._send_point(names, {**goal.actual, **(self._place() or {})}, then)
+
+    def _send_point(
+        self, names: Sequence[str], place: Mapping[str, float], then: Callable[[Any], None]
+    ) -> bool:
+        if not self._hold:
+            return False
+        try:
+            positions = [place[name] for name in names]
+            zeros = [0.0] * len(names)
+            point = JointTrajectoryPoint(positions=positions, velocities=zeros, accelerations=zeros)
+            trajectory = JointTrajectory(joint_names=names, points=[point])
+            point.effort = _value(self._efforts(trajectory))[0].tolist()
+        except KeyError as error:
+            self._node.log_throttled("hold", f"{NAME}: no hold point: {error} was not measured")
+            return False
+        except MessageError as error:
+            self._node.log_throttled("hold", f"{NAME}: no hold point, {error.reason}: {error}")
+            return False
+        self._holding += 1
+
+        def answered(future: Any) -> None:
+            self._holding -= 1
+            self._lives()
+            then(future.result())
+
+        self._resting = (time.monotonic() + SETTLING, list(names), positions, [])
+        goal = FollowJointTrajectory.Goal(trajectory=trajectory)
+        self._client.send_goal_async(goal).add_done_callback(answered)
+        return True
+
+    def _look_for_rest(self) -> None:
+        """A machine that comes to rest elsewhere gets the effort of that place."""
+        if self._resting is None:
+            return
+        end, names, held, before = self._resting
+        measured = self._place()
+        if time.monotonic() > end or measured is None:
+            self._resting = None
+            return
+        positions = [measured[name] for name in names if name in measured]
+        self._resting = end, names, held, positions
+        if len(positions) < len(held) or not before:
+            return
+        if np.abs(np.subtract(positions, before)).max() < REST * LOOK:
+            self._resting = None
+            if np.abs(np.subtract(positions, held)).max() > APART:
+                self._send_point(names, measured, lambda _: None)
+
+    def _abort(self, goal: _Goal, text: str) -> None:
         self._node.log_throttled(NAME, f"{NAME}: {text}")
-        result = FollowJointTrajectory.Result(
-            error_code=FollowJointTrajectory.Result.INVALID_GOAL, error_string=text
-        )
+        result = Result(error_code=Result.INVALID_GOAL, error_string=text)
         self._finish(goal, GoalStatus.STATUS_ABORTED, result)
 
-    def _finish(self, goal: Any, status: int, result: Any) -> None:
+    def _finish(self, goal: _Goal, status: int, result: Any) -> None:
         """End a goal as the controller has ended it; once, whatever comes late."""
-        key = _key(goal)
-        if key not in self._waiting and key not in self._sent:
+        key = _key(goal.handle)
+        if self._goals.pop(key, None) is None:
             return
-        for table in (self._handles, self._waiting, self._sent):
-            table.pop(key, None)
+        self._ending.add(key)
 
-        def end(goal: Any) -> Any:
+        def end(handle: Any) -> Any:
+            self._ending.discard(key)
             if status == GoalStatus.STATUS_SUCCEEDED:
-                goal.succeed()
-            elif status == GoalStatus.STATUS_CANCELED and goal.is_cancel_requested:
-                goal.canceled()
+                handle.succeed()
+            elif handle.is_cancel_requested:
+                handle.canceled()
+                # The controller calls a goal invalid that the hold point has replaced.
+                return Result() if goal.held else result
             else:
-                goal.abort()
+                handle.abort()
             return result
 
-        goal.execute(end)
+        goal.handle.execute(end)
 
-    def _never_begun(self, goal: Any) -> Any:
+    def _never_begun(self, handle: Any) -> Any:
         raise NotImplementedError("goals end by what the controller says")
 
 
-def _key(goal: Any) -> bytes:
-    return bytes(goal.goal_id.uuid)
+def _value(steps: Generator[None, None, Any]) -> Any:
+    """What a generator returns, at once."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value
+
+
+def _key(handle: Any) -> bytes:
+    return bytes(handle.goal_id.uuid)

@@ -6,48 +6,94 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.noise import Noise
+from delta_dynamics.noise import AVERAGED, Noise
 from delta_dynamics.observer import MomentumObserver, platform_wrench
-from delta_dynamics.uncertainty import torque_deviation
-from pkm_twin.codegen.arrays import one_vector
+from delta_dynamics.rest import friction_reach, moving_rates
+from delta_dynamics.uncertainty import (
+    EffortParts,
+    effort_parts,
+    states_efforts,
+    torque_deviation,
+    usual_effort,
+)
+from delta_dynamics.virtual_work import mass_matrix
+from pkm_twin.codegen.arrays import later, one_vector
 from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import SECOND
+from pkm_twin.streams.drives import RELEASE, DriveWatch
+from pkm_twin.streams.rest import RestWatch
 
 Array = NDArray[np.float64]
 
 SIGMAS: Final = 6.0
-"""Deviations of model and noise together that are a contact."""
+"""Standard deviations of model and noise together that are a contact."""
 LEARNING: Final = 0.2
 """Time after a beginning in which only the noise is learnt, s."""
 CLIPPED: Final = 9.0
 """A square counts as noise up to so many times the average: a push is none."""
 SHARE: Final = 1e-3
-"""Least deviation of an effort, as a share of the greatest that the stream has shown."""
+"""Least standard deviation of an effort, as a share of the greatest that the stream has shown."""
+
+MOST_DRAG: Final = 0.2
+"""Friction that may be learnt, as a share of the greatest effort of the motion."""
 
 
 @dataclass(frozen=True)
 class Contact:
     """External efforts and their bound, shape (n,), N m or N; the wrench (6,) that explains them.
 
-    ``touching``: whether an effort is beyond its bound.
+    ``touching``: whether an effort is beyond its bound. ``idle``: the drives are off or braked, so
+    that the efforts say nothing; ``touching`` is then the verdict of before.
     """
 
     external: Array
     bound: Array
     wrench: Array
     touching: bool
+    idle: bool = False
+
+
+class Drag:
+    """Friction that the model does not have: what opposes a joint in both directions alike.
+
+    A push does so in one direction at most. So it is learnt at all times, also while the estimate
+    looks like a contact.
+    """
+
+    def __init__(self, joints: int) -> None:
+        # By joint and direction, [backwards, forwards]: the mean, and the time of the motion.
+        self._known = [[[0.0, 0.0], [0.0, 0.0]] for _ in range(joints)]
+
+    def learn(self, step: float, external: Array, qd: Array) -> Array:
+        """Take external efforts and rates, zero at rest, shape (n,); the friction known by now."""
+        known = []
+        for (means, times), effort, rate in zip(
+            self._known, external.tolist(), qd.tolist(), strict=True
+        ):
+            if rate != 0.0:
+                k = int(rate > 0.0)
+                times[k] += step
+                opposing = -effort if k else effort
+                means[k] += min(1.0, step / min(times[k], AVERAGED)) * (opposing - means[k])
+            known.append(max(0.0, min(means)) if min(times) > LEARNING else 0.0)
+        return np.array(known)
 
 
 class ContactMonitor:
     """The momentum observer with a bound that follows from how sure the model and its input are.
 
-    The bound is ``sigmas`` deviations: those of the efforts by the uncertainty of the robot's file,
-    and the noise that the estimate itself shows while nothing pushes.
+    The bound is ``sigmas`` standard deviations: those of the model's efforts, by the robot's file
+    or :meth:`~delta_dynamics.uncertainty.EffortParts.default_deviation`, and the noise that the
+    estimate itself shows while nothing pushes. On top come friction at rest, :class:`Drag`,
+    and what the doubt of the rates makes of the momentum. All but the noise goes through the
+    observer's own low pass: the estimate lags, and its bound with it.
     """
 
     def __init__(self, robot: Robot, bandwidth: float = 60.0, sigmas: float = SIGMAS) -> None:
@@ -57,24 +103,34 @@ class ContactMonitor:
         """
         if not sigmas > 0.0:
             raise ValueError(f"sigmas is {sigmas:g}, allowed above 0")
-        self.robot, self.sigmas = robot, sigmas
+        self.sigmas = sigmas
         self.observer = MomentumObserver(robot, bandwidth)
+        self.change_robot(robot)
         self.reset()
 
     def reset(self) -> None:
         """Forget the stream, as after a gap."""
         n = self.robot.joints_count
         self.observer.reset()
-        self._noise = Noise(np.zeros(n), LEARNING, CLIPPED)
-        self._greatest, self._last = np.zeros(n), 0.0
+        self.drives = DriveWatch()
+        self._rest = RestWatch(0.0)
+        self._noise = self._kept = Noise(np.zeros(n), LEARNING, CLIPPED)
+        self._unsure, self._slack, self._impulse = np.zeros((3, n))
+        self._greatest = usual_effort(self.robot)
+        self._last: float | None = None
+        self._touching, self._since = False, 0.0
+        self._drag = Drag(n)
 
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity or friction."""
         self.robot = self.observer.robot = robot
+        self.stated = states_efforts(robot)
+        """Whether the robot's file says how sure its efforts are."""
+        self._reach = friction_reach(robot)
 
     def push(
         self, time: float, motion: tuple[Array, Array, Array], effort: Array,
-        wrench: Array | None = None,
+        wrench: Array | None = None, doubt: Array | None = None,
     ) -> Contact | None:  # fmt: skip
         """Take a sample; None until the noise is known.
 
@@ -82,24 +138,74 @@ class ContactMonitor:
         :param motion: q, qd and qdd, shape (n,) each; qdd counts for the model's deviation alone.
         :param effort: measured, shape (n,).
         :param wrench: on the platform, known otherwise, base axes at its reference point, (6,).
+        :param doubt: how far the rates may be off, (n,); by default by their own noise.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
-            not finite; it moves nothing.
+            not finite; it moves nothing, nor does one without an assembly.
         """
-        n = self.robot.joints_count
+        n, last = self.robot.joints_count, self._last
+        time = later(time, last)
         q, qd, qdd, effort = (one_vector(v, n, "a sample") for v in (*motion, effort))
-        external = self.observer.push(time, q, qd, effort, wrench)
-        step, self._last = time - self._last, time
-        self._greatest = np.maximum(self._greatest, np.abs(effort))
-        if external is None:
+        mass = mass_matrix(self.robot, q)
+        if doubt is None:
+            doubt = self._rest.push(round(time * SECOND), q, qd, qd)
+        still = np.abs(qd) <= doubt
+        sure = moving_rates(qd, still, self._reach)
+        parts = effort_parts(self.robot, q, sure, qdd, wrench)
+        self._last = time
+        self._greatest = np.maximum(self._greatest, np.abs(parts.whole))
+        was_idle = self.drives.idle
+        idle = self.drives.push(time, still, effort, parts.rest)
+        if idle and not was_idle:
+            self._noise = self._kept
+        elif was_idle and not idle:
+            self.observer.reset()
+        if not self.drives.repeated:
+            # The efforts from here on may turn out to be a brake's.
+            self._kept = copy.copy(self._noise)
+        external = self.observer.push(time, q, qd, effort, wrench, (mass, parts.moving))
+        if external is None or last is None:
             return None
+        step = time - last
+        if idle:
+            if not was_idle and time - self._since < RELEASE:
+                # It was the brake that took the weight.
+                self._touching = False
+            return self._verdict(q, external, idle)
+        drag = self._drag.learn(step, external, np.where(still, 0.0, qd))
+        friction = np.minimum(drag, MOST_DRAG * self._greatest) + np.where(still, self._reach, 0.0)
+        self._follow(step, self._deviation(parts, q, sure, qdd, wrench), friction, doubt)
         self._noise.advance(step)
-        least = (SHARE * self._greatest) ** 2
-        if not self._noise.settled:
-            self._noise.learn(external, least)
-            return None
-        model = torque_deviation(self.robot, q, qd, qdd, wrench)
-        bound = self.sigmas * np.sqrt(model**2 + self._noise.variance)
-        touching = bool((np.abs(external) > bound).any())
-        if not touching:
-            self._noise.learn(external, least)
-        return Contact(external, bound, platform_wrench(self.robot, q, external), touching)
+        left = np.maximum(np.abs(external) - self._slack - self._impulse, 0.0)
+        if self._noise.settled:
+            touching = bool((np.abs(external) > self._bound()).any())
+            if touching and not self._touching:
+                self._since = time
+            self._touching = touching
+            verdict = self._verdict(q, external, idle)
+        else:
+            verdict = None
+        if not self._touching:
+            self._noise.learn(left, (SHARE * self._greatest) ** 2)
+        return verdict
+
+    def _deviation(self, parts: EffortParts, *motion: Any) -> Array:
+        """Standard deviation of the model's efforts, shape (n,)."""
+        if self.stated:
+            return torque_deviation(self.robot, *motion)
+        return parts.default_deviation(self._greatest)
+
+    def _follow(self, step: float, deviation: Array, friction: Array, doubt: Array) -> None:
+        """What is unsure of the efforts, and of the momentum, as it is in the estimate."""
+        part = self.observer.bandwidth * step
+        self._impulse = self.observer.bandwidth * np.abs(self.observer.mass) @ doubt
+        slack = friction + self.observer.jump + self._impulse
+        self._unsure = (self._unsure + part * deviation) / (1.0 + part)
+        self._slack = (self._slack + part * slack) / (1.0 + part)
+
+    def _bound(self) -> Array:
+        spread = np.sqrt(self._unsure**2 + self._noise.variance)
+        return np.asarray(self.sigmas * spread + self._slack + self._impulse, np.float64)
+
+    def _verdict(self, q: Array, external: Array, idle: bool) -> Contact:
+        wrench = platform_wrench(self.robot, q, external)
+        return Contact(external, self._bound(), wrench, self._touching, idle)

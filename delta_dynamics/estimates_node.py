@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import InertiaStamped, WrenchStamped
 from rclpy.time import Time
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from delta_dynamics.contact import SIGMAS, ContactMonitor
+from delta_dynamics.contact import SIGMAS, Contact, ContactMonitor
 from delta_dynamics.feedforward import Torques
 from delta_dynamics.payload import PayloadEstimator
+from delta_dynamics.uncertainty import FRICTION, MASSES
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
+from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.messages import SECOND
 
 PAYLOAD_PERIOD = 4_000_000
@@ -101,9 +102,19 @@ class Estimates:
         if not wanted:
             return None
         self._wrench = node.create_guarded_publisher(WrenchStamped, "~/external_wrench")
-        self._effort = node.create_guarded_publisher(JointState, "~/external_effort")
+        self._effort = JointPublisher(node, robot, "~/external_effort")
         self._event = node.create_guarded_publisher(Bool, "~/contact", latched=True)
         return ContactMonitor(robot, bandwidth, sigmas)
+
+    def warning(self) -> str:
+        """What the user should know before the first sample; empty where there is nothing."""
+        if self._contact is None or self._contact.stated:
+            return ""
+        return (
+            "the robot's file does not say how sure its efforts are (section uncertainty); by "
+            f"default their standard deviation is {100 * MASSES:g} % of what masses need and "
+            f"{100 * FRICTION:g} % of the greatest effort"
+        )
 
     def reset(self) -> None:
         """A stream begins anew: the load stays, time does not."""
@@ -135,39 +146,60 @@ class Estimates:
             self._due = torques.stamp
             self._take_payload(self._payload, torques, effort)
 
+    @property
+    def wanted(self) -> bool:
+        """Whether anything is estimated."""
+        return self._contact is not None or self._payload is not None
+
+    @property
+    def idle(self) -> bool:
+        """Whether the drives are off or braked, so that their efforts are left out."""
+        return any(core is not None and core.drives.idle for core in (self._contact, self._payload))
+
     def diagnose(self) -> dict[str, object]:
         """Values of the node's diagnostic status."""
         values: dict[str, object] = {}
+        if self.wanted:
+            values["drives off or braked"] = self.idle
         if self._contact is not None:
             values |= {"contact": self.touching, "contacts": self.contacts}
+            values["model uncertainty"] = "the file's" if self._contact.stated else "default"
         if self._payload is not None:
             found = self._payload.estimate()
-            values["payload estimate (kg)"] = f"{found.mass:.4g} +- {found.mass_deviation:.2g}"
+            value = f"{found.mass:.4g} +- {found.mass_deviation:.2g}"
+            if found.asked < 0.0:
+                value += f", held at zero: the efforts ask for {found.asked:.4g}"
+            values["payload estimate (kg)"] = value
             values["payload changes seen"] = found.resets
         return values
 
     def _take_contact(self, core: ContactMonitor, torques: Torques, effort: Any) -> None:
-        found = core.push(torques.stamp / SECOND, torques.motion, effort, torques.wrench)
+        found = core.push(
+            torques.stamp / SECOND, torques.motion, effort, torques.wrench, torques.doubt
+        )
         if found is None:
             return
-        stamp = Time(nanoseconds=torques.stamp).to_msg()
-        message = WrenchStamped()
-        message.header.stamp, message.header.frame_id = stamp, self._frames[0]
-        force, torque = message.wrench.force, message.wrench.torque
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = found.wrench.tolist()
-        self._wrench.publish(message)
-        controller = self._robot().controller
-        efforts = JointState(name=list(controller.names))
-        efforts.header.stamp = stamp
-        efforts.effort = controller.controller_efforts(found.external).tolist()
-        self._effort.publish(efforts)
+        if not found.idle:
+            self._publish_contact(torques.stamp, found)
         if found.touching != self.touching:
             self.touching = found.touching
             self.contacts += found.touching
             self._event.publish(Bool(data=found.touching))
 
+    def _publish_contact(self, stamp: int, found: Contact) -> None:
+        message = WrenchStamped()
+        message.header.stamp = Time(nanoseconds=stamp).to_msg()
+        message.header.frame_id = self._frames[0]
+        force, torque = message.wrench.force, message.wrench.torque
+        force.x, force.y, force.z, torque.x, torque.y, torque.z = found.wrench.tolist()
+        self._wrench.publish(message)
+        own = self._robot().controller
+        self._effort.publish(stamp, own.controller_efforts(found.external))
+
     def _take_payload(self, core: PayloadEstimator, torques: Torques, effort: Any) -> None:
-        found = core.push(torques.stamp / SECOND, *torques.motion, effort, torques.wrench)
+        found = core.push(
+            torques.stamp / SECOND, *torques.motion, effort, torques.wrench, torques.doubt
+        )
         if found is None:
             return
         pairs = (

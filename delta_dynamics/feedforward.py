@@ -15,13 +15,16 @@ from typing import Any, Final, Literal, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from delta_dynamics.rest import friction_reach, moving_rates
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import (
     SECOND,
     ExtraJoints,
     JointReader,
+    JointSample,
     StampRules,
     Trajectory,
     as_message_error,
@@ -30,6 +33,7 @@ from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, rate_doubt
 from pkm_twin.streams.wrench import counting
 
 Array = NDArray[np.float64]
@@ -86,6 +90,7 @@ class Torques(NamedTuple):
     """Efforts for one joint state; ``residual`` is measured minus predicted, None if unmeasured.
 
     ``wrench``: the one that they bear, base axes at the platform's reference point, shape (6,).
+    ``doubt``: how far the rates may be off, shape (n,), where somebody asks for it.
     """
 
     stamp: int
@@ -95,18 +100,21 @@ class Torques(NamedTuple):
     residual: Array | None
     saturated: bool
     wrench: Array | None = None
+    doubt: Array | None = None
 
 
 @dataclass
 class Feedforward:
     """Answers trajectories and a stream of joint states with feedforward efforts.
 
-    ``wrenches``: those that the stream's efforts bear; None bears none.
+    ``wrenches``: those that the stream's efforts bear; None bears none. ``doubted``: the doubt of
+    rates is told for every robot, else it is known of those with dry friction alone.
     """
 
     robot: Robot
     settings: Settings = field(default_factory=Settings)
     wrenches: WrenchWindow | None = None
+    doubted: bool = False
 
     def __post_init__(self) -> None:
         s = self.settings
@@ -122,6 +130,8 @@ class Feedforward:
         self._last_now = 0
         self._last_good: Array | None = None
         self._differentiator = Differentiator(s.order, s.window)
+        self._rest = _rest_watch(s)
+        self._reach = friction_reach(self.robot)
         self._rules = s.stamp_rules
         self._reader = JointReader(self.robot, extra_joints=s.extra_joints)
         self._continuity = Continuity(
@@ -136,6 +146,7 @@ class Feedforward:
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity, friction or limits, between two samples."""
         self.robot = robot
+        self._reach = friction_reach(robot)
         self._reader = JointReader(robot, extra_joints=self.settings.extra_joints)
         self._continuity.robot = robot
 
@@ -153,6 +164,7 @@ class Feedforward:
             self.wrenches.change_stamps(settings.accept_zero_stamp, settings.future_tolerance)
         if (before.order, before.window) != (settings.order, settings.window):
             self._differentiator = Differentiator(settings.order, settings.window)
+            self._rest = _rest_watch(settings)
             if self.wrenches is not None:
                 self.wrenches.change_fit(settings.order, settings.window)
 
@@ -173,8 +185,8 @@ class Feedforward:
         """Distance of the last answered state from a singularity, 0 in one, 1 at best."""
         return None if self._last_good is None else float(self.robot.singularity(self._last_good))
 
-    def trajectory(self, message: Any, now: int) -> Array:
-        """Efforts for every point, shape (points, n), in the message's joint order.
+    def trajectory(self, message: Any, now: int) -> ControllerNumbers:
+        """The controller's efforts for every point, (points, n), in the message's joint order.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -183,9 +195,9 @@ class Feedforward:
             try:
                 next(steps)
             except StopIteration as end:
-                return cast(Array, end.value)
+                return cast(ControllerNumbers, end.value)
 
-    def trajectory_steps(self, message: Any, now: int) -> Generator[None, None, Array]:
+    def trajectory_steps(self, message: Any, now: int) -> Generator[None, None, ControllerNumbers]:
         """As :meth:`trajectory`, some points at a time: it yields between them.
 
         The robot and the settings are those of the beginning.
@@ -254,12 +266,15 @@ class Feedforward:
             return zero
         return inverse_dynamics(self.robot, self._last_good, zero, zero)
 
-    def _trajectory_steps(self, message: Any, now: int) -> Generator[None, None, Array]:
+    def _trajectory_steps(self, message: Any, now: int) -> Generator[None, None, ControllerNumbers]:
         robot, settings, reader = self.robot, self.settings, self._reader
         t = reader.trajectory(message, now)
         yield
         qd, qdd = _derivatives(t, settings.differentiate)
         reader.check_derived(qd, qdd)
+        if t.qd is None and self._reach.any():
+            doubt = rate_doubt(t.times, t.q, gradient_gain(t.times))
+            qd = moving_rates(qd, np.abs(qd) <= doubt, self._reach)
         efforts = np.empty_like(t.q)
         saturated = False
         for first in range(0, len(t.q), SLICE):
@@ -273,14 +288,14 @@ class Feedforward:
         self.saturations += saturated
         return self._for_joints(efforts, t.columns)
 
-    def sent(self, effort: Array) -> Array:
+    def sent(self, effort: Array) -> ControllerNumbers:
         """Efforts of the model, shape (..., n), in the controller's numbers."""
         return self.robot.controller.controller_efforts(effort)
 
-    def _for_joints(self, efforts: Array, columns: Sequence[int]) -> Array:
+    def _for_joints(self, efforts: Array, columns: Sequence[int]) -> ControllerNumbers:
         """Efforts (p, n) in a message's order, zero for joints that the model lacks."""
         padded = np.hstack([self.sent(efforts), np.zeros((len(efforts), 1))])
-        return np.ascontiguousarray(padded[:, columns])
+        return ControllerNumbers(np.ascontiguousarray(padded[:, columns]))
 
     def _check_singularity(self, measures: Array, first: int) -> None:
         """Points of a trajectory from ``first`` on, shape (points,)."""
@@ -301,6 +316,7 @@ class Feedforward:
 
     def _restart_fit(self) -> None:
         self._differentiator.reset()
+        self._rest.reset()
         if self.wrenches is not None:
             self.wrenches.restart()
 
@@ -342,6 +358,7 @@ class Feedforward:
             raise
         try:
             rates = self._differentiator.push(sample.stamp, sample.q, sample.qd)
+            doubt = self._doubt(sample, rates)
             measured, external = sample.effort, None
             if self.wrenches is not None:
                 self.wrenches.push(sample, self.robot.platform(sample.q)[1], wrench)
@@ -350,10 +367,16 @@ class Feedforward:
                 motion = (sample.q, *rates)
                 if self.wrenches is not None:
                     external, measured = self.wrenches.through()
-                solved = as_message_error(inverse_dynamics, self.robot, *motion, external)
+                sure = rates[0]
+                if doubt is not None:
+                    sure = moving_rates(sure, np.abs(sure) <= doubt, self._reach)
+                solved = as_message_error(
+                    inverse_dynamics, self.robot, sample.q, sure, rates[1], external
+                )
                 effort, saturated = _gate(self.robot, self.settings.limit_policy, solved)
         except MessageError:
             self._differentiator.retract()
+            self._rest.retract()
             if self.wrenches is not None:
                 self.wrenches.retract()
             self._continuity.retract()
@@ -365,7 +388,19 @@ class Feedforward:
             return None
         self._last_good = sample.q
         residual = None if measured is None else measured - effort
-        return Torques(sample.stamp, motion, effort, residual, saturated, external)
+        return Torques(sample.stamp, motion, effort, residual, saturated, external, doubt)
+
+    def _doubt(self, sample: JointSample, rates: tuple[Array, Array] | None) -> Array | None:
+        """How far the sample's rates may be off, where that makes a difference."""
+        if not (self.doubted or self._reach.any()):
+            return None
+        rate = None if rates is None else rates[0]
+        return self._rest.push(sample.stamp, sample.q, sample.qd, rate)
+
+
+def _rest_watch(s: Settings) -> RestWatch:
+    """For the rates that the differentiator gives where the stream has none."""
+    return RestWatch(fit_gain(s.order + 1, s.window, s.window - 1))
 
 
 def warm_up(robot: Robot) -> None:

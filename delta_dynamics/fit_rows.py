@@ -28,14 +28,13 @@ from delta_dynamics.samples import (
 )
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.robot import Robot
+from pkm_twin.streams.rest import SIGMAS
 
 Array = NDArray[np.float64]
 
 BLOCK: Final = 2048
 OUTLIER: Final = 8.0
 """Robust deviations beyond which a measured effort is no measurement."""
-STILL: Final = 4.0
-"""Deviations of a rate's noise below which a joint stands still."""
 LEAST_EFFORT: Final = 1e-9
 """Efforts that change by less are no measurement, N m or N."""
 LARGEST: Final = 1e9
@@ -112,7 +111,7 @@ def rows_of(
     )
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
-    slow = STILL * rate_noise(how, pieces[0].period)
+    slow = SIGMAS * rate_noise(how, pieces[0].period)
     parts = [_piece(robot, parameters, r.carried, track, slow) for track in pieces]
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
@@ -188,7 +187,7 @@ def _piece(
 
     both = by_blocks(len(track.q), BLOCK, block)
     table, rest = both[..., :-1], both[..., -1]
-    rough = STILL * np.abs(track.qd - np.asarray(_smooth(track.qd))).mean(0)
+    rough = SIGMAS * np.abs(track.qd - np.asarray(_smooth(track.qd))).mean(0)
     moves = np.abs(track.qd) > np.maximum(np.maximum(rough, slow), 1e-9)
     return _Piece(table, track.effort - rest, rest, moves.astype(np.float64))
 

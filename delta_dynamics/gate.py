@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError, PkmTwinError
+from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import SECOND, JointReader, StampRules
 from pkm_twin.streams.monitor import StreamMonitor
@@ -66,7 +67,7 @@ class Gate:
             max_age=round(s.deadline * SECOND),
         )
         self._reader = JointReader(self.robot)
-        self._limits = effort_limits(self.robot)
+        self._limits = _sent_limits(self.robot)
         self._last_stamp = 0
         self._last_arrival = 0
         self._state: tuple[int, Array] | None = None
@@ -75,7 +76,7 @@ class Gate:
         """Take a robot with another payload, gravity or limits, between two messages."""
         self.robot = robot
         self._reader = JointReader(robot)
-        self._limits = effort_limits(robot)
+        self._limits = _sent_limits(robot)
 
     def reset(self) -> None:
         """The clock jumped: stamps of before say nothing about those to come."""
@@ -83,8 +84,10 @@ class Gate:
         self._last_stamp = 0
         self._state = None
 
-    def torques(self, message: Any, now: int, steady: int) -> Array | None:
+    def torques(self, message: Any, now: int, steady: int) -> ControllerNumbers | None:
         """The command for one message of stamped torques, shape (n,), or None while closed.
+
+        The numbers are those of the message, bit by bit, in the robot's joint order.
 
         :param message: sensor_msgs/JointState with an effort a joint, in any order of names.
         :param now: the ROS clock, ns; stamps are judged by it.
@@ -94,13 +97,13 @@ class Gate:
         self.watch(steady)
         try:
             sample = self._reader.efforts(message, now, self._rules)
-            self._check(sample.stamp, sample.effort)
+            self._check(sample.stamp, sample.given)
         except MessageError as error:
             self.refuse_torques(error)
             raise
         self._last_stamp = sample.stamp
         self._last_arrival = steady
-        return sample.effort if self.stream.accept() else None
+        return sample.given if self.stream.accept() else None
 
     def refuse_torques(self, error: MessageError) -> None:
         """Count torques that are refused; several in a row close the gate."""
@@ -131,37 +134,44 @@ class Gate:
         if not self.stream.stopped and silent > self.settings.deadline:
             self.stream.stop("stale torques", f"no torque for {silent:.3f} s")
 
-    def stop_command(self, steady: int) -> Array:
+    def stop_command(self, steady: int) -> ControllerNumbers:
         """What is sent while the gate is closed, shape (n,): zeros, or what bears the weight.
+
+        In the controller's numbers.
 
         Gravity needs a joint state within the deadline, a pose that the model has an answer
         for, and an answer within the effort limits; without these it is zeros.
         """
-        zeros = np.zeros(len(self.robot.joint_names))
+        rest = np.zeros(self.robot.joints_count)
+        zeros = ControllerNumbers(rest)
         if self.settings.on_stop == "zeros" or self._state is None:
             return zeros
         measured, q = self._state
         if steady - measured > self.settings.deadline * SECOND:
             return zeros
         try:
-            effort = inverse_dynamics(self.robot, q, zeros, zeros)
+            effort = inverse_dynamics(self.robot, q, rest, rest)
         except (PkmTwinError, ValueError):
             return zeros
-        return zeros if self._beyond(effort) is not None else effort
+        command = self.robot.controller.controller_efforts(effort)
+        return zeros if self._beyond(command) is not None else command
 
-    def _check(self, stamp: int, effort: Array) -> None:
+    def _check(self, stamp: int, effort: ControllerNumbers) -> None:
         if stamp <= self._last_stamp:
             behind = (self._last_stamp - stamp) / SECOND
+            # Those after it are judged by it: a stop's torque is stamped later than the states are
+            # that the next ones answer. Of two that take turns every other one is still behind.
+            self._last_stamp = stamp
             raise MessageError("stamp order", f"the stamp is {behind:.6f} s before the last")
         joint = self._beyond(effort)
         if joint is not None:
             raise MessageError(
                 "effort limit",
-                f"effort of {self.robot.joint_names[joint]} is {effort[joint]:g}, "
+                f"effort of {self.robot.controller.names[joint]} is {effort[joint]:g}, "
                 f"allowed {self._limits[joint]:g}",
             )
 
-    def _beyond(self, effort: Array) -> int | None:
+    def _beyond(self, effort: ControllerNumbers) -> int | None:
         """The first joint whose effort is not finite or passes its limit."""
         bad = ~(np.isfinite(effort) & (np.abs(effort) <= self._limits))
         return int(bad.argmax()) if bad.any() else None
@@ -171,3 +181,11 @@ def effort_limits(robot: Robot) -> Array:
     """The robot's effort limits, shape (n,), infinite where it has none."""
     efforts = getattr(getattr(robot, "limits", None), "effort", None)
     return np.full(len(robot.joint_names), np.inf) if efforts is None else np.asarray(efforts)
+
+
+def _sent_limits(robot: Robot) -> Array:
+    """The same in the controller's numbers.
+
+    Converted as the torques are: one that was clamped to its limit does not pass it by rounding.
+    """
+    return np.abs(robot.controller.controller_efforts(effort_limits(robot)))

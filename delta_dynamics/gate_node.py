@@ -5,23 +5,24 @@ from __future__ import annotations
 
 import sys
 import time
-from array import array
 from typing import Any
 
 import numpy as np
 from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics.gate import Gate, GateSettings, effort_limits
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
+from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.intake import JointStateDecoder
+from pkm_twin.ros.joints import CommandPublisher, JointPublisher
+from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.run import run
 
 PAYLOAD = {
@@ -29,6 +30,9 @@ PAYLOAD = {
     "payload.com": ("com", "m, from the platform's origin"),
 }
 """What of the payload may change while the gate runs: the part that has a weight."""
+TORQUES = "delta_dynamics/joint_torques"
+MAX_DEADLINE = 3600.0
+"""Longest deadline that a node of the suite promises, s; the middleware's "none" is longer."""
 LAST_WORD = 0.5
 """How long the end waits for the controller to acknowledge the last command, s."""
 
@@ -45,9 +49,9 @@ class CommandGate(health.TwinNode):
         settings = self._declare_settings()
         self._gate = Gate(robot, settings)
         self._closed = True
-        self._commands = self.create_guarded_publisher(Float64MultiArray, "~/commands")
+        self._commands = CommandPublisher(self, robot, "~/commands")
         # The same with names and a stamp, for recordings and plots.
-        self._stamped = self.create_guarded_publisher(JointState, "~/commands_stamped")
+        self._stamped = JointPublisher(self, robot, "~/commands_stamped")
         self._declare_robot(settings)
         # A stranger's message of any size takes no time of the torques.
         definition = message_definition("sensor_msgs/msg/JointState")
@@ -55,7 +59,7 @@ class CommandGate(health.TwinNode):
         self._decode_state = JointStateDecoder(definition)
         self.create_guarded_subscription(
             JointState,
-            "delta_dynamics/joint_torques",
+            TORQUES,
             self._on_torques,
             raw=True,
             awaited=True,
@@ -103,9 +107,8 @@ class CommandGate(health.TwinNode):
 
     def farewell(self) -> None:
         """As deactivated; and the controller has it before the process ends."""
-        if self.active:
-            self.deactivated()
-        self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
+        super().farewell()
+        self._commands.publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     def reset_stop(self) -> str:
         """Open without waiting for good torques."""
@@ -119,17 +122,32 @@ class CommandGate(health.TwinNode):
         if self._gate.last_reject:
             level, message = health.WARN, f"last reject: {self._gate.last_reject}"
         if stream.stopped:
-            level, message = health.ERROR, f"closed: {stream.reason}: {stream.text}"
+            late = self._promised_too_late()
+            level, message = health.ERROR, f"closed: {late or f'{stream.reason}: {stream.text}'}"
         values: dict[str, object] = {
             "robot": self._gate.robot.name,
             "open": not stream.stopped,
             "torques forwarded": stream.accepted,
-            "controllers": self._commands.get_subscription_count(),
+            "controllers": self._commands.publisher.get_subscription_count(),
         }
         values |= {f"torques rejected: {k}": v for k, v in stream.rejected.items()}
         values |= {f"joint states rejected: {k}": v for k, v in self._gate.states.rejected.items()}
         values |= {f"closed: {k}": v for k, v in stream.stops.items()}
         return level, message, values
+
+    def _promised_too_late(self) -> str:
+        """Whose torques the middleware keeps from the gate, as they promise a longer deadline."""
+        deadline = self._gate.settings.deadline
+        for publisher in self.get_publishers_info_by_topic(self.resolve_topic_name(TORQUES)):
+            promised = publisher.qos_profile.deadline.nanoseconds / SECOND
+            if promised > deadline:
+                name = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+                bound = f"{promised:g} s" if promised < MAX_DEADLINE else "none"
+                return (
+                    f"{name} promises torques with deadline {bound}, the gate demands "
+                    f"{deadline:g} s, so none arrive: stale_after has to be that or less"
+                )
+        return ""
 
     def _declare_settings(self) -> GateSettings:
         d = GateSettings()
@@ -223,12 +241,9 @@ class CommandGate(health.TwinNode):
         else:
             self.get_logger().info("open: torques are forwarded")
 
-    def _send(self, command: np.ndarray[Any, Any]) -> None:
-        values = array("d", command.tobytes())
-        self._commands.publish(Float64MultiArray(data=values))
-        told = JointState(name=list(self._gate.robot.controller.names), effort=values)
-        told.header.stamp = self.get_clock().now().to_msg()
-        self._stamped.publish(told)
+    def _send(self, command: ControllerNumbers) -> None:
+        self._commands.publish(command)
+        self._stamped.publish(self.now(), command)
 
 
 def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
@@ -247,7 +262,7 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
 
 def main() -> None:
     """Entry point of ``ros2 run pkm_twin command_gate``."""
-    sys.exit(run(CommandGate, farewell=True))
+    sys.exit(run(CommandGate))
 
 
 if __name__ == "__main__":

@@ -12,9 +12,9 @@ from typing import Any, Final
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
+from rclpy.duration import Duration
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics.estimates_node import Estimates
@@ -27,15 +27,16 @@ from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.sections import MAX_MASS
 from pkm_twin.ros import node as health
 from pkm_twin.ros.changes import follow_changes
-from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
+from pkm_twin.ros.intake import JointStateDecoder, RawTrajectory
+from pkm_twin.ros.joints import CommandPublisher, JointPublisher
 from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import SECONDS, declare_mounts, declare_wrench
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.wrench import WrenchReader
 
-JOINT_STATE: Final = "sensor_msgs/msg/JointState"
-NUMBERS: Final = "std_msgs/msg/Float64MultiArray"
+LAST_WORD: Final = 0.5
+"""How long the end waits for the controller to acknowledge the last command, s."""
 CHANGES = {
     "payload.mass": ("payload", "mass"),
     "payload.com": ("payload", "com"),
@@ -98,30 +99,19 @@ class DeltaDynamics(health.TwinNode):
         self._trajectory = self.create_guarded_publisher(JointTrajectory, "~/joint_trajectory_ff")
         # A torque is worth nothing once the stream that it answers would be stale.
         stale_after = self._feedforward.settings.stale_after
-        self._torques = self.create_guarded_publisher(JointState, "~/joint_torques", stale_after)
-        self._residual = self.create_guarded_publisher(JointState, "~/torque_residual")
+        self._torques = JointPublisher(self, robot, "~/joint_torques", expiry=stale_after)
+        self._residual = JointPublisher(self, robot, "~/torque_residual")
         self._commands = (
-            self.create_guarded_publisher(Float64MultiArray, "~/commands", stale_after)
-            if commands
-            else None
+            CommandPublisher(self, robot, "~/commands", stale_after) if commands else None
         )
         self._reactions = self._create_reaction_publishers(robot)
         self._estimates = Estimates(
             self, lambda: self._feedforward.robot, (self._base_frame, "platform")
         )
-        names = list(robot.controller.names)
-        numbers = [0.0] * len(names)
-        definition = message_definition(JOINT_STATE)
-        self._decode = JointStateDecoder(definition)
-        self._effort_message = DoublesTemplate(
-            JOINT_STATE,
-            definition,
-            {"name": names, "position": [], "velocity": [], "effort": numbers},
-            stamped=True,
-        )
-        self._numbers_message = DoublesTemplate(
-            NUMBERS, message_definition(NUMBERS), {"data": numbers}, stamped=False
-        )
+        self._feedforward.doubted = self._estimates.wanted
+        if self._estimates.warning():
+            self.get_logger().warning(self._estimates.warning())
+        self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         # Long messages must not lose their parts.
         self.create_guarded_subscription(
             JointTrajectory, "~/joint_trajectory", self._on_trajectory, raw=True, best_effort=False
@@ -137,6 +127,8 @@ class DeltaDynamics(health.TwinNode):
         self._action = self._create_action()
         follow_changes(self, [*CHANGES, *SETTINGS], self._prepare, self._take)
         self._last_heard = 0
+        self._measured: Any = None
+        """The newest joint state that was taken."""
         self._watchdog: Any = None
         self._watch_every(stale_after)
         # A step after which no stamp that was good before is good now.
@@ -175,6 +167,19 @@ class DeltaDynamics(health.TwinNode):
         if self._last_heard:
             self._stop("inactive", "the node was deactivated")
 
+    def farewell(self) -> None:
+        """What has to be the last: goals are ended, the machine held, a stop's torque sent."""
+        if self._action is not None:
+            self._action.farewell()
+        super().farewell()
+        if self._commands is not None:
+            self._commands.publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
+
+    @property
+    def parting(self) -> bool:
+        """Whether the ends of goals still wait for turns of the executor."""
+        return self._action is not None and self._action.parting
+
     def reset_stop(self) -> str:
         """End a stop without waiting for good samples."""
         stream = self._feedforward.stream
@@ -209,8 +214,10 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
         values |= self._estimates.diagnose()
-        if self._estimates.touching and level == health.OK:
-            level, message = health.WARN, "something pushes: an external effort is beyond its bound"
+        if self._estimates.idle and level == health.OK:
+            message = "the drives are off or braked: their efforts are left out"
+        elif self._estimates.touching and level == health.OK:
+            level, message = health.WARN, "contact detected: an external effort is beyond its bound"
         if core.wrenches is not None:
             taken = core.wrenches.stream
             values["wrenches taken"] = taken.accepted
@@ -229,6 +236,14 @@ class DeltaDynamics(health.TwinNode):
             "forwards to; empty: none",
             read_only=True,
         )
+        hold = self.declare(
+            "on_cancel",
+            "hold",
+            "what a goal that ends early leaves to its controller: a hold point with the effort "
+            "of the machine's weight, or what the controller does itself",
+            choices=("hold", "controller"),
+            read_only=True,
+        )
         if not controller:
             return None
         try:
@@ -241,7 +256,17 @@ class DeltaDynamics(health.TwinNode):
             self,
             controller,
             lambda trajectory: self._feedforward.trajectory_steps(trajectory, self.now()),
+            self._place,
+            hold == "hold",
         )
+
+    def _place(self) -> dict[str, float] | None:
+        """Where the joints are, by the controller's names and numbers; None where not measured."""
+        silent = (time.monotonic_ns() - self._last_heard) / SECOND
+        state = self._measured
+        if state is None or silent > self._feedforward.settings.stale_after:
+            return None
+        return dict(zip(state.name, map(float, state.position), strict=True))
 
     def _create_wrenches(self, settings: Settings) -> WrenchWindow | None:
         """The measured wrench, where the parameter asks for it."""
@@ -434,6 +459,7 @@ class DeltaDynamics(health.TwinNode):
                 core.refuse_joint_state(error)
                 raise
             torques = core.joint_state(message, self.now())
+            self._measured = message
             if torques is None:
                 return
             # The process may have stood still since.
@@ -441,12 +467,12 @@ class DeltaDynamics(health.TwinNode):
         finally:
             if running and core.stream.stopped:
                 self._send_stop()
-        stamp = divmod(torques.stamp, SECOND)
-        self._torques.publish(self._effort_message.fill(core.sent(torques.effort), stamp))
+        effort = core.sent(torques.effort)
+        self._torques.publish(torques.stamp, effort)
         if torques.residual is not None:
-            self._residual.publish(self._effort_message.fill(core.sent(torques.residual), stamp))
+            self._residual.publish(torques.stamp, core.sent(torques.residual))
         if self._commands is not None:
-            self._commands.publish(self._numbers_message.fill(core.sent(torques.effort)))
+            self._commands.publish(effort)
         for tell in (self._estimates.take, self._tell_reactions):
             try:
                 tell(torques)
@@ -493,13 +519,13 @@ class DeltaDynamics(health.TwinNode):
     def _send_stop(self) -> None:
         core = self._feedforward
         self.log_throttled("stop", f"stopped: {core.stream.reason}: {core.stream.text}")
-        effort = core.stop_effort()
-        if effort is None:
+        model = core.stop_effort()
+        if model is None:
             return
-        effort = core.sent(effort)
-        self._torques.publish(self._effort_message.fill(effort, divmod(self.now(), SECOND)))
+        effort = core.sent(model)
+        self._torques.publish(self.now(), effort)
         if self._commands is not None:
-            self._commands.publish(self._numbers_message.fill(effort))
+            self._commands.publish(effort)
 
     def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
         core = self._feedforward
@@ -536,6 +562,10 @@ def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
         else:
             sections[section] = plain
     return robot.changed(**sections)
+
+
+NODE = DeltaDynamics
+"""What a process of several nodes makes."""
 
 
 def main() -> None:

@@ -33,6 +33,9 @@ class MomentumObserver:
     of the momentum less what the change of M itself brings: no acceleration and no derivative of M
     is needed, and the error is of second order in the period. The step is implicit, so it is
     stable at every period (the observer of De Luca and Mattone, 2003, in its sampled form).
+
+    ``mass``: the mass matrix of the last sample, (n, n). ``jump``: half of what the efforts that
+    drive the motion changed by since the sample before, (n,): the greatest error of a step's mean.
     """
 
     def __init__(self, robot: Robot, bandwidth: float = 60.0) -> None:
@@ -45,23 +48,26 @@ class MomentumObserver:
             raise ValueError(f"bandwidth is {bandwidth:g} 1/s, allowed above 0")
         self.robot = robot
         self.bandwidth = bandwidth
-        self._last: tuple[float, Array, Array, Array] | None = None
-        self._estimate = np.zeros(robot.joints_count)
         self._still = np.zeros(robot.joints_count)
+        self.reset()
 
     def reset(self) -> None:
         """Forget the stream, as after a gap."""
-        self._last = None
+        self._last: tuple[float, Array, Array, Array] | None = None
         self._estimate = np.zeros_like(self._still)
+        self.jump = np.zeros_like(self._still)
 
     def push(
-        self, time: float, q: Array, qd: Array, effort: Array, wrench: Array | None = None
-    ) -> Array | None:
+        self, time: float, q: Array, qd: Array, effort: Array, wrench: Array | None = None,
+        known: tuple[Array, Array] | None = None,
+    ) -> Array | None:  # fmt: skip
         """Take a sample; the external efforts (n,), N m or N, None for the first sample.
 
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), rad or m, with their rates ``qd`` and measured ``effort``.
         :param wrench: on the platform, known otherwise, base axes at its reference point, (6,).
+        :param known: mass matrix (n, n), and the model's efforts at these rates without
+            acceleration (n,), where they have been computed.
         :raises UnreachableError: a joint state without an assembly.
         :raises SingularityError: the Jacobian of the closure has no inverse.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
@@ -73,13 +79,18 @@ class MomentumObserver:
             one_vector(values, n, what)
             for values, what in ((q, "joint positions"), (qd, "joint rates"), (effort, "efforts"))
         )
-        mass = mass_matrix(self.robot, q)
-        driving = effort - inverse_dynamics(self.robot, q, qd, self._still, wrench)
+        if known is None:
+            needed = inverse_dynamics(self.robot, q, qd, self._still, wrench)
+            known = mass_matrix(self.robot, q), needed
+        self.mass, needed = known
+        mass = self.mass
+        driving = effort - needed
         self._last = (time, qd.copy(), mass, driving)
         if last is None:
             return None
         before, qd_before, mass_before, driving_before = last
         step = time - before
+        self.jump = 0.5 * np.abs(driving - driving_before)
         change = 0.5 * (mass + mass_before) @ (qd - qd_before)
         change -= 0.5 * step * (driving + driving_before)
         gain = self.bandwidth

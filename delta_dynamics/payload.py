@@ -6,6 +6,7 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -15,9 +16,13 @@ from numpy.typing import NDArray
 
 from delta_dynamics.noise import Noise
 from delta_dynamics.regressor import PAYLOAD, parameter_names, regressor
+from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import later, one_vector
 from pkm_twin.machine.robot import Robot
+from pkm_twin.ros.messages import SECOND
+from pkm_twin.streams.drives import DriveWatch
+from pkm_twin.streams.rest import RestWatch
 
 Array = NDArray[np.float64]
 
@@ -44,7 +49,8 @@ class PayloadEstimate:
     """Mass, kg, and centre of mass (3,), m from the platform's reference point, platform axes.
 
     With standard deviations; a centre that the motion does not tell has an infinite one and is that
-    of the robot's own payload.
+    of the robot's own payload. ``asked``: the mass that the efforts ask for without the bound at
+    zero; where it is below zero the mass is zero and its standard deviation covers the difference.
     """
 
     mass: float
@@ -52,6 +58,7 @@ class PayloadEstimate:
     mass_deviation: float
     com_deviation: Array
     resets: int
+    asked: float
 
 
 class PayloadEstimator:
@@ -60,6 +67,9 @@ class PayloadEstimator:
     Efforts are linear in mass and first moments (:mod:`delta_dynamics.regressor`). Information of a
     sample counts by the time that it stands for, at most the correlation time of the errors, and
     fades slowly. Where what is left jumps, the load has changed: all is forgotten but the noise.
+
+    A joint with dry friction that stands still tells its effort within the friction, as often as it
+    stops. Where the drives are off or braked, efforts tell nothing.
     """
 
     def __init__(self, robot: Robot, *, mass_range: float = 5.0, reach: float = 0.2) -> None:
@@ -78,6 +88,9 @@ class PayloadEstimator:
         rest = inverse_dynamics(robot, robot.inverse(robot.home()), still, still)
         # A machine that hangs in balance has no effort at rest.
         self._least = SHARE * max(float(np.abs(rest).max()), 1e-3 * self._scale())
+        self._reach = friction_reach(robot)
+        self.drives = DriveWatch()
+        self._rest = RestWatch(0.0)
         self.resets = 0
         self._noise = Noise(np.full(robot.joints_count, 4.0 * self._least**2), STEADY, CLIPPED)
         self.reset()
@@ -94,51 +107,71 @@ class PayloadEstimator:
         self._weighted = self._information @ self._own
         self._average = np.zeros(self.robot.joints_count)
         self._since = 0.0
+        self._keep()
         self.begin_anew()
+
+    def _keep(self) -> None:
+        """Remember what is known: the efforts from here on may turn out to be a brake's."""
+        noise = copy.copy(self._noise)
+        self._kept = self._information, self._weighted, self._average, self._since, noise
 
     def begin_anew(self) -> None:
         """Forget when the last sample was, as where the clock goes back; the load stays."""
         self._last: float | None = None
+        self.drives.reset()
+        self._rest.reset()
 
     def push(
         self, time: float, q: Array, qd: Array, qdd: Array, effort: Array,
-        wrench: Array | None = None,
+        wrench: Array | None = None, doubt: Array | None = None,
     ) -> PayloadEstimate | None:  # fmt: skip
-        """Take a sample; None for the first one after a reset or a new beginning.
+        """Take a sample; None for the first one after a beginning, and where efforts tell nothing.
 
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), with rates, accelerations and measured efforts (n,).
         :param wrench: on the platform at its reference point, base axes, (6,), where it is known.
+        :param doubt: how far the rates may be off, (n,); by default by their own noise.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
             not finite; it moves nothing, nor does one without an assembly.
         """
         n, last = self.robot.joints_count, self._last
         time = later(time, last)
-        effort = one_vector(effort, n, "efforts")
-        columns = regressor(self.robot, *(one_vector(v, n, "a motion") for v in (q, qd, qdd)))
-        columns = columns[:, self._columns]
-        computed = inverse_dynamics(self.robot, q, qd, qdd, wrench)
+        q, qd, qdd, effort = (one_vector(v, n, "a sample") for v in (q, qd, qdd, effort))
+        held = inverse_dynamics(self.robot, q, 0.0 * q, 0.0 * q, wrench)
         self._last = time
-        if last is None:
+        if doubt is None:
+            doubt = self._rest.push(round(time * SECOND), q, qd, qd)
+        still = np.abs(qd) <= doubt
+        was_idle = self.drives.idle
+        idle = self.drives.push(time, still, effort, held)
+        if idle and not was_idle:
+            self._information, self._weighted, self._average, self._since, self._noise = self._kept
+        if idle or last is None:
             return None
+        if not self.drives.repeated:
+            self._keep()
         step = time - last
+        sure = moving_rates(qd, still, self._reach)
+        columns = regressor(self.robot, q, sure, qdd)[:, self._columns]
+        computed = inverse_dynamics(self.robot, q, sure, qdd, wrench)
         target = effort - computed + columns @ self._own
-        left = target - columns @ self._solution()
+        left = beyond_friction(target - columns @ self._solution(), still, self._reach)
         if self._jumped(left, step):
             self.reset()
             self._last = time
             return self.estimate()
         fade = math.exp(-step / MEMORY)
-        share = min(1.0, step / CORRELATION)
-        rows = columns / self._noise.variance[:, None]
+        rubs = still & (self._reach > 0.0)
+        share = np.where(rubs, min(1.0, step / MEMORY), min(1.0, step / CORRELATION))
+        variance = self._noise.variance + np.where(rubs, self._reach**2, 0.0)
+        rows = columns * (share / variance)[:, None]
         prior = np.diag(self._prior**-2.0)
         # What fades away gives place to what is known of any load.
-        self._information = fade * self._information + (1 - fade) * prior + share * rows.T @ columns
-        self._weighted = (
-            fade * self._weighted + (1 - fade) * prior @ self._own + share * rows.T @ target
-        )
+        self._information = fade * self._information + (1 - fade) * prior + rows.T @ columns
+        self._weighted = fade * self._weighted + (1 - fade) * prior @ self._own + rows.T @ target
         self._noise.advance(step)
-        self._noise.learn(target - columns @ self._solution(), self._least**2)
+        left = beyond_friction(target - columns @ self._solution(), still, self._reach)
+        self._noise.learn(left, self._least**2)
         return self.estimate()
 
     def _solution(self) -> Array:
@@ -168,6 +201,13 @@ class PayloadEstimator:
         spread = np.sqrt(np.einsum("ki,ij,kj->k", gradient, covariance, gradient))
         known = told & np.isfinite(com)
         own = self.robot.payload.com
+        if mass < 0.0:
+            # No load is lighter than none, and none has a centre.
+            nowhere = np.full(3, np.inf)
+            return PayloadEstimate(
+                0.0, own.copy(), math.hypot(deviation, mass), nowhere, self.resets, mass
+            )
         return PayloadEstimate(
-            mass, np.where(known, com, own), deviation, np.where(known, spread, np.inf), self.resets
-        )
+            mass, np.where(known, com, own), deviation, np.where(known, spread, np.inf),
+            self.resets, mass,
+        )  # fmt: skip

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine that moves: its rigid bodies under efforts, with dry friction and stops.
+"""A machine that moves: its rigid bodies under efforts, with friction and stops.
 
 In the actuated joints' coordinates, so that no loop can drift open. Pure: time is a step.
 
@@ -8,6 +8,7 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field
 from typing import Final
@@ -15,23 +16,37 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.virtual_work import forward_dynamics, mass_matrix
+from delta_dynamics.equations import Terms
+from delta_dynamics.resistance import Law, Resistance
+from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
-SWEEPS: Final = 500
-"""Most sweeps of the search for rates under dry friction; it ends where they stand still."""
+CHANGES: Final = 60
+"""Changes of what sticks or slides in a step that are followed one by one."""
+HALVINGS: Final = 12
+"""How often a part is halved that cannot be followed, or that gains energy."""
+RESOLVED: Final = 1e-8
+"""How exactly the time of a change is found, part of a step."""
+CRAWL: Final = 1e-6
+"""First part of a step that is taken implicitly where changes pile up; the next are longer."""
+GROWTH: Final = 1e-9
+"""Energy that the method may add in a part, which then is taken away; part of the kinetic one."""
+ROUNDING: Final = 1e-14
+"""Of energies, part of the greatest summand."""
 
 
 @dataclass
 class Plant:
     """A robot's state and how it goes on.
 
-    A step is one of the classical Runge-Kutta method, efforts and wrench constant in it. Coulomb
-    friction and stops act as a constant load of the step: the one that the implicit law of friction
-    (Moreau's time stepping) asks for, so that a joint sticks exactly and leaves only beyond
-    its friction. Friction of passive joints acts while they move. Stops do not bounce.
+    Between changes a step is one of a Runge-Kutta method of order four that is exact in viscous
+    friction, however stiff; efforts and wrench are constant in it. Dry friction of all joints and
+    stops obey Coulomb's law, and what sticks or slides changes at times that are found, not at
+    steps' ends: a joint sticks exactly and leaves only beyond its friction. Stops do not bounce: an
+    impact projects the rates, in the mass matrix, onto those that all stops allow. Energy grows by
+    what efforts and wrench do and by nothing else; a part of a step that gains some is divided.
     """
 
     robot: Robot
@@ -45,14 +60,9 @@ class Plant:
 
     def change_robot(self, robot: Robot) -> None:
         """Go on as a robot of the same joints, with another payload."""
-        n = robot.joints_count
         self.robot = robot
-        self._coulomb = np.array(robot.friction.coulomb, np.float64)
-        self._smooth = robot.changed(friction={"coulomb": [0.0] * n})
-        self._rubs = bool(self._coulomb.any())
-        limits = robot.limits.position
-        limits = np.tile([-math.inf, math.inf], (n, 1)) if limits is None else limits
-        self._low, self._high = limits[:, 0].copy(), limits[:, 1].copy()
+        self._resistance = Resistance(robot)
+        self._here: Terms | None = None
 
     def rest(self) -> None:
         """Stand still."""
@@ -66,77 +76,116 @@ class Plant:
             axes, shape (6,), N and N m.
         :raises UnreachableError: the machine has left where it can be assembled.
         :raises SingularityError: it has reached a singularity.
-        :raises ValueError: a result that is not finite.
+        :raises ValueError: a result that is not finite, or a motion that no part of the step is
+            short enough for.
         """
-        robot, q, qd = self._smooth, self.q, self.qd
-        first = forward_dynamics(robot, q, qd, effort, wrench)
-        rates = self._resisted(first, step)
-        if rates is not None:
-            matrix = mass_matrix(robot, q)
-            load = matrix @ (qd + step * first - rates) / step
-            effort = effort - load
-            first = (rates - qd) / step
-        half = 0.5 * step
-        second_qd = qd + half * first
-        second = forward_dynamics(robot, q + half * qd, second_qd, effort, wrench)
-        third_qd = qd + half * second
-        third = forward_dynamics(robot, q + half * second_qd, third_qd, effort, wrench)
-        last_qd = qd + step * third
-        last = forward_dynamics(robot, q + step * third_qd, last_qd, effort, wrench)
-        moved = q + (step / 6.0) * (qd + 2.0 * (second_qd + third_qd) + last_qd)
-        self.qd = qd + (step / 6.0) * (first + 2.0 * (second + third) + last)
-        self.q = np.clip(moved, self._low, self._high)
-        if rates is None:
-            return
-        stopped = rates == 0.0
-        self.qd[stopped] = 0.0
-        held = stopped & (qd == 0.0)
-        self.q[held] = q[held]
-        outward = ((moved >= self._high) & (self.qd > 0.0)) | (
-            (moved <= self._low) & (self.qd < 0.0)
+        effort = np.asarray(effort, np.float64)
+        load = np.asarray(wrench, np.float64) if np.any(wrench) else None
+        here, left = self._here, step
+        if here is None or here.q.tobytes() + here.qd.tobytes() != (
+            self.q.tobytes() + self.qd.tobytes()
+        ):
+            here = self._resistance.arrive(self.q.copy(), self.qd.copy())
+        at_once, crawled = 0, step * CRAWL
+        for part in itertools.count():
+            law = self._resistance.law(here, effort, load)
+            taken = left
+            if at_once > 2 * len(law.pull) or (part > CHANGES and part % 4 == 0):
+                here, taken = self._crawl(here, law, min(left, crawled))
+                at_once, crawled = 0, 4.0 * crawled
+            elif not law.stands:
+                here, taken = self._follow(here, law, left, step * RESOLVED)
+            self._here, self.q, self.qd = here, here.q.copy(), here.qd.copy()
+            left -= taken
+            if left <= 0.0:
+                return
+            at_once = 0 if taken else at_once + 1
+
+    def _crawl(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
+        """Go on implicitly, for no longer than loses energy; the time that this took."""
+        for _ in range(HALVINGS):
+            end = self._resistance.crawl(here, law, span)
+            growth = _growth(here, end, law, 0.0)
+            if growth <= end.kinetic + _rounding(here, end, law):
+                break
+            span *= 0.5
+        return _lessened(here, end, law), span
+
+    def _follow(self, here: Terms, law: Law, left: float, instant: float) -> tuple[Terms, float]:
+        """Go on under a law, until it changes or for what is left; the time that this took.
+
+        :param instant: a time that is none.
+        """
+        resistance, span, least, tries = self._resistance, left, left * 0.5**HALVINGS, 0
+        while True:
+            tries += 1
+            try:
+                end, work = self._flow(here, law, span)
+            except (PkmTwinError, ValueError):
+                # The law may change before.
+                if span <= least:
+                    raise
+                span *= 0.5
+                continue
+            time, hit = resistance.change(here, end, law, span, RESOLVED)
+            if time <= instant and hit is not None:
+                return resistance.settle(here, law, hit, passed=False), 0.0
+            if time < span - instant:
+                # Of what is no cubic a guess may hardly be better than the one before.
+                span = time if tries < 4 else min(time, 0.5 * span)
+                continue
+            growth = _growth(here, end, law, work)
+            if growth > 0.0 and growth > GROWTH * (here.kinetic + end.kinetic) + _rounding(
+                here, end, law
+            ):
+                if span <= least:
+                    raise ValueError(f"energy grows by {growth:.3g} J in {span:.3g} s")
+                span *= 0.5
+                continue
+            settled = resistance.settle(end, law, hit, passed=True)
+            if settled is end and growth <= 0.0:
+                return end, span
+            return _lessened(here, settled, law, work), span
+
+    def _flow(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
+        """The state after a part, and the work of the wrench in it, J."""
+        resistance, powers = self._resistance, []
+
+        def accelerations(q: Array, qd: Array) -> Array:
+            t = here if q is here.q else resistance.at(q, qd)
+            if law.wrench is not None:
+                powers.append(float(law.wrench @ (t.twists @ qd)))
+            return law.first if t is here else resistance.accelerate(law, t)[0]
+
+        end = resistance.at(
+            *resistance.stepper(here, law, span).run(here.q, here.qd, accelerations)
         )
-        self.qd[outward] = 0.0
-
-    def _resisted(self, acceleration: Array, step: float) -> Array | None:
-        """Rates at the step's end under dry friction and stops; None where neither acts.
-
-        They are least in (v - free)' M (v - free) / 2 + step sum C |v| within the rates that the
-        stops leave, whose optimality is Coulomb's law.
-        """
-        free = self.qd + step * acceleration
-        low, high = (self._low - self.q) / step, (self._high - self.q) / step
-        inside = bool(((free >= low) & (free <= high)).all())
-        if not self._rubs and inside:
-            return None
-        matrix = mass_matrix(self._smooth, self.q)
-        impulse = step * self._coulomb
-        if inside:
-            sliding = np.sign(self.qd)
-            rates = free - np.linalg.solve(matrix, impulse * sliding)
-            kept = (np.sign(rates) == sliding) & (sliding != 0.0)
-            if bool((kept | (impulse == 0.0)).all() and ((rates >= low) & (rates <= high)).all()):
-                return np.asarray(rates, np.float64)
-        return _least(matrix, free, impulse, low, high)
+        if not powers:
+            return end, 0.0
+        return end, span / 6.0 * (powers[0] + 2.0 * (powers[1] + powers[2]) + powers[3])
 
 
-def _least(matrix: Array, free: Array, impulse: Array, low: Array, high: Array) -> Array:
-    """The rates of :meth:`Plant._resisted`, coordinate by coordinate, shape (n,)."""
-    rows = matrix.tolist()
-    goal, dry = free.tolist(), impulse.tolist()
-    bounds = list(zip(low.tolist(), high.tolist(), strict=True))
-    v = [0.0] * len(goal)
-    size = 1e-15 * max(map(abs, goal))
-    for _ in range(SWEEPS):
-        change = 0.0
-        for j, row in enumerate(rows):
-            # The best rate of joint j alone, without friction, then with it and with the stops.
-            pull = sum(row[k] * (goal[k] - v[k]) for k in range(len(v)) if k != j)
-            own = goal[j] + pull / row[j]
-            best = math.copysign(max(abs(own) - dry[j] / row[j], 0.0), own)
-            best = min(max(best, bounds[j][0]), bounds[j][1])
-            change = max(change, abs(best - v[j]))
-            v[j] = best
-        if change <= size:
-            break
-    # Zeros of both signs are one.
-    return np.array(v) + 0.0
+def _growth(here: Terms, end: Terms, law: Law, work: float) -> float:
+    """Energy that comes from nowhere, J.
+
+    :param work: of the wrench, J.
+    """
+    done = work + float((law.given) @ (end.q - here.q))
+    return end.kinetic - here.kinetic + (end.potential - here.potential) - done
+
+
+def _rounding(here: Terms, end: Terms, law: Law) -> float:
+    """What rounding makes of it, J. Positions too are rounded: the less they change, the more."""
+    forces = np.abs(law.given) + np.abs(here.bias)
+    size = here.kinetic + end.kinetic + abs(here.potential) + abs(end.potential)
+    return ROUNDING * (size + float(forces @ np.abs(here.q)))
+
+
+def _lessened(here: Terms, end: Terms, law: Law, work: float = 0.0) -> Terms:
+    """The end without energy from nowhere."""
+    growth = _growth(here, end, law, work)
+    if growth <= 0.0 or growth <= _rounding(here, end, law):
+        return end
+    # So little that the other terms of the state stay.
+    left = max(0.0, 1.0 - growth / end.kinetic) if end.kinetic else 0.0
+    return end._replace(qd=math.sqrt(left) * end.qd, kinetic=left * end.kinetic)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import sys
 import time
-from array import array
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -18,7 +17,6 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
@@ -38,6 +36,7 @@ from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.variation import KINDS, MAX_SPREAD, Variation, varied
 from pkm_twin.ros import node as health
 from pkm_twin.ros.intake import RawTrajectory
+from pkm_twin.ros.joints import FIELDS, JointPublisher
 from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.run import run
 
@@ -46,6 +45,9 @@ Array = NDArray[np.float64]
 BEGIN: Final = SECOND
 """Simulated time at the start, ns: a stamp of zero would be none."""
 TICK: Final = 1e-3
+"""Shortest period of the clock, s."""
+EARLY: Final = 0.75
+"""The part of a period after which the next one may begin."""
 BUDGET: Final = 5e-3
 """How long one tick of the clock may simulate, s: messages are taken between."""
 BEHIND: Final = 0.1
@@ -88,7 +90,9 @@ class MachineSim(health.TwinNode):
         if self._lockstep:
             self.create_guarded_timer(LOOK, self._go_alone)
         else:
-            self.create_guarded_timer(TICK, self._catch_up)
+            step = settings.period / self._factor if self._factor else 0.0
+            # One turn of the executor a period: with more it would cost more than the machine.
+            self.create_guarded_timer(max(TICK, step), self._catch_up)
         self.start()
         self._publish_drawn()
 
@@ -249,7 +253,7 @@ class MachineSim(health.TwinNode):
         return np.broadcast_to(values, default.shape).copy()
 
     def _create_topics(self) -> None:
-        self._states = self.create_guarded_publisher(JointState, "joint_states")
+        self._states = JointPublisher(self, self._simulation.robot, "joint_states", FIELDS)
         self._wrenches = self.create_guarded_publisher(WrenchStamped, "wrench")
         kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._drawn = self.create_publisher(DiagnosticArray, "~/drawn", kept)
@@ -289,7 +293,8 @@ class MachineSim(health.TwinNode):
         if self._factor == 0.0:
             self._due = begun - BUDGET
         step = period / self._factor if self._factor else 0.0
-        while self._due + step <= (now := time.monotonic()):
+        # The timer that is a little early does not wait for its next turn.
+        while self._due + EARLY * step <= (now := time.monotonic()):
             if now - begun > BUDGET:
                 break
             self._due += step
@@ -326,15 +331,15 @@ class MachineSim(health.TwinNode):
             self._clock_due = measured.stamp + CLOCK_PERIOD
             self._clock_topic.publish(Clock(clock=stamp))
         self._wrenches.publish(self._wrench(measured, stamp))
-        robot = self._simulation.robot.controller
-        state = JointState(name=list(robot.names))
-        state.header.stamp = stamp
-        state.position = _numbers(robot.offsets + robot.factors * measured.q)
-        state.velocity = _numbers(robot.factors * measured.qd)
-        state.effort = _numbers(robot.controller_efforts(measured.effort))
+        own = self._simulation.robot.controller
         self._flying += 1
         # Last: who answers it has all else.
-        self._states.publish(state)
+        self._states.publish(
+            measured.stamp,
+            own.controller_positions(measured.q),
+            own.controller_rates(measured.qd),
+            own.controller_efforts(measured.effort),
+        )
 
     def _wrench(self, measured: Measured, stamp: Any) -> WrenchStamped:
         message = WrenchStamped()
@@ -365,8 +370,8 @@ def _refuse_sim_time(changes: Sequence[Parameter]) -> SetParametersResult:
     return SetParametersResult(successful=good, reason=reason)
 
 
-def _numbers(values: Array) -> array[float]:
-    return array("d", values.tobytes())
+NODE = MachineSim
+"""What a process of several nodes makes."""
 
 
 def main() -> None:

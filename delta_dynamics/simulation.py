@@ -10,7 +10,6 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
@@ -22,7 +21,6 @@ from delta_dynamics.virtual_work import mass_matrix
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import (
-    MAX_EFFORT,
     MAX_RATE,
     SECOND,
     JointReader,
@@ -179,7 +177,7 @@ class Simulation:
         :raises MessageError: refused whole, and counted; what was commanded before stays.
         """
         try:
-            effort = self._efforts(message.data)
+            effort = self._reader.commands(message.data)
         except MessageError as error:
             self.stream.reject(error.reason, str(error))
             raise
@@ -312,17 +310,3 @@ class Simulation:
 
     def _wrench(self) -> Array:
         return self.settings.wrench.at(self.time) + self._pushed
-
-    def _efforts(self, values: Sequence[float]) -> Array:
-        names = self.robot.joint_names
-        if len(values) != len(names):
-            raise MessageError("length", f"{len(values)} efforts for {len(names)} joints")
-        effort = self.robot.controller.efforts(np.array(values, np.float64))
-        for name, value in zip(names, effort.tolist(), strict=True):
-            if not np.isfinite(value):
-                raise MessageError("not finite", f"effort of {name} is {value}")
-            if abs(value) > MAX_EFFORT:
-                raise MessageError(
-                    "bounds", f"effort of {name} is {value:g}, allowed up to {MAX_EFFORT:g}"
-                )
-        return effort

@@ -6,14 +6,74 @@ May import: numpy, pkm_twin's core, this package; never rclpy.
 
 from __future__ import annotations
 
+from typing import Final, NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delta_dynamics.virtual_work import inverse_dynamics
+from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.uncertainty import deviation
 
 Array = NDArray[np.float64]
+
+MASSES: Final = 0.015
+"""Default standard deviation of what masses need, as a share of gravity's, inertia's and the
+velocities' effort each: parts from CAD or a scale, cables and screws left out, are within a few
+percent."""
+FRICTION: Final = 0.015
+"""Default standard deviation of what is not in the model at all, as friction and cables, as a share
+of the greatest effort."""
+FALL: Final = 9.81
+"""Acceleration of the platform by which the usual effort is judged before there was any, m/s2."""
+
+
+class EffortParts(NamedTuple):
+    """Efforts of a motion: at rest, with its velocities, and the whole, shape (n,), N m or N."""
+
+    rest: Array
+    moving: Array
+    whole: Array
+
+    def default_deviation(self, greatest: Array) -> Array:
+        """Standard deviation of the efforts of a robot whose file says nothing of it, shape (n,).
+
+        :param greatest: the greatest efforts that the robot's motion needs, shape (n,).
+        """
+        sizes = np.abs(self.rest) + np.abs(self.moving - self.rest)
+        sizes = sizes + np.abs(self.whole - self.moving)
+        return np.asarray(np.hypot(MASSES * sizes, FRICTION * greatest), np.float64)
+
+
+def effort_parts(
+    robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | None = None
+) -> EffortParts:
+    """The efforts of one motion sample by what needs them; arguments as ``inverse_dynamics``'."""
+    still = np.zeros_like(q)
+    return EffortParts(
+        inverse_dynamics(robot, q, still, still, wrench),
+        inverse_dynamics(robot, q, qd, still, wrench),
+        inverse_dynamics(robot, q, qd, qdd, wrench),
+    )
+
+
+def usual_effort(robot: Robot) -> Array:
+    """What each joint needs at home to bear the weight, or to move the platform by it, (n,)."""
+    q, still = robot.inverse(robot.home()), np.zeros(robot.joints_count)
+    lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
+    moves = np.linalg.norm(robot.platform_jacobian(q) * lever[:, None], axis=0)
+    inertia = np.diag(mass_matrix(robot, q))
+    held = np.abs(inverse_dynamics(robot, q, still, still))
+    felt = moves > 1e-6 * moves.max(initial=0.0)
+    return np.where(felt, np.maximum(held, FALL * inertia / np.where(felt, moves, 1.0)), held)
+
+
+def states_efforts(robot: Robot) -> bool:
+    """Whether the robot's file says how sure a number is that its efforts depend on."""
+    if not robot.uncertainty:
+        return False
+    q, ones = robot.inverse(robot.home()), np.ones(robot.joints_count)
+    return bool(torque_deviation(robot, q, ones, ones).any())
 
 
 def torque_deviation(

@@ -6,6 +6,7 @@ May import: numpy, pkm_twin's core, the standard library; never rclpy.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -207,15 +208,15 @@ class Forces:
     def joint(self, joint: Joint, three: Numbers) -> None:
         """The same of one joint: viscous, Coulomb, rotor."""
         viscous, coulomb, rotor = three
-        rate, second = self._relative(joint, accelerated=True)
-        self._pair(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
+        rate, second = self.relative(joint, accelerated=True)
+        self.pair(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
 
     def passive_momenta(self, values: Objects) -> None:
         """Momenta of the passive joints' rotors."""
         for k, joint in enumerate(loaded_joints(self.motion.graph)):
-            self._pair(joint, values[3 * k + 2] * self._relative(joint, accelerated=False)[0])
+            self.pair(joint, values[3 * k + 2] * self.relative(joint, accelerated=False)[0])
 
-    def _relative(self, joint: Joint, *, accelerated: bool) -> tuple[Any, Any]:
+    def relative(self, joint: Joint, *, accelerated: bool) -> tuple[Any, Any]:
         """Rate and acceleration of a passive joint, of its outer body against its inner one."""
         m, a, b = self.motion, joint.inner, joint.outer
         axis = m.direction(a, joint.axes[0])
@@ -231,7 +232,7 @@ class Forces:
             second = axis @ (m.acceleration(b, joint.at) - carried)
         return axis @ (m.velocity(b, joint.at) - m.speed[a] - cross(m.omega[a], lever)), second
 
-    def _pair(self, joint: Joint, amount: Any) -> None:
+    def pair(self, joint: Joint, amount: Any) -> None:
         """An effort along a joint's freedom on its outer body, its opposite on the inner one."""
         m, a, b = self.motion, joint.inner, joint.outer
         load = m.direction(a, joint.axes[0]) * amount
@@ -279,14 +280,15 @@ def _matrix(ten: Objects) -> Objects:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=object)
 
 
-def _begun(t: Traced) -> tuple[Layout, list[Objects]]:
+def begun(t: Traced) -> tuple[Layout, list[Objects]]:
+    """The layout of the run-time inputs, and its parts; closures are solved."""
     t.solve()
     layout = Layout(t.tree)
     return layout, layout.split(t.tape.inputs(PARAMETERS, layout.size))
 
 
 def _torques(t: Traced) -> Program:
-    layout, (bodies, rods, gravity, viscous, coulomb, offset, rotors, passive) = _begun(t)
+    layout, (bodies, rods, gravity, viscous, coulomb, offset, rotors, passive) = begun(t)
     n = t.joints
     qd, qdd, wrench = t.tape.inputs("qd", n), t.tape.inputs("qdd", n), t.tape.inputs("wrench", 6)
     t.set_rates(qd)
@@ -310,42 +312,60 @@ def _torques(t: Traced) -> Program:
     return Program(sizes, layout.size, {"efforts": t.lift(tau)}, t.equations())
 
 
-def _masses(t: Traced) -> Program:
-    layout, (bodies, rods, *_, rotors, passive) = _begun(t)
+def mass_entries(
+    t: Traced, parts: list[Objects], visit: Callable[[Forces], None] | None = None
+) -> list[Any]:
+    """Entries of the mass matrix, row by row.
+
+    :param visit: called once a joint, while that joint alone moves, at rate one.
+    """
+    bodies, rods, *_, rotors, passive = parts
     columns = t.rate_columns()
     n = t.joints
     table: list[list[Any]] = [[0.0] * n for _ in range(n)]
     for j in range(n):
         t.motion.set_rates(columns[j], np.eye(n)[j])
         forces = Forces(t.motion)
+        if visit is not None:
+            visit(forces)
         forces.momenta(bodies, rods)
         forces.passive_momenta(passive)
         unknown, driven = forces.generalised()
         for k in range(j + 1):
             value = driven[k] + columns[k] @ unknown
             table[j][k] = table[k][j] = value + rotors[j] if j == k else value
-    entries = [table[j][k] for j in range(n) for k in range(n)]
-    return Program({"q": n}, layout.size, {"matrix": t.lift(entries)}, t.equations())
+    return [value for row in table for value in row]
 
 
-def _energy(t: Traced) -> Program:
-    layout, (bodies, rods, gravity, *_, rotors, passive) = _begun(t)
-    n = t.joints
-    qd = t.tape.inputs("qd", n)
-    u = t.set_rates(qd)
+def _masses(t: Traced) -> Program:
+    layout, parts = begun(t)
+    outputs = {"matrix": t.lift(mass_entries(t, parts))}
+    return Program({"q": t.joints}, layout.size, outputs, t.equations())
+
+
+def potential(t: Traced, bodies: Objects, rods: Objects, gravity: Objects) -> Any:
+    """Potential energy, zero at the base's origin."""
     motion = t.motion
-    forces = Forces(motion)
-    forces.momenta(bodies, rods)
-    forces.passive_momenta(passive)
-    unknown, driven = forces.generalised()
-    double = driven @ qd + u @ unknown + sum((rotors[k] * qd[k] * qd[k] for k in range(n)), 0.0)
     weighted: Any = np.zeros(3)
     for name, ten in zip(t.tree.links, bodies, strict=True):
         weighted = weighted + motion.origin[name] * ten[0] + motion.rotation[name] @ ten[1:4]
     for mass, rod in zip(rods, t.graph.rods.values(), strict=True):
         ends = motion.point(rod.inner, rod.ends[0]) + motion.point(rod.outer, rod.ends[1])
         weighted = weighted + ends * (mass * 0.5)
-    outputs = {"energy": t.lift([double * 0.5, -(weighted @ gravity)])}
+    return -(weighted @ gravity)
+
+
+def _energy(t: Traced) -> Program:
+    layout, (bodies, rods, gravity, *_, rotors, passive) = begun(t)
+    n = t.joints
+    qd = t.tape.inputs("qd", n)
+    u = t.set_rates(qd)
+    forces = Forces(t.motion)
+    forces.momenta(bodies, rods)
+    forces.passive_momenta(passive)
+    unknown, driven = forces.generalised()
+    double = driven @ qd + u @ unknown + sum((rotors[k] * qd[k] * qd[k] for k in range(n)), 0.0)
+    outputs = {"energy": t.lift([double * 0.5, potential(t, bodies, rods, gravity)])}
     return Program({"q": n, "qd": n}, layout.size, outputs, t.equations())
 
 

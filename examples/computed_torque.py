@@ -36,6 +36,8 @@ class Controller(Node):
     def __init__(self, options):
         super().__init__("computed_torque")
         self.robot = load(options.robot)
+        # The controller's names and numbers of the joints: messages carry these.
+        self.controller = self.robot.controller
         self.options = options
         self.errors, self.stopped, self.done = [], "", False
         self._first = self._last = None
@@ -66,8 +68,9 @@ class Controller(Node):
         if trouble:
             self.stop(trouble)
             return
-        index = [message.name.index(name) for name in self.robot.joint_names]
-        q, qd = np.array(message.position)[index], np.array(message.velocity)[index]
+        index = [message.name.index(name) for name in self.controller.names]
+        q = self.controller.positions(np.array(message.position)[index])
+        qd = self.controller.rates(np.array(message.velocity)[index])
         if self._first is None:
             self._first, self._start = stamp, q
         self._last = stamp
@@ -86,7 +89,7 @@ class Controller(Node):
 
     def _trouble(self, message, stamp):
         """What is wrong with a joint state, or nothing."""
-        missing = set(self.robot.joint_names) - set(message.name)
+        missing = set(self.controller.names) - set(message.name)
         if missing:
             return f"no joint {', '.join(sorted(missing))}"
         if not len(message.name) == len(message.position) == len(message.velocity):
@@ -120,7 +123,8 @@ class Controller(Node):
         if not np.isfinite(effort).all() or (limits is not None and (abs(effort) > limits).any()):
             self.stop(f"effort {effort.round(3).tolist()} is beyond the limits")
             return
-        self._publisher.publish(Float64MultiArray(data=effort.tolist()))
+        command = self.controller.controller_efforts(effort)
+        self._publisher.publish(Float64MultiArray(data=command.tolist()))
 
     def stop(self, why):
         """Zeros, and nothing after them."""

@@ -79,21 +79,25 @@ def main():
         start, by = robot.home(), np.array(options.by)
         if by.shape != start.shape or not by.any():
             parser.error(f"--by is {options.by}, not a cut in {', '.join(robot.pose_names)}")
-        times, q, qd, qdd, v, bent = cut(robot, start, start + by, options)
+        times, *motion, v, bent = cut(robot, start, start + by, options)
     except PkmTwinError as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
+    # Messages carry the controller's names and numbers of the joints.
+    joints = robot.controller
+    q = joints.controller_positions(motion[0])
+    qd, qdd = (joints.controller_rates(rates) for rates in motion[1:])
     rclpy.init()
     client = Client()
     try:
         client.until(lambda: client.states, 60.0, "joint_states")
-        here = positions(client.states[-1], robot.joint_names)
+        here = positions(client.states[-1], joints.names)
         if abs(here - q[0]).max() > 1e-6:
             # First there, at rest.
             reach, ways = blend()
             rows = [np.outer(way, q[0] - here) for way in ways]
-            client.go(trajectory(robot.joint_names, reach, here + rows[0], *rows[1:]))
-        states, _ = client.go(trajectory(robot.joint_names, times, q, qd, qdd))
+            client.go(trajectory(joints.names, reach, here + rows[0], *rows[1:]))
+        states, _ = client.go(trajectory(joints.names, times, q, qd, qdd))
     except (TimeoutError, RuntimeError) as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1

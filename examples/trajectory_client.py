@@ -133,10 +133,13 @@ def main():
     try:
         robot = load(options.robot)
         client.until(lambda: client.states, 60.0, "joint_states")
-        start = positions(client.states[-1], robot.joint_names)
+        # Messages carry the controller's names and numbers of the joints.
+        joints = robot.controller
+        start = positions(client.states[-1], joints.names)
         times, ways = blend(seconds=options.seconds)
-        rows = [np.outer(way, reaches(robot, options.reach)) for way in ways]
-        message = trajectory(robot.joint_names, times, start + rows[0], *rows[1:])
+        way = joints.controller_rates(reaches(robot, options.reach))
+        rows = [np.outer(share, way) for share in ways]
+        message = trajectory(joints.names, times, start + rows[0], *rows[1:])
         states, efforts = client.go(message)
     except (TimeoutError, RuntimeError, PkmTwinError) as error:
         print(f"failed: {error}", file=sys.stderr)
@@ -144,7 +147,7 @@ def main():
     finally:
         client.destroy_node()
         rclpy.try_shutdown()
-    miss = abs(positions(states[-1], robot.joint_names) - start - rows[0][-1]).max()
+    miss = abs(positions(states[-1], joints.names) - start - rows[0][-1]).max()
     peak = ", ".join(f"{value:.3g}" for value in abs(efforts).max(0))
     print(f"{len(efforts)} points, peak efforts {peak}, {miss:.2e} from the goal at the end")
     return 0

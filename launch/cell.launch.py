@@ -22,6 +22,8 @@ ARGUMENTS = {
     "machines": (MACHINES, "NAMESPACE=ROBOT for each machine, commas between"),
     "params_file": ("", "parameters, a YAML file with a section /NAMESPACE/NODE a node"),
     "command_gate": ("false", "run this node in every namespace"),
+    "machine_state": ("false", "run this node in every namespace"),
+    "composed": ("false", "the nodes of each machine in one process, command_gate apart"),
     "use_sim_time": ("false", "true where a bag is replayed with --clock"),
     "respawn": ("true", "start a node again that has ended"),
     "log_level": ("info", "debug, info, warn, error or fatal"),

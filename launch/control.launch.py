@@ -2,12 +2,14 @@
 """A robot under ros2_control: mock hardware, controllers, and the twin's efforts between.
 
 Trajectories go to ``delta_dynamics/joint_trajectory``, or as goals of the action
-``delta_dynamics/follow_joint_trajectory``, and on to joint_trajectory_controller with effort.
+``delta_dynamics/follow_joint_trajectory``, and on to joint_trajectory_controller with effort. With
+``command_gate:=true`` the stamped torques go through the gate to effort_controller instead.
 """
 
 import subprocess
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import yaml
 from ament_index_python.packages import get_package_prefix
@@ -15,6 +17,7 @@ from launch.actions import (
     DeclareLaunchArgument,
     GroupAction,
     IncludeLaunchDescription,
+    LogInfo,
     OpaqueFunction,
     RegisterEventHandler,
     Shutdown,
@@ -25,17 +28,26 @@ from launch.launch_description_entity import LaunchDescriptionEntity
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch_ros.actions import Node
 
+from delta_dynamics.simulation import tuned
 from launch import LaunchDescription
 from pkm_twin import load
+from pkm_twin.errors import PkmTwinError
 
 HERE = Path(__file__).parent
 CONTROLLER = "joint_trajectory_controller"
+EFFORTS = "effort_controller"
 
 ARGUMENTS = {
     "robot": ("delta_cu", "a name or a path"),
     "namespace": ("", "of everything"),
     "description": ("", "a URDF with a ros2_control element; default: what pkm-twin urdf writes"),
     "controllers": ("", "settings of ros2_control; default: controllers.yaml beside this file"),
+    "hardware_plugin": ("mock_components/GenericSystem", "of that description"),
+    "bandwidth": (
+        "",
+        "Hz: gains of joint_trajectory_controller by the machine's masses; default: the file's",
+    ),
+    "command_gate": ("false", f"true: torques through command_gate to {EFFORTS}"),
     "robot_state_publisher": ("true", "false where another node publishes robot_description"),
     "params_file": ("", "parameters of delta_dynamics, a YAML file"),
     "log_level": ("info", "of delta_dynamics: debug, info, warn, error or fatal"),
@@ -58,17 +70,30 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """Everything, once the arguments have their values."""
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     namespace = given["namespace"]
+    gate = given["command_gate"].lower()
+    if gate not in ("true", "false"):
+        raise RuntimeError(f"command_gate: {given['command_gate']!r} is neither true nor false")
+    controller = EFFORTS if gate == "true" else CONTROLLER
     space = f"/{namespace}".rstrip("/")
     folder = tempfile.TemporaryDirectory(prefix="pkm_twin_")
     file = Path(folder.name) / "controllers.yaml"
-    file.write_text(yaml.safe_dump(_controllers(given, space)), encoding="utf-8")
+    sections = _controllers(given, space)
+    file.write_text(yaml.safe_dump(sections), encoding="utf-8")
     publisher = Node(
         package="robot_state_publisher",
         executable="robot_state_publisher",
         namespace=namespace,
         parameters=[{"robot_description": _description(given)}],
     )
+    settings = sections.get(f"{space}/{CONTROLLER}", {}).get("ros__parameters", {})
+    gains = settings.get("gains", {})
+    loose = [joint for joint, gain in gains.items() if not gain.get("p")]
+    warning = (
+        f"{CONTROLLER} has no gain for {', '.join(loose)}: the machine is carried and not held in "
+        "place; see bandwidth:=HZ"
+    )
     return [
+        *([LogInfo(msg=warning)] if loose and controller == CONTROLLER else []),
         RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: folder.cleanup())),
         *([publisher] if given["robot_state_publisher"] == "true" else []),
         Node(
@@ -85,7 +110,7 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             namespace=namespace,
             arguments=[
                 "joint_state_broadcaster",
-                CONTROLLER,
+                controller,
                 *("--param-file", str(file)),
                 *("--controller-manager", f"{space}/controller_manager"),
             ],
@@ -101,8 +126,14 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
                         "params_file": given["params_file"],
                         "log_level": given["log_level"],
                         "stiffness_monitor": "false",
-                        "joint_trajectory_ff": f"{CONTROLLER}/joint_trajectory",
-                        "controller_action": f"{CONTROLLER}/follow_joint_trajectory",
+                        **(
+                            {"command_gate": "true", "commands": f"{EFFORTS}/commands"}
+                            if controller == EFFORTS
+                            else {
+                                "joint_trajectory_ff": f"{CONTROLLER}/joint_trajectory",
+                                "controller_action": f"{CONTROLLER}/follow_joint_trajectory",
+                            }
+                        ),
                     }.items(),
                 )
             ]
@@ -115,18 +146,32 @@ def _description(given: dict[str, str]) -> str:
         return Path(given["description"]).read_text(encoding="utf-8")
     program = Path(get_package_prefix("pkm_twin"), "lib/pkm_twin/pkm-twin")
     written = subprocess.run(
-        [program, "urdf", given["robot"]], capture_output=True, text=True, check=False
+        [program, "urdf", given["robot"], "--hardware-plugin", given["hardware_plugin"]],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if written.returncode:
         raise RuntimeError(f"robot: {written.stderr.strip()}")
     return written.stdout
 
 
-def _controllers(given: dict[str, str], space: str) -> dict[str, object]:
+def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[str, Any]]]:
     """The settings with the robot's joints, each section under its node's full name."""
     path = Path(given["controllers"] or HERE / "controllers.yaml")
     sections = yaml.safe_load(path.read_text(encoding="utf-8"))
-    joints = list(load(given["robot"]).joint_names)
+    try:
+        robot = load(given["robot"])
+        strong, damped = tuned(robot, float(given["bandwidth"] or 0.0))
+    except (PkmTwinError, ValueError) as error:
+        raise RuntimeError(f"robot {given['robot']}, bandwidth: {error}") from None
+    joints = list(robot.controller.names)
+    # Efforts of the controller's numbers per the controller's numbers.
+    scale = robot.controller.factors**2
+    tuned_gains = {
+        joint: {"p": float(p), "i": 0.0, "d": float(d), "i_clamp": 0.0}
+        for joint, p, d in zip(joints, strong / scale, damped / scale, strict=True)
+    }
     for name, section in sections.items():
         parameters = section["ros__parameters"]
         if name not in ("controller_manager", "joint_state_broadcaster"):
@@ -136,4 +181,6 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, object]:
             each = gains.pop("each")
             # Copies: the middleware's reader takes no YAML with references.
             parameters["gains"] = {joint: dict(gains.get(joint, each)) for joint in joints}
+        if given["bandwidth"] and name == CONTROLLER:
+            parameters["gains"] = tuned_gains
     return {f"{space}/{name}": section for name, section in sections.items()}

@@ -1,16 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The twin of one robot: its nodes, in one namespace. Every argument has a default."""
+"""The twin of one robot: its nodes, in one namespace. Every argument has a default.
 
+A node that ends is started again. One that rejects its configuration would reject it again: it is
+tried a few times only, with growing pauses.
+"""
+
+import atexit
+import re
+import shutil
+import tempfile
+import time
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
+import yaml
+from launch.actions import (
+    DeclareLaunchArgument,
+    LogInfo,
+    OpaqueFunction,
+    SetEnvironmentVariable,
+    TimerAction,
+)
+from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
+from launch.launch_description_entity import LaunchDescriptionEntity
 from launch_ros.actions import Node
 
+from delta_dynamics.feedforward import Settings
+from delta_dynamics.gate import GateSettings
 from launch import LaunchDescription
+from pkm_twin import load
+from pkm_twin.errors import PkmTwinError
 
 ROBOT = "delta_cu"
+GATE = "command_gate"
+"""Outlives the node whose torques it forwards: a process of its own."""
 RESPAWN_DELAY = 1.0
+REJECTED = 1
+"""Exit code of a node that rejects its configuration."""
+RETRIES = 3
+"""How often such a node is started again, after RESPAWN_DELAY, twice and four times as long."""
+SETTLED = 30.0
+"""A node that ran for so long had a good configuration, s."""
 
 ARGUMENTS = {
     "robot": ("", f"robot of all nodes, a name or a path; default: params_file's, else {ROBOT}"),
@@ -33,6 +63,8 @@ ARGUMENTS = {
     "use_wrench": ("", "of delta_dynamics: true where torques bear the measured wrench"),
     "wrench_frame": ("", "frame of the measured wrench"),
     "use_sim_time": ("false", "true where a bag is replayed with --clock"),
+    "executor": ("", "of all nodes: single or events; default: each node's own, composed: events"),
+    "composed": ("false", "all nodes but command_gate in one process, which takes less time"),
     "respawn": ("true", "start a node again that has ended; command_gate always is"),
     "log_level": ("info", "debug, info, warn, error or fatal"),
 }
@@ -74,29 +106,141 @@ def nodes(context: LaunchContext) -> list[Node]:
     file = given["params_file"]
     if file and not Path(file).is_file():
         raise RuntimeError(f"params_file: {file!r} is no file")
-    return [_node(name, given) for name in PARAMETERS if _flag(given, name)]
-
-
-def _node(name: str, given: dict[str, str]) -> Node:
-    # A file may name the robot; an argument that is given goes before the file's.
-    default = [] if given["robot"] else [{"mechanism": ROBOT}]
-    file = [given["params_file"]] if given["params_file"] else []
-    chosen = {key: given[key] for key in PARAMETERS[name] if given[key]}
     if given["robot"]:
-        chosen["mechanism"] = given["robot"]
+        try:
+            load(given["robot"])
+        except PkmTwinError as error:
+            raise RuntimeError(f"robot: {error}") from None
+    chosen = [name for name in PARAMETERS if _flag(given, name)]
+    _check_deadline(given, chosen)
+    together = [name for name in chosen if name != GATE]
+    if _flag(given, "composed") and together:
+        groups = [[name] for name in chosen if name == GATE] + [together]
+    else:
+        groups = [[name] for name in chosen]
+    return [_process(names, given) for names in groups]
+
+
+def _check_deadline(given: dict[str, str], chosen: list[str]) -> None:
+    """Torques that may come later than the gate demands never reach it: the middleware stops them.
+
+    :raises RuntimeError: they may.
+    """
+    if not {"delta_dynamics", GATE} <= set(chosen):
+        return
+    stale_after = _parameter(given, "delta_dynamics", "stale_after", Settings().stale_after)
+    deadline = _parameter(given, GATE, "deadline", GateSettings().deadline)
+    if stale_after > deadline:
+        raise RuntimeError(
+            f"params_file: delta_dynamics has stale_after {stale_after:g} s and command_gate has "
+            f"deadline {deadline:g} s: no torque would reach the gate; stale_after has to be at "
+            "most the deadline"
+        )
+
+
+def _parameter(given: dict[str, str], node: str, name: str, default: float) -> float:
+    """A parameter of a node by the file, whose later sections go before its earlier ones."""
+    file = given["params_file"]
+    if not file:
+        return default
+    full, found = _full(given, node), default
+
+    def look(section: object, path: str) -> None:
+        nonlocal found
+        for key, value in section.items() if isinstance(section, dict) else ():
+            if key != "ros__parameters":
+                look(value, f"{path}/{str(key).strip('/')}")
+            elif re.fullmatch(_pattern(path), full) and isinstance(value, dict):
+                found = value.get(name, found)
+
+    try:
+        look(yaml.safe_load(Path(file).read_text(encoding="utf-8")), "")
+        return float(found)
+    except (OSError, yaml.YAMLError, TypeError, ValueError) as error:
+        raise RuntimeError(f"params_file: {file!r}: {' '.join(str(error).split())}") from None
+
+
+def _full(given: dict[str, str], node: str) -> str:
+    """A node's name with its namespace."""
+    return f"/{given['namespace'].strip('/')}/{node}".replace("//", "/")
+
+
+def _pattern(path: str) -> str:
+    """The middleware's ** stands for any names, none included; its * for one."""
+    return re.escape(path).replace(r"/\*\*", "(/.*)?").replace(r"\*", "[^/]*")
+
+
+def _process(names: list[str], given: dict[str, str], tries: int = 0) -> Node:
+    """One node, or several in one process: a file of parameters has a section for each."""
+    folder = tempfile.mkdtemp(prefix="pkm_twin_")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    before, after = Path(folder, "before.yaml"), Path(folder, "after.yaml")
+    # A file may name the robot; an argument that is given goes before the file's.
+    for file, section in (
+        (before, lambda _: {"mechanism": ROBOT}),
+        (after, lambda name: _parameters(name, given)),
+    ):
+        told = {_full(given, name): {"ros__parameters": section(name)} for name in names}
+        file.write_text(yaml.safe_dump(told), encoding="utf-8")
+    files = [] if given["robot"] else [str(before)]
+    files += [given["params_file"]] if given["params_file"] else []
+    remappings = [
+        word
+        for name in names
+        for topic in TOPICS[name]
+        for word in ("-r", f"{name}:{topic}:={given[topic.removeprefix('~/')]}")
+    ]
+    single = names[0] if len(names) == 1 else None
     return Node(
         package="pkm_twin",
-        executable=name,
-        name=name,
+        executable=single or "composed",
+        name=single,
         namespace=given["namespace"],
-        parameters=[*default, *file, {**chosen, "use_sim_time": _flag(given, "use_sim_time")}],
-        remappings=[(topic, given[topic.removeprefix("~/")]) for topic in TOPICS[name]],
-        ros_arguments=["--log-level", given["log_level"]],
-        respawn=name == "command_gate" or _flag(given, "respawn"),
-        # The gate's absence is the time that a controller holds the last torque.
-        respawn_delay=0.0 if name == "command_gate" else RESPAWN_DELAY,
+        arguments=[] if single else names,
+        parameters=[*files, str(after)],
+        ros_arguments=[*remappings, "--log-level", given["log_level"]],
+        on_exit=_Again(names, given, tries),
         output="screen",
     )
+
+
+def _parameters(name: str, given: dict[str, str]) -> dict[str, object]:
+    """What the arguments say of a node's parameters."""
+    chosen: dict[str, object] = {key: given[key] for key in PARAMETERS[name] if given[key]}
+    if given["robot"]:
+        chosen["mechanism"] = given["robot"]
+    executor = given["executor"] or ("events" if _flag(given, "composed") else "")
+    if executor:
+        chosen["executor"] = executor
+    if "use_wrench" in chosen:
+        chosen["use_wrench"] = _flag(given, "use_wrench")
+    return {**chosen, "use_sim_time": _flag(given, "use_sim_time")}
+
+
+class _Again:
+    """What follows the end of a node: its next start, or a line that says that there is none."""
+
+    def __init__(self, names: list[str], given: dict[str, str], tries: int) -> None:
+        self._names, self._given, self._tries = names, given, tries
+        self._began = time.monotonic()
+
+    def __call__(
+        self, event: ProcessExited, context: LaunchContext
+    ) -> list[LaunchDescriptionEntity]:
+        names, given = self._names, self._given
+        gate = names == [GATE]
+        if context.is_shutdown or not (gate or _flag(given, "respawn")):
+            return []
+        if event.returncode != REJECTED or time.monotonic() - self._began > SETTLED:
+            # The gate's absence is the time that a controller holds the last torque.
+            again = _process(names, given)
+            return [again] if gate else [TimerAction(period=RESPAWN_DELAY, actions=[again])]
+        if self._tries == RETRIES:
+            text = f"{', '.join(names)}: the configuration is rejected; not started again"
+            return [LogInfo(msg=text)]
+        pause = RESPAWN_DELAY * 2**self._tries
+        again = _process(names, given, self._tries + 1)
+        return [TimerAction(period=pause, actions=[again])]
 
 
 def _flag(given: dict[str, str], name: str) -> bool:

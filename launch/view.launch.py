@@ -87,7 +87,7 @@ def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
                 namespace=namespace,
                 parameters=[
                     {
-                        "robot_description": robot_urdf(load(given["robot"])),
+                        "robot_description": robot_urdf(load(given["robot"]), ""),
                         "frame_prefix": prefix,
                         "publish_frequency": 100.0,
                         **sim_time,

@@ -1,8 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """pkm_twin: the digital twin of parallel kinematic machines."""
 
-from pkm_twin.machine.catalogue import load, robot_names
-from pkm_twin.machine.robot import Robot
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pkm_twin.machine.catalogue import load, robot_names
+    from pkm_twin.machine.robot import Robot
 
 __all__ = ["Robot", "load", "robot_names"]
 __version__ = "0.1.0"
+
+_HOMES = {
+    "Robot": "pkm_twin.machine.robot",
+    "load": "pkm_twin.machine.catalogue",
+    "robot_names": "pkm_twin.machine.catalogue",
+}
+"""Loaded when they are asked for: a command or a node answers signals before it loads numpy."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

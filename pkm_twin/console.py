@@ -25,7 +25,7 @@ from rich.progress import (
 )
 
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.files import require_replaceable
+from pkm_twin.files import decimal, require_replaceable
 
 
 @contextmanager
@@ -61,7 +61,7 @@ def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
 def parse_numbers(text: str) -> list[float]:
     """Finite numbers with commas between; empty where it is anything else."""
     try:
-        numbers = [float(word) for word in text.split(",")]
+        numbers = [decimal(word) for word in text.split(",")]
     except ValueError:
         return []
     return numbers if all(map(math.isfinite, numbers)) else []

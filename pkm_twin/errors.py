@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Typed errors: each carries the value and the bound, as text and as attributes."""
+"""Typed errors: each carries the value and the bound, as text and as attributes; and warnings."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import sys
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, TextIO
 
 
 class PkmTwinError(Exception):
@@ -36,6 +40,55 @@ class UnknownNameError(ParameterError):
         hint = f"did you mean {self.closest!r}? " if self.closest else ""
         super().__init__(field, name, f"{hint}valid: {', '.join(names)}")
         self.valid = names
+
+
+class MobilityError(ParameterError):
+    """A machine whose actuated joints do not determine it, or cannot all move.
+
+    ``actuated`` joints stand against ``freedoms``; ``causes`` are texts, the likeliest first.
+    """
+
+    def __init__(self, actuated: int, freedoms: int, causes: Sequence[str]) -> None:
+        super().__init__("joints", freedoms, f"a mobility of {actuated}")
+        self.actuated, self.freedoms, self.causes = actuated, freedoms, tuple(causes)
+        joints = f"{actuated} actuated joint{'' if actuated == 1 else 's'}"
+        degrees = f"{freedoms} degree{'' if freedoms == 1 else 's'} of freedom"
+        self.args = (one_line(f"joints: {joints} for {degrees}; {'; '.join(causes)}", 2000),)
+
+
+class RobotWarning(UserWarning):
+    """Something in a robot's file that is taken as it stands and may be a mistake."""
+
+
+_warned: dict[str, dict[Any, Any]] = {}
+"""By file, what it was warned of: once, whoever loads it again."""
+
+
+def warn(path: str | Path, text: str) -> None:
+    """Warn of something in a robot's file, by the file and not by a line of the program."""
+    known = _warned.setdefault(str(path), {})
+    warnings.warn_explicit(text, RobotWarning, str(path), 0, registry=known)
+
+
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Warnings of a robot's file are a line on stderr, without a line of the program."""
+    usual = warnings.showwarning
+
+    def show(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int,
+        file: TextIO | None = None, line: str | None = None,
+    ) -> None:  # fmt: skip
+        if issubclass(category, RobotWarning):
+            print(one_line(f"warning: {filename}: {message}", 2000), file=file or sys.stderr)
+        else:
+            usual(message, category, filename, lineno, file, line)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = usual
 
 
 class UnreachableError(PkmTwinError, ValueError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that a user names: regular ones only, and written whole or not at all.
+"""Files that a user names: regular ones only, and written whole or not at all; numbers in them.
 
 May import: the standard library.
 """
@@ -49,6 +49,16 @@ def _require_regular(mode: int, path: Path) -> None:
     if not stat.S_ISREG(mode):
         kind = next((name for test, name in _KINDS if test(mode)), "something else")
         raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", str(path))
+
+
+def decimal(text: str) -> float:
+    """A number as files have it: ``1_0`` and digits of other scripts are Python's own.
+
+    :raises ValueError: no number.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(f"could not convert string to float: {text!r}")
+    return float(text)
 
 
 def require_replaceable(path: Path) -> None:

@@ -6,16 +6,15 @@ Only the node ``stiffness_monitor`` imports this module.
 
 from __future__ import annotations
 
-from array import array
 from typing import Any
 
 import numpy as np
-from rclpy.time import Time
 from sensor_msgs.msg import JointState
 
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros import node as health
+from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.messages import SECOND, JointReader, StampRules
 from pkm_twin.streams.wrench import counting
 from stiffness_monitor.correction import setpoint_correction
@@ -81,8 +80,9 @@ class SetpointCorrection:
             return
         q = robot.inverse(robot.home())
         setpoint_correction(robot, q, np.zeros(6), tool=self._tool, bound=self._bound)
-        self._offsets = node.create_guarded_publisher(JointState, "~/setpoint_offset")
-        self._corrected = node.create_guarded_publisher(JointState, "~/corrected_setpoint")
+        fields = ("position",)
+        self._offsets = JointPublisher(node, robot, "~/setpoint_offset", fields)
+        self._corrected = JointPublisher(node, robot, "~/corrected_setpoint", fields)
         node.create_guarded_subscription(JointState, "setpoint", self._on_setpoint, raw=True)
 
     def reset(self) -> None:
@@ -106,11 +106,8 @@ class SetpointCorrection:
         )
         self.bounded += bool(found.bounded)
         self._offset = answer.stamp, found.offset
-        self._publish(self._offsets, answer.stamp, self._rates(found.offset))
-
-    def _rates(self, offset: Any) -> Any:
-        """A difference of positions in the controller's numbers."""
-        return offset * self._robot.controller.factors
+        own = self._robot.controller
+        self._offsets.publish(answer.stamp, own.controller_rates(found.offset))
 
     def diagnose(self) -> dict[str, object]:
         """Values of the node's diagnostic status."""
@@ -141,12 +138,5 @@ class SetpointCorrection:
                 "no wrench",
                 f"the last wrench is {age:.3f} s away, allowed {self._age:g} s",
             )
-        controller = self._robot.controller
-        told = controller.offsets + controller.factors * sample.q + self._rates(offset)
-        self._publish(self._corrected, sample.stamp, told)
-
-    def _publish(self, publisher: Any, stamp: int, positions: Any) -> None:
-        message = JointState(name=list(self._robot.controller.names))
-        message.header.stamp = Time(nanoseconds=stamp).to_msg()
-        message.position = array("d", positions)
-        publisher.publish(message)
+        own = self._robot.controller
+        self._corrected.publish(sample.stamp, own.controller_positions(sample.q + offset))

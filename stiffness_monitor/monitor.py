@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.messages import SECOND, WrenchSample, as_message_error
+from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.pairing import PairingCore
 from pkm_twin.streams.wrench import Mount, Recent, WrenchSettings
 from stiffness_monitor.compliance import StrainEnergy, compliance, strain_energy
@@ -47,6 +48,7 @@ class Monitor(PairingCore):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._recent: Recent[Array] = Recent()
+        self.pace = Pace(0.0)
 
     @property
     def latest(self) -> tuple[int, Array] | None:
@@ -56,6 +58,7 @@ class Monitor(PairingCore):
     def reset(self) -> None:
         """Forget all joint states, as when the clock jumps."""
         self._recent.clear()
+        self.pace.reset()
 
     def joint_state(self, message: Any, now: int) -> None:
         """Take a joint state's positions; an older one than the last is dropped and counted.
@@ -66,8 +69,8 @@ class Monitor(PairingCore):
             sample = self._reader.positions(message, now, self._rules)
             self._recent.push(sample.stamp, sample.q)
 
-    def wrench(self, message: Any, now: int) -> Answer:
-        """Answer a wrench.
+    def wrench(self, message: Any, now: int) -> Answer | None:
+        """Answer a wrench; None where ``pace`` leaves it out.
 
         A wrench in the base frame has fixed axes; one in any other frame has the platform's, as a
         force-torque sensor mounted there measures it. From where the settings, or transforms, say
@@ -78,13 +81,16 @@ class Monitor(PairingCore):
         with self._judging(self.wrenches):
             return self._wrench(message, now)
 
-    def _wrench(self, message: Any, now: int) -> Answer:
+    def _wrench(self, message: Any, now: int) -> Answer | None:
         sample, mount = self._wrench_reader.read(message, now)
+        if not self.pace.due(sample.stamp):
+            return None
         q = self._nearest(sample.stamp)
         answer: Answer = as_message_error(self._answer, sample, mount, q)
         deflection = answer.energy.deflection
         if not (np.isfinite(answer.compliance).all() and np.isfinite(deflection).all()):
             raise MessageError("non-finite result", "the model gave a value that is not finite")
+        self.pace.answered(sample.stamp)
         return answer
 
     def _answer(self, sample: WrenchSample, mount: Mount, q: Array) -> Answer:

@@ -35,6 +35,7 @@ from pkm_twin.ros.wrench import (
     declare_mounts,
     declare_wrench,
 )
+from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from stiffness_monitor.compliance import kernels
@@ -52,7 +53,7 @@ class StiffnessMonitor(health.TwinNode):
     """Live compliance and strain energy of any robot with elastic members."""
 
     def __init__(self) -> None:
-        super().__init__("stiffness_monitor")
+        super().__init__("stiffness_monitor", executor="events")
         robot = load(self.declare("mechanism", "upr_rpu", "robot: name or path", read_only=True))
         for kernel in kernels(robot):
             kernel.warm_up()
@@ -67,6 +68,12 @@ class StiffnessMonitor(health.TwinNode):
         mounts = declare_mounts(self, given or PLATFORM)
         self._platform_frame = given or ("" if mounts is None else PLATFORM)
         self._monitor = Monitor(robot, settings, mounts)
+        self._monitor.pace = Pace(
+            self.declare(
+                "rate", 0.0, "wrenches answered a second at most, by their stamps, 0: every one",
+                unit="Hz", low=0.0, high=1e4, read_only=True,
+            )
+        )  # fmt: skip
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self._correction = SetpointCorrection(self, robot, settings.stamp_rules, self._decode)
         self._alarm = StiffnessAlarmTopics(
@@ -182,6 +189,8 @@ class StiffnessMonitor(health.TwinNode):
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         answer = self._monitor.wrench(message, self.now())
+        if answer is None:
+            return
         stamp = Time(nanoseconds=answer.stamp).to_msg()
         base = self._monitor.settings.base_frame
         self._compliance.publish(_matrix(answer.compliance))
@@ -213,6 +222,9 @@ class StiffnessMonitor(health.TwinNode):
         """Of the latest joint state: a pose costs milliseconds, so not of every one."""
         latest = self._monitor.latest
         if not self.active or latest is None or latest[0] == self._known:
+            return
+        listeners = (self._frequencies, self._frequencies_stamped)
+        if not any(publisher.get_subscription_count() for publisher in listeners):
             return
         self._known, q = latest
         robot = self._monitor.robot
@@ -287,6 +299,10 @@ def _transform(answer: Answer) -> TransformStamped:
     rotation.x, rotation.y, rotation.z = (scale * turn).tolist()
     rotation.w = math.cos(angle / 2)
     return message
+
+
+NODE = StiffnessMonitor
+"""What a process of several nodes makes."""
 
 
 def main() -> None:

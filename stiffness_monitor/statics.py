@@ -9,6 +9,9 @@ May import: numpy, scipy, pkm_twin's core, this package, the standard library; n
 
 from __future__ import annotations
 
+from collections import deque
+from typing import Final
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky, solve_triangular  # type: ignore[import-untyped]
@@ -20,6 +23,10 @@ from stiffness_monitor.beams import System, assemble
 from stiffness_monitor.structure import Member, structural_model
 
 Array = NDArray[np.float64]
+
+_Solved = tuple[System, Array, Array]
+_LAST: Final[deque[tuple[tuple[int, bytes], Robot, _Solved]]] = deque(maxlen=2)
+"""Frames that were solved last, with the robots that they are of."""
 
 
 def frame_compliance(robot: Robot, pose: ArrayLike, *, elements: int = 1) -> Array:
@@ -37,8 +44,7 @@ def frame_compliance(robot: Robot, pose: ArrayLike, *, elements: int = 1) -> Arr
     poses = checked_poses(robot, pose)
     result = np.empty((*poses.shape[:-1], 6, 6))
     for index in np.ndindex(*poses.shape[:-1]):
-        root = stiffness_root(assemble(structural_model(robot, poses[index]), elements), index)
-        half = _platform_columns(root)
+        _, _, half = _solved(robot, poses[index], elements, index)
         result[index] = half.T @ half
     return result
 
@@ -64,9 +70,8 @@ def frame_energies(
     names: tuple[str, ...] = ()
     deflections, energies = np.empty((*batch, 6)), []
     for index in np.ndindex(*batch):
-        system = assemble(structural_model(robot, poses[index]), 1)
-        root = stiffness_root(system, index)
-        shape = _loaded_shape(root, loads[index])
+        system, root, half = _solved(robot, poses[index], 1, index)
+        shape = _loaded_shape(root, half, loads[index])
         every, strain, _ = system.energies(shape)
         elastic = [every.index(name) for name in system.elastic]
         names = system.elastic
@@ -90,7 +95,8 @@ def frame_deflections(
     poses = checked_poses(robot, pose)
     model = structural_model(robot, poses)
     system = assemble(model, elements)
-    shape = _loaded_shape(stiffness_root(system, ()), one_vector(wrench, 6, "the wrench"))
+    root = stiffness_root(system, ())
+    shape = _loaded_shape(root, _platform_columns(root), one_vector(wrench, 6, "the wrench"))
     # The platform's node comes first, then those of each member.
     moved = system.displacements(shape)[1:, :3]
     points = system.positions[1:]
@@ -123,13 +129,26 @@ def stiffness_root(system: System, index: tuple[int, ...]) -> Array:
     return root
 
 
-def _loaded_shape(root: Array, wrench: Array) -> Array:
+def _solved(robot: Robot, pose: Array, elements: int, index: tuple[int, ...]) -> _Solved:
+    """A pose's frame, the factor of its stiffness, and its answers L^-1 E to unit wrenches.
+
+    The last ones are kept: what asks for the energy of a wrench asks for the compliance too.
+    """
+    key = elements, pose.tobytes()
+    for known, owner, solved in tuple(_LAST):
+        if known == key and owner is robot:
+            return solved
+    system = assemble(structural_model(robot, pose), elements)
+    root = stiffness_root(system, index)
+    solved = system, root, _platform_columns(root)
+    _LAST.append((key, robot, solved))
+    return solved
+
+
+def _loaded_shape(root: Array, half: Array, wrench: Array) -> Array:
     """Coordinates of the frame under a wrench on the platform, shape (6,)."""
     return np.asarray(
-        solve_triangular(
-            root, _platform_columns(root) @ wrench, lower=True, trans=1, check_finite=False
-        ),
-        np.float64,
+        solve_triangular(root, half @ wrench, lower=True, trans=1, check_finite=False), np.float64
     )
 
 

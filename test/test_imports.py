@@ -25,6 +25,7 @@ MAY = {
     "pkm_twin.machine": CORE,
     "pkm_twin.kinematics": CORE,
     "pkm_twin.mechanisms": CORE,
+    "pkm_twin.export": CORE,
     PURE: {"pkm_twin.machine"},
     "pkm_twin.streams": CORE | {PURE},
     "pkm_twin.state": STREAMS,

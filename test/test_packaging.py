@@ -21,7 +21,7 @@ import pkm_twin
 REPOSITORY = Path(__file__).resolve().parents[1]
 EXECUTABLES = {
     "delta_dynamics", "stiffness_monitor", "command_gate", "machine_state", "machine_sim",
-    "pkm-twin",
+    "composed", "pkm-twin",
 }  # fmt: skip
 COLCON = Path(sys.executable).with_name("colcon")
 needs_colcon = pytest.mark.skipif(
@@ -58,7 +58,7 @@ def copy(tmp_path_factory):
     """A clean copy of the tree, without recordings and tests."""
     target = tmp_path_factory.mktemp("workspace") / "src/pkm_twin"
     for name in tracked():
-        if name.parts[0] not in ("bags", "test", "docs"):
+        if name.parts[0] not in ("test", "docs"):
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(REPOSITORY / name, target / name)
     return target
@@ -141,6 +141,8 @@ class TestColcon:
         assert (share / "package.xml").is_file()
         launched = {file.name for file in (share / "launch").iterdir()}
         assert launched == {name.name for name in tracked() if str(name.parent) == "launch"}
+        bags = {name.name for name in tracked() if name.match("bags/*.mcap")}
+        assert bags and bags <= {file.name for file in (share / "bags").iterdir()}
         layouts = {"machine.rviz", "machine.foxglove.json", "machine.plotjuggler.xml"}
         assert {file.name for file in (share / "view").iterdir()} == layouts
         assert {file.stem for file in (share / "config").glob("*.yaml")} == robots()
@@ -154,9 +156,10 @@ class TestColcon:
         assert {line.split()[0] for line in listed.splitlines()} == robots()
         assert "Usage: pkm-twin" in run(*start, "--help", cwd=tmp_path, PYTHONPATH=str(site))
         arguments = "--ros-args", "-p", "mechanism:=no_such_robot"
+        others = {"composed": ["delta_dynamics", "machine_state"]}
         for node in EXECUTABLES - {"pkm-twin"} if find_spec("rclpy") else ():
             refused = subprocess.run(
-                [*start[:1], start[1].with_name(node), *arguments],
+                [*start[:1], start[1].with_name(node), *others.get(node, ()), *arguments],
                 cwd=tmp_path,
                 env={**os.environ, "PYTHONPATH": str(site)}
                 | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "87"},
@@ -211,3 +214,40 @@ class TestManifest:
         changes = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
         found["CHANGELOG.md"] = re.search(r"^## \[?v?(\d+\.\d+\.\d+)", changes, re.MULTILINE)[1]
         assert len(set(found.values())) == 1, found
+
+
+DECLARED = {
+    "hypothesis", "matplotlib", "numpy", "pkm_twin", "delta_dynamics", "stiffness_monitor",
+    "pytest", "rich", "scipy", "setuptools", "support", "test", "bags", "typer", "yaml",
+    "zstandard", "lz4", "mcap",
+}  # fmt: skip
+"""What package.xml's dependencies bring, and this package."""
+
+
+def foreign_imports(path):
+    """Top-level imports of a test module that it has not asked for by pytest.importorskip."""
+    asked = set()
+    for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+        call = getattr(statement, "value", None)
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "pytest.importorskip":
+            asked.add(call.args[0].value.split(".")[0])
+        modules = []
+        if isinstance(statement, ast.Import):
+            modules = [alias.name for alias in statement.names]
+        elif isinstance(statement, ast.ImportFrom) and not statement.level:
+            modules = [statement.module]
+        for module in {module.split(".")[0] for module in modules}:
+            # The middleware and its messages come together.
+            ros = module == "rclpy" or re.search("_(msgs|interfaces|srvs)$", module)
+            brought = module in DECLARED | asked | sys.stdlib_module_names
+            if not (brought or (ros and "rclpy" in asked)):
+                yield module
+
+
+def test_a_workspace_with_the_declared_dependencies_collects_every_module():
+    """What else a module needs it asks for by name, so that it is skipped where that is missing."""
+    paths = [REPOSITORY / name for name in tracked() if name.match("test/**/test_*.py")]
+    assert len(paths) > 100
+    assert {
+        path.name: list(foreign_imports(path)) for path in paths if any(foreign_imports(path))
+    } == {}

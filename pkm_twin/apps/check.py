@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
+from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
 from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.limits import ranges
 from pkm_twin.apps.loads import Load, by_load
@@ -21,10 +22,14 @@ from pkm_twin.apps.verdict import Item, Verdict
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
+from pkm_twin.streams.drives import idle_samples
+from pkm_twin.streams.rest import SIGMAS, fit_gain, noise, rate_doubt
 
 Array = NDArray[np.float64]
 # Samples computed at a time, so that memory stays flat.
 _BLOCK = 4096
+# Of the differentiator: degree of the velocity's polynomial, samples.
+_ORDER, _WINDOW = 3, 9
 DEVIATIONS: Final = (1, 2, 3)
 """Of the model, inside which residuals are counted."""
 
@@ -222,9 +227,9 @@ def _residuals(r: Recording, bounds: Bounds) -> tuple[list[Item], dict[str, Mode
     )
     if reason or r.effort is None:
         return [Item(what, reason, bound, Verdict.UNKNOWN)], {}
-    models = (inverse_dynamics, torque_deviation)[: 2 if r.robot.uncertainty else 1]
+    models = (inverse_dynamics, _held, torque_deviation)[: 3 if r.robot.uncertainty else 2]
     try:
-        (expected, *spread), used = _modelled(r, *models)
+        (expected, held, *spread), used, still = _modelled(r, *models)
     except (UnreachableError, SingularityError):
         raise
     except ValueError as error:  # numbers within bounds whose result is not finite
@@ -232,14 +237,20 @@ def _residuals(r: Recording, bounds: Bounds) -> tuple[list[Item], dict[str, Mode
     used = _judged(r, used)
     if not used.any():
         return [Item(what, "too few joint states in a row", bound, Verdict.UNKNOWN)], {}
-    residual = (r.effort - expected)[used]
+    idle = used & idle_samples(r.time, still, r.effort, held)
+    items = [_idle(r, idle, used)] if idle.any() else []
+    used = used & ~idle
+    if not used.any():
+        return items, {}
+    reach = friction_reach(r.robot)
+    residual = beyond_friction((r.effort - expected)[used], still[used], reach)
     bands = _bands(r.robot, residual, spread[0][used]) if spread else {}
     rms = np.sqrt(np.mean(residual**2, 0))
     peak = np.abs(r.effort).max(0)
     units = r.robot.effort_units
     good = rms <= bounds.residual * peak
     hint = "" if r.load or good.all() else "; a payload that nobody told of? --payload"
-    items = [
+    items += [
         _item(
             f"{what} of {name}",
             f"RMS {rms[i]:.4g} {units[i]}, {100 * rms[i] / max(peak[i], 1e-12):.2f} % of "
@@ -250,6 +261,17 @@ def _residuals(r: Recording, bounds: Bounds) -> tuple[list[Item], dict[str, Mode
         for i, name in enumerate(r.robot.joint_names)
     ]
     return items, bands
+
+
+def _idle(r: Recording, idle: NDArray[np.bool_], used: NDArray[np.bool_]) -> Item:
+    """How much of a recording is left out because the drives bear nothing."""
+    seconds = float(np.sum(np.gradient(r.time)[idle]))
+    return Item(
+        "drives off or braked",
+        f"{seconds:.3f} s of {r.time[-1]:.3f} s, left out: efforts zero or constant at standstill",
+        "some efforts measured",
+        Verdict.GOOD if (used & ~idle).any() else Verdict.UNKNOWN,
+    )
 
 
 def _bands(robot: Robot, residual: Array, spread: Array) -> dict[str, ModelBand]:
@@ -284,27 +306,48 @@ def _judged(r: Recording, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def predicted(r: Recording) -> tuple[Array, NDArray[np.bool_]]:
     """Efforts that the twin expects (samples, n), zero where its window is not full; and where."""
-    (efforts,), used = _modelled(r, inverse_dynamics)
+    (efforts,), used, _ = _modelled(r, inverse_dynamics)
     return efforts, used
 
 
-def _modelled(r: Recording, *models: Callable[..., Array]) -> tuple[list[Array], NDArray[np.bool_]]:
-    """What functions of robot, motion and wrench say, shape (samples, n) each; and where."""
+def _held(robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
+    """What bears the weight and the wrench at rest, shape (samples, n)."""
+    return inverse_dynamics(robot, q, 0.0 * qd, 0.0 * qdd, wrench)
+
+
+def at_rest(r: Recording, qd: Array) -> NDArray[np.bool_]:
+    """Which joints stand still, shape (samples, n), as far as their rates ``qd`` can tell."""
+    if r.qd is not None:
+        return np.asarray(np.abs(qd) <= SIGMAS * noise(r.time, r.qd))
+    if len(r.time) < 3:
+        return np.zeros(r.q.shape, np.bool_)
+    gain = fit_gain(_ORDER + 1, _WINDOW, _WINDOW // 2) / float(np.median(np.diff(r.time)))
+    return np.asarray(np.abs(qd) <= rate_doubt(r.time, r.q, gain, _WINDOW // 2))
+
+
+def _modelled(
+    r: Recording, *models: Callable[..., Array]
+) -> tuple[list[Array], NDArray[np.bool_], NDArray[np.bool_]]:
+    """What functions of robot, motion and wrench say, shape (samples, n) each; where; what rests.
+
+    Where a joint stands still dry friction has no direction, and the model none of it.
+    """
     qd, qdd, used = motion(r)
+    still = at_rest(r, qd)
+    qd = moving_rates(qd, still, friction_reach(r.robot))
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
     values = [np.zeros_like(r.q) for _ in models]
     for robot, part in by_load(r.robot, r.load, r.time, _BLOCK):
         rows = np.arange(part.start, part.stop)[used[part]]
         for found, model in zip(values, models, strict=True):
             found[rows] = model(robot, r.q[rows], qd[rows], qdd[rows], wrench[rows])
-    return values, used
+    return values, used, still
 
 
 def motion(r: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Rates and accelerations (samples, n) by the differentiator's middle, and where they are."""
-    window = 9
-    late = window // 2
-    differentiator = Differentiator(order=3, window=window, middle=True)
+    late = _WINDOW // 2
+    differentiator = Differentiator(order=_ORDER, window=_WINDOW, middle=True)
     gap = 10 * float(np.median(np.diff(r.time))) if len(r.time) > 1 else 1.0
     qd, qdd = np.zeros_like(r.q), np.zeros_like(r.q)
     used = np.zeros(len(r.time), bool)

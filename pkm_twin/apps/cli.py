@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from pkm_twin.apps import export
 from pkm_twin.apps.calibrate import calibrate_command
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
@@ -42,7 +44,7 @@ from pkm_twin.console import (
     system_error,
     table_console,
 )
-from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line, plain_warnings
 from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
@@ -176,7 +178,19 @@ def info(
 
 
 @app.command()
-def urdf(robot: RobotName, platform: Platform = None) -> None:
+def urdf(
+    robot: RobotName,
+    platform: Platform = None,
+    hardware_plugin: Annotated[
+        str, typer.Option(help="of ros2_control", metavar="NAME")
+    ] = "mock_components/GenericSystem",
+    prefix: Annotated[
+        str, typer.Option(help="of the names of all links and joints", metavar="TEXT")
+    ] = "",
+    no_ros2_control: Annotated[
+        bool, typer.Option("--no-ros2-control", help="no ros2_control element")
+    ] = False,
+) -> None:
     """Print a robot as a URDF that parsers of trees read, its cut loops as <constraint> elements.
 
     Its joints are the actuated and the passive ones; its ground is base_link, its platform's link
@@ -185,7 +199,12 @@ def urdf(robot: RobotName, platform: Platform = None) -> None:
     from pkm_twin import load
     from pkm_twin.machine.robot_urdf import robot_urdf
 
-    typer.echo(robot_urdf(load(robot, platform=platform)), nl=False)
+    if re.search(r"[^\w./-]", prefix, re.ASCII):
+        raise ParameterError("--prefix", prefix, "letters, digits and . / _ -")
+    if not hardware_plugin.strip():
+        raise ParameterError("--hardware-plugin", hardware_plugin, "a plugin, or --no-ros2-control")
+    loaded = load(robot, platform=platform)
+    typer.echo(robot_urdf(loaded, "" if no_ros2_control else hardware_plugin, prefix), nl=False)
 
 
 @app.command()
@@ -518,6 +537,7 @@ def certify(
 
 
 app.add_typer(atlases.app, name="atlas")
+app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
 app.command()(guard_check)
 app.command()(view)
@@ -545,7 +565,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point: errors are one line on stderr and exit code 1, Ctrl-C is code 130."""
     open_standard_streams()
     try:
-        with first_signal(lambda: SystemExit(INTERRUPTED)):
+        with first_signal(lambda: SystemExit(INTERRUPTED)), plain_warnings():
             app(arguments, prog_name="pkm-twin")
     except SystemExit:
         failed = flush_output()

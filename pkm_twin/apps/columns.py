@@ -15,12 +15,14 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError
-from pkm_twin.files import open_regular
+from pkm_twin.errors import ParameterError, warn
+from pkm_twin.files import decimal, open_regular
 
 Array = NDArray[np.float64]
 MAX_CSV_BYTES = 1024**3
 """Largest CSV that is read: some millions of samples."""
+LONGEST_STEP = 0.2
+"""Between two samples of a motion, s, from which on the times look like milliseconds."""
 SHORTEST_STEP = 1e-9
 """Between two times, s: what a bag's stamps resolve."""
 LONGEST = 1e6
@@ -65,6 +67,27 @@ def times_of(path: Path, values: Array) -> Array:
     return time
 
 
+def check_motion_times(path: Path, time: Array, q: Array, qd: Array | None) -> None:
+    """Times of a motion are in seconds: its steps are short, its velocities those of its positions.
+
+    :param time: shape (samples,); q and qd, shape (samples, n), qd where the file tells it.
+    :raises ParameterError: velocities are a thousand times those of the positions.
+    """
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if qd is not None and len(time) > 2:
+        with np.errstate(all="ignore"):
+            moved = float(np.sqrt(np.mean(np.gradient(q, time, axis=0) ** 2)))
+            told = float(np.sqrt(np.mean(qd**2)))
+        if moved > 0.0 and 300.0 < told / moved < 3000.0:
+            raise ParameterError(
+                f"{path}: time", f"steps of {step:g} s",
+                f"seconds: velocities are {told / moved:.4g} times those of the positions, as with "
+                "times in milliseconds",
+            )  # fmt: skip
+    if step > LONGEST_STEP:
+        warn(path, f"time: steps of {step:g} s; the model takes seconds, does it say milliseconds?")
+
+
 def _lines(text: TextIO, path: Path) -> Iterator[str]:
     """The lines of a file, none so long that a row takes all the memory."""
     while line := text.readline(MAX_CSV_LINE):
@@ -83,7 +106,7 @@ def _parse_columns(path: Path, rows: Iterator[list[str]]) -> dict[str, Array]:
         if len(row) != len(header):
             raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
         try:
-            values = [float(cell) for cell in row]
+            values = [decimal(cell) for cell in row]
         except ValueError as error:
             raise ParameterError(f"{path}: line {number}", str(error), "numbers") from None
         if not all(map(math.isfinite, values)):

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demonstration: every recorded bag through the real nodes over the real middleware.
 
-For each bag a node and the player run as processes of their own, then the twin beside a simulated
-machine; this process records what the nodes publish into one MCAP, reads that back, and ends with
-a table, a picture and a verdict.
+For each bag a node runs as a process of its own, then the twin beside a simulated machine. This
+process plays the bags in lockstep with the answers, records what the nodes publish into one MCAP,
+reads that back, and ends with a table, a picture and a verdict. Time is simulated everywhere, so a
+loaded machine takes longer and finds the same.
 """
 
 from __future__ import annotations
@@ -24,9 +25,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pkm_twin.apps import demo_tracking
 from pkm_twin.apps.demo_recorder import (
-    MATCH_SECONDS,
+    DEPTH,
+    PATIENCE,
     STATE,
     TRAJECTORY,
+    Lockstep,
     Recorder,
     drain,
     process,
@@ -34,25 +37,40 @@ from pkm_twin.apps.demo_recorder import (
 )
 from pkm_twin.apps.demo_report import REPORTS, Finding, draw, print_findings
 from pkm_twin.apps.tracking_report import report_tracking
-from pkm_twin.bags.reader import BagWriter, inspect
-from pkm_twin.errors import BagError, PkmTwinError
+from pkm_twin.bags.reader import BagMessage, BagWriter, inspect
+from pkm_twin.errors import PkmTwinError
 from pkm_twin.ros.context import middleware_arguments
+from pkm_twin.ros.player import play
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One bag, the node that answers it, and the node's output topics with their types."""
+    """One bag, the node that answers it, and the node's output topics with their types.
+
+    ``asked``: the input whose every message is answered, with its stamp, on ``answer``.
+    """
 
     bag: str
     module: str
     parameters: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: dict[str, str]
+    asked: str
+    answer: str
+
+    @property
+    def arguments(self) -> list[str]:
+        """Of the node: no queue on the way overflows, whatever waits for a turn on this machine."""
+        queues = [f"qos_overrides.{t}.subscription.reliability:=reliable" for t in self.inputs]
+        queues += [f"qos_overrides.{t}.publisher.depth:={DEPTH}" for t in self.outputs]
+        given = ("use_sim_time:=true", "future_tolerance:=1.0", *self.parameters, *queues)
+        return ["--ros-args", *(word for parameter in given for word in ("-p", parameter))]
 
 
-# A shared machine may leave the node waiting for a while: here nobody is pushed by a late torque.
-PATIENT = ("stale_after:=1.0", "qos_overrides./joint_states.subscription.depth:=1000")
+# Nobody is pushed by a late torque here.
+PATIENT = f"stale_after:={PATIENCE}"
+JOINTS = "/joint_states"
 DYNAMICS_OUTPUTS = {
     "/delta_dynamics/joint_torques": STATE,
     "/delta_dynamics/torque_residual": STATE,
@@ -62,37 +80,34 @@ STAGES = (
     Stage(
         "delta_cu_pick_and_place",
         "delta_dynamics.node",
-        ("mechanism:=delta_cu", *PATIENT),
-        ("/joint_states", "/delta_dynamics/joint_trajectory"),
+        ("mechanism:=delta_cu", PATIENT),
+        (JOINTS, "/delta_dynamics/joint_trajectory"),
         DYNAMICS_OUTPUTS,
+        JOINTS,
+        "/delta_dynamics/joint_torques",
     ),
     Stage(
         "prru_milling",
         "delta_dynamics.node",
-        (
-            "mechanism:=prru",
-            "use_wrench:=true",
-            *PATIENT,
-            "qos_overrides./wrench.subscription.depth:=1000",
-        ),
-        ("/joint_states", "/wrench", "/delta_dynamics/joint_trajectory"),
+        ("mechanism:=prru", "use_wrench:=true", PATIENT),
+        (JOINTS, "/wrench", "/delta_dynamics/joint_trajectory"),
         DYNAMICS_OUTPUTS,
+        JOINTS,
+        "/delta_dynamics/joint_torques",
     ),
     Stage(
         "upr_rpu_milling",
         "stiffness_monitor.node",
-        (
-            "mechanism:=upr_rpu",
-            "qos_overrides./joint_states.subscription.depth:=1000",
-            "qos_overrides./wrench.subscription.depth:=1000",
-        ),
-        ("/joint_states", "/wrench"),
+        ("mechanism:=upr_rpu",),
+        (JOINTS, "/wrench"),
         {
             "/stiffness_monitor/compliance": "std_msgs/msg/Float64MultiArray",
             "/stiffness_monitor/strain_energy": "diagnostic_msgs/msg/DiagnosticArray",
             "/stiffness_monitor/dominant_element": "std_msgs/msg/String",
             "/stiffness_monitor/deflection": "geometry_msgs/msg/TransformStamped",
         },
+        "/wrench",
+        "/stiffness_monitor/deflection",
     ),
 )
 
@@ -100,14 +115,14 @@ STAGES = (
 def run_stage(
     stage: Stage, bag: Path, recorder: Recorder, executor: SingleThreadedExecutor, console: Console
 ) -> None:
-    """Start the node, replay the bag, and record until the node has answered all of it."""
+    """Start the node, play the bag as fast as it is answered, and record the answers."""
     node = executor.get_nodes()[0]
-    recorder.listen(stage.bag, stage.outputs)
-    parameters = [word for p in ("use_sim_time:=true", *stage.parameters) for word in ("-p", p)]
+    recorder.listen(stage.bag, stage.outputs, stage.answer)
     report = inspect(bag)
     seconds = (report.end_time - report.start_time) / 1e9
+    what = f"{stage.module} to answer {stage.bag}"
     with (
-        process([sys.executable, "-m", stage.module, "--ros-args", *parameters]) as twin,
+        process([sys.executable, "-m", stage.module, *stage.arguments]) as twin,
         Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -120,28 +135,35 @@ def run_stage(
         wait_for(
             executor,
             lambda: all(node.count_publishers(topic) for topic in stage.outputs),
-            MATCH_SECONDS,
             f"{stage.module} to come up",
             twin,
         )
-        command = [sys.executable, "-m", "pkm_twin.apps.cli", "play", str(bag)]
-        command += ["--clock", "200", "--wait", "20"]
-        command += [word for topic in stage.inputs for word in ("--topic", topic)]
-        with process([*command, "--quiet"]) as player:
-            begin, before = time.monotonic(), sum(recorder.counts.values())
-            while player.poll() is None:
-                executor.spin_once(timeout_sec=0.05)
-                progress.update(
-                    bar,
-                    completed=min(seconds, time.monotonic() - begin),
-                    messages=sum(recorder.counts.values()) - before,
-                )
-            if player.returncode != 0:
-                raise BagError(f"the player ended with code {player.returncode}", path=bag)
-        drain(executor, recorder)
-        answers = sum(recorder.counts.values()) - before
-        progress.update(bar, completed=seconds, messages=answers)
+        lockstep = Lockstep(stage.asked, recorder, executor, twin, what)
+        lockstep.begin(report.start_time)
+        begin, before = time.monotonic(), recorder.total
+
+        def pace(message: BagMessage) -> None:
+            lockstep.pace(message)
+            done = (message.log_time - report.start_time) / 1e9
+            progress.update(bar, completed=done, messages=recorder.total - before)
+
+        play(
+            bag,
+            topics=stage.inputs,
+            wait_for_subscribers=PATIENCE,
+            progress=False,
+            pace=pace,
+        )
+        drain(executor, recorder, lambda: lockstep.answered)
+        lockstep.close()
+        progress.update(bar, completed=seconds, messages=recorder.total - before)
     recorder.stop()
+    taken = time.monotonic() - begin
+    if taken > seconds:
+        console.print(
+            f"[yellow]{stage.bag}: {taken:.0f} s for {seconds:.0f} s of recording. This machine is "
+            "too slow or too busy for a live stream of this rate.[/yellow]"
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

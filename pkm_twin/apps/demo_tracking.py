@@ -21,7 +21,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pkm_twin import load
 from pkm_twin.apps.demo_recorder import (
-    MATCH_SECONDS,
+    DEPTH,
     STATE,
     TRAJECTORY,
     Recorder,
@@ -70,7 +70,7 @@ def run(
     node = executor.get_nodes()[0]
     recorder.listen(prefix(spread), {"/joint_states": STATE, INPUT: TRAJECTORY})
     watch = _Watch()
-    states = node.create_subscription(JointState, "/joint_states", watch.take, 10)
+    states = node.create_subscription(JointState, "/joint_states", watch.take, DEPTH)
     depth = QoSProfile(depth=1)
     topics = {t: node.create_publisher(JointTrajectory, t, depth) for t in (INPUT, TWIN)}
     reset = node.create_client(Trigger, "/machine_sim/reset")
@@ -81,15 +81,15 @@ def run(
     machine = [*module, "delta_dynamics.sim_node", "--ros-args", "-p", f"mechanism:={ROBOT}"]
     machine += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
     # A loaded computer catches up in bursts.
-    machine += ["-p", f"spread:={spread}", "-p", f"{QUEUE}:=2000"]
+    machine += ["-p", f"spread:={spread}", "-p", f"{QUEUE}:={DEPTH}"]
     console.print(f"machine_sim at {100 * spread:g} % spread: PD, then with feedforward")
     with process(machine) as first, process(twin) as second:
 
         def await_that(condition: Callable[[], bool], what: str) -> None:
-            wait_for(executor, condition, MATCH_SECONDS, what, first)
+            wait_for(executor, condition, what, first)
 
         await_that(lambda: watch.newest > 0, "machine_sim")
-        wait_for(executor, lambda: _matched(node, topics), MATCH_SECONDS, "delta_dynamics", second)
+        wait_for(executor, lambda: _matched(node, topics), "delta_dynamics", second)
         for publisher in topics.values():
             await_that(reset.service_is_ready, "machine_sim's reset")
             done = reset.call_async(Trigger.Request())

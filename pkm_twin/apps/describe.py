@@ -3,13 +3,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 
 from delta_dynamics import reactions
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.plausibility import Finding, findings
 from pkm_twin.machine.robot import Robot
+
+MOST_NAMES: Final = 6
+"""Most names that a line has."""
 
 
 def why_no_torques(robot: Robot) -> str:
@@ -49,7 +55,9 @@ def describe(robot: Robot) -> dict[str, Any]:
         "rank": robot.engine.mobility.rank,
         "redundant_closures": robot.engine.mobility.redundant,
         "assumed_joints": [joint.name for joint in robot.graph.joints.values() if joint.given],
+        "home_choice": robot.home_choice or None,
         "singularity_at_home": float(robot.singularity(q)),
+        "plausibility": [dataclasses.asdict(finding) for finding in findings(robot)],
         "parameters": robot.parameter_sections(),
         "parameter_units": robot.parameter_units(),
     }
@@ -67,6 +75,47 @@ def overconstraint(robot: Robot) -> list[str]:
     return [f"{count} are redundant, among {', '.join(mobility.parts)}"]
 
 
+def grouped_reactions(names: Sequence[str]) -> list[str]:
+    """Reactions in few words: of each joint what is not determined, alike joints in one line.
+
+    :param names: as :func:`delta_dynamics.reactions` has them, "JOINT: force along DIRECTION".
+    """
+    joints: dict[str, dict[str, list[str]]] = {}
+    others = []
+    for name in names:
+        joint, colon, rest = name.rpartition(": ")
+        kind, along, direction = rest.partition(" along ")
+        if colon and along:
+            joints.setdefault(joint, {}).setdefault(kind, []).append(direction)
+        else:
+            others.append(name)
+    alike: dict[str, list[str]] = {}
+    for joint, kinds in joints.items():
+        words = [f"{kind} {_directions(directions)}".strip() for kind, directions in kinds.items()]
+        alike.setdefault(" and ".join(words), []).append(joint)
+    return [f"{what} in {_some(names)}" for what, names in alike.items()] + others
+
+
+def _directions(names: list[str]) -> str:
+    """Directions of one joint's forces or moments."""
+    if len(names) == 3:
+        return "in all directions"
+    both = {"across 1", "across 2"} <= set(names)
+    words = ["along the axis" if n == "axis" else f"along {n}" for n in names if "across" not in n]
+    if both:
+        words.append("across the axis")
+    elif any("across" in n for n in names):
+        words.append("in one direction across the axis")
+    return " and ".join(words)
+
+
+def _some(names: list[str]) -> str:
+    """Names, of many the first."""
+    if len(names) <= MOST_NAMES:
+        return ", ".join(names)
+    return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"
+
+
 def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
     """The same as pairs of words for a table."""
     pose = ", ".join(f"{name} ({unit})" for name, unit in data["pose"].items())
@@ -81,11 +130,15 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
         ("home pose", _pairs(data["home_pose"], data["pose"])),
         ("home joints", _pairs(data["home_joints"], joint_units)),
         ("distance to singularity at home", f"{data['singularity_at_home']:.3f} (1 is best)"),
-        (
-            "overconstrained",
-            "; ".join(data["overconstrained"]) or "no: rigid bodies determine every reaction",
-        ),
     ]
+    if data["home_choice"]:
+        rows.append(("home", data["home_choice"]))
+    grouped = grouped_reactions(data["overconstrained"])
+    rows += [("overconstrained", text) for text in grouped] or [
+        ("overconstrained", "no: rigid bodies determine every reaction")
+    ]
+    found = [Finding(**finding).text for finding in data["plausibility"]]
+    rows += [("plausibility", text) for text in found or ["nothing implausible"]]
     for section, value in data["parameters"].items():
         if section not in ("mechanism", "name") and not (
             section == "joints" and isinstance(value, list)

@@ -9,6 +9,7 @@ import sys
 from pkm_twin.errors import install
 from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.arguments import answer
+from pkm_twin.ros.signals import leave_at_once
 
 MODULES = {
     "delta_dynamics": "delta_dynamics.node",
@@ -24,6 +25,8 @@ SUMMARIES = {
     "machine_state": "Joint states in; all joints, the platform's motion and markers out.",
     "machine_sim": "Efforts or trajectories in, a simulated machine's joint states out.",
 }
+TOGETHER = tuple(name for name in MODULES if name != "command_gate")
+COMPOSED = f"Nodes in one process and one executor: {', '.join(TOGETHER)}."
 
 
 def delta_dynamics() -> None:
@@ -51,9 +54,35 @@ def machine_sim() -> None:
     _run("machine_sim")
 
 
+def composed() -> None:
+    """Entry point of ``ros2 run pkm_twin composed NODE... --ros-args ...``."""
+    leave_at_once()
+    open_standard_streams()
+    words = sys.argv[1:]
+    end = words.index("--ros-args") if "--ros-args" in words else len(words)
+    names = [word for word in words[:end] if not word.startswith("-")]
+    answer("composed", COMPOSED, [word for word in words[:end] if word not in names], "NODE")
+    if not names or set(names) - set(TOGETHER) or len(set(names)) < len(names):
+        print(
+            f"refused to start: composed {' '.join(names)}: expected {', '.join(TOGETHER)}, one or "
+            "more, each once; command_gate has to outlive the others and runs by itself",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+    _require_ros("composed")
+    nodes = [importlib.import_module(MODULES[name]).NODE for name in names]
+    sys.exit(importlib.import_module("pkm_twin.ros.run").run(*nodes))
+
+
 def _run(name: str) -> None:
+    leave_at_once()
     open_standard_streams()
     answer(name, SUMMARIES[name], sys.argv[1:])
+    _require_ros(name)
+    importlib.import_module(MODULES[name]).main()
+
+
+def _require_ros(name: str) -> None:
     try:
         importlib.import_module("rclpy")
     except ImportError as error:
@@ -63,4 +92,3 @@ def _run(name: str) -> None:
             file=sys.stderr,
         )
         sys.exit(1)
-    importlib.import_module(MODULES[name]).main()

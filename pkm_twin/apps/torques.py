@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
+from delta_dynamics.rest import friction_reach, moving_rates
 from pkm_twin import load
-from pkm_twin.apps.check import motion
-from pkm_twin.apps.columns import read_columns, times_of
+from pkm_twin.apps.check import at_rest, motion
+from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.apps.loads import Load, by_load
 from pkm_twin.apps.recorded import read_recording
@@ -29,6 +30,7 @@ from pkm_twin.errors import (
 )
 from pkm_twin.files import replacing
 from pkm_twin.machine.robot import Robot
+from pkm_twin.streams.rest import gradient_gain, rate_doubt
 
 Array = NDArray[np.float64]
 BLOCK = 4096
@@ -37,6 +39,8 @@ ENDINGS = (".csv", ".parquet")
 WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
+MAPPED = "tables have the model's numbers of the joints; joint_map is for messages and bags"
+"""Said of a robot that has a map."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,8 @@ class Motion:
     per s and s2; wrench (samples, 6), N and N m, fixed axes; measured efforts (samples, n).
 
     ``load`` is a payload beside the robot's own. ``notes`` are for people: what was read and what
-    was left out.
+    was left out. ``still`` (samples, n): where differentiation cannot tell a joint from one at
+    rest, so that dry friction has no direction; None is nowhere.
     """
 
     robot: Robot
@@ -57,6 +62,7 @@ class Motion:
     measured: Array | None = None
     load: Load | None = None
     notes: tuple[str, ...] = ()
+    still: NDArray[np.bool_] | None = None
 
 
 def motion_of_bag(
@@ -89,7 +95,9 @@ def motion_of_bag(
             str(r.topics),
             f"payload: {r.load or 'the robot file alone'}",
             *([f"left out as a node does: {refused}; first: {r.first_reject}"] if refused else []),
+            *([] if r.robot.controller.plain else [MAPPED]),
         ),
+        at_rest(r, qd)[used],
     )
 
 
@@ -98,9 +106,10 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
 
     Columns, in any order: ``time``; for every joint NAME ``NAME.position``, and optionally
     ``NAME.velocity`` and ``NAME.acceleration`` (of all joints or of none); optionally the wrench
-    ``fx fy fz mx my mz``. Absent rates are differentiated by second-order differences, absent
-    parts of the wrench are zero. Other columns are left alone, but not those that begin with a
-    joint's name and are none of these or of :func:`table`'s: they are misspelt.
+    ``fx fy fz mx my mz``. Absent rates are differentiated by second-order differences; below what
+    these can tell dry friction has no direction and is zero. Absent parts of the wrench are zero.
+    Other columns are left alone, but not those that begin with a joint's name and are none of these
+    or of :func:`table`'s: they are misspelt.
 
     :raises ParameterError: a column is missing or misspelt, or a value is no finite number.
     """
@@ -130,10 +139,13 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
     time = columns["time"]
     times_of(path, time)
     qd, qdd = stack("velocity"), stack("acceleration")
+    check_motion_times(path, time, q, qd)
     if (qd is None or qdd is None) and len(time) < 3:
         raise ParameterError(str(path), f"{len(time)} rows", "3 or more, to differentiate")
     rates = _differentiated(q, time) if qd is None else qd
     wrench = [columns.get(name, np.zeros(len(time))) for name in WRENCH_AXES]
+    still = None if qd is not None else np.abs(rates) <= rate_doubt(time, q, gradient_gain(time))
+    notes = [] if carried is None else [f"payload: {carried}"]
     return Motion(
         machine,
         time,
@@ -142,7 +154,8 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
         _differentiated(rates, time) if qdd is None else qdd,
         np.stack(wrench, -1),
         load=carried,
-        notes=() if carried is None else (f"payload: {carried}",),
+        notes=tuple(notes if machine.controller.plain else [*notes, MAPPED]),
+        still=still,
     )
 
 
@@ -171,9 +184,10 @@ def table(m: Motion, progress: Callable[[int], None] | None = None) -> dict[str,
         columns.setdefault(name, []).append(values)
 
     outside, _ = beyond_limits(m.robot, m.q, m.qd)
+    rates = m.qd if m.still is None else moving_rates(m.qd, m.still, friction_reach(m.robot))
     for robot, part in by_load(m.robot, m.load, m.time, BLOCK):
         begin = part.start
-        state = (robot, m.q[part], m.qd[part], m.qdd[part], m.wrench[part])
+        state = (robot, m.q[part], rates[part], m.qdd[part], m.wrench[part])
         try:
             tau, terms, react = inverse_dynamics(*state), dynamics_terms(*state), reactions(*state)
             spread = torque_deviation(*state) if robot.uncertainty else None

@@ -168,7 +168,11 @@ class Engine:
     def _samples(self) -> list[tuple[Array, Array]]:
         """States (x, q) at home and near it, found by the first engine of a geometry for all."""
         first = _engines.setdefault(self.graph.key, self)
-        return self._near_home() if first is self else first._samples
+        if first is not self:
+            return first._samples
+        # The one that chooses pose coordinates is followed by the one that has them.
+        _hold(self)
+        return self._near_home()
 
     def _near_home(self) -> list[tuple[Array, Array]]:
         """The same in every run."""
@@ -206,28 +210,25 @@ class Engine:
         ju, _ = self._sampled
         rows = independent_rows(ju)
         if len(rows) < self.tree.unknown_rates:
-            raise ParameterError("joints", self.mobility.freedoms, self._free(ju[0]))
+            from pkm_twin.kinematics.diagnosis import mobility_error
+
+            raise mobility_error(self)
         return rows
 
-    def _free(self, ju: Array) -> str:
-        """What moves with the actuated joints held, in words."""
-        _, s, vt = np.linalg.svd(ju) if len(ju) else (0, np.zeros(0), np.eye(ju.shape[1]))
-        rank = int((s > RANK * max(1.0, float(s.max(initial=0.0)))).sum())
-        loose = np.abs(vt[rank:]).max(0, initial=0.0) > 1e-6
-        owners = list(
-            dict.fromkeys(o for o, free in zip(self.tree.owners, loose, strict=True) if free)
-        )
-        return (
-            f"a machine whose {self.joints} actuated joints hold everything; mobility is "
-            f"{self.mobility.freedoms}, and free to move with them held: {', '.join(owners)}"
-        )
+    def scaled_at_home(self) -> tuple[Array, Array]:
+        """Derivatives of the closures at home by u and by qd, every row and column of unit one."""
+        return self._scaled(self.at(self.tree.home, self.graph.home)[1])
+
+    def regular_state(self) -> tuple[Motion, Array]:
+        """The motion in a state of the highest rank at or beside home, and derivatives by u."""
+        k = int(np.argmax([_rank(ju) for ju in self._sampled[0]]))
+        return self.at(*self._samples[k])[0], np.asarray(self._sampled[0][k], np.float64)
 
     @cached_property
     def mobility(self) -> Mobility:
         """Freedoms, rank and redundancy at home."""
         _, rows = self.at(self.tree.home, self.graph.home)
-        ju, jq = self._scaled(rows)
-        both = np.hstack([ju, jq])
+        both = np.hstack(self._scaled(rows))
         rank = _rank(both)
         parts: tuple[str, ...] = ()
         if rank < len(rows):
@@ -246,13 +247,13 @@ class Engine:
         """
         near = [_rank(np.hstack([a, b])) for a, b in zip(*self._sampled, strict=True)]
         if len(near) > 1 and near[0] < min(near[1:]):
-            raise ParameterError(
-                "joints", f"rank {near[0]} of the closures at home, {min(near[1:])} beside it",
-                "a home that is no singularity",
-            )  # fmt: skip
+            from pkm_twin.kinematics.diagnosis import singular_home
+
+            raise singular_home(self, near[0], min(near[1:]))
         if self.mobility.freedoms != self.joints:
-            ju = self._sampled[0]
-            raise ParameterError("joints", self.mobility.freedoms, self._free(ju[0]))
+            from pkm_twin.kinematics.diagnosis import mobility_error
+
+            raise mobility_error(self)
         _ = self.kept
         if len(self.coordinates) != self.joints:
             raise ParameterError(
@@ -755,6 +756,11 @@ _recent: Final[deque[Engine]] = deque(maxlen=16)
 """Held although no machine may: loading a file again takes no engine anew."""
 
 
+def _hold(engine: Engine) -> None:
+    if engine not in _recent:
+        _recent.append(engine)
+
+
 def engine_of(
     graph: Graph,
     coordinates: Sequence[Coordinate],
@@ -770,7 +776,7 @@ def engine_of(
     engine = _engines.get(key)
     if engine is None:
         engine = _engines.setdefault(key, Engine(graph, coordinates, closed, branch, mark))
-        _recent.append(engine)
+        _hold(engine)
     return engine
 
 

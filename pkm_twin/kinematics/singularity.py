@@ -37,8 +37,17 @@ from pkm_twin.codegen.cholesky import traces_over
 from pkm_twin.codegen.expressions import Objects, maximum, minimum, norm, plain, sqrt
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
+from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.engine import Engine, Traced
-from pkm_twin.kinematics.motion import Columns, Motion, Row, cross, difference
+from pkm_twin.kinematics.motion import (
+    Columns,
+    Motion,
+    Row,
+    cross,
+    difference,
+    matrices,
+    numbers,
+)
 from pkm_twin.machine.graph import BASE, Array, Graph, Rod
 from pkm_twin.machine.tree import Tree
 
@@ -105,12 +114,36 @@ def _singularity(t: Traced) -> Program:
     return Program({"q": t.joints}, 0, outputs, t.equations())
 
 
-def singularity_measure(t: Traced) -> Any:
+def singularity_measure(t: Traced | _AtHome) -> Any:
     """The measure of a solved motion, to write other programs with; rates are overwritten."""
     return minimum(_held(t), _moved(t))
 
 
-def _held(t: Traced) -> Any:
+def singularity_at_home(graph: Graph) -> float:
+    """The measure at home, on numbers: nothing is compiled.
+
+    :raises SingularityError: something moves although the actuated joints are locked.
+    """
+    return float(singularity_measure(_AtHome(Engine(graph, ()))))
+
+
+class _AtHome:
+    """What the measure asks of a traced machine, on numbers at home."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.graph, self.joints = engine.graph, engine.joints
+        self.motion, rows = engine.at(engine.tree.home, engine.graph.home)
+        ju, jq = (numbers(m) for m in matrices(engine.tree, rows))
+        if ju.size and np.linalg.matrix_rank(ju, 1e-9) < ju.shape[1]:
+            raise SingularityError("home", (), 0.0, 1e-9)
+        self._rates = -np.linalg.lstsq(ju, jq, rcond=1e-9)[0]
+
+    def rate_columns(self) -> list[Array]:
+        """Rates of the unknowns per joint rate."""
+        return list(self._rates.T)
+
+
+def _held(t: Traced | _AtHome) -> Any:
     placed = Placed(t.motion)
     unknown = placed.tree.unknown_rates
     if not unknown:
@@ -132,7 +165,7 @@ def _held(t: Traced) -> Any:
     return minimum(1.0, 0.5 * unknown / np.sqrt(len(rows)) / sqrt(response))
 
 
-def _moved(t: Traced) -> Any:
+def _moved(t: Traced | _AtHome) -> Any:
     n, graph = t.joints, t.graph
     table: dict[str, list[Columns]] = {name: [{} for _ in range(6)] for name in graph.bodies}
     for j, u in enumerate(t.rate_columns()):

@@ -16,45 +16,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.rotations import about
+from pkm_twin.machine.rotations import skew
 from pkm_twin.machine.urdf_file import Joint, Urdf
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
-ROUNDS: Final = 200
+ROUNDS: Final = 100
 """Corrections of one closing, and steps towards the zeros."""
 SLOW: Final = 10
 """Corrections in a row that gain less than 2 %: a minimum that is not zero."""
 STEP: Final = 0.5
 """Largest change of a joint in one correction, rad or m."""
-RANK: Final = 1e-8
-"""Singular values below this share of the greatest are none."""
+RANKS: Final = (1e-4, 1e-6, 1e-8)
+"""Singular values below this share of the greatest are none; where that does not close, less."""
+FAR: Final = 1e-2
+"""A miss that no choice of directions makes good, m or rad."""
 EXACT: Final = 1e-9
 """Loops that miss by less are closed for all purposes, m or rad."""
-CLOSED: Final = 1e-5
-"""A loop that misses by more is open, m or rad; exporters write six digits."""
-NEARBY: Final = 0.02
-"""How far away from home what is free in general is told from what is free there alone, rad, m."""
-
-SPIN: Final = 0.05
-"""A part whose centre of mass moves less than this share of the machine a radian only spins."""
+CLOSED: Final = (1e-5, 1e-4)
+"""A loop that misses by more is open, m or rad: at least the one, at most the other."""
+ROUNDED: Final = 20.0
+"""In between, so many times the file's last digit: a loop is a chain of rounded places."""
 
 
 class Assembly:
     """The tree of a URDF, placed by its joint values, with its closures' residuals.
 
-    ``steps``: the joint of each single step, in the order of the values.
+    ``steps``: the joint of each single step, in the order of the values; ``turns``: whether it is a
+    turn. ``size``: of the drawing, m.
     """
 
     def __init__(self, urdf: Urdf) -> None:
         self.urdf = urdf
+        least, most = CLOSED
+        self.closed = min(most, max(least, ROUNDED * urdf.accuracy))
+        """A loop that misses by more is open, m or rad."""
         self.order = _order(urdf)
         self.steps: list[str] = []
         self._kinds: list[str] = []
         self._axes: list[Array] = []
         self._first: dict[str, int] = {}
+        self._count: dict[str, int] = {}
         self._moved: dict[str, list[int]] = {urdf.root: []}
         for joint in self.order:
             self._first[joint.name] = len(self.steps)
@@ -62,29 +67,41 @@ class Assembly:
                 self.steps.append(joint.name)
                 self._kinds.append(kind)
                 self._axes.append(axis)
+            self._count[joint.name] = len(self.steps) - self._first[joint.name]
             own = list(range(self._first[joint.name], len(self.steps)))
-            self._moved[joint.child] = self._moved[joint.parent] + own
+            before = self._moved[joint.parent]
+            self._moved[joint.child] = before + own if own else before
+        skews = [skew(axis) for axis in self._axes]
+        self._turning = [(first, first @ first) for first in skews]
+        self.turns = np.array([kind == "R" for kind in self._kinds], bool)
         self.links: dict[str, Pose] = {}
-        self.axes: list[Array] = []
-        """The steps' axes at the placed values, root axes, a unit vector (3,) each."""
-        self._points: list[Array] = []
+        self.axes = np.zeros((0, 3))
+        """The steps' axes at the placed values, root axes, unit vectors, shape (count, 3)."""
+        self._points = np.zeros((0, 3))
+        self.place(np.zeros(len(self.steps)))
+        self.size = self._extent()
 
     def place(self, values: Array) -> None:
         """Set ``links`` (poses in the root) and ``axes`` for the steps' values, shape (count,)."""
         self.links = {self.urdf.root: Pose()}
-        self.axes, self._points = [], []
+        # Rodrigues: 1 + sin K + (1 - cos) K K.
+        sines, lacks = np.sin(values).tolist(), (1.0 - np.cos(values)).tolist()
+        axes, points = [], []
         for joint in self.order:
             pose = self.links[joint.parent] @ joint.origin
             start = self._first[joint.name]
-            for i in range(start, start + len(_steps(joint))):
+            for i in range(start, start + self._count[joint.name]):
                 axis = self._axes[i]
-                self.axes.append(pose.rotation @ axis)
-                self._points.append(pose.position)
+                axes.append(pose.rotation @ axis)
+                points.append(pose.position)
                 if self._kinds[i] == "R":
-                    pose = pose @ Pose(rotation=about(axis, values[i]))
+                    first, second = self._turning[i]
+                    turned = pose.rotation + pose.rotation @ (sines[i] * first + lacks[i] * second)
+                    pose = Pose(turned, pose.position)
                 else:
-                    pose = pose @ Pose(position=axis * values[i])
+                    pose = Pose(pose.rotation, pose.position + axes[-1] * values[i])
             self.links[joint.child] = pose
+        self.axes, self._points = np.reshape(axes, (-1, 3)), np.reshape(points, (-1, 3))
 
     def frame(self, closure: Closure, end: int) -> Pose:
         """A closure's frame on one of its links, in the root."""
@@ -93,19 +110,21 @@ class Assembly:
     def twist(self, link: str, point: Array) -> tuple[Array, Array]:
         """Velocity of a link's point and its angular velocity per step's rate, (3, count) each."""
         linear, angular = np.zeros((2, 3, len(self.steps)))
-        for i in self._moved[link]:
-            if self._kinds[i] == "R":
-                linear[:, i] = np.cross(self.axes[i], point - self._points[i])
-                angular[:, i] = self.axes[i]
-            else:
-                linear[:, i] = self.axes[i]
+        moved = self._moved[link]
+        axes, turns = self.axes[moved].T, self.turns[moved]
+        arms = np.cross(self.axes[moved], point - self._points[moved]).T
+        linear[:, moved] = np.where(turns, arms, axes)
+        angular[:, moved] = np.where(turns, axes, 0.0)
         return linear, angular
 
-    def residual(self, closure: Closure) -> tuple[Array, Array]:
-        """How far a closure is open, shape (rows,), m and rad, and its rates, (rows, count)."""
+    def residual(self, closure: Closure, rates: bool = True) -> tuple[Array, Array]:
+        """How far a closure is open, shape (rows,), m and rad, and its rates, (rows, count).
+
+        :param rates: without them their count is zero.
+        """
         a, b = self.frame(closure, 0), self.frame(closure, 1)
         (va, wa), (vb, wb) = (
-            self.twist(link, pose.position)
+            self.twist(link, pose.position) if rates else np.zeros((2, 3, 0))
             for link, pose in zip(closure.links, (a, b), strict=True)
         )
         apart, slip, turn = b.position - a.position, vb - va, wb - wa
@@ -129,27 +148,49 @@ class Assembly:
             rows.append((np.array([first @ second]), (normal @ turn)[None]))
         return np.concatenate([r for r, _ in rows]), np.vstack([j for _, j in rows])
 
-    def residuals(self) -> tuple[Array, Array]:
+    def residuals(self, rates: bool = True) -> tuple[Array, Array]:
         """All closures' rows."""
-        rows = [self.residual(closure) for closure in self.urdf.closures]
+        rows = [self.residual(closure, rates) for closure in self.urdf.closures]
         if not rows:
-            return np.zeros(0), np.zeros((0, len(self.steps)))
+            return np.zeros(0), np.zeros((0, len(self.steps) if rates else 0))
         return np.concatenate([r for r, _ in rows]), np.vstack([j for _, j in rows])
 
-    def close(self, values: Array) -> tuple[Array, float]:
-        """Values that close the loops by least steps of least norm, and the greatest miss left."""
+    def close(self, values: Array, held: Mask | None = None) -> tuple[Array, float]:
+        """Values that close the loops by least steps, and the greatest miss left.
+
+        Redundant closures of a rounded file contradict each other by that rounding: directions that
+        only they have are left alone at first, as steps along them lead anywhere.
+
+        :param held: steps that keep their values, shape (count,); by default none does.
+        """
+        best, miss = values, math.inf
+        for rank in RANKS:
+            new, left = self._close(best, rank, held)
+            if left < 0.5 * miss:
+                best, miss = new, left
+            if miss < 1e-14 or miss > FAR:
+                break
+        self.place(best)
+        return best, miss
+
+    def _close(self, values: Array, rank: float, held: Mask | None) -> tuple[Array, float]:
         self.place(values)
-        residual, rates = self.residuals()
+        residual, _ = self.residuals(rates=False)
         slow = 0
         for _ in range(ROUNDS):
             miss = float(np.linalg.norm(residual))
             if miss < 1e-15 or slow > SLOW:
                 break
-            step = -np.linalg.lstsq(rates, residual, rcond=RANK)[0]
-            step *= min(1.0, STEP / max(float(np.abs(step).max()), 1e-300))
+            rates = self.residuals()[1]
+            if held is not None:
+                rates = np.where(held, 0.0, rates)
+            step = -np.linalg.lstsq(rates, residual, rcond=rank)[0]
+            if held is not None:
+                step[held] = 0.0
+            step *= min(1.0, STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
             for _ in range(12):
                 self.place(values + step)
-                residual, rates = self.residuals()
+                residual, _ = self.residuals(rates=False)
                 less = float(np.linalg.norm(residual))
                 if less < miss:
                     break
@@ -159,24 +200,21 @@ class Assembly:
             values = values + step
             slow = slow + 1 if less > 0.98 * miss else 0
         self.place(values)
-        residual, _ = self.residuals()
-        return values, float(np.abs(residual).max(initial=0.0))
+        return values, self.miss()
+
+    def miss(self) -> float:
+        """How far the loops are open at the placed values, m or rad."""
+        return float(np.abs(self.residuals(rates=False)[0]).max(initial=0.0))
 
     def nearest(self) -> tuple[Array, float]:
         """The closed values nearest to zero, shape (count,), and how far they still miss.
 
         :raises ParameterError: a loop that does not close, by how much.
         """
-        values = np.zeros(len(self.steps))
-        self.place(values)
-        miss = float(np.abs(self.residuals()[0]).max(initial=0.0))
-        if miss <= EXACT:
-            # The file's own numbers, not what a correction of rounding makes of them.
-            return values, miss
-        values, miss = self.close(values)
+        values, miss = self.close(np.zeros(len(self.steps)))
         rng = np.random.default_rng(0)
         for spread in (0.05, 0.1, 0.2, 0.4, 0.8) * 2:
-            if miss <= CLOSED:
+            if miss <= self.closed:
                 break
             # Zero may be a place from which no small step helps.
             start = rng.uniform(-spread, spread, len(self.steps))
@@ -184,17 +222,11 @@ class Assembly:
             if less < miss:
                 values, miss = other, less
         self.place(values)
-        if miss > CLOSED:
-            misses = {c.name: float(np.abs(self.residual(c)[0]).max()) for c in self.urdf.closures}
-            worst = max(misses, key=lambda name: misses[name])
-            raise ParameterError(
-                worst,
-                f"open by {misses[worst]:.3g} (m or rad)",
-                f"loops that close within {CLOSED:g} from the zeros of the joints",
-            )
+        if miss > self.closed:
+            raise self._open()
         for _ in range(ROUNDS):
             _, rates = self.residuals()
-            slope = values - np.linalg.lstsq(rates, rates @ values, rcond=RANK)[0]
+            slope = values - np.linalg.lstsq(rates, rates @ values, rcond=RANKS[0])[0]
             if float(np.abs(slope).max(initial=0.0)) < 1e-12:
                 break
             size = float(values @ values)
@@ -207,51 +239,28 @@ class Assembly:
                 break
             self.place(values)
         self.place(values)
-        residual, _ = self.residuals()
-        return values, float(np.abs(residual).max(initial=0.0))
+        return values, self.miss()
 
-    def spins(self, values: Array, held: set[str], platform: str) -> list[str]:
-        """Joints that only let a part spin about itself: held, nothing else moves otherwise.
+    def _open(self) -> ParameterError:
+        """The error of loops that do not close, with the one that misses the most."""
+        misses = {c.name: self.residual(c)[0] for c in self.urdf.closures}
+        worst = max(misses, key=lambda name: float(np.abs(misses[name]).max()))
+        closure = next(c for c in self.urdf.closures if c.name == worst)
+        a, b = (self.frame(closure, end) for end in (0, 1))
+        apart = 1e3 * float(np.linalg.norm(b.position - a.position))
+        turned = float(np.linalg.norm(_angle(a.rotation.T, b.rotation)))
+        what = f"{apart:.3g} mm"
+        if closure.type == "fixed":
+            what += f" and {turned:.3g} rad"
+        return ParameterError(
+            worst, f"open by {what} between {closure.links[0]} and {closure.links[1]}",
+            f"loops that close within {self.closed:g} (m or rad)",
+        )  # fmt: skip
 
-        With the joints ``held`` at rest such a spin moves no platform and hardly a centre of
-        mass: a bar between two ball joints, a pin between two hinges of one axis.
-
-        :param values: a closed assembly, shape (count,).
-        :returns: as many joints as there are such spins.
-        """
-        rng = np.random.default_rng(1)
-        _, miss = self.close(values + rng.uniform(-NEARBY, NEARBY, len(self.steps)))
-        _, rates = self.residuals()
-        # What is in no loop hangs loose and is left to be found so.
-        loose = [i for i, name in enumerate(self.steps) if name not in held and rates[:, i].any()]
-        found: list[str] = []
-        if miss <= CLOSED and loose:
-            free = _null(rates[:, loose], RANK)
-            tool = self.links[platform].position
-            turned = np.vstack(self.twist(platform, tool))[:, loose]
-            free = free @ _null(turned @ free, RANK, absolute=True)
-            size = float(np.linalg.norm(np.ptp([p.position for p in self.links.values()], axis=0)))
-            swung = []
-            for link in self.urdf.links.values():
-                if link.mass > 0.0:
-                    pose = self.links[link.name]
-                    centre = pose.rotation @ link.com + pose.position
-                    swung.append(self.twist(link.name, centre)[0][:, loose])
-            spins = free
-            if swung:
-                spins = free @ _null(np.vstack(swung) @ free, SPIN * size, absolute=True)
-            while spins.shape[1]:
-                single = [
-                    float(np.linalg.norm(row)) if self.steps.count(self.steps[i]) == 1 else 0.0
-                    for i, row in zip(loose, spins, strict=True)
-                ]
-                at = int(np.argmax(np.round(single, 6)))
-                if not single[at] > 0.0:
-                    break
-                found.append(self.steps[loose[at]])
-                spins = spins @ _null(spins[at][None], RANK)
-        self.place(values)
-        return found
+    def _extent(self) -> float:
+        """Greatest distance of two links along a root axis, m; 1 where all are one point."""
+        extent = float(np.ptp([p.position for p in self.links.values()], axis=0).max(initial=0.0))
+        return extent if extent > 1e-6 else 1.0
 
 
 def _order(urdf: Urdf) -> list[Joint]:
@@ -305,14 +314,3 @@ def _angle(inverse: Array, rotation: Array) -> Array:
     axis = np.linalg.eigh(turn + turn.T)[1][:, -1]
     turned: Array = axis * angle
     return turned
-
-
-def _null(matrix: Array, bound: float, absolute: bool = False) -> Array:
-    """Columns that span what the matrix maps to (nearly) zero, shape (count, free)."""
-    if not matrix.size:
-        return np.eye(matrix.shape[1])
-    _, values, rows = np.linalg.svd(matrix)
-    least = bound if absolute else bound * float(values.max(initial=0.0))
-    rank = int(np.count_nonzero(values > max(least, 1e-300)))
-    free: Array = rows[rank:].T
-    return free

@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from pkm_twin.errors import ParameterError, UnknownNameError, one_line
+from pkm_twin.errors import ParameterError, UnknownNameError, one_line, warn
 from pkm_twin.machine import schema
+from pkm_twin.machine.plausibility import findings
 from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.urdf_read import read_urdf
+from pkm_twin.machine.urdf_read import read_tree
 
 CATALOGUE: Final = {
     "delta": "pkm_twin.mechanisms.delta:Delta",
@@ -39,8 +41,14 @@ def robot_path(robot: str | Path) -> Path:
     """The file of a robot's name or path.
 
     :raises UnknownNameError: no such name; the closest one is named.
+    :raises ParameterError: a xacro file, which is a program that writes a URDF.
     """
     text = str(robot)
+    if text.endswith(".xacro"):
+        written = Path(text.removesuffix(".xacro")).with_suffix(".urdf").name
+        raise ParameterError(
+            text, "a xacro file", f"a URDF: run `xacro {Path(text).name} > {written}` and give that"
+        )
     if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
         return Path(robot)
     if text in robot_names():
@@ -51,6 +59,9 @@ def robot_path(robot: str | Path) -> Path:
 def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     """A robot by its name in ``config/``, from a parameter file, or from a URDF with its loops.
 
+    Of a user's file what was done to it, and numbers that are hardly meant, are given as warnings
+    (:class:`pkm_twin.errors.RobotWarning`), each once.
+
     :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF or MJCF file.
     :param platform: of a URDF the link that carries the tool; default by its name.
     :raises UnknownNameError: no such name; the closest one is named.
@@ -58,12 +69,22 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     """
     path = robot_path(robot)
     if path.suffix in TREES:
-        data = read_urdf(path, platform=platform)
-    elif platform is not None:
+        reading = read_tree(path, platform=platform)
+        for note in reading.notes:
+            warn(path, note)
+        robot_read = robot_of_data(reading.description, path.stem)
+        return _told(path, replace(robot_read, home_choice=reading.home))
+    if platform is not None:
         raise ParameterError("platform", platform, "none: the file names its own platform")
-    else:
-        data = schema.read_yaml(path)
-    return robot_of_data(data, path.stem)
+    return _told(path, robot_of_data(schema.read_yaml(path), path.stem))
+
+
+def _told(path: Path, robot: Robot) -> Robot:
+    """The robot, after warnings of what is implausible in a user's file."""
+    if path.parent != config_folder():
+        for finding in findings(robot):
+            warn(path, finding.text)
+    return robot
 
 
 def robot_of_data(data: Mapping[str, Any], name: str) -> Robot:

@@ -60,7 +60,8 @@ def _joint(joint: Joint) -> dict[str, Any]:
         data["lead"] = joint.pitch * TURN
     if joint.actuated:
         data["actuated"] = True
-    if joint.home:
+    # Of a slide the file says where it counts from, lest a leg seems to have no length.
+    if joint.home or (joint.actuated and joint.kind == "prismatic"):
         data["home"] = joint.home
     if joint.rotor_inertia:
         data["rotor_inertia"] = joint.rotor_inertia

@@ -127,13 +127,13 @@ class JointSpec:
     """A joint between an inner and an outer body, through the point ``at`` (m) at home.
 
     Its number is the motion of the outer body against the inner one, along or about ``axis``, and
-    ``home`` at home. ``axes``: of a universal joint, the first fixed in the inner body, the second
-    in the outer one. ``lead``: how far a ``helical`` joint goes along its axis in a turn, m; its
-    number is the turn, and a left-handed thread has a lead below zero. A ``translation`` is three
-    slides along base axes. ``limits`` are those of
-    actuated joints. ``rotor_inertia``: of the drive, reflected to the joint, inertia without
-    weight; or ``drive``, which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a
-    screw's or belt's ``lead`` (joints that slide). ``compliance``: in the joint's own axes.
+    ``home`` at home (0 where left out). ``axes``: of a universal joint, the first fixed in the
+    inner body, the second in the outer one. ``lead``: how far a ``helical`` joint goes along its
+    axis in a turn, m; its number is the turn, and a left-handed thread has a lead below zero. A
+    ``translation`` is three slides along base axes. ``limits`` are those of actuated joints.
+    ``rotor_inertia``: of the drive, reflected to the joint, inertia without weight; or ``drive``,
+    which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a screw's or belt's
+    ``lead`` (joints that slide). ``compliance``: in the joint's own axes.
     """
 
     type: str = schema.choice(*TYPES)
@@ -143,7 +143,7 @@ class JointSpec:
     axes: Array | None = schema.matrix(2, 3, default=None)
     lead: float | None = schema.number(at_least=-10.0, at_most=10.0, unit="m a turn", default=None)
     actuated: bool = schema.flag(default=False)
-    home: float = schema.number(unit="{joint}", default=0.0)
+    home: float | None = schema.number(unit="{joint}", default=None)
     limits: LimitSpec | None = schema.section(LimitSpec, default=None)
     friction: FrictionSpec | None = schema.section(FrictionSpec, default=None)
     rotor_inertia: float = schema.number(at_least=0.0, unit="{rotor}", default=0.0)
@@ -183,7 +183,7 @@ class JointSpec:
             if getattr(self, key) and len(freedoms) != 1:
                 raise ParameterError(f"{path}.{key}", self.type, "a joint of one freedom")
         if len(freedoms) == 1 and freedoms[0].turns:
-            check_angles(self.home, f"{path}.home")
+            check_angles(self.home or 0.0, f"{path}.home")
 
     @property
     def slides(self) -> bool:
@@ -209,7 +209,7 @@ class JointSpec:
         at = np.zeros(3) if self.at is None else self.at
         return Joint(
             name, self.type, inner, outer, array(at), array(self._unit_axes()), self.actuated,
-            self.home, rub.viscous, rub.coulomb, rotor,
+            self.home or 0.0, rub.viscous, rub.coulomb, rotor,
             pitch=0.0 if self.lead is None else self.lead / TURN,
         )  # fmt: skip
 
@@ -294,9 +294,13 @@ def written_out(
                 for name, entry in entries.items():
                     full = f"{name}_{number}"
                     if full in result[kind]:
+                        other = sources[kind, full].path
+                        where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in other)
                         raise ParameterError(
-                            f"{path}{kind}.{name}", full, "a name that is not taken"
-                        )
+                            f"{path}{kind}.{name}", full,
+                            f"a name of its own for each copy: {full} stands for {where[1:]} "
+                            f"already, so rename one of the two, for example {name}_b",
+                        )  # fmt: skip
                     copy = entry[number - 1]
                     result[kind][full] = _turned(copy, float(azimuth), own, number)
                     sources[kind, full] = Source(

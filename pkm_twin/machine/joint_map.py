@@ -5,6 +5,10 @@ controller = offset + sign * ratio * model. So ``offset`` is what the controller
 model's joint is at zero, and ``ratio`` how many of the controller's units are one of the model's:
 turns of a motor a turn of the joint, millimetres a metre. Power is the same on both sides.
 
+Messages and bags carry the controller's numbers, everything else computes with the model's. A joint
+number enters through :class:`pkm_twin.ros.messages.JointReader` and leaves as
+:data:`ControllerNumbers`, which only this module makes and which the publishers ask for.
+
 May import: numpy, this package's schema, the standard library.
 """
 
@@ -12,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NewType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +25,8 @@ from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 
 Array = NDArray[np.float64]
+ControllerNumbers = NewType("ControllerNumbers", np.ndarray[Any, np.dtype[np.float64]])
+"""Joint numbers as a controller has them, shape (..., n), in the robot's order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +90,14 @@ class JointMap:
         """The model's efforts of the controller's, shape (..., n)."""
         return np.asarray(controller * self.factors, np.float64)
 
-    def controller_efforts(self, model: Array) -> Array:
+    def controller_positions(self, model: Array) -> ControllerNumbers:
+        """The controller's positions of the model's, shape (..., n)."""
+        return ControllerNumbers(self.offsets + self.factors * model)
+
+    def controller_rates(self, model: Array) -> ControllerNumbers:
+        """The controller's velocities, accelerations or position differences, shape (..., n)."""
+        return ControllerNumbers(self.factors * model)
+
+    def controller_efforts(self, model: Array) -> ControllerNumbers:
         """The controller's efforts of the model's, shape (..., n)."""
-        return np.asarray(model / self.factors, np.float64)
+        return ControllerNumbers(model / self.factors)

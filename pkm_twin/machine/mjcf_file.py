@@ -11,7 +11,7 @@ May import: mujoco, numpy, the URDF file's parts.
 from __future__ import annotations
 
 import math
-import warnings
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError, install
+from pkm_twin.errors import ParameterError, install, warn
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.rotations import about, from_quaternion
 from pkm_twin.machine.urdf_file import Joint, Link, Urdf
@@ -28,6 +28,9 @@ from pkm_twin.machine.urdf_xml import Pose
 
 Array = NDArray[np.float64]
 
+_ENDLESS: Final = re.compile(
+    r"(?:^|\s)[-+]?(?:nan(?:\(\S*\))?|inf|infinity)(?:\s|$)", re.IGNORECASE
+)
 WORLD: Final = "world"
 """The root's name."""
 MAX_INCLUDES: Final = 8
@@ -66,11 +69,16 @@ def _require_bounded(path: Path, depth: int = 0) -> None:
     top = urdf_xml.elements(path)
     if depth > MAX_INCLUDES:
         raise ParameterError(str(path), "nested includes", f"a nesting of at most {MAX_INCLUDES}")
+    names = {element.get("name") for element in top.iter()}
     folders = [path.parent]
     for compiler in top.iter("compiler"):
         folders += [path.parent / value for key, value in compiler.items() if key.endswith("dir")]
     pairs = [(element, key, text) for element in top.iter() for key, text in element.items()]
     for element, key, text in pairs:
+        # MuJoCo takes these for numbers; a part may be called so.
+        if _ENDLESS.search(text) and key != "name" and text not in names:
+            where = ".".join(filter(None, (element.tag, element.get("name"), key)))
+            raise ParameterError(where, text, "finite numbers")
         places = [folder / text for folder in folders] if key.startswith("file") else []
         for place in places:
             if place.exists() and not place.is_file():
@@ -191,7 +199,7 @@ class _Reader:
         if m.jnt_actfrclimited[joint]:
             limits["effort"] = float(np.abs(m.jnt_actfrcrange[joint]).max())
         if m.jnt_stiffness[joint]:
-            warnings.warn(f"{self.path}: the spring of joint {name} is left out", stacklevel=6)
+            warn(self.path, f"the spring of joint {name} is left out")
         dof = m.jnt_dofadr[joint]
         return {
             "axes": axis[None],

@@ -98,6 +98,8 @@ class Robot:
     mechanism: str
     name: str = ""
     """The name that the robot was loaded by."""
+    home_choice: str = ""
+    """How the home was chosen, of a file that leaves it open."""
     payload: Payload = schema.section(Payload, default={})
     friction: Coefficients = schema.section(friction_of(3), default={})
     gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])
@@ -240,6 +242,11 @@ class Robot:
         raise NotImplementedError
 
     # What follows for all.
+
+    @property
+    def without_home(self) -> frozenset[str]:
+        """Joints of which the file should say where they count from, and does not."""
+        return frozenset()
 
     def shared_drives(self) -> tuple[Shared, ...]:
         """Friction of each actuated joint and the rotors, as linear parameters of the file."""

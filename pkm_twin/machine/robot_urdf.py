@@ -18,18 +18,22 @@ from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.urdf_tree import urdf_tree
-from pkm_twin.machine.urdf_write import UrdfBody, UrdfDrive, write_urdf
+from pkm_twin.machine.urdf_write import MOCK, UrdfBody, UrdfDrive, write_urdf
 
 Array = NDArray[np.float64]
 
 
-def robot_urdf(robot: Robot) -> str:
+def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
     """The robot as a URDF that parsers of trees read, see docs/urdf.md.
 
     Its joints are ``robot.joint_names`` and ``robot.passive_joints``; with their values the link
     ``platform`` stands where ``robot.platform`` says, and the masses sum to the robot's. A URDF
     has no place for rotors and offsets, nor for friction in the joints that it cuts: they are left
     out.
+
+    :param hardware: ros2_control's plugin, by default mock hardware; empty: no ``<ros2_control>``
+        element, as for a description that a controller_manager must not make hardware of.
+    :param prefix: of the names of all links and joints.
     """
     engine, load = robot.engine, robot.payload
     tree = urdf_tree(
@@ -40,7 +44,7 @@ def robot_urdf(robot: Robot) -> str:
         drives=_drives(robot),
         payload=UrdfBody("payload", load.mass, load.com, load.inertia),
     )
-    return write_urdf(tree)
+    return write_urdf(tree, hardware, prefix)
 
 
 def robot_description(robot: Robot) -> dict[str, Any]:

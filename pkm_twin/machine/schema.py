@@ -36,7 +36,10 @@ T = TypeVar("T")
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Plain YAML only: no tags, aliases, merges or duplicate keys, no integer beyond all floats."""
+    """Plain YAML only: no tags, aliases, merges or duplicate keys, no integer beyond all floats.
+
+    Numbers are decimal: 1_0, 1:30 and 010 are numbers in YAML 1.1 (10, 90, 8), and slips here.
+    """
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -60,16 +63,26 @@ class _StrictLoader(yaml.SafeLoader):
         return mapping
 
     def construct_yaml_int(self, node: Any) -> int:
+        if not re.fullmatch(r"[-+]?(0|[1-9][0-9]*)", node.value):
+            raise yaml.YAMLError(f"{node.value}: write a decimal number, or text in quotes")
         value: int = super().construct_yaml_int(node)
         if value.bit_length() > 1023:
             raise yaml.YAMLError("an integer beyond all floats")
         return value
 
+    def construct_yaml_float(self, node: Any) -> float:
+        if "_" in node.value or ":" in node.value:
+            raise yaml.YAMLError(f"{node.value}: write a decimal number, or text in quotes")
+        return float(super().construct_yaml_float(node))
+
 
 _StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_yaml_int)
-# YAML 1.1 reads 1e-10 as a string; everybody means the number.
+_StrictLoader.add_constructor("tag:yaml.org,2002:float", _StrictLoader.construct_yaml_float)
+# YAML 1.1 reads 1e-10 and 5.0e6 as strings; everybody means the numbers.
 _StrictLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+[eE][-+]?\d+$"), list("-+0123456789")
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
+    list("-+.0123456789"),
 )
 
 

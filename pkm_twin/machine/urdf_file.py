@@ -6,25 +6,29 @@ May import: numpy, the standard library, the parameter files' reader.
 
 from __future__ import annotations
 
-import warnings
+import math
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import schema, urdf_loops, urdf_xml
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import UNLIMITED, Pose
 
 Array = NDArray[np.float64]
 
+_PLACES: Final = ("axis", "parent_axis", "child_axis")
 LARGE: Final = 10.0
 """Offsets beyond this, m, look like millimetres."""
 
+MOST_MOVING: Final = 1000
+"""Most joints that are not fixed: assembling takes the cube of their number."""
 JOINTS: Final = ("revolute", "continuous", "prismatic", "fixed", "spherical")
 
 
@@ -60,7 +64,11 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Urdf:
-    """A file's content; ``root``: the link that has no parent; ``gravity``: m/s2, if it tells."""
+    """A file's content; ``root``: the link that has no parent; ``gravity``: m/s2, if it tells.
+
+    ``initial``: values that ``<ros2_control>`` begins with, of the joints for which it has them.
+    ``accuracy``: half of the last digit of its places and directions, m or rad.
+    """
 
     name: str
     root: str
@@ -69,6 +77,8 @@ class Urdf:
     closures: tuple[Closure, ...]
     actuated: tuple[str, ...]
     gravity: list[float] | None = None
+    initial: Mapping[str, float] = field(default_factory=dict)
+    accuracy: float = 0.0
 
 
 def read(path: Path, robot: ET.Element) -> Urdf:
@@ -98,10 +108,13 @@ def read(path: Path, robot: ET.Element) -> Urdf:
         )
     beside = _beside(path)
     joints = _retyped(joints, beside)
+    moving = sum(joint.type != "fixed" for joint in joints.values())
+    if moving > MOST_MOVING:
+        raise ParameterError(str(path), f"{moving} joints that move", f"at most {MOST_MOVING}")
     closures = urdf_loops.closures(
         robot, beside, links, {name: joint.child for name, joint in joints.items()}
     )
-    _warn_of_units(joints, closures)
+    _warn_of_units(path, robot, joints, closures)
     actuated = _actuated(path, robot, beside, joints)
     idle = [j.name for j in joints.values() if j.type != "fixed" and j.name not in actuated]
     if not closures and idle:
@@ -111,19 +124,23 @@ def read(path: Path, robot: ET.Element) -> Urdf:
             "<constraint> or <loop> elements, or closed_loop in a YAML file beside it",
         )
     name = robot.get("name") or path.stem
-    return Urdf(name, root, links, joints, tuple(closures.values()), actuated)
+    initial = _initial(robot, actuated)
+    return Urdf(
+        name, root, links, joints, tuple(closures.values()), actuated, initial=initial,
+        accuracy=_accuracy(robot),
+    )  # fmt: skip
 
 
 def _link(element: ET.Element, name: str) -> Link:
-    inertial = element.find("inertial")
+    inertial = urdf_xml.single(element, "inertial", f"link.{name}")
     if inertial is None:
         return Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
     where = f"link.{name}.inertial"
-    mass = inertial.find("mass")
+    mass = urdf_xml.single(inertial, "mass", where)
     value = urdf_xml.number(None if mass is None else mass.get("value"), f"{where}.mass")
     if value < 0.0:
         raise ParameterError(f"{where}.mass", value, "zero or more, kg")
-    inertia = inertial.find("inertia")
+    inertia = urdf_xml.single(inertial, "inertia", where)
     if inertia is None:
         raise ParameterError(f"{where}.inertia", None, "an <inertia> beside the mass, kg m2")
     xx, xy, xz, yy, yz, zz = (
@@ -132,7 +149,7 @@ def _link(element: ET.Element, name: str) -> Link:
         )
         for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     )
-    pose = urdf_xml.origin(inertial.find("origin"), where)
+    pose = urdf_xml.origin(urdf_xml.single(inertial, "origin", where), where)
     matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return Link(name, value, pose.position, pose.rotation @ matrix @ pose.rotation.T)
 
@@ -147,19 +164,19 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     if element.find("mimic") is not None:
         raise ParameterError(f"{where}.mimic", "<mimic>", "joints that move by themselves")
     parent, child = (
-        urdf_xml.reference(element.find(end), f"{where}.{end}", links)
+        urdf_xml.reference(urdf_xml.single(element, end, where), f"{where}.{end}", links)
         for end in ("parent", "child")
     )
-    origin = urdf_xml.origin(element.find("origin"), where)
+    origin = urdf_xml.origin(urdf_xml.single(element, "origin", where), where)
     bare = kind in ("fixed", "spherical")
     axes = [] if bare else [urdf_xml.axis(element, "axis", where)]
     limits: dict[str, Any] = {}
-    limit = element.find("limit")
+    limit = urdf_xml.single(element, "limit", where)
     if limit is not None and kind in ("revolute", "continuous", "prismatic"):
         limits = _limits(limit, where, kind)
     viscous = coulomb = 0.0
     for tag in ("dynamics", "joint_properties"):
-        dynamics = element.find(tag)
+        dynamics = urdf_xml.single(element, tag, where)
         if dynamics is not None:
             viscous = urdf_xml.positive(dynamics.get("damping", "0"), f"{where}.{tag}.damping")
             coulomb = urdf_xml.positive(dynamics.get("friction", "0"), f"{where}.{tag}.friction")
@@ -211,15 +228,19 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         raise ParameterError("robot", roots, "one root link: exactly one that is no child")
-    for name in links:
-        seen: set[str] = set()
-        while name in parents:
-            if name in seen:
+    known = {roots[0]}
+    for link in links:
+        # Up to what is known to hang on the root: every link is passed once.
+        way: dict[str, None] = {}
+        while link not in known:
+            if link in way:
+                circle = sorted(way)
                 raise ParameterError(
-                    f"joint.{parents[name].name}", sorted(seen), "a tree: these go in a circle"
+                    f"joint.{parents[link].name}", circle, "a tree: these go in a circle"
                 )
-            seen.add(name)
-            name = parents[name].parent
+            way[link] = None
+            link = parents[link].parent
+        known.update(way)
     return roots[0]
 
 
@@ -298,6 +319,8 @@ def _actuated(
             "no actuated joint",
             "command interfaces in a <ros2_control> element, or name_mot in a YAML file beside it",
         )
+    if len(set(names)) != len(names):
+        raise ParameterError(source, names, "each joint once")
     for name in names:
         if name not in joints:
             raise UnknownNameError(source, name, joints)
@@ -305,12 +328,44 @@ def _actuated(
             raise ParameterError(
                 f"{source}.{name}", joints[name].type, "a revolute or prismatic joint"
             )
-        if names.count(name) > 1:
-            raise ParameterError(source, name, "each joint once")
     return tuple(names)
 
 
-def _warn_of_units(joints: dict[str, Joint], closures: dict[str, Closure]) -> None:
+def _initial(robot: ET.Element, actuated: tuple[str, ...]) -> dict[str, float]:
+    """The actuated joints' ``initial_value`` in a ``<ros2_control>`` element."""
+    found: dict[str, float] = {}
+    for joint in robot.findall("ros2_control/joint"):
+        name = joint.get("name", "")
+        for state in joint.findall("state_interface"):
+            for param in state.findall("param") if state.get("name") == "position" else ():
+                if param.get("name") == "initial_value" and name in actuated:
+                    where = f"ros2_control.{name}.initial_value"
+                    found[name] = urdf_xml.number((param.text or "").strip(), where)
+    return found
+
+
+def _accuracy(robot: ET.Element) -> float:
+    """Half of the last digit of the file's longest numbers, m or rad; of whole ones nothing."""
+    words = [
+        word
+        for element in robot.iter() if element.tag in _PLACES or "origin" in element.tag
+        for key in ("xyz", "rpy") for word in element.get(key, "").split()
+    ]  # fmt: skip
+    digits = [_decimals(word) for word in words]
+    longest = max(digits, default=0)
+    return 0.5 * 10.0**-longest if longest else 0.0
+
+
+def _decimals(word: str) -> int:
+    """How many digits stand behind the point."""
+    mantissa, _, exponent = word.lower().partition("e")
+    places = len(mantissa.partition(".")[2]) - int(exponent or 0)
+    return min(max(places, 0), 18)
+
+
+def _warn_of_units(
+    path: Path, robot: ET.Element, joints: dict[str, Joint], closures: dict[str, Closure]
+) -> None:
     offsets = {f"joint.{n}.origin": j.origin for n, j in joints.items()}
     offsets |= {f"{n}.{i}": f for n, c in closures.items() for i, f in enumerate(c.frames)}
     where, pose = max(
@@ -320,7 +375,16 @@ def _warn_of_units(joints: dict[str, Joint], closures: dict[str, Closure]) -> No
     )
     size = float(np.abs(pose.position).max())
     if size > LARGE:
-        warnings.warn(
+        warn(
+            path,
             f"{where}: an offset of {size:g} m; a URDF is in metres, does it say millimetres?",
-            stacklevel=4,
         )
+    for top in robot:
+        angles = [word for e in top.iter() for word in e.get("rpy", "").split()]
+        largest = max((abs(urdf_xml.number(word, "rpy")) for word in angles), default=0.0)
+        if largest > 2.0 * math.pi + 1e-6:
+            warn(
+                path,
+                f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF is in radians, does it "
+                "say degrees?",
+            )

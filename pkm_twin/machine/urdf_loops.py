@@ -11,7 +11,8 @@ May import: numpy, the standard library, the XML's parts.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping, Sequence
+from collections import ChainMap
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -63,7 +64,7 @@ class Closure:
 
 
 def closures(
-    robot: ET.Element, beside: Mapping[str, Any], links: Iterable[str], joints: Mapping[str, str]
+    robot: ET.Element, beside: Mapping[str, Any], links: Collection[str], joints: Mapping[str, str]
 ) -> dict[str, Closure]:
     """All closures of a robot by name.
 
@@ -71,34 +72,34 @@ def closures(
     :param joints: the joints' names, each with its child link.
     :raises ParameterError: an element that is refused, by name.
     """
-    known = list(links)
     found: dict[str, Closure] = {}
+    taken = ChainMap[str, Any](found, dict(joints))
     for element in robot.findall("constraint"):
-        name = urdf_xml.name(element, {**joints, **found})
-        found[name] = _constraint(element, name, known)
+        name = urdf_xml.name(element, taken)
+        found[name] = _constraint(element, name, links)
     for element in robot.findall("loop"):
-        name = urdf_xml.name(element, {**joints, **found})
-        found[name] = _loop(element, name, known)
-    for closure in _pairs(beside, known, joints):
+        name = urdf_xml.name(element, taken)
+        found[name] = _loop(element, name, links)
+    for closure in _pairs(beside, links, joints):
         if closure.name in joints or closure.name in found:
             raise ParameterError("closed_loop", closure.name, "each pair once")
         found[closure.name] = closure
     return found
 
 
-def _constraint(element: ET.Element, name: str, links: Sequence[str]) -> Closure:
+def _constraint(element: ET.Element, name: str, links: Collection[str]) -> Closure:
     where = f"constraint.{name}"
     kind = (element.get("type") or "").removesuffix("_joint")
     if kind not in CONSTRAINTS:
         raise UnknownNameError(f"{where}.type", element.get("type"), CONSTRAINTS)
     urdf_xml.only(element, where, PARTS)
     for end in ("parent", "child"):
-        urdf_xml.only(element.find(end), f"{where}.{end}", ())
+        urdf_xml.only(urdf_xml.single(element, end, where), f"{where}.{end}", ())
     ends = tuple(
         urdf_xml.reference(element.find(e), f"{where}.{e}", links) for e in ("parent", "child")
     )
     frames = tuple(
-        urdf_xml.origin(element.find(f"{e}_origin"), f"{where}.{e}_origin")
+        urdf_xml.origin(urdf_xml.single(element, f"{e}_origin", where), f"{where}.{e}_origin")
         for e in ("parent", "child")
     )
     parent = urdf_xml.axis(element, "parent_axis", where)
@@ -108,7 +109,7 @@ def _constraint(element: ET.Element, name: str, links: Sequence[str]) -> Closure
     return _closure(name, CONSTRAINTS[kind], ends, frames, (parent, child))
 
 
-def _loop(element: ET.Element, name: str, links: Sequence[str]) -> Closure:
+def _loop(element: ET.Element, name: str, links: Collection[str]) -> Closure:
     where = f"loop.{name}"
     kind = element.get("type")
     if kind not in LOOPS:
@@ -116,17 +117,20 @@ def _loop(element: ET.Element, name: str, links: Sequence[str]) -> Closure:
     urdf_xml.only(element, where, ("predecessor", "successor", "sucessor", "axis"))
     ends, frames = [], []
     for tags in (("predecessor",), ("successor", "sucessor")):
-        end = next((e for tag in tags if (e := element.find(tag)) is not None), None)
+        stated = [e for tag in tags if (e := urdf_xml.single(element, tag, where)) is not None]
+        if len(stated) > 1:
+            raise ParameterError(f"{where}.{tags[0]}", f"{len(stated)} elements", "one")
+        end = stated[0] if stated else None
         urdf_xml.only(end, f"{where}.{tags[0]}", ("origin",))
         ends.append(urdf_xml.reference(end, f"{where}.{tags[0]}", links))
-        origin = None if end is None else end.find("origin")
+        origin = None if end is None else urdf_xml.single(end, "origin", f"{where}.{tags[0]}")
         frames.append(urdf_xml.origin(origin, f"{where}.{tags[0]}"))
     axis = urdf_xml.axis(element, "axis", where)
     return _closure(name, LOOPS[kind], ends, frames, (axis, axis))
 
 
 def _pairs(
-    beside: Mapping[str, Any], links: Sequence[str], joints: Mapping[str, str]
+    beside: Mapping[str, Any], links: Collection[str], joints: Mapping[str, str]
 ) -> list[Closure]:
     """The closures of the YAML file: two frames that meet whole (6d) or in their origins (3d)."""
     pairs = beside.get("closed_loop", [])
@@ -141,10 +145,9 @@ def _pairs(
         if str(kind).lower() not in types:
             raise UnknownNameError(f"type[{i}]", kind, types)
         # A joint's frame moves with its child, so that the child link's frame is the same.
-        for name in pair:
-            if name not in joints and name not in links:
-                raise UnknownNameError(f"closed_loop[{i}]", name, [*links, *joints])
-        ends = [joints.get(name, name) for name in pair]
+        known = [*links, *joints]
+        found = [urdf_xml.known_link(f"closed_loop[{i}]", name, known) for name in pair]
+        ends = [joints.get(name, name) for name in found]
         closures.append(
             _closure("_".join(pair), types[str(kind).lower()], ends, (Pose(), Pose()), None)
         )

@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """A URDF or MJCF with its loop closures as plain data of a ``mechanism: machine`` description.
 
-May import: numpy, the files' parts, the assembly.
+May import: numpy, the files' parts, the assembly and its home.
 """
 
 from __future__ import annotations
 
-import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
-from pkm_twin.machine.urdf_file import Joint, Urdf
+from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.urdf_file import Joint, Link, Urdf
+from pkm_twin.machine.urdf_home import Home, HomeSearch
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
 
@@ -41,15 +43,42 @@ GROUND: Final = "base"
 """The ground's name in a description."""
 
 
+@dataclass(frozen=True, eq=False)
+class UrdfReading:
+    """A file as a ``mechanism: machine`` description, and how it came to be.
+
+    ``home``: how the home was chosen, in words. ``notes``: what was done to the file's machine.
+    """
+
+    description: dict[str, Any]
+    home: str
+    notes: tuple[str, ...]
+
+
 def read_urdf(
     path: str | Path, *, platform: str | None = None, base: str | None = None
 ) -> dict[str, Any]:
     """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
 
+    As :func:`read_tree`, whose notes are given as warnings.
+    """
+    reading = read_tree(path, platform=platform, base=base)
+    for note in reading.notes:
+        warn(path, note)
+    return reading.description
+
+
+def read_tree(
+    path: str | Path, *, platform: str | None = None, base: str | None = None
+) -> UrdfReading:
+    """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
+
     A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package.
 
-    Links that fixed joints hold together are one body. Home is the assembly nearest to the zeros
-    of the joints; ``home`` of a joint is its value there, so that joint values are the URDF's.
+    Links that fixed joints hold together are one body. Home: see :mod:`pkm_twin.machine.urdf_home`;
+    ``home`` of a joint is its value there, so that joint values are the URDF's. Parts that only
+    spin about themselves are held, and axes that a rounded file leaves nearly parallel, or nearly
+    meeting, are made so where the machine could not move otherwise.
 
     :param platform: the link that carries the tool; default the first of ``PLATFORMS``.
     :param base: the link that is the ground and gives the base axes; default the root.
@@ -60,21 +89,38 @@ def read_urdf(
     urdf = mjcf_file.read(path) if top.tag == "mujoco" else urdf_file.read(path, top)
     tool = _platform(urdf, platform)
     ground = urdf.root if base is None else base
-    if ground not in urdf.links:
-        raise UnknownNameError("base", ground, urdf.links)
+    ground = urdf_xml.known_link("base", ground, urdf.links)
     assembly = Assembly(urdf)
     bodies = _bodies(urdf, assembly.order, tool, ground)
-    values, miss = assembly.nearest()
-    if miss > EXACT:
-        warnings.warn(f"{path}: the loops close within {miss:.1g} only (m or rad)", stacklevel=2)
-    spins = assembly.spins(values, set(urdf.actuated), tool)
-    if spins:
-        warnings.warn(
-            f"{path}: held, as they only let a part spin about itself: {', '.join(spins)}",
-            stacklevel=2,
-        )
+    home = HomeSearch(assembly, lambda: _description(assembly, bodies, tool, ground)).home()
+    assembly.place(home.values)
+    data = _description(assembly, bodies, tool, ground, home.values)
+    notes = []
+    if home.miss > EXACT:
+        notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
+    if home.graph is not None:
+        _take(data, home, home.graph)
+        if home.rounding:
+            notes.append(
+                f"axes and points were moved by up to {home.rounding:.1g} (rad, or parts of the "
+                "machine's size), so that the machine can move: the file is rounded"
+            )
+        if home.held:
+            notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
+    return UrdfReading(data, home.text, tuple(notes))
+
+
+def _description(
+    assembly: Assembly, bodies: dict[str, str], tool: str, ground: str, values: Array | None = None
+) -> dict[str, Any]:
+    """The machine at the placed values.
+
+    :param values: of the joints, shape (steps,); without them all are zero.
+    """
+    urdf = assembly.urdf
     view = assembly.links[ground].inverse()
-    home = dict(zip(assembly.steps, values.tolist(), strict=True))
+    at = np.zeros(len(assembly.steps)) if values is None else values
+    home = dict(zip(assembly.steps, at.tolist(), strict=True))
     axes: dict[str, list[Array]] = {}
     for name, axis in zip(assembly.steps, assembly.axes, strict=True):
         axes.setdefault(name, []).append(view.rotation @ axis)
@@ -86,8 +132,6 @@ def read_urdf(
         if joint.type == "free":
             continue
         joints[name] = _joint(joint, bodies, places, axes[name], home[name], name in urdf.actuated)
-        if name in spins:
-            joints[name] = {k: joints[name][k] for k in ("between", "at")} | {"type": "fixed"}
     for closure in urdf.closures:
         if bodies[closure.links[0]] != bodies[closure.links[1]]:
             joints[closure.name] = _closure(
@@ -107,11 +151,27 @@ def read_urdf(
     }
 
 
+def _take(data: dict[str, Any], home: Home, graph: Graph) -> None:
+    """Write the idealised places and axes of a home into a description, and what holds spins."""
+    for name, joint in data["joints"].items():
+        ideal = graph.joints[name]
+        if name in home.held:
+            joint = data["joints"][name] = {
+                "type": ideal.kind, **{k: joint[k] for k in ("between", "at")}
+            }  # fmt: skip
+        if home.rounding:
+            joint["at"] = _snapped(ideal.at)
+        if home.rounding or name in home.held:
+            axes = [_snapped(axis) for axis in ideal.axes]
+            if ideal.kind == "universal":
+                joint["axes"] = axes
+            elif axes:
+                joint["axis"] = axes[0]
+
+
 def _platform(urdf: Urdf, asked: str | None) -> str:
     if asked is not None:
-        if asked not in urdf.links:
-            raise UnknownNameError("platform", asked, urdf.links)
-        return asked
+        return urdf_xml.known_link("platform", asked, urdf.links)
     lower = {name.lower(): name for name in urdf.links}
     for name in PLATFORMS:
         if name in lower:
@@ -132,12 +192,14 @@ def _bodies(urdf: Urdf, order: list[Joint], tool: str, ground: str) -> dict[str,
             group[joint.child] = group[joint.parent]
     if group[tool] == group[ground]:
         raise ParameterError("platform", tool, "a link that can move")
-    names = {group[ground]: GROUND}
+    names, taken = {group[ground]: GROUND}, {GROUND}
     for first, wanted in ((group[tool], tool), *((first, first) for first in group.values())):
-        name = wanted
-        while first not in names and name in names.values():
-            name += "_"
-        names.setdefault(first, name)
+        if first in names:
+            continue
+        while wanted in taken:
+            wanted += "_"
+        names[first] = wanted
+        taken.add(wanted)
     return {link: names[first] for link, first in group.items()}
 
 
@@ -160,8 +222,8 @@ def _joint(
         data["axis"] = _snapped(axes[0])
         if actuated:
             data["actuated"] = True
-        value = round(home, 14)
-        if value != 0.0:
+        value = round(home, 14) + 0.0
+        if value != 0.0 or (actuated and joint.type == "prismatic"):
             data["home"] = value
     if actuated and joint.limits:
         data["limits"] = joint.limits
@@ -192,10 +254,11 @@ def _masses(
 ) -> dict[str, dict[str, Any]]:
     """Masses, centres (m) and inertias about them of all bodies but the ground, base axes."""
     result: dict[str, dict[str, Any]] = {}
-    for body in dict.fromkeys(bodies.values()):
-        if body == GROUND:
-            continue
-        links = [link for name, link in urdf.links.items() if bodies[name] == body]
+    members: dict[str, list[Link]] = {body: [] for body in bodies.values() if body != GROUND}
+    for link in urdf.links.values():
+        if bodies[link.name] != GROUND:
+            members[bodies[link.name]].append(link)
+    for body, links in members.items():
         centres = [
             places[link.name].rotation @ link.com + places[link.name].position for link in links
         ]

@@ -24,6 +24,7 @@ from pkm_twin.machine.urdf_write import (
     UrdfJoint,
     UrdfTree,
 )
+from pkm_twin.machine.urdf_xml import plain_name
 
 PAYLOAD: Final = "payload"
 """The link of a payload, apart from the platform's."""
@@ -120,8 +121,9 @@ def _capsules(graph: Graph, links: Mapping[str, str]) -> list[UrdfCapsule]:
 def _link_names(names: Sequence[str]) -> dict[str, str]:
     """A link for each name, apart from those that the file has of its own."""
     links = {BASE: GROUND}
-    for name in names:
-        link = name
+    # What needs no change keeps its name, whatever else would come to have it.
+    for name in sorted(names, key=lambda name: plain_name(name) != name):
+        link = plain_name(name)
         while name not in links and link in (GROUND, PLATFORM, PAYLOAD, *links.values()):
             link += "_body"
         links.setdefault(name, link)

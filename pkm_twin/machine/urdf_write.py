@@ -27,8 +27,12 @@ Array = NDArray[np.float64]
 
 GROUND: Final = "base_link"
 """The root link's name."""
+MOCK: Final = "mock_components/GenericSystem"
+"""The hardware of ros2_control that needs none."""
 PLATFORM: Final = "platform"
 """The link that stands on the platform's reference point."""
+NAMED: Final = ("link", "joint", "constraint", "ros2_control")
+"""Elements whose name is of one machine; those of interfaces and parameters are not."""
 CLOSURES: Final = {
     "revolute": "revolute_joint",
     "prismatic": "prismatic_joint",
@@ -119,11 +123,14 @@ class UrdfTree:
     origin: Array
 
 
-def write_urdf(tree: UrdfTree) -> str:
+def write_urdf(tree: UrdfTree, hardware: str = MOCK, prefix: str = "") -> str:
     """The URDF of a tree.
 
     The root is ``base_link``; ``platform`` is a link without mass on the reference point, fixed
     to the platform's body.
+
+    :param hardware: plugin of the ``<ros2_control>`` element, empty: no such element.
+    :param prefix: of the names of all links, joints and closures, for several machines in one file.
     """
     robot = ET.Element("robot", name=tree.name)
     places = {GROUND: np.zeros(3)} | {joint.child: joint.point for joint in tree.joints}
@@ -142,7 +149,13 @@ def write_urdf(tree: UrdfTree) -> str:
     _joint(robot, tool, places)
     for closure in tree.closures:
         _closure(robot, closure, places)
-    _control(robot, tree)
+    if hardware:
+        _control(robot, tree, hardware)
+    if prefix:
+        for element in robot.iter():
+            for key in ("name", "link"):
+                if key in element.attrib and (key == "link" or element.tag in NAMED):
+                    element.set(key, prefix + element.attrib[key])
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
@@ -227,10 +240,10 @@ def _closure(robot: ET.Element, closure: UrdfClosure, places: dict[str, Array]) 
             ET.SubElement(element, f"{end}_axis", xyz=_text(axis))
 
 
-def _control(robot: ET.Element, tree: UrdfTree) -> None:
+def _control(robot: ET.Element, tree: UrdfTree, plugin: str) -> None:
     control = ET.SubElement(robot, "ros2_control", name=tree.name, type="system")
     hardware = ET.SubElement(control, "hardware")
-    ET.SubElement(hardware, "plugin").text = "mock_components/GenericSystem"
+    ET.SubElement(hardware, "plugin").text = plugin
     joints = {joint.name: joint for joint in tree.joints}
     for name in tree.actuated:
         element = ET.SubElement(control, "joint", name=name)

@@ -7,10 +7,10 @@ May import: numpy, the standard library, the parameter files' bounds.
 from __future__ import annotations
 
 import math
+import re
 import stat
-import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Container, Iterable
+from collections.abc import Collection, Container
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.files import decimal
 from pkm_twin.machine import schema
 from pkm_twin.machine.rotations import from_rpy
 
@@ -29,6 +30,7 @@ MAX_FILE_SIZE: Final = 4 * 1024 * 1024
 """Largest URDF that is read, bytes."""
 MAX_DEPTH: Final = 64
 """Deepest nesting of elements that is read."""
+ROMAN: Final = {"I": "1", "II": "2", "III": "3", "IV": "4", "V": "5", "VI": "6"}
 UNLIMITED: Final = {
     "revolute": 2.0 * math.pi - 1e-6,
     "prismatic": 10.0,
@@ -93,6 +95,7 @@ def elements(path: Path) -> ET.Element:
     parser.StartElementHandler = start
     parser.EndElementHandler = end
     parser.StartDoctypeDeclHandler = doctype
+    parser.CharacterDataHandler = builder.data
     try:
         parser.Parse(content, True)
     except (expat.ExpatError, ValueError, LookupError) as error:
@@ -123,7 +126,35 @@ def only(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
             raise UnknownNameError(where, child.tag, tags)
 
 
-def reference(element: ET.Element | None, where: str, links: Iterable[str]) -> str:
+def single(element: ET.Element, tag: str, where: str) -> ET.Element | None:
+    """The child element of that tag, None where there is none.
+
+    :raises ParameterError: there are several, of which a parser may take any.
+    """
+    found = element.findall(tag)
+    if len(found) > 1:
+        raise ParameterError(f"{where}.{tag}", f"{len(found)} <{tag}> elements", "at most one")
+    return found[0] if found else None
+
+
+def plain_name(name: str) -> str:
+    """A link's name that takes no quoting anywhere: ``arm I`` is ``arm_1``."""
+    words = re.sub(r" (I{1,3}|IV|VI?)(?![A-Za-z0-9])", lambda found: "_" + ROMAN[found[1]], name)
+    return re.sub(r"\s", "_", words)
+
+
+def known_link(where: str, name: str, links: Collection[str]) -> str:
+    """A link by its name, or by the name of a robot's part that it is written out for.
+
+    :raises UnknownNameError: there is none.
+    """
+    for known in (name, plain_name(name)):
+        if known in links:
+            return known
+    raise UnknownNameError(where, name, links)
+
+
+def reference(element: ET.Element | None, where: str, links: Collection[str]) -> str:
     """The link that an element names."""
     link = None if element is None else element.get("link", element.get("name"))
     if link is None:
@@ -135,7 +166,7 @@ def reference(element: ET.Element | None, where: str, links: Iterable[str]) -> s
 
 def axis(element: ET.Element, tag: str, where: str) -> Array:
     """A unit vector; a missing one is x, as in every URDF."""
-    stated = element.find(tag)
+    stated = single(element, tag, where)
     value = vector("1 0 0" if stated is None else stated.get("xyz"), f"{where}.{tag}", 3)
     size = float(np.linalg.norm(value))
     if not size > 1e-9:
@@ -158,11 +189,6 @@ def origin(element: ET.Element | None, where: str) -> Pose:
         skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         return Pose(np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew, position)
     angles = vector(element.get("rpy", "0 0 0"), f"{where}.rpy", 3)
-    if float(np.abs(angles).max()) > 2.0 * math.pi + 1e-6:
-        warnings.warn(
-            f"{where}.rpy: {angles.tolist()}; a URDF is in radians, does it say degrees?",
-            stacklevel=5,
-        )
     return Pose(from_rpy(angles), position)
 
 
@@ -185,7 +211,7 @@ def positive(text: str | None, where: str) -> float:
 def number(text: str | None, where: str) -> float:
     """A finite number."""
     try:
-        value = float(text)  # type: ignore[arg-type]
+        value = decimal(text or "")
     except (TypeError, ValueError):
         raise ParameterError(where, text, "a number") from None
     if not math.isfinite(value) or abs(value) > schema.MAX_SIZE:

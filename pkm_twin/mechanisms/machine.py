@@ -175,6 +175,11 @@ class Machine(Robot):
         """Greatest distance of a joint on the platform from its reference point, m."""
         return self.graph.rim
 
+    @property
+    def without_home(self) -> frozenset[str]:
+        """Joints of which the file does not say where they count from."""
+        return frozenset(n for n, joint in self.specs["joints"].items() if joint.home is None)
+
     def make_graph(self) -> Graph:
         """The graph of the file."""
         return self.described

@@ -5,20 +5,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 
-USAGE = """usage: {name} [--help] [--version] [--ros-args -p PARAMETER:=VALUE -r FROM:=TO ...]
+USAGE = """usage: {words} [--help] [--version] [--ros-args -p PARAMETER:=VALUE -r FROM:=TO ...]
 
 {summary}
 
-Runs until SIGINT or SIGTERM. Its parameters: `ros2 param describe /{name} PARAMETER` while it runs,
-or the README's section {name}."""
+Runs until SIGINT or SIGTERM. Its parameters: `ros2 param describe /{node} PARAMETER` while it runs,
+or the README's section {node}."""
 
 
-def answer(name: str, summary: str, arguments: Sequence[str]) -> None:
+def answer(name: str, summary: str, arguments: Sequence[str], others: str = "") -> None:
     """Print help or the version and end, where the command line asks for one.
 
     :param arguments: what stands behind the command's name.
+    :param others: what the help calls the names of nodes that stand before the options.
     :raises SystemExit: 0 when something was printed, 2 where an argument is no node's.
     """
     end = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
@@ -26,7 +26,7 @@ def answer(name: str, summary: str, arguments: Sequence[str]) -> None:
     if not own:
         return
     if own[0] in ("-h", "--help"):
-        print(USAGE.format(name=name, summary=summary))
+        print(USAGE.format(words=f"{name} {others}".strip(), summary=summary, node=others or name))
         raise SystemExit(0)
     if own[0] == "--version":
         print(_version())
@@ -40,6 +40,8 @@ def answer(name: str, summary: str, arguments: Sequence[str]) -> None:
 
 
 def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version("pkm_twin")
     except PackageNotFoundError:

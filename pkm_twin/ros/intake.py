@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.errors import BagError, MessageError
+from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.ros.messages import COLUMNS, Ragged, TrajectoryFields
 
 Array = NDArray[np.float64]
@@ -152,25 +153,44 @@ def _layout(data: bytes, message: Any, arrays: Sequence[Sequence[float]]) -> _La
 
 
 class DoublesTemplate:
-    """Messages that differ in their stamp and in the doubles at their end.
+    """Messages that differ in their stamp and in the numbers of their arrays of doubles.
 
-    :param message: fields of the message, its last array of ``count`` numbers; ``stamped``: it
-        begins with a header.
+    :param message: fields of the message; each list of numbers that is not empty is an array to
+        fill. ``stamped``: it begins with a header.
     """
 
     def __init__(
         self, type_name: str, definition: str, message: dict[str, Any], *, stamped: bool
     ) -> None:
         codec = MessageCodec(type_name, definition)
-        *_, (last, numbers) = message.items()
-        data = codec.encode({**message, last: [0.0] * len(numbers)})
+        arrays = [k for k, v in message.items() if v and isinstance(v, list) and v[0] == 0.0]
+        # Eight bytes that no text in UTF-8 has.
+        marks = [bytes([0x80 + k] * 8) for k in range(len(arrays))]
+        filled = {
+            name: list(struct.unpack("<d", mark)) * len(message[name])
+            for name, mark in zip(arrays, marks, strict=True)
+        }
+        data = codec.encode({**message, **filled})
         self._head = data[:HEAD]
-        self._middle = data[STAMP.stop if stamped else HEAD : len(data) - 8 * len(numbers)]
+        rest, self._pieces = data[STAMP.stop if stamped else HEAD :], list[bytes]()
+        self._sizes = [8 * len(message[name]) for name in arrays]
+        for mark, size in zip(marks, self._sizes, strict=True):
+            piece, rest = rest.split(mark * (size // 8))
+            self._pieces.append(piece)
+        self._tail = rest
 
     def fill(self, values: Array, stamp: tuple[int, int] | None = None) -> bytes:
-        """The message with these values, and the stamp (sec, nanosec) where it has one."""
-        time = b"" if stamp is None else struct.pack("<iI", *stamp)
-        return self._head + time + self._middle + values.astype("<f8", copy=False).tobytes()
+        """The message with these values, and the stamp (sec, nanosec) where it has one.
+
+        :param values: of all arrays to fill, one after the other.
+        """
+        numbers = values.astype("<f8", copy=False).tobytes()
+        parts, at = [self._head, b"" if stamp is None else struct.pack("<iI", *stamp)], 0
+        for piece, size in zip(self._pieces, self._sizes, strict=True):
+            parts += (piece, numbers[at : at + size])
+            at += size
+        parts.append(self._tail)
+        return b"".join(parts)
 
 
 @dataclass(frozen=True)
@@ -229,7 +249,7 @@ class RawTrajectory:
         fields = TrajectoryFields(header, tuple(names), seconds, columns)
         return cls(data, order, begin, fields, tuple(lengths))
 
-    def with_effort(self, efforts: Array) -> bytes:
+    def with_effort(self, efforts: ControllerNumbers) -> bytes:
         """The message with these efforts, shape (points, n), and nothing else changed."""
         points, joints = efforts.shape
         before = _Points(self.begin, points, self.lengths)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
-from pkm_twin.machine.joint_map import JointMap
+from pkm_twin.machine.joint_map import ControllerNumbers, JointMap
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -36,6 +36,8 @@ MAX_MOMENT: Final = 1e7
 MAX_POINTS: Final = 100_000
 MAX_DURATION: Final = 1_000_000 * SECOND
 """Bounds beyond all machines of this kind, for values that no limit of the robot bounds."""
+ROUNDING: Final = 4.0 * sys.float_info.epsilon
+"""Of a number that is converted there and back, relative."""
 MAX_SHOWN: Final = 80
 """Characters of a foreign name that an error shows."""
 COLUMNS: Final = {
@@ -100,10 +102,14 @@ class JointSample(NamedTuple):
 
 @dataclass(frozen=True)
 class EffortSample:
-    """One message of stamped torques in the robot's joint order, shape (n,), N m or N."""
+    """One message of stamped torques in the robot's joint order, shape (n,), N m or N.
+
+    ``given``: the same as they came, to be forwarded bit by bit.
+    """
 
     stamp: int
     effort: Array
+    given: ControllerNumbers
 
 
 @dataclass(frozen=True)
@@ -174,7 +180,7 @@ class Trajectory:
 
 @dataclass
 class JointReader:
-    """Reads joint states and trajectories of one robot.
+    """Reads joint numbers of one robot: the controller's come in, the model's go out.
 
     ``limited``: positions and velocities beyond the robot's limits are refused, else only those
     beyond all machines. ``extra_joints``: a trajectory's joints that the model lacks, such as a
@@ -201,6 +207,14 @@ class JointReader:
             [(-r, r) for r in reach] if position is None else list(map(tuple, position.tolist()))
         )
         rates = [MAX_RATE] * joints if velocity is None else velocity.tolist()
+        if self._map is not None:
+            # What is at its limit is there still after the conversion's rounding.
+            shift = np.abs(self._map.offsets / self._map.factors).tolist()
+            self._position = [
+                (low - ROUNDING * (abs(low) + o), high + ROUNDING * (abs(high) + o))
+                for (low, high), o in zip(self._position, shift, strict=True)
+            ]
+            rates = [rate * (1.0 + ROUNDING) for rate in rates]
         self._velocity = [(-rate, rate) for rate in rates]
         self.highest_velocity: tuple[float, ...] = tuple(rates)
         self._highest_velocity = np.array(rates)
@@ -243,7 +257,18 @@ class JointReader:
         effort = self._take("effort", message.effort, count, index, self._effort)
         if effort is None:
             raise MessageError("empty", f"no efforts; {count} names are given")
-        return EffortSample(stamp, effort)
+        given = np.array([message.effort[i] for i in index], np.float64)
+        return EffortSample(stamp, effort, ControllerNumbers(given))
+
+    def commands(self, values: Sequence[float]) -> Array:
+        """Efforts without names, as std_msgs/Float64MultiArray carries them: one a joint."""
+        count = len(self._names)
+        if len(values) != count:
+            raise MessageError("length", f"{len(values)} efforts for {count} joints")
+        effort = self._take("effort", values, count, list(range(count)), self._effort)
+        if effort is None:
+            raise MessageError("not finite", "all efforts are nan")
+        return effort
 
     def trajectory(self, message: Any, now: int) -> Trajectory:
         """A trajectory_msgs/JointTrajectory with exactly the robot's joints, in any order.

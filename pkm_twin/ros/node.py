@@ -24,7 +24,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockChange, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.qos import (
     QoSCompatibility,
@@ -95,7 +94,11 @@ class TwinNode(ParameterNode):
     active takes no message.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, executor: str = "single") -> None:
+        """Declare what all nodes have.
+
+        :param executor: the default of the parameter of that name.
+        """
         self._logged: dict[str, float] = {}
         self._seen = dict.fromkeys(
             ("messages", "exceptions", "requests refused", "clock messages refused"), 0
@@ -120,7 +123,7 @@ class TwinNode(ParameterNode):
         )
         self.executor_kind: str = self.declare(
             "executor",
-            "single",
+            executor,
             "rclpy's executor: single (SingleThreadedExecutor) or events (EventsExecutor)",
             choices=("single", "events"),
             read_only=True,
@@ -179,7 +182,13 @@ class TwinNode(ParameterNode):
         self.time_jumped_backward()
 
     def farewell(self) -> None:
-        """The last thing to do while the topics are still there; see ``ros.run``."""
+        """The end: nothing is answered from here on, while the topics are still there."""
+        self._quit()
+
+    @property
+    def parting(self) -> bool:
+        """Whether something of the end still waits for turns of the executor."""
+        return False
 
     def stream_broken(self, where: str) -> None:
         """A callback failed: whatever it feeds cannot be trusted now."""
@@ -417,12 +426,7 @@ class TwinNode(ParameterNode):
             self._tasks.popleft()
 
     def caught(self, where: str, error: Exception) -> None:
-        """An exception in a callback: the node lives; one traceback a kind.
-
-        :raises ExternalShutdownException: it came from a signal in the middle of the callback.
-        """
-        if not self.context.ok():
-            raise ExternalShutdownException from error
+        """An exception in a callback: the node lives; one traceback a kind."""
         self._seen["exceptions"] += 1
         self._last_kind = _cut(f"{where}: {type(error).__name__}: {error}")
         text = traceback.format_exc()
@@ -465,8 +469,6 @@ class TwinNode(ParameterNode):
                     return response
                 return callback(request, response)
             except Exception as error:
-                if not self.context.ok():
-                    raise ExternalShutdownException from error
                 self._seen["requests refused"] += 1
                 text = _cut(f"{type(error).__name__}: {error}")
                 self.log_throttled("request", f"{kind.__name__}: refused, {text}")

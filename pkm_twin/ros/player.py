@@ -12,14 +12,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pkm_twin.bags.definitions import message_class, message_definition, parse_definition
 from pkm_twin.bags.qos import OfferedQos, parse_qos, require_topic
-from pkm_twin.bags.reader import Bag, TopicInfo, open_bag
+from pkm_twin.bags.reader import Bag, BagMessage, TopicInfo, open_bag
 from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.ros.context import own_node
 
@@ -70,6 +70,7 @@ def play(
     remap: Mapping[str, str] | None = None,
     wait_for_subscribers: float = 0.0,
     progress: bool = True,
+    pace: Callable[[BagMessage], None] | None = None,
 ) -> PlayResult:
     """Publish a bag's messages in log-time order, as far apart as they were recorded.
 
@@ -86,6 +87,8 @@ def play(
     :param wait_for_subscribers: wait up to this long (s) until each topic has a subscriber; those
         still missing are named on standard error, and the replay starts.
     :param progress: draw a progress bar on standard error.
+    :param pace: play in lockstep instead: called before every message, which goes out when it
+        returns, whatever the time is. Clock and signals are then the caller's.
     :raises BagError: the bag is damaged, lacks a topic, or holds a type that is not installed or
         differs from the installed one.
     :raises ParameterError: a number is out of range.
@@ -101,10 +104,13 @@ def play(
     names = _selected(bag, topics, bool(clock))
     targets = _targets(bag, names, remap or {})
     stop = _Stop()
-    with _signals(stop), _publishers(bag, targets, bool(clock)) as (publishers, clock_publisher):
+    with (
+        _signals(stop) if pace is None else nullcontext(),
+        _publishers(bag, targets, bool(clock)) as (publishers, clock_publisher),
+    ):
         awaited = {**publishers, CLOCK_TOPIC: clock_publisher} if clock else publishers
         _await_subscribers(awaited, wait_for_subscribers, stop)
-        replay = _Replay(bag, publishers, rate, stop)
+        replay = _Replay(bag, publishers, rate, stop, pace)
         if clock and clock_publisher:
             replay.add_clock(clock_publisher, clock)
         with _bar(bag, progress) as update:
@@ -293,10 +299,18 @@ def _bar(bag: Bag, shown: bool) -> Iterator[Callable[[float, int], None]]:
 
 
 class _Replay:
-    """Passes through a bag on an absolute schedule."""
+    """Passes through a bag on an absolute schedule, or in lockstep."""
 
-    def __init__(self, bag: Bag, publishers: Mapping[str, Any], rate: float, stop: _Stop) -> None:
+    def __init__(
+        self,
+        bag: Bag,
+        publishers: Mapping[str, Any],
+        rate: float,
+        stop: _Stop,
+        pace: Callable[[BagMessage], None] | None,
+    ) -> None:
         self._bag = bag
+        self._pace = pace
         self._publishers = publishers
         self._rate = rate
         self._stop = stop
@@ -346,7 +360,9 @@ class _Replay:
                     return
                 self._clock(first + round((tick - begin) * self._rate * 1e9))
                 tick += self._clock_period
-            if not self._sleep_until(due):
+            if self._pace is not None:
+                self._pace(message)
+            elif not self._sleep_until(due):
                 return
             self._publishers[message.topic].publish(message.data)
             now = time.monotonic()

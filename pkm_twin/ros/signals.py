@@ -9,6 +9,7 @@ May import: the standard library.
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -29,7 +30,6 @@ class _Process:
 
     asked = -float("inf")
     ending = False
-    raises = True
 
 
 def ignore_signals() -> None:
@@ -38,7 +38,7 @@ def ignore_signals() -> None:
     # Python ends itself by SIGINT if the last text that it ran was interrupted, caught or not.
     exec("")  # noqa: S102
     if threading.current_thread() is threading.main_thread():
-        for number in SIGNALS:
+        for number in (*SIGNALS, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
 
 
@@ -62,8 +62,7 @@ def first_signal(
         now = time.monotonic()
         if now - _Process.asked > PATIENCE:
             _Process.asked = now
-            if _Process.raises:
-                raise raising()
+            raise raising()
 
     before = [signal.signal(number, end) for number in numbers]
     try:
@@ -76,35 +75,39 @@ def first_signal(
                 signal.signal(number, handler)
 
 
-@contextmanager
-def nothing_raised() -> Iterator[None]:
-    """Inside :func:`first_signal`: a signal raises nothing here, as something else ends the block.
+def leave_at_once() -> None:
+    """From here on a signal ends the process with 0: for imports, after which nothing is left.
 
-    An exception in the middle of a library's clean-up is printed there and lost.
+    An exception in the middle of an import may be lost, or come out as another one.
     """
-    _Process.raises = False
-    try:
-        yield
-    finally:
-        _Process.raises = True
+    for number in _of_nodes():
+        signal.signal(number, lambda *_: os._exit(0))
 
 
-@contextmanager
-def noted_signals(numbers: Sequence[signal.Signals] = SIGNALS) -> Iterator[Callable[[], bool]]:
-    """Signals are noted, and the yielded function says whether one came.
+class NodeSignals:
+    """The signals of a node's process: noted from here to its end, and raised while it is made.
 
-    For loops with something left to do at their end: no exception can come in the middle of a
-    library that does not expect one.
+    The handlers stay the same and are never the default ones again: there is no moment at which a
+    signal could end the process without its last words. Once one has come, a change of phase is
+    the assignment to :attr:`raises`, before which Python delivers none.
     """
-    came = False
 
-    def note(*_: object) -> None:
-        nonlocal came
-        came = True
+    def __init__(self) -> None:
+        self.raises = False
+        """Whether the first signal raises KeyboardInterrupt; and a later one, if that was lost."""
+        self.came = False
+        for number in _of_nodes():
+            signal.signal(number, self._take)
 
-    before = [signal.signal(number, note) for number in numbers]
-    try:
-        yield lambda: came
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, signal.SIG_IGN if came else handler)
+    def _take(self, *_: object) -> None:
+        self.came = True
+        now = time.monotonic()
+        if self.raises and now - _Process.asked > PATIENCE:
+            _Process.asked = now
+            raise KeyboardInterrupt
+
+
+def _of_nodes() -> list[signal.Signals]:
+    """A closed terminal ends a node too, but not one that was started to outlive it."""
+    deaf = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return [*SIGNALS] if deaf else [*SIGNALS, signal.SIGHUP]

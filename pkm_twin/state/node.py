@@ -36,6 +36,7 @@ from pkm_twin.ros.wrench import (
 )
 from pkm_twin.state.scene import Load, Scales, Scene
 from pkm_twin.state.state import MachineState, State
+from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
 from stiffness_monitor.compliance import compliance, kernels, strain_energy
 from stiffness_monitor.statics import frame_deflections
@@ -48,7 +49,7 @@ class MachineStateNode(health.TwinNode):
     """What others need to see the machine: rviz2, Foxglove, robot_state_publisher, plots."""
 
     def __init__(self) -> None:
-        super().__init__("machine_state")
+        super().__init__("machine_state", executor="events")
         robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
         settings = self._declare_settings()
         self._frames = {
@@ -61,6 +62,12 @@ class MachineStateNode(health.TwinNode):
         )
         mounts = declare_mounts(self, self._frames["platform"])
         self._core = MachineState(robot, settings, mounts)
+        self._core.pace = Pace(
+            self.declare(
+                "rate", 100.0, "of ~/joint_states, ~/pose and ~/twist at most, 0: every sample",
+                unit="Hz", low=0.0, high=1e4, read_only=True,
+            )
+        )  # fmt: skip
         self._scene = Scene(robot, self._declare_scales())
         self._elastic = _is_elastic(robot)
         _warm_up(robot)
@@ -69,7 +76,12 @@ class MachineStateNode(health.TwinNode):
         self._pose = self.create_guarded_publisher(PoseStamped, "~/pose")
         self._twist = self.create_guarded_publisher(TwistStamped, "~/twist")
         self._description = self.create_guarded_publisher(String, "robot_description", latched=True)
-        self._urdf = robot_urdf(robot)
+        # Hardware only where it is asked for: a controller_manager beside would load and move it.
+        hardware = self.declare(
+            "hardware_plugin", "", "of the ros2_control element in robot_description; empty: no "
+            "such element", read_only=True,
+        )  # fmt: skip
+        self._urdf = robot_urdf(robot, hardware)
         self._transforms = self._create_transforms()
         self._transforms_due = 0
         self._drawn = 0
@@ -206,6 +218,8 @@ class MachineStateNode(health.TwinNode):
             self._core.refuse_joint_state(error)
             raise
         state = self._core.joint_state(message, self.now())
+        if state is None:
+            return
         stamp = Time(nanoseconds=state.stamp).to_msg()
         base = self._core.settings.base_frame
         quaternion = rotations.to_quaternion(state.rotation)
@@ -227,6 +241,8 @@ class MachineStateNode(health.TwinNode):
         """Of the latest state: shapes are for the eye, and elasticity takes its milliseconds."""
         state = self._core.latest
         if not self.active or state is None or state.stamp == self._drawn:
+            return
+        if not self._markers.get_subscription_count():
             return
         self._drawn = state.stamp
         shapes = self._scene.shapes(state, self._load(state))
@@ -274,6 +290,10 @@ def _warm_up(robot: Robot) -> None:
     robot.passive_rates(q, np.zeros_like(q))
     robot.platform_jacobian(q)
     robot.placements(q)
+
+
+NODE = MachineStateNode
+"""What a process of several nodes makes."""
 
 
 def main() -> None:

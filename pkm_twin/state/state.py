@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.messages import SECOND, JointSample, WrenchSample, as_message_error
+from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.pairing import PairingCore
 from pkm_twin.streams.wrench import Mount, Recent, check_order
 
@@ -47,24 +48,31 @@ class MachineState(PairingCore):
         super().__post_init__()
         self.joint_names = (*self.robot.joint_names, *self.robot.passive_joints)
         self.latest: State | None = None
+        self.pace = Pace(0.0)
+        self._last_stamp = 0
         self._recent: Recent[tuple[WrenchSample, Mount]] = Recent()
 
     def reset(self) -> None:
         """Forget the past, as when the clock jumps."""
         self.latest = None
+        self.pace.reset()
         self._recent.clear()
 
-    def joint_state(self, message: Any, now: int) -> State:
-        """The machine's state at a sensor_msgs/JointState.
+    def joint_state(self, message: Any, now: int) -> State | None:
+        """The machine's state at a sensor_msgs/JointState; None where ``pace`` leaves it out.
 
         :raises MessageError: the message is rejected, and counted.
         """
         with self._judging(self.states):
             sample = self._reader.joint_state(message, now, self._rules)
             if self.latest is not None:
-                check_order(sample.stamp, self.latest.stamp)
+                check_order(sample.stamp, self._last_stamp)
+            if not self.pace.due(sample.stamp):
+                self._last_stamp = sample.stamp
+                return None
             state: State = as_message_error(self._state, sample)
-        self.latest = state
+        self.latest, self._last_stamp = state, sample.stamp
+        self.pace.answered(sample.stamp)
         return state
 
     def wrench(self, message: Any, now: int) -> None:

@@ -5,13 +5,16 @@ import json
 import os
 import random
 
+import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
+from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.topics import JOINT_STATE, WRENCH
 from pkm_twin.bags.reader import BagWriter, inspect, open_bag, read_messages
 from test.bags.folders import make_folder
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
+from test.support.mapped import sides
 from test.support.robots import massless, often
 
 JOINTS = "/joint_states"
@@ -109,6 +112,30 @@ def test_a_fault_is_bad_and_named(twin, tmp_path, change, what, value):
     shown = twin("check", bag)
     assert shown.code == 1
     assert what in shown.out.splitlines()[-1]
+
+
+@pytest.mark.parametrize("effort", [0.0, 0.1])
+def test_drives_that_are_off_or_braked_are_left_out(twin, tmp_path, effort):
+    """The machine stands for 0.41 s; a part of it without efforts, then all that is judged."""
+
+    def braked(topic, message, time):
+        if topic == JOINTS and time < 0.3:
+            message.effort = [effort] * 3
+        return message
+
+    result = twin("check", rewrite(DELTA, tmp_path / "braked.mcap", braked), "--json")
+    assert (result.code, result.err) == (0, "")
+    items = items_of(result)
+    item = items["drives off or braked"]
+    assert item["verdict"] == "good"
+    assert 0.28 < float(item["value"].split()[0]) < 0.45
+    assert sum("torque residual of" in what for what in items) == 3
+    bag = rewrite(DELTA, tmp_path / "off.mcap", braked, seconds=0.29)
+    result = twin("check", bag, "--json")
+    assert (result.code, result.err) == (0, "")
+    items = items_of(result)
+    assert items["drives off or braked"]["verdict"] == "unknown"
+    assert not any("torque residual" in what for what in items)
 
 
 def test_only_the_contradicted_joint_is_bad(twin, tmp_path):
@@ -404,18 +431,42 @@ class TestTopics:
         assert twin("torques", "delta_cu", bag, "--no-picture", "--out", out).code == 0
 
     def test_joints_are_those_of_the_controller(self, twin, tmp_path, variant):
-        names = {"arm_1": "motor_a", "arm_2": "motor_b", "arm_3": "motor_c"}
-        variant("delta_cu", joint_map={model: {"name": name} for model, name in names.items()})
+        """By name and number: the verdict and the table are those of the model's numbers."""
+        both = sides("delta_cu")
+        variant("delta_cu", joint_map=both.data["joint_map"])
 
-        def renamed(topic, message, time):
-            if topic == JOINTS:
-                message.name = [names[name] for name in message.name]
+        def plain(topic, message, time):
+            return message if topic == JOINTS else None
+
+        def mapped(topic, message, time):
+            if topic != JOINTS:
+                return None
+            order = [both.plain.joint_names.index(name) for name in message.name]
+            back = np.argsort(order)
+            message.name = [both.names[k] for k in order]
+            for field, turn in (
+                ("position", both.positions), ("velocity", both.rates), ("effort", both.efforts)
+            ):  # fmt: skip
+                values = np.array(getattr(message, field))[back]
+                setattr(message, field, turn(values)[order].tolist())
             return message
 
-        bag = rewrite(DELTA, tmp_path / "named.mcap", renamed, seconds=0.3)
+        one = rewrite(DELTA, tmp_path / "plain.mcap", plain, seconds=0.3)
+        bag = rewrite(DELTA, tmp_path / "mapped.mcap", mapped, seconds=0.3)
         robot = tmp_path / "delta_cu_variant.yaml"
-        assert twin("check", bag, "--robot", robot).code == 0
+        result, expected = twin("check", bag, "--robot", robot), twin("check", one)
+        assert result.code == expected.code == 0
+        kept = [line for line in expected.out.splitlines() if "residual" in line]
+        assert kept and [line for line in result.out.splitlines() if "residual" in line] == kept
         assert "'arm_1' is missing" in twin("check", bag).one_line_error()
+        tables = []
+        for name, source in (("delta_cu", one), (robot, bag)):
+            out = tmp_path / f"{source.stem}.csv"
+            assert twin("torques", name, source, "--no-picture", "--out", out).code == 0
+            tables.append(read_columns(out))
+        assert list(tables[1]) == list(tables[0])
+        for name, values in tables[0].items():
+            np.testing.assert_allclose(tables[1][name], values, rtol=1e-6, atol=1e-6)
 
     def test_a_topic_can_be_named(self, twin, tmp_path):
         bag = with_others(DELTA, tmp_path / "all.mcap")

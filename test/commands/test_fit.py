@@ -36,6 +36,7 @@ def table(path, robot, seconds=6.0, efforts=True):
 
 
 def test_fit_of_a_table_writes_a_robot_with_deviations_and_a_report(capsys, tmp_path):
+    pytest.importorskip("cvxpy")
     true = load("five_bar").changed(
         friction={"viscous": [0.03, 0.05], "coulomb": [0.2, 0.15]},
         payload={"mass": 0.2, "com": [0.03, 0.0, 0.01], "inertia": [1e-4, 1e-4, 1e-4]},

@@ -96,27 +96,6 @@ with interrupts.first_signal(lambda: SystemExit(7)):
     assert done.returncode == 7
 
 
-def test_where_something_else_ends_a_block_a_signal_raises_nothing():
-    """Not in a destructor either, which would print a traceback and lose it."""
-    script = """
-import signal
-from pkm_twin.ros.signals import first_signal, nothing_raised
-class Ending:
-    def __del__(self):
-        signal.raise_signal(signal.SIGINT)
-        print("ended", flush=True)
-with first_signal(KeyboardInterrupt):
-    with nothing_raised():
-        Ending()
-print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN, flush=True)
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=environment(), capture_output=True, text=True
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.split() == ["ended", "True"]
-
-
 def open_files(process):
     """What a process has open; one that is closed meanwhile is left out."""
     names = set()

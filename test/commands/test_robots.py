@@ -259,7 +259,7 @@ class TestEnds:
 
 def test_a_picture_that_cannot_be_written_is_one_line(twin, tmp_path):
     for path, why in (
-        (tmp_path / "none" / "a.png", "No such file"),
+        (tmp_path / "none" / "a.png", "there is no folder"),
         (tmp_path / "a", ".png or .svg"),
     ):
         result = twin("info", "five_bar", "--picture", str(path))

@@ -370,7 +370,7 @@ def test_parquet_has_the_same_columns(twin, tmp_path):
     [
         ("delta_cuu", DELTA, "t.csv", "did you mean 'delta_cu'"),
         ("delta_cu", DELTA, "t.txt", ".csv or .parquet"),
-        ("delta_cu", DELTA, "absent/t.csv", "cannot write"),
+        ("delta_cu", DELTA, "absent/t.csv", "there is no folder"),
         ("delta_cu", "absent.csv", "t.csv", "absent.csv"),
         ("delta_cu", "absent.mcap", "t.csv", "does not exist"),
         ("prru", DELTA, "t.csv", "slider_1"),

@@ -60,8 +60,14 @@ or all numbers below a name together (`joints_compliance`): each an independent 
 `torque_deviation` and `compliance_deviation` follow. Either `deviation`, the standard deviation in
 the number's own unit, or `relative`, that of a common factor."""
 
-JOINT_MAP = """Between a controller's numbers and the model's: its name for the joint, and
-controller = offset + sign * ratio * model."""
+JOINT_MAP = """Converts between the controller's names and numbers of a joint and the model's:
+controller = offset + sign * ratio * model for positions, without the offset for velocities and
+accelerations, divided by sign * ratio for efforts, so that power is the same on both sides.
+
+Messages and bags carry the controller's names and numbers, and so does the table of poses that
+`calibrate` reads. Everything else has the model's: the Python API, parameters of nodes
+(`effort_limits`, `friction.*`, `start`), the tables of `torques` and `fit`, the exported code, and
+`machine_state`'s `~/joint_states`, whose joints are those of the URDF."""
 ELEMENTS = """### `element_compliance`
 
 Factors on the compliance of elastic elements by their names (those of `strain_energy`: members

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from delta_dynamics import Contact, ContactMonitor
+from delta_dynamics import Contact, ContactMonitor, inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.apps.check import motion
 from pkm_twin.apps.recorded import Recording, read_recording
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.entries import given
-from test.support.robots import load
+from test.laws.contacts import OFF, REST, measured, moves, pushed, seen_after
+from test.support.robots import load, partly_long
 
 Array = NDArray[np.float64]
 
@@ -88,3 +89,98 @@ def test_a_model_that_is_less_sure_lets_more_pass() -> None:
 def test_what_cannot_be_a_bound_is_refused() -> None:
     with pytest.raises(ValueError, match="sigmas is 0, allowed above 0"):
         ContactMonitor(load("delta"), sigmas=0.0)
+
+
+WATCHED = partly_long(
+    ["delta_cu", "linear_delta", "rps3", "stewart", "prru", "upr_rpu", "five_bar"],
+    "delta_cu", "linear_delta",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(1, marks=pytest.mark.long), pytest.param(2, marks=pytest.mark.long)]
+)
+@pytest.mark.parametrize("name", WATCHED)
+class TestDepartures:
+    """Machines that depart from their models by a few percent, after two seconds of rest."""
+
+    @pytest.mark.parametrize("what", [what for what in OFF if "10 %" not in what])
+    def test_they_touch_nothing(self, name: str, seed: int, what: str) -> None:
+        robot, rng = load(name), np.random.default_rng(seed)
+        stream = measured(robot, rng, moves(robot, rng, 5, 0.7), **OFF[what])
+        assert not stream.watched(robot).any()
+
+    def test_a_push_is_seen_all_the_same(self, name: str, seed: int) -> None:
+        """Of a third of the peak effort, in motion."""
+        robot, rng = load(name), np.random.default_rng(seed)
+        motion = moves(robot, rng, 5, 0.7)
+        begin = rng.uniform(REST + 0.4, REST + 1.0)
+        wrench = pushed(robot, rng, motion, 0.35, begin)
+        stream = measured(robot, rng, motion, wrench=wrench, masses=0.03, friction=0.03)
+        assert seen_after(stream, robot, begin) < 0.06
+
+    def test_friction_that_is_left_out_is_learnt(self, name: str, seed: int) -> None:
+        """A tenth of the peak effort: whatever it looked like before, it is no contact then."""
+        robot, rng = load(name), np.random.default_rng(seed)
+        stream = measured(robot, rng, moves(robot, rng, 14, 0.7), friction=0.1)
+        touching = stream.watched(robot)
+        assert not touching[len(touching) // 2 :].any()
+
+
+def test_a_push_that_lasts_is_no_friction() -> None:
+    """Both ways, for seconds: it pushes one way only."""
+    robot, rng = load("delta_cu"), np.random.default_rng(1)
+    motion = moves(robot, rng, 14, 0.7)
+    wrench = pushed(robot, rng, motion, 0.6, REST + 0.5)
+    touching = measured(robot, rng, motion, wrench=wrench).watched(robot)
+    assert touching[motion[0] > REST + 1.0].mean() > 0.9
+
+
+def test_a_push_at_rest_is_seen() -> None:
+    """Also against joints that stick, beyond what their friction bears."""
+    for name, share in (("delta_cu", 0.15), ("linear_delta", 0.5)):
+        robot, rng = load(name), np.random.default_rng(2)
+        motion = moves(robot, rng, 1, 0.7)
+        wrench = pushed(robot, rng, motion, share, 1.0)
+        stream = measured(robot, rng, motion, wrench=wrench)
+        assert seen_after(stream, robot, 1.0) < 0.06
+
+
+def test_joints_that_stick_are_no_contact() -> None:
+    """At rest friction is anything up to its size, and stays so."""
+    robot, rng = load("linear_delta"), np.random.default_rng(3)
+    home, still = robot.inverse(robot.home()), np.zeros(3)
+    held = inverse_dynamics(robot, home, still, still)
+    monitor = ContactMonitor(robot)
+    for k in range(1500):
+        stuck = robot.friction.coulomb * np.array([0.95, -0.95, 0.95]) * (k > 500)
+        qd = 1e-4 * rng.normal(size=3)
+        found = monitor.push(2e-3 * k, (home, qd, still), held + stuck + 0.01 * rng.normal(size=3))
+        assert found is None or not found.touching
+
+
+@pytest.mark.parametrize("braked", [0.0, 0.3])
+def test_drives_that_are_off_or_braked_are_no_contact(braked: float) -> None:
+    """Off from the first sample on; then on; then off at once."""
+    robot, rng = load("delta_cu"), np.random.default_rng(4)
+    home, still = robot.inverse(robot.home()), np.zeros(3)
+    held = inverse_dynamics(robot, home, still, still)
+    monitor, idle = ContactMonitor(robot), []
+    for k in range(3000):
+        live = k // 1000 == 1
+        effort = held + 2e-3 * rng.normal(size=3) if live else braked * held
+        found = monitor.push(1e-3 * k, (home, 1e-5 * rng.normal(size=3), still), effort)
+        idle.append(monitor.drives.idle)
+        # A jump to another effort looks like a push until it has lasted.
+        assert found is None or not found.touching or (braked and 0 <= k - 2000 < 120)
+    idle_parts = np.array(idle).reshape(3, 1000)[:, 600:].mean(1)
+    np.testing.assert_array_equal(idle_parts, [1.0, 0.0, 1.0])
+
+
+def test_the_default_is_used_where_the_file_says_nothing_of_efforts() -> None:
+    robot = load("delta_cu")
+    data = {**given(robot.parameter_sections()), "mechanism": robot.mechanism}
+    sure = robot_of_data({**data, "uncertainty": {"inertia": {"relative": 0.02}}}, "sure")
+    assert ContactMonitor(sure).stated
+    # The second one is unsure of its elastic parts alone.
+    assert not ContactMonitor(robot).stated and not ContactMonitor(load("upr_rpu")).stated

@@ -7,9 +7,11 @@ import weakref
 
 import numpy as np
 import pytest
+import yaml
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, mass_matrix
-from test.support.robots import load
+from pkm_twin.kinematics.engine import Engine
+from test.support.robots import load, parameters_of
 
 
 @pytest.mark.parametrize("heavy_first", [True, False])
@@ -82,3 +84,17 @@ def test_directions_of_reactions_are_each_machines_own():
     ]  # fmt: skip
     assert np.abs(one.values[along]).max() > 100.0
     np.testing.assert_allclose(other.values[along], -one.values[along], atol=1e-9)
+
+
+def test_states_near_home_are_found_once_a_geometry(monkeypatch, tmp_path):
+    """Also where a file leaves the pose's coordinates to be chosen, by an engine without any."""
+    data = parameters_of("rps3")
+    del data["pose"]
+    data["origin"] = [0.001, 0.0, 0.6]
+    path = tmp_path / "chosen.yaml"
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+    found = []
+    once = Engine._near_home
+    monkeypatch.setattr(Engine, "_near_home", lambda self: found.append(self) or once(self))
+    load(path).engine.check()
+    assert len(found) == 1

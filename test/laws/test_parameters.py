@@ -366,6 +366,11 @@ class TestFiles:
             "payload: 'open\n",
             "payload: \x00\n",
             "payload: {com: 2001-99-99}\n",
+            "payload: {mass: 1_0}\n",
+            "payload: {mass: 1_0.5}\n",
+            "payload: {mass: 1:30}\n",
+            "payload: {mass: 010}\n",
+            "payload: {mass: 0x10}\n",
             "payload: {mass: 0x" + "f" * 3000 + "}\n",
             "payload: 0x" + "f" * 5000 + "\n",
             "payload: {mass: " + "9" * 5000 + "}\n",
@@ -403,6 +408,12 @@ class TestFiles:
 
     def test_many_keys_are_refused(self, load_text):
         refusal(load_text, "".join(f"k{i}: 0\n" for i in range(7000)))
+
+    @pytest.mark.parametrize(
+        "text", ["5e-1", "5.0e-1", "5.0E-1", ".5e0", "5.e-1", "+0.5", "0.05e1"]
+    )
+    def test_a_number_is_one_however_it_is_written(self, load_text, text):
+        assert load_text(f"{self.GOOD}\npayload: {{mass: {text}}}\n").payload.mass == 0.5
 
     @pytest.mark.parametrize(
         "path", ["/dev/zero", "/dev/null", "/", "/nonexistent.yaml", "a\0.yaml"]

@@ -96,3 +96,118 @@ def test_a_reset_forgets_the_load_alone() -> None:
     assert found.mass == pytest.approx(0.0, abs=1e-9)
     assert found.mass_deviation > 1.0
     assert estimator.push(10.0, q[0], qd[0], qdd[0], effort[0]) is None
+
+
+def test_a_stream_four_times_as_fast_is_not_surer() -> None:
+    """Errors last for a while: samples closer together than that share one and the same."""
+    robot = load("stewart").changed(payload={"mass": 0.0})
+    laden = robot.changed(payload={"mass": 1.3, "com": [0.03, -0.02, 0.05]})
+    time, q, qd, qdd = moved(robot, 2.0)
+    effort = inverse_dynamics(laden, q, qd, qdd)
+    found = []
+    for step in (1, 4):
+        estimator = PayloadEstimator(robot)
+        rows = (array[::step] for array in (time, q, qd, qdd, effort))
+        for sample in zip(*rows, strict=True):
+            estimator.push(*sample)
+        found.append(estimator.estimate().mass_deviation)
+    assert found[0] == pytest.approx(found[1], rel=0.1)
+
+
+def test_what_is_known_of_a_wrench_is_not_taken_for_a_load() -> None:
+    robot = load("stewart").changed(payload={"mass": 0.0})
+    laden = robot.changed(payload={"mass": 1.3})
+    time, q, qd, qdd = moved(robot, 1.0)
+    wrench = np.array([20.0, -10.0, 30.0, 1.0, 2.0, -1.0])
+    effort = inverse_dynamics(laden, q, qd, qdd, wrench)
+    masses = []
+    for known in (wrench, None):
+        estimator = PayloadEstimator(robot)
+        for sample in zip(time, q, qd, qdd, effort, strict=True):
+            estimator.push(*sample, known)
+        masses.append(estimator.estimate().mass)
+    assert masses[0] == pytest.approx(1.3, rel=0.01)
+    assert abs(masses[1] - 1.3) > 1.0
+
+
+def test_after_a_long_pause_a_load_is_as_unknown_as_any() -> None:
+    """What fades away gives place to what is known of any load: it never is less than that."""
+    robot = load("stewart").changed(payload={"mass": 0.0})
+    time, q, qd, qdd = moved(robot, 0.5)
+    effort = inverse_dynamics(robot, q, qd, qdd)
+    estimator = PayloadEstimator(robot, mass_range=5.0, reach=0.2)
+    for sample in zip(time, q, qd, qdd, effort, strict=True):
+        estimator.push(*sample)
+    surer = estimator.estimate()
+    found = estimator.push(time[-1] + 1e4, q[-1], qd[-1], qdd[-1], effort[-1])
+    assert found is not None
+    assert surer.mass_deviation < found.mass_deviation <= 5.0
+    assert abs(found.mass) < 0.1
+
+
+def swung(robot: Robot, seconds: float) -> tuple[Array, Array, Array, Array]:
+    """The same from home on: no jump where a machine that stood at home begins to move."""
+    time, q, qd, qdd = moved(robot, seconds)
+    return time, q - q[0] + robot.inverse(robot.home()), qd, qdd
+
+
+@pytest.mark.parametrize("name", ["delta_cu", "linear_delta"])
+@pytest.mark.parametrize("braked", [0.0, 0.02])
+def test_drives_that_are_off_or_braked_weigh_nothing(name: str, braked: float) -> None:
+    """Two seconds of zero or constant efforts at standstill, then the drives of a laden machine."""
+    robot = load(name)
+    laden = robot.changed(payload={"mass": 0.4})
+    home, still = robot.inverse(robot.home()), np.zeros(robot.joints_count)
+    held = inverse_dynamics(laden, home, still, still)
+    estimator = PayloadEstimator(robot)
+    for k in range(500):
+        found = estimator.push(PERIOD * k, home, still, still, braked * held)
+        assert found is None or k < 30
+    assert estimator.drives.idle
+    known = estimator.estimate()
+    assert 0.0 <= known.mass < 3.0 * known.mass_deviation
+    time, *motion = swung(robot, 3.0)
+    effort = inverse_dynamics(laden, *motion)
+    for sample in zip(time + 2.1, *motion, effort, strict=True):
+        found = estimator.push(*sample)
+    assert found is not None and not estimator.drives.idle
+    assert found.mass == pytest.approx(0.4, rel=0.03)
+
+
+@pytest.mark.parametrize("share", [-0.2, -1.0])
+def test_no_load_is_lighter_than_none(share: float) -> None:
+    """Efforts that ask for a mass below zero: it is zero, with a deviation that covers theirs."""
+    robot = load("delta_cu")
+    time, q, qd, qdd = moved(robot, 2.0)
+    bare = inverse_dynamics(robot, q, qd, qdd)
+    heavy = inverse_dynamics(robot.changed(payload={"mass": 1.0}), q, qd, qdd)
+    effort = bare + share * (heavy - bare)
+    estimator = PayloadEstimator(robot)
+    for sample in zip(time, q, qd, qdd, effort, strict=True):
+        found = estimator.push(*sample)
+        assert found is None or found.mass >= 0.0
+    assert found is not None
+    assert found.mass == 0.0
+    assert found.asked == pytest.approx(share, rel=0.02)
+    assert found.mass_deviation >= abs(found.asked)
+    np.testing.assert_array_equal(found.com, robot.payload.com)
+    assert np.isinf(found.com_deviation).all()
+
+
+def test_at_rest_dry_friction_may_bear_a_part_of_the_load() -> None:
+    """What it bears stays the same as long as the joint stands, so time makes nothing surer."""
+    robot = load("linear_delta")
+    load_mass, rng = 0.5, np.random.default_rng(4)
+    laden = robot.changed(payload={"mass": load_mass})
+    home, still = robot.inverse(robot.home()), np.zeros(3)
+    held = inverse_dynamics(laden, home, still, still)
+    misses = []
+    for _ in range(6):
+        stuck = rng.uniform(-1.0, 1.0, 3) * robot.friction.coulomb
+        estimator = PayloadEstimator(robot)
+        for k in range(400):
+            noise = 0.01 * rng.normal(size=3)
+            found = estimator.push(PERIOD * k, home, still, still, held + stuck + noise)
+        assert found is not None
+        misses.append((found.mass - load_mass) / found.mass_deviation)
+    assert np.abs(misses).max() < 3.0

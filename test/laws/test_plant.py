@@ -1,14 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine that moves: energy, an independent engine, dry friction, stops."""
+"""A machine that moves: energy, an independent engine, friction, stops."""
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from delta_dynamics import energy, inverse_dynamics, mass_matrix
-from delta_dynamics.plant import Plant, _least
-from test.support.robots import FREE, load, massive, random_joints
+from delta_dynamics.complementarity import resisting
+from delta_dynamics.equations import Equations
+from delta_dynamics.plant import Plant
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.inertia import loaded_joints
+from test.machine.random_machines import FILES, variant
+from test.support.robots import (
+    FREE,
+    MASSIVE,
+    joint_units_of_size,
+    load,
+    massive,
+    often,
+    partly_long,
+    random_joints,
+)
 
 STEP = 1e-3
 NO_WRENCH = np.zeros(6)
@@ -25,6 +41,11 @@ def rubs_inside(robot):
     """Whether a passive joint has friction."""
     return any(joint.viscous or joint.coulomb for joint in robot.graph.joints.values()
                if not joint.actuated)  # fmt: skip
+
+
+def inner_friction(robot):
+    """Dry friction of all passive joints, N m or N."""
+    return sum(joint.coulomb for joint in loaded_joints(robot.graph))
 
 
 def beside_rest(robot):
@@ -147,18 +168,211 @@ def test_stops_hold_and_let_go():
 
 
 @pytest.mark.parametrize("n", range(1, 7))
-def test_rates_under_dry_friction_obey_coulomb(n, rng):
-    for _ in range(50):
+def test_forces_of_friction_and_stops_obey_coulomb(n, rng):
+    for k in range(60):
         root = rng.normal(size=(n, n))
         matrix = root @ root.T + 0.1 * np.eye(n)
-        free, dry = rng.normal(size=n), rng.uniform(0.0, 1.0, n)
-        low, high = -rng.uniform(0.0, 2.0, n), rng.uniform(0.0, 2.0, n)
-        v = _least(matrix, free, dry, low, high)
-        impulse = matrix @ (free - v)
-        size = 1e-8 * np.linalg.norm(matrix)
-        assert (v >= low).all() and (v <= high).all()
+        motion, dry = rng.normal(size=n), rng.uniform(0.0, 1.0, n)
+        # A row at a stop is pushed back as hard as it takes; others rub alone.
+        low = np.where(rng.random(n) < 0.2, -np.inf, -dry)
+        high = np.where(rng.random(n) < 0.2, np.inf, dry)
+        if k % 3 == 0 and n > 1:
+            # One row says the same as another.
+            matrix[-1], motion[-1] = matrix[0], motion[0]
+            matrix[:, -1] = matrix[:, 0]
+            matrix[-1, -1] = matrix[0, 0]
+        force, states = resisting(matrix, motion, low, high, rng.integers(-1, 2, n))
+        left = motion - matrix @ force
+        size = 1e-6 * max(1.0, np.abs(motion).max() + np.abs(matrix @ np.minimum(dry, 1.0)).max())
+        assert (force >= low - size).all() and (force <= high + size).all()
         for j in range(n):
-            least, most = (dry[j] * s for s in ((-1, 1) if v[j] == 0.0 else (np.sign(v[j]),) * 2))
-            # A stop pushes back as hard as it takes.
-            assert impulse[j] >= (-np.inf if v[j] == low[j] else least - size)
-            assert impulse[j] <= (np.inf if v[j] == high[j] else most + size)
+            assert left[j] >= -size or force[j] <= low[j] + size
+            assert left[j] <= size or force[j] >= high[j] - size
+            assert states[j] or abs(left[j]) <= size
+
+
+# Of the chain rccc every state is near a singularity.
+UNSEEN = {name: load(path) for name, path in FILES.items() if name not in (*MASSIVE, "rccc")}
+VARIANTS = ("five_bar", "elbow_motors", "rps3", "hinged_platform", "rrr3_spherical")
+
+
+@pytest.fixture(scope="module")
+def machine():
+    """A robot by its name: shipped, of a file, or of random dimensions with friction all over."""
+    made = {}
+
+    def get(name):
+        if name not in made:
+            kind, _, what = name.partition(" ")
+            rng = np.random.default_rng([3, len(name)])
+            if kind == "random":
+                made[name] = robot_of_data(variant(what, rng), what)
+            else:
+                made[name] = UNSEEN[name] if name in UNSEEN else load(name)
+        return made[name]
+
+    return get
+
+
+def every_machine(*kept):
+    """Shipped machines, those of files, and random ones; ``kept`` are run by default."""
+    names = [*MASSIVE, *UNSEEN, *(f"random {name}" for name in VARIANTS)]
+    return pytest.mark.parametrize("name", partly_long(names, *kept))
+
+
+def rubbing(robot, rng, q):
+    """The robot with friction from none to a locked drive, and stops about q."""
+    n, scale = robot.joints_count, joint_units_of_size(robot)
+    changes = {
+        "friction": {
+            "viscous": rng.choice([0.0, 0.0, 1e-3, 0.1, 1.0, 28.0, 1e3, 1e6], n).tolist(),
+            "coulomb": rng.choice([0.0, 0.0, 0.01, 1.0, 30.0], n).tolist(),
+        }
+    }
+    if robot.mechanism == "machine" or hasattr(robot.limits, "position"):
+        room = rng.choice([0.01, 0.1]) * scale
+        stops = np.stack([q - room * rng.random(n), q + room * rng.random(n)], 1)
+        try:
+            return robot.changed(**changes, limits={"position": stops.tolist()})
+        except PkmTwinError:
+            # Of some mechanisms limits are about another quantity.
+            pass
+    return robot.changed(**changes)
+
+
+def balance(plant, effort):
+    """Mechanical energy less the work of constant efforts, J; and what it is a sum of."""
+    both = energy(plant.robot, plant.q, plant.qd)
+    parts = [float(both.kinetic), float(both.potential), -float(effort @ plant.q)]
+    return sum(parts), sum(map(abs, parts))
+
+
+@every_machine("delta_cu", "upr_rpu", "rps3", "gantry", "random five_bar", "random elbow_motors")
+@pytest.mark.parametrize("trials", often(5, 40))
+def test_energy_never_grows_without_input(name, trials, machine):
+    robot = machine(name)
+    n, scale = robot.joints_count, joint_units_of_size(robot)
+    moved = 0
+    for trial in range(trials):
+        rng = np.random.default_rng([11, trial, n, len(name)])
+        q = random_joints(robot, rng, 1)[0]
+        plant = Plant(rubbing(robot, rng, q), q)
+        plant.qd = rng.normal(0.0, rng.choice([0.0, 0.1, 1.0, 5.0]), n) * scale
+        effort = rng.normal(0.0, 1.0, n) * rng.choice([0.0, 1.0, 10.0])
+        step = rng.choice([1e-4, 1e-3, 5e-3])
+        before, size = balance(plant, effort)
+        for _ in range(40):
+            try:
+                plant.advance(effort, NO_WRENCH, step)
+            except PkmTwinError:
+                break  # where it cannot be assembled
+            if plant.robot.singularity(plant.q) < 1e-2:
+                break  # nor simulated
+            now, size = balance(plant, effort)
+            assert now <= before + 1e-12 * (size + np.abs(effort) @ np.abs(plant.q)), (trial, step)
+            before = now
+            moved += 1
+    assert moved > 15 * trials
+
+
+@every_machine("delta_cu", "rps3", "random hinged_platform")
+def test_an_impact_is_the_least_change_that_all_stops_allow(name, machine, rng):
+    robot = machine(name)
+    n = robot.joints_count
+    for trial in range(6):
+        q = random_joints(robot, rng, 1)[0]
+        stopped = rng.random(n) < 0.6
+        stops = np.stack([q - 1.0, np.where(stopped, q, q + 1.0)], 1)
+        try:
+            plant = Plant(robot.changed(limits={"position": stops.tolist()}), q)
+        except PkmTwinError:
+            pytest.skip("its limits are of another kind")
+        qd = rng.normal(0.0, 1.0, n) * joint_units_of_size(robot)
+        plant.qd = qd.copy()
+        instant = 1e-9
+        plant.advance(np.zeros(n), NO_WRENCH, instant)
+        # Of all choices of who is stopped the one that obeys the laws of impact.
+        masses, found = mass_matrix(robot, q), []
+        for held in product([False, True], repeat=int(stopped.sum())):
+            rows = np.eye(n)[np.flatnonzero(stopped)[list(held)]]
+            back = np.linalg.solve(masses, rows.T)
+            push = np.linalg.solve(rows @ back, rows @ qd) if len(rows) else np.zeros(0)
+            after = qd - back @ push
+            if (push >= 0.0).all() and (after[stopped] <= 1e-12).all():
+                found.append(after)
+        assert found, trial
+        size = np.abs(qd).max()
+        assert np.abs(plant.qd - found[0]).max() < 1e-5 * size
+
+
+@every_machine("delta_cu", "rps3", "five_bar", "random elbow_motors")
+def test_stick_and_slip_at_the_default_step_is_that_of_small_steps(name, machine):
+    robot = machine(name)
+    n = robot.joints_count
+    q = robot.inverse(robot.home())
+    weight = inverse_dynamics(smooth(robot), q, 0.0 * q, 0.0 * q)
+    dry = 0.2 * np.abs(weight).max() + 0.02 + 4.0 * inner_friction(robot)
+    rng = np.random.default_rng(len(name))
+    robot = robot.changed(friction={"coulomb": (dry * rng.uniform(0.8, 1.0, n)).tolist()})
+    turn, phase = 2.0 * np.pi * rng.uniform(4.0, 12.0, n), rng.uniform(0.0, 6.0, n)
+    ends, stuck = [], 0
+    for parts in (1, 10):
+        plant = Plant(robot, q)
+        for k in range(300):
+            effort = weight + 1.5 * dry * np.sin(turn * k * STEP + phase)
+            for _ in range(parts):
+                before = plant.q
+                plant.advance(effort, NO_WRENCH, STEP / parts)
+            stuck += int((plant.q == before).any())
+        ends.append(plant.q)
+    print(f"{name}: {np.abs(ends[0] - ends[1]).max():.1e}, moved {np.abs(ends[1] - q).max():.1e}")
+    assert np.abs(ends[0] - ends[1]).max() < 1e-7
+    assert np.abs(ends[1] - q).max() > 1e-5 and stuck
+
+
+@pytest.mark.parametrize("decay", [0.01, 0.3, 2.8, 50.0, 1e5])
+def test_viscous_friction_is_exact_however_stiff(decay):
+    """Of one mass that a constant force moves: rate and place are known."""
+    robot = load(GANTRY)
+    q = robot.inverse(robot.home())
+    mass = mass_matrix(robot, q)[0, 0]
+    drag = decay * mass / STEP
+    robot = robot.changed(friction={"viscous": [drag, 0.0, 0.0], "coulomb": [0.0, 1e9, 1e9]})
+    weight = inverse_dynamics(smooth(robot), q, 0.0 * q, 0.0 * q)
+    plant, force, began = Plant(robot, q), 4.0, 0.3
+    effort = weight + np.array([force, 0.0, 0.0])
+    plant.qd = np.array([began, 0.0, 0.0])
+    for _ in range(20):
+        plant.advance(effort, NO_WRENCH, STEP)
+    time, last = 20 * STEP, force / drag
+    part = -np.expm1(-drag / mass * time)
+    assert abs(plant.qd[0] - (began + (last - began) * part)) < 1e-9 * began
+    place = last * time + (began - last) * mass / drag * part
+    assert abs(plant.q[0] - q[0] - place) < 1e-9 * abs(place)
+    assert (plant.q[1:] == q[1:]).all()
+
+
+@every_machine("rps3", "four_bar", "random five_bar")
+def test_all_terms_are_those_of_inverse_dynamics(name, machine, rng):
+    robot = machine(name)
+    n, equations = robot.joints_count, Equations(robot)
+    friction, passive = robot.friction, loaded_joints(robot.graph)
+    for q in random_joints(robot, rng, 3):
+        qd, qdd = rng.normal(size=(2, n)) * joint_units_of_size(robot)
+        wrench = rng.normal(size=6)
+        t = equations.at(q, qd)
+        efforts = t.mass @ qdd + t.bias - wrench @ t.twists
+        efforts += friction.viscous * qd + friction.coulomb * np.sign(qd) + friction.offset
+        for row, joint in zip(t.rows, passive, strict=True):
+            rate = row @ qd
+            efforts += row * (joint.viscous * rate + joint.coulomb * np.sign(rate))
+        wanted = inverse_dynamics(robot, q, qd, qdd, wrench)
+        assert np.abs(efforts - wanted).max() < 1e-11 * np.abs(wanted).max()
+        both = energy(robot, q, qd)
+        assert abs(t.kinetic - both.kinetic) < 1e-12 * (abs(t.kinetic) + 1e-9)
+        assert abs(t.potential - both.potential) < 1e-12 * (abs(t.potential) + 1.0)
+        if len(passive):
+            small = 1e-6
+            ahead, behind = (equations.at(q + s * small * qd, qd).rows for s in (1.0, -1.0))
+            drift = (ahead - behind) @ qd / (2.0 * small)
+            assert np.abs(t.drift - drift).max() < 1e-7 * (1.0 + np.abs(drift).max())

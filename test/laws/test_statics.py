@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import yaml
@@ -10,7 +12,7 @@ import yaml
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from stiffness_monitor import compliance, stiffness, strain_energy
 from stiffness_monitor.compliance import kernels
-from stiffness_monitor.statics import frame_energies
+from stiffness_monitor.statics import frame_energies, stiffness_root
 from test.support.robots import ELASTIC, load, parameters_of, random_joints
 
 FRAMES = [name for name in ELASTIC if not load(name).element_names]
@@ -169,6 +171,18 @@ def test_a_file_without_members_has_no_compliance(name, tmp_path):
     ):
         with pytest.raises(ParameterError, match="members"):
             ask()
+
+
+@pytest.mark.parametrize("left", [0.0, 1e-12, 1e-10, -1e-12])
+def test_a_frame_that_hardly_holds_is_singular(left):
+    """Not only where no factor is found: rounding alone may let one through."""
+    system = SimpleNamespace(stiffness=np.array([[2.0, 1.0 - left], [1.0 - left, 0.5]]))
+    with pytest.raises(SingularityError) as caught:
+        stiffness_root(system, (3,))
+    assert caught.value.index == (3,)
+    sound = SimpleNamespace(stiffness=np.array([[2.0, 1.0 - 1e-6], [1.0 - 1e-6, 0.5]]))
+    root = stiffness_root(sound, ())
+    np.testing.assert_allclose(root @ root.T, sound.stiffness)
 
 
 def test_equal_limbs_tie_under_an_axial_load():

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closed-loop machines as URDFs in three dialects, with link frames and joint zeros of any kind.
+"""Closed-loop machines as URDFs in four dialects, with link frames and joint zeros of any kind.
+
+Of two of them a YAML file tells the closures; ``spheres`` has a small sphere on a hinge at both
+sides of each, as drawing programs export them: one of the two hinges is one too many.
 
 They share no code with the package: each is a list of links, joints and closures in base axes at a
 closed assembly, from which the URDF is written in each link's own, randomly turned frame.
@@ -14,6 +17,12 @@ import pinocchio as pin
 
 Z = np.array([0.0, 0.0, 1.0])
 X = np.array([1.0, 0.0, 0.0])
+
+
+SPHERE = (
+    '<inertial><mass value="6e-6"/><inertia ixx="1e-11" ixy="0" ixz="0" iyy="1e-11" iyz="0" '
+    'izz="1e-11"/></inertial>'
+)
 
 
 @dataclass
@@ -91,6 +100,10 @@ class Sketch:
                 '<dynamics damping="0.1" friction="0.2"/></joint>'
             )
         pairs = []
+        # Pinocchio has two numbers for a joint without limits.
+        hinge, limit = "continuous", ""
+        if dialect == "spheres":
+            hinge, limit = "revolute", '<limit lower="-9" upper="9" velocity="7" effort="50"/>'
         for name, kind, a, b, point, axis in self.closures:
             # The two frames differ in orientation but by what the dialect lets open.
             frame = pin.SE3(frames[a].rotation, point)
@@ -110,15 +123,16 @@ class Sketch:
                 )
             else:
                 for end, link, side in zip(ends, (a, b), "AB", strict=True):
-                    last = kind == "revolute" and side == "A"
+                    turns = kind == "revolute" and (side == "A" or dialect == "spheres")
                     out.append(
-                        f'<link name="{name}_{side}"/><joint name="{name}_{side}_frame" '
-                        f'type="{"continuous" if last else "fixed"}"><parent link="{link}"/>'
+                        f'<link name="{name}_{side}">{SPHERE if dialect == "spheres" else ""}'
+                        f'</link><joint name="{name}_{side}_frame" '
+                        f'type="{hinge if turns else "fixed"}"><parent link="{link}"/>{limit}'
                         f'<child link="{name}_{side}"/>{pose("origin", end)}'
                         f'<axis xyz="{local}"/></joint>'
                     )
                 pairs.append(([f"{name}_A", f"{name}_B"], "6d" if kind == "revolute" else "3D"))
-        if dialect != "yaml":
+        if dialect not in ("yaml", "spheres"):
             commands = "".join(
                 f'<joint name="{name}"><command_interface name="effort"/></joint>'
                 for name in self.actuated
@@ -130,7 +144,7 @@ class Sketch:
             "type": [kind for _, kind in pairs],
             "name_mot": self.actuated,
         }
-        return "\n".join(out), (beside if dialect == "yaml" else None)
+        return "\n".join(out), (beside if dialect in ("yaml", "spheres") else None)
 
     def save(self, folder, dialect="constraint"):
         content, beside = self.urdf(dialect)
@@ -302,6 +316,40 @@ def stewart():
                 s.joint(f"ball_{k}", "revolute", parent, child, head, axis, 0.1 - 0.1 * k)
         else:
             s.loop(f"head_{i}", "spherical", f"piston_{i}", "platform", head)
+    return s
+
+
+def palletizer():
+    """Two motors move the platform in a plane; two parallelograms keep it from turning.
+
+    At the closed assembly both motors are at zero and no other joint is.
+    """
+    s = Sketch(seed=6)
+    y, drive = [0, 1, 0], np.array([-0.02, 0, 0])
+    far, elbow_1, elbow_2 = (
+        np.array(p) for p in ([0.02, 0, 0], [-0.09, 0, -0.05], [0.1, 0, -0.04])
+    )
+    tip, side = np.array([0.01, 0, -0.14]), np.array([0.02, 0, 0.03])
+    foot, lift = far + np.array([0.03, 0, 0.01]), np.array([0.03, 0, 0.01])
+    s.link("arm_1", 0.05, (drive + elbow_1) / 2, size=0.02)
+    s.link("fore_1", 0.04, (elbow_1 + tip) / 2, size=0.02)
+    s.link("platform", 0.06, tip + np.array([0.005, 0.002, 0]), size=0.02)
+    s.link("arm_2", 0.05, (far + elbow_2) / 2, size=0.02)
+    s.link("fore_2", 0.04, (elbow_2 + tip) / 2, size=0.02)
+    s.link("guide_1", 0.02, (foot + elbow_2 + lift) / 2, size=0.02)
+    s.link("corner", 0.02, elbow_2 + lift / 2, size=0.02)
+    s.link("guide_2", 0.02, (elbow_2 + side + tip + side) / 2, size=0.02)
+    s.joint("m1", "revolute", "ground", "arm_1", drive, y, 0.0, actuated=True)
+    s.joint("e1", "revolute", "arm_1", "fore_1", elbow_1, y, 0.7)
+    s.joint("t1", "revolute", "fore_1", "platform", tip, y, -0.9)
+    s.joint("m2", "revolute", "ground", "arm_2", far, y, 0.0, actuated=True)
+    s.joint("e2", "revolute", "arm_2", "fore_2", elbow_2, y, 0.5)
+    s.joint("g1", "revolute", "ground", "guide_1", foot, y, -0.6)
+    s.joint("g2", "revolute", "guide_1", "corner", elbow_2 + lift, y, 1.1)
+    s.joint("g3", "revolute", "corner", "guide_2", elbow_2 + side, y, -0.4)
+    s.loop("tip", "revolute", "fore_2", "platform", tip, y)
+    s.loop("elbow", "revolute", "corner", "fore_2", elbow_2, y)
+    s.loop("side", "revolute", "guide_2", "platform", tip + side, y)
     return s
 
 

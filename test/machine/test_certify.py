@@ -14,12 +14,7 @@ import pkm_twin.apps.certificate as judges
 from pkm_twin.apps import certify as certification
 from pkm_twin.apps.certify import ENGINES, Certificate, certify
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.machine.catalogue import CATALOGUE
 from test.machine.random_machines import FILES, plain
-
-needs_machines = pytest.mark.skipif(
-    "machine" not in CATALOGUE, reason="load knows no mechanism machine"
-)
 
 
 def test_judges_import_nothing_of_the_twin():
@@ -133,7 +128,6 @@ def test_a_machine_that_no_judge_can_take(echoes):
         judged(twin)
 
 
-@needs_machines
 @pytest.mark.parametrize("name", ["five_bar", "linear_delta", "rps3", "slider_crank"])
 def test_the_command_certifies_a_file(name):
     from pkm_twin import load
@@ -144,7 +138,6 @@ def test_the_command_certifies_a_file(name):
     assert result.robot == name
 
 
-@needs_machines
 def test_a_file_that_is_not_the_machine_fails(tmp_path):
     from pkm_twin import load
 

@@ -13,12 +13,8 @@ from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import random_states
 from pkm_twin.apps.certify import effort_differences, relative
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.machine.catalogue import CATALOGUE
 from test.machine.random_machines import NAMES, plain, variant
 from test.support.robots import load, partly_long
-
-if "machine" not in CATALOGUE:
-    pytest.skip("load knows no mechanism machine", allow_module_level=True)
 
 VARIANTS = int(os.environ.get("PKM_TWIN_VARIANTS", "1"))
 """Machines of other dimensions for each of the folder; hundreds for a long run."""

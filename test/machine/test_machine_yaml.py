@@ -14,6 +14,8 @@ from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.urdf_read import read_urdf
 
+pytest.importorskip("pinocchio")
+
 from .descriptions import DESCRIPTIONS
 from .sketches import SKETCHES
 

@@ -223,3 +223,20 @@ def test_included_files_are_read(tmp_path):
     (tmp_path / "part.xml").write_text('<mujoco><option gravity="0 0 -1"/></mujoco>')
     path = five_bar(tmp_path, old='<option gravity="0 -9.81 0"/>', new='<include file="part.xml"/>')
     assert read_urdf(path)["gravity"] == [0.0, 0.0, -1.0]
+
+
+@pytest.mark.parametrize("value", ["nan", "NaN", "-inf", "infinity", "nan(1)"])
+@pytest.mark.parametrize("place", ['damping="{}"', 'range="{} 60"', 'axis="0 {} 2"'])
+def test_numbers_that_are_not_finite_are_refused_by_name(value, place, tmp_path):
+    key = place.partition("=")[0]
+    old = next(word for word in ('axis="0 0 2"', 'range="-60 60"', 'damping="0.1"') if key in word)
+    path = five_bar(tmp_path, old=old, new=place.format(value))
+    with pytest.raises(ParameterError) as error:
+        read_urdf(path)
+    assert error.value.field == f"joint.m1.{key}"
+
+
+def test_a_part_may_be_called_like_such_a_number(tmp_path):
+    path = five_bar(tmp_path)
+    path.write_text(path.read_text().replace('"m1"', '"nan"'))
+    assert "nan" in read_urdf(path)["joints"]

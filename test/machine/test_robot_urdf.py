@@ -3,19 +3,23 @@
 
 from __future__ import annotations
 
+import re
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
-from pkm_twin.machine import urdf_file, urdf_xml
+from pkm_twin.machine import urdf_file, urdf_tree, urdf_xml
 from pkm_twin.machine.robot_urdf import robot_description, robot_urdf
 from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.mechanisms.machine import Machine
 from test.support.robots import load
+
+pytest.importorskip("pinocchio")
+
+import pinocchio as pin
 
 from .sketches import closure_rows
 
@@ -87,6 +91,55 @@ def test_mock_hardware_begins_inside_the_limits(robot):
     if limits is not None:
         assert (limits[:, 0] <= start).all()
         assert (start <= limits[:, 1]).all()
+
+
+def test_links_need_no_quoting_and_their_old_names_are_found(robot, tmp_path):
+    root = ET.fromstring(robot_urdf(robot))
+    links = [link.get("name") for link in root.findall("link")]
+    assert len(set(links)) == len(links)
+    assert all(re.fullmatch(r"\w+", link) for link in links)
+    assert not any(re.search(r"_I+(_|$)", link) for link in links)
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot_urdf(robot))
+    body = next(body for body in robot.graph.bodies if body != "platform")
+    assert read_urdf(path, platform=body)["platform"] == urdf_xml.plain_name(body)
+
+
+@pytest.mark.parametrize(
+    ("names", "links"),
+    [
+        (("arm I", "arm IV b", "a\tb"), ("arm_1", "arm_4_b", "a_b")),
+        (("arm Iota", "I", "V"), ("arm_Iota", "I", "V")),
+        (("arm 1", "arm I", "arm_1"), ("arm_1_body", "arm_1_body_body", "arm_1")),
+    ],
+)
+def test_a_link_s_name_is_plain_and_its_own(names, links):
+    found = urdf_tree._link_names(names)
+    assert tuple(found[name] for name in names) == links
+
+
+def test_a_description_has_hardware_as_it_is_asked_for(robot):
+    plain = ET.fromstring(robot_urdf(robot, hardware=""))
+    assert plain.find("ros2_control") is None
+    mine = ET.fromstring(robot_urdf(robot, "mine/Hardware"))
+    assert mine.find("ros2_control/hardware/plugin").text == "mine/Hardware"
+    mine.remove(mine.find("ros2_control"))
+    assert [element.tag for element in mine] == [element.tag for element in plain]
+
+
+def test_a_prefix_stands_before_every_name_of_links_and_joints(robot):
+    plain, prefixed = (ET.fromstring(robot_urdf(robot, prefix=p)) for p in ("", "left/"))
+    names = 0
+    for one, other in zip(plain.iter(), prefixed.iter(), strict=True):
+        named = one.tag in ("link", "joint", "constraint", "ros2_control")
+        for key, value in one.attrib.items():
+            changed = key == "link" or (key == "name" and named)
+            assert other.get(key) == ("left/" + value if changed else value)
+            names += changed
+    assert names > 2 * len(robot.passive_joints)
+    # Whatever names something in there names something that is there.
+    defined = {element.get("name") for element in prefixed.iter() if element.tag == "link"}
+    assert {e.get("link") for e in prefixed.iter() if e.get("link")} <= defined
 
 
 def test_the_text_is_the_same_each_time(robot):

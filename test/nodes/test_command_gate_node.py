@@ -193,7 +193,8 @@ def test_a_publisher_that_promises_no_deadline_is_told_of(heard, launch):
     gated = Gated(heard, launch, "demanding")
     heard.talk(JointState, "/demanding/torques")
     also = "incompatible QoS of another node on delta_dynamics/joint_torques: deadline"
-    gated.diagnostics(lambda a: also in values_of(a)["also"])
+    array = gated.diagnostics(lambda a: also in values_of(a)["also"])
+    assert "/peer promises torques with deadline none" in array.status[0].message
     assert all(command == ZEROS for command in gated.commands)
     gated.process.stop()
 

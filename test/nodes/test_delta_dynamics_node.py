@@ -440,9 +440,8 @@ import delta_dynamics.node as node
 original = node.DeltaDynamics.{callback}
 def interrupted(self, *arguments):
     os.kill(os.getpid(), {int(number)})
-    while self.context.ok():
-        time.sleep(0.001)
-    # The middleware refuses whatever the callback publishes now.
+    time.sleep(0.05)
+    # The topics are there until the callback is over, and for the node's last words.
     self._torques.publish(node.JointState())
 node.DeltaDynamics.{callback} = interrupted
 node.main()

@@ -15,8 +15,9 @@ from std_msgs.msg import Bool
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Torques
+from pkm_twin.machine.catalogue import robot_of_data
 from test.nodes.harness import SECOND, Maker, Ros
-from test.support.robots import load
+from test.support.robots import load, parameters_of
 
 ROBOT = load("delta_cu")
 PARAMETERS = ("estimate_payload:=true", "observe_wrench:=true", "stale_after:=600.0")
@@ -139,3 +140,58 @@ def test_a_stream_that_begins_anew_at_earlier_stamps_is_estimated_as_before(back
     assert counts[1] == pytest.approx(counts[0], abs=1)
     assert counts[0]["~/payload"] > 300
     assert counts[0]["~/external_wrench"] > 1200
+
+
+def stood(estimates, begin, seconds, effort):
+    """A machine at home: samples of these measured efforts, and their end, ns."""
+    home, still = ROBOT.inverse(ROBOT.home()), np.zeros(3)
+    held = inverse_dynamics(ROBOT, home, still, still)
+    rng = np.random.default_rng(2)
+    stamps = begin + 1_000_000 * np.arange(round(1000 * seconds))
+    for stamp in stamps.tolist():
+        measured = held + 1e-3 * rng.normal(size=3) if effort is None else np.array(effort)
+        motion = home, still, still
+        estimates.take(Torques(stamp, motion, held, measured - held, False, None, still))
+    return int(stamps[-1]) + 1_000_000
+
+
+@pytest.mark.parametrize("braked", [(0.0, 0.0, 0.0), (0.1, 0.1, 0.1)])
+def test_drives_that_are_off_or_braked_are_told_and_left_out(braked):
+    node = Topics()
+    estimates = Estimates(node, lambda: ROBOT, ("base_link", "platform"))
+    end = stood(estimates, SECOND, 1.0, None)
+    assert not estimates.idle
+    begin = stood(estimates, end, 0.15, braked)
+    counts = {topic: len(told) for topic, told in node.published.items()}
+    assert estimates.idle
+    end = stood(estimates, begin, 1.0, braked)
+    assert estimates.diagnose()["drives off or braked"] is True
+    assert {topic: len(told) for topic, told in node.published.items()} == counts
+    # What a brake does as it closes is no contact, once that is known.
+    assert not estimates.touching
+    assert all(m.inertia.m >= 0.0 for m in node.published["~/payload"])
+    stood(estimates, end, 1.0, None)
+    assert not estimates.idle
+    assert not estimates.touching
+    assert len(node.published["~/external_wrench"]) > counts["~/external_wrench"] + 400
+    assert node.published["~/payload"][-1].inertia.m < 0.01
+    # Off from the first sample on: nothing is ever told.
+    node = Topics()
+    stood(Estimates(node, lambda: ROBOT, ("base_link", "platform")), SECOND, 1.0, braked)
+    assert not node.published["~/contact"]
+    assert not [m for m in node.published["~/payload"][30:]]
+
+
+def test_a_file_that_says_nothing_of_its_efforts_is_warned_of():
+    told = []
+    for name in ("delta_cu", "upr_rpu"):
+        estimates = Estimates(Topics(), lambda name=name: load(name), ("base_link", "platform"))
+        told.append(estimates.warning())
+        assert estimates.diagnose()["model uncertainty"] == "default"
+    # One has no uncertainty, the other one of elastic parts alone.
+    assert all(told)
+    data = {**parameters_of("delta_cu"), "uncertainty": {"inertia": {"relative": 0.02}}}
+    sure = robot_of_data(data, "sure")
+    estimates = Estimates(Topics(), lambda: sure, ("base_link", "platform"))
+    assert not estimates.warning()
+    assert estimates.diagnose()["model uncertainty"] == "the file's"

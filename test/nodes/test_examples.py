@@ -14,6 +14,7 @@ from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics import inverse_dynamics
 from test.nodes.harness import REPOSITORY
+from test.support.mapped import sides
 from test.support.robots import load, parameters_of
 
 EXAMPLES = REPOSITORY / "examples"
@@ -70,16 +71,20 @@ class TestComputedTorque:
         peer.hear(Float64MultiArray, "/machine_sim/commands")
         return peer.received("/machine_sim/commands")
 
-    def test_it_follows_a_machine_that_is_one_percent_another(self, launch_alone, peer, commands):
+    def test_it_follows_a_machine_that_is_one_percent_another(
+        self, launch_alone, peer, commands, tmp_path
+    ):
+        """One whose controller has other names and numbers for the joints."""
+        robot = sides("delta_cu").write(tmp_path)
         kinds = "spread_kinds:=[masses, inertias, friction]"
         # Silence is of the wall's time, which a loaded machine has little of.
         controller = example(
             launch_alone, "computed_torque.py", "--deadline", "60", "--seconds", "1.5",
-            parameters=(SIM_TIME,),
+            "--robot", str(robot), parameters=(SIM_TIME,),
         )  # fmt: skip
         # Its whole path takes a second or two: who is to hear it has to be there before.
         peer.until(lambda: peer.node.count_publishers("/machine_sim/commands"))
-        sim = launch_alone(SIM, "clock:=lockstep", "spread:=0.01", kinds)
+        sim = launch_alone(SIM, f"mechanism:={robot}", "clock:=lockstep", "spread:=0.01", kinds)
         peer.until(lambda: not controller.alive(), PATIENCE)
         assert controller.wait() == 0, controller.output
         samples, worst = numbers(controller.output.splitlines()[-1])

@@ -107,6 +107,31 @@ def test_each_bad_message_closes_the_gate_and_good_ones_open_it(make, reason, ch
     assert [answer is None for answer in answers] == [True, False]
 
 
+def test_a_stop_that_is_stamped_later_than_the_next_torques_closes_the_gate_for_a_few_only(make):
+    """Torques carry the stamp of the state they answer, a stop's torque the time it was sent at."""
+    core = gate(recovery_count=3)
+    for k in range(3):
+        send(core, make, k * STEP)
+    assert send(core, make, 3 * STEP) is not None
+    lag = DEADLINE - 20 * STEP
+    forwarded = []
+    for k in range(4, 12):
+        try:
+            forwarded.append(send(core, make, k * STEP, stamp=NOW + k * STEP - lag) is not None)
+        except MessageError as error:
+            forwarded.append(error.reason)
+    assert forwarded == ["stamp order", False, False, *[True] * 5]
+
+
+def test_of_two_that_take_turns_the_older_one_keeps_the_gate_closed(make):
+    core = gate(recovery_count=2)
+    for k in range(20):
+        send(core, make, 2 * k * STEP)
+        with pytest.raises(MessageError, match="stamp"):
+            send(core, make, (2 * k + 1) * STEP, stamp=NOW + (2 * k - 1) * STEP)
+    assert core.stream.stopped
+
+
 def test_bad_messages_below_the_trip_count_are_only_left_out(make):
     core, last = opened(make, trip_count=2)
     refused(core, make, last + STEP, effort=(math.nan, 0.0, 0.0))

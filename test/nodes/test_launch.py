@@ -373,8 +373,11 @@ class TestRunning:
             def outputs():
                 return np.array([m.output.effort for m in peer.received(state)])
 
-            # The controller runs over the points, and holds the last one's.
-            peer.until(lambda: np.abs(outputs()[-1] - efforts[-1]).max() < least)
+            # The controller runs over the points. The last one accelerates: what bears the weight
+            # where the mock hardware stands takes its place.
+            weight = inverse_dynamics(ROBOT, Q, 0 * qd[0], 0 * qd[0])
+            peer.until(lambda: np.abs(outputs()[-1] - weight).max() < least)
+            efforts = np.vstack((efforts, weight))
             moving = outputs()[np.abs(outputs()).max(1) > 0.0]
             assert len(moving) > 5
             assert (moving >= efforts.min(0) - least).all()
@@ -387,6 +390,8 @@ class TestRunning:
         ("name", "argument", "said"),
         [
             ("twin", "params_file:=/no/such.yaml", "params_file: '/no/such.yaml' is no file"),
+            ("twin", "robot:=nope", "nope"),
+            ("cell", "machines:=a=nope", "nope"),
             ("twin", "respawn:=maybe", "respawn: 'maybe' is neither true nor false"),
             ("cell", "machines:=a", "machines: 'a' is not NAMESPACE=ROBOT"),
             ("cell", "machines:=a=delta,a=prru", "two share a namespace"),
@@ -396,6 +401,50 @@ class TestRunning:
         process = launched(name, argument)
         assert process.wait() == 1
         assert said in process.output
+
+    @pytest.mark.parametrize("key", ["/**", "/left/delta_dynamics", "left"])
+    def test_torques_that_the_gate_would_never_get_are_refused(self, launched, tmp_path, key):
+        """The middleware connects nobody to a topic whose deadline is longer than demanded."""
+        file = tmp_path / "parameters.yaml"
+        parameters = {"ros__parameters": {"stale_after": 0.2}}
+        section = {"delta_dynamics": parameters} if key == "left" else parameters
+        file.write_text(yaml.safe_dump({key: section}))
+        arguments = ["namespace:=left", f"params_file:={file}", "stiffness_monitor:=false"]
+        process = launched("twin", *arguments, "command_gate:=true")
+        assert process.wait() == 1
+        assert "stale_after 0.2 s" in process.output and "deadline 0.1 s" in process.output
+
+    def test_a_node_that_refuses_its_configuration_is_not_started_for_ever(
+        self, launched, peer, tmp_path
+    ):
+        file = tmp_path / "parameters.yaml"
+        file.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"stale_aftr": 0.2}}}))
+        process = launched("twin", f"params_file:={file}", "stiffness_monitor:=false")
+        peer.until(lambda: "not started again" in process.output)
+        assert len(process.started("delta_dynamics")) == 4
+
+    def test_composed_nodes_share_a_process_and_have_their_own_parameters(
+        self, launched, peer, tmp_path
+    ):
+        file = tmp_path / "parameters.yaml"
+        sections = {
+            "/left/delta_dynamics": {"ros__parameters": {"stale_after": 0.05}},
+            "/left/machine_state": {"ros__parameters": {"rate": 50.0}},
+        }
+        file.write_text(yaml.safe_dump(sections))
+        process = launched(
+            "twin", "namespace:=left", "composed:=true", "command_gate:=true",
+            "machine_state:=true", "joint_states:=measured", f"params_file:={file}",
+        )  # fmt: skip
+        self.until_nodes(peer, process, *(f"/left/{node}" for node in NODES))
+        assert len(process.started("composed")) == len(process.started("command_gate")) == 1
+        assert self.parameter(peer, "/left/delta_dynamics", "stale_after") == 0.05
+        assert self.parameter(peer, "/left/machine_state", "rate") == 50.0
+        assert self.parameter(peer, "/left/machine_state", "mechanism") == "delta_cu"
+        peer.until(lambda: "/left/measured" in self.subscribed(peer))
+        assert "/left/joint_states" not in self.subscribed(peer)
+        os.kill(process.started("composed")[0], signal.SIGKILL)
+        peer.until(lambda: len(process.started("composed")) == 2)
 
     def test_ctrl_c_ends_all_of_it_cleanly(self, launched, peer):
         process = launched("twin", "command_gate:=true", "machine_state:=true")

@@ -165,7 +165,7 @@ def test_a_late_joiner_gets_the_description(answers, peer):
     late = peer.node.create_subscription(String, "/robot_description", received.append, qos)
     peer.until(lambda: received)
     peer.node.destroy_subscription(late)
-    assert received[0].data == robot_urdf(ROBOT)
+    assert received[0].data == robot_urdf(ROBOT, hardware="")
 
 
 def test_transforms_where_tf2_is_installed(answers, expected, node, peer):

@@ -163,6 +163,36 @@ def test_a_bad_deflection_is_refused_whole(changes, reason):
     assert watch.count == 0
 
 
+def test_samples_older_than_the_window_are_dropped():
+    """Of a machine that has warmed up what was measured cold tells nothing."""
+    recording = twin_recording({})
+    alarm = StiffnessAlarm(ROBOT, AlarmSettings(window=1.0))
+    row = ROBOT.forward(recording.q[0]), recording.wrench[0], recording.deflection[0]
+    counts = []
+    for time in (0.0, 0.5, 1.0, 1.2, 5.0):
+        alarm.push(time, *row)
+        counts.append(alarm.count)
+    assert counts == [1, 2, 3, 3, 1]
+
+
+def test_the_wrench_of_a_deflection_is_that_between_its_neighbours(monkeypatch):
+    taken = []
+    monkeypatch.setattr(StiffnessAlarm, "push", lambda self, *row: taken.append(row))
+    watch, monitor = StiffnessWatch(ROBOT, RULES, FRAMES), Monitor(ROBOT)
+    joints = MAKE.joint_state(ROBOT.joint_names, [0.62, 0.6, 0.65], stamp=SECOND)
+    monitor.joint_state(joints, SECOND)
+    loads = np.array([[9.0, 8, 7, 1, 2, 3], [19.0, -2, 7, 1, 3, 3]])
+    turn = ROBOT.platform([0.62, 0.6, 0.65])[1]
+    fixed = [np.concatenate((turn @ wrench[:3], turn @ wrench[3:])) for wrench in loads]
+    for k, wrench in enumerate(loads):
+        stamp = SECOND + k * 10_000_000
+        watch.answer(monitor.wrench(MAKE.wrench(wrench, stamp), stamp))
+    watch.deflection(deflection(SECOND + 2_500_000), SECOND)
+    ((time, _, wrench, _),) = taken
+    assert time == pytest.approx(1.0025)
+    np.testing.assert_allclose(wrench, 0.75 * fixed[0] + 0.25 * fixed[1])
+
+
 def answers(watch, monitor, stamps):
     for stamp in stamps:
         monitor.joint_state(

@@ -237,6 +237,17 @@ class TestTorques:
                 break
         assert core.stream.stopped and core.stream.stops["no wrench"] == 2
 
+    def test_a_wrench_of_much_later_is_none(self):
+        """The first one may come before the joint state that it follows: by its age it is none."""
+        core = self.core("stop")
+        self.push(core, 21)
+        with pytest.raises(MessageError) as caught:
+            self.answer(core, 0)
+        assert caught.value.reason == "no wrench"
+        near = self.core("stop")
+        self.push(near, 19)
+        self.answer(near, 0)
+
     def test_refused_wrenches_are_counted_and_leave_nothing(self):
         core = self.core()
         self.push(core, 5)

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The equations of motion in the actuated joints, all terms of one state at once.
+
+What a simulation asks for several thousand times a second: one program, one solved closure.
+
+May import: numpy, pkm_twin's core, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.virtual_work import Forces, begun, mass_entries, potential
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics.engine import Traced
+from pkm_twin.machine.inertia import loaded_joints
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+class Terms(NamedTuple):
+    """Of M qdd + bias = effort + twists' wrench - friction, at one state; k passive joints.
+
+    ``mass`` (n, n) and ``bias`` (n,): velocity terms and weight, without friction and offset.
+    ``kinetic`` and ``potential`` energy, J, the latter zero at the base's origin. ``twists``
+    (6, n): of the platform at its reference point by joint rates, base axes. ``rows`` (k, n): rates
+    of the passive joints that have friction or a rotor by joint rates; ``drift`` (k,): their
+    accelerations at qdd = 0.
+    """
+
+    q: Array
+    qd: Array
+    mass: Array
+    bias: Array
+    kinetic: float
+    potential: float
+    twists: Array
+    rows: Array
+    drift: Array
+
+
+class Equations:
+    """The terms of a robot's equations of motion, by state."""
+
+    def __init__(self, robot: Robot) -> None:
+        n, k = robot.joints_count, len(loaded_joints(robot.graph))
+        self.robot = robot
+        self._shapes = ((n, n), (n,), (2,), (6, n), (k, n), (k,))
+        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self._shapes)]).tolist()
+        self._parts = [slice(a, b) for a, b in pairwise(ends)]
+
+    def at(self, q: Array, qd: Array) -> Terms:
+        """At joint positions and rates, shape (n,) each.
+
+        :raises UnreachableError: a joint state without an assembly.
+        :raises SingularityError: a singularity on the way from home.
+        :raises ValueError: a value that is not finite.
+        """
+        robot = self.robot
+        flat = robot.call_one("motion", lambda: _kernel(robot), robot.inertial, q, qd)
+        if flat is None:
+            (flat,), status = _kernel(robot)(robot.inertial, q, qd)
+            if status is not None:
+                robot.refuse_joints(status, q, (q, qd))
+        mass, bias, energies, twists, rows, drift = self._parts
+        n, _ = self._shapes[0]
+        kinetic, height = flat[energies].tolist()
+        return Terms(
+            q,
+            qd,
+            flat[mass].reshape(n, n),
+            flat[bias],
+            kinetic,
+            height,
+            flat[twists].reshape(6, n),
+            flat[rows].reshape(-1, n),
+            flat[drift],
+        )
+
+
+def _kernel(robot: Robot) -> Kernel:
+    return robot.massive().kernel("motion", _motion)
+
+
+def _motion(t: Traced) -> Program:
+    layout, parts = begun(t)
+    bodies, rods, gravity, *_, passive = parts
+    n, graph, motion = t.joints, t.engine.graph, t.motion
+    qd = t.tape.inputs("qd", n)
+    t.set_rates(qd)
+    t.set_accelerations(np.zeros(n), gravity)
+    forces = Forces(motion)
+    forces.inertia(bodies, rods)
+    drift = []
+    for k, joint in enumerate(loaded_joints(graph)):
+        _, second = forces.relative(joint, accelerated=True)
+        forces.pair(joint, passive[3 * k + 2] * second)
+        drift.append(second)
+    unknown, driven = forces.generalised()
+    bias = driven - t.jq[t.engine.kept].T @ t.lu.solve_transposed(unknown)
+    height = potential(t, bodies, rods, gravity)
+    twists: list[Any] = []
+    rows: list[Any] = []
+
+    def visit(forces: Forces) -> None:
+        twists.append(
+            [*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]]
+        )
+        rows.append([forces.relative(j, accelerated=False)[0] for j in loaded_joints(graph)])
+
+    mass = mass_entries(t, parts, visit)
+    # By columns, as the joints were visited: turned round, rows of joints.
+    kinetic = 0.5 * (qd @ (np.reshape(mass, (n, n)) @ qd))
+    flat = [*mass, *bias, kinetic, height]
+    flat += [column[i] for i in range(6) for column in twists]
+    flat += [column[k] for k in range(len(drift)) for column in rows]
+    outputs = {"terms": t.lift([*flat, *drift])}
+    return Program({"q": n, "qd": n}, layout.size, outputs, t.equations())

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runge-Kutta steps that are exact in a linear damping, however stiff.
+
+The exponential method of order four of Cox and Matthews (2002, Exponential time differencing for
+stiff systems) for q' = v, v' = n(q, v) - d v with d >= 0; without damping it is the classical
+method for second-order equations.
+
+May import: numpy; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Stepper:
+    """The method for a span of time.
+
+    :param weights: see :func:`_damped`; matrices, shape (11, n, n), where something is damped.
+    :param damping: shape (n, n), 1/s; None: none.
+    """
+
+    def __init__(self, weights: Any, damping: Array | None = None) -> None:
+        self._weights, self._damping = weights, damping
+        self._on: Callable[..., Any] = np.multiply if damping is None else np.matmul
+
+    def run(
+        self, q: Array, v: Array, accelerations: Callable[[Array, Array], Array]
+    ) -> tuple[Array, Array]:
+        """Positions and rates at the end, shape (n,) each.
+
+        :param accelerations: called four times, at positions and rates, damping included.
+        """
+        on, damping = self._on, self._damping
+        half, drift, lift, whole, far, v0, v1, v2, q0, q1, q2 = self._weights
+
+        def rest(q: Array, v: Array) -> Array:
+            a = accelerations(q, v)
+            return a if damping is None else a + damping @ v
+
+        def moved(q: Array, v: Array, n: Array) -> tuple[Array, Array]:
+            return q + on(drift, v) + on(lift, n), on(half, v) + on(drift, n)
+
+        first = rest(q, v)
+        a = moved(q, v, first)
+        second = rest(*a)
+        third = rest(*moved(q, v, second))
+        fourth = rest(*moved(*a, 2.0 * third - first))
+        inner = second + third
+        return (
+            q + on(far, v) + on(q0, first) + on(q1, inner) + on(q2, fourth),
+            on(whole, v) + on(v0, first) + on(v1, inner) + on(v2, fourth),
+        )
+
+
+@lru_cache(64)
+def undamped(span: float) -> Stepper:
+    """The classical method."""
+    return Stepper(_undamped(span))
+
+
+def damped(span: float, modes: Array, back: Array, decays: Array) -> Stepper:
+    """The method that is exact in a damping.
+
+    :param modes: of the damping, columns, shape (n, r); across them nothing is damped.
+    :param back: takes rates to the modes, shape (r, n).
+    :param decays: of the modes, 1/s, shape (r,).
+    """
+    plain = np.array(_undamped(span))
+    deltas = _damped(span, decays) - plain[:, None]
+    weights = plain[:, None, None] * np.eye(len(modes)) + (modes * deltas[:, None, :]) @ back
+    return Stepper(weights, (modes * decays) @ back)
+
+
+def _undamped(h: float) -> list[float]:
+    """Weights, see :func:`_damped`, of no damping."""
+    sixth = h / 6.0
+    return [1.0, 0.5 * h, h * h / 8.0, 1.0, h, sixth, 2.0 * sixth, sixth, h * sixth, h * sixth, 0.0]
+
+
+def _damped(h: float, decays: Array) -> Array:
+    """Weights by mode, shape (11, r).
+
+    Of half a span: rates by rates, positions by rates (and rates by accelerations), positions by
+    accelerations. Of a whole one: rates by rates, positions by rates; then the weights of the
+    stages for rates and for positions.
+    """
+    z = -h * decays
+    near, far = _phi(0.5 * z), _phi(z)
+
+    def stages(k: int) -> list[Array]:
+        a, b, c = far[k : k + 3]
+        return [a - 3.0 * b + 4.0 * c, 2.0 * (b - 2.0 * c), 4.0 * c - b]
+
+    rows = [near[0], 0.5 * h * near[1], 0.25 * h * h * near[2], far[0], h * far[1]]
+    rows += [h * row for row in stages(1)]
+    rows += [h * h * row for row in stages(2)]
+    return np.array(rows)
+
+
+def _phi(z: Array) -> Array:
+    """Functions phi_0 = exp to phi_4 of numbers that are not positive, shape (5, r).
+
+    phi_k(z) = z phi_(k+1)(z) + 1 / k!.
+    """
+    factorials = np.array([1.0, 1.0, 2.0, 6.0, 24.0])
+    up = np.empty((5, len(z)))
+    up[0] = np.exp(z)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for k in range(4):
+            up[k + 1] = (up[k] - 1.0 / factorials[k]) / z
+    # Near zero that loses digits: a series, and down.
+    down = np.empty_like(up)
+    term = total = np.full_like(z, 1.0 / 24.0)
+    for k in range(5, 25):
+        term = term * z / k
+        total = total + term
+    down[4] = total
+    for k in reversed(range(4)):
+        down[k] = z * down[k + 1] + 1.0 / factorials[k]
+    return np.where(np.abs(z) < 1.0, down, up)

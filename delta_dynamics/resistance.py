@@ -1,0 +1,389 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which joints of a machine stick, slide or stand at their stops, and what follows for its motion.
+
+Rows are the actuated joints, then the passive ones that have friction or a rotor.
+
+May import: numpy, scipy, pkm_twin's core, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
+
+from delta_dynamics.complementarity import States, first_fall, independent, resisting
+from delta_dynamics.equations import Equations, Terms
+from delta_dynamics.exponential import Stepper, damped, undamped
+from pkm_twin.machine.inertia import loaded_joints
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+STILL: Final = 1e-12
+"""Rate that is none, part of what the joints add to it."""
+STIFF: Final = 0.1
+"""Decay in a part of a step by viscous friction from which on that is integrated exactly."""
+DEPENDENT: Final = 1e-12
+"""Singular value of rows that depend on each other, part of the greatest."""
+_NONE: Final = np.zeros(0)
+_NOBODY: Final = np.zeros(0, np.intp)
+
+
+@dataclass(slots=True)
+class Law:
+    """What slides which way and what is held, until one of them changes; m rows slide, h hold."""
+
+    pull: Array
+    """Constant dry friction of all rows, shape (n + k,)."""
+    still: Flags
+    """Rows that do not move, shape (n + k,)."""
+    slides: Indices
+    signs: Array
+    """Rows with dry friction that slide, and which way, shape (m,)."""
+    held: Indices = field(default_factory=lambda: _NOBODY)
+    """Rows that hold the others still, drives first, shape (h,)."""
+    low: Array = field(default_factory=lambda: _NONE)
+    high: Array = field(default_factory=lambda: _NONE)
+    """Bounds of the forces that hold, shape (h,)."""
+    moves: Indices = field(default_factory=lambda: _NOBODY)
+    """Actuated joints that are not held."""
+    floor: Array = field(default_factory=lambda: _NONE)
+    ceiling: Array = field(default_factory=lambda: _NONE)
+    """How far they may go: to their stops; one that began beyond, no farther."""
+
+    given: Array = field(default_factory=lambda: _NONE)
+    effort: Array = field(default_factory=lambda: _NONE)
+    """Of the drives, less their offset, shape (n,); and less their dry friction."""
+    wrench: Array | None = None
+    first: Array = field(default_factory=lambda: _NONE)
+    """Accelerations at the start, shape (n,)."""
+    force: Array = field(default_factory=lambda: _NONE)
+    """What holds at the start, shape (h,)."""
+
+    @property
+    def stands(self) -> bool:
+        """Whether nothing moves."""
+        return len(self.held) == len(self.effort)
+
+
+class Resistance:
+    """Friction and stops of a robot, and which of its rows move."""
+
+    def __init__(self, robot: Robot) -> None:
+        n = robot.joints_count
+        friction, passive = robot.friction, loaded_joints(robot.graph)
+        self._offset = np.array(friction.offset, np.float64)
+        self._viscous = np.array(friction.viscous, np.float64)
+        self._inner = np.array([joint.viscous for joint in passive])
+        self._damped = bool(self._viscous.any() or self._inner.any())
+        self._passive = bool(passive)
+        self._dry = np.array([*friction.coulomb, *(joint.coulomb for joint in passive)])
+        self._rubs = self._dry > 0.0
+        limits = robot.limits.position
+        limits = np.tile([-math.inf, math.inf], (n, 1)) if limits is None else limits
+        self._low, self._high = limits[:, 0].copy(), limits[:, 1].copy()
+        self._equations = Equations(robot)
+        self.at = self._equations.at
+        self._drives = np.eye(n)
+        self._still = np.zeros(len(self._dry), bool)
+        self._states: States = np.zeros(len(self._dry), np.int8)
+        """Of a row that slides which way, of one that is still the state of its force."""
+        self._law: Law | None = None
+
+    # Rows.
+
+    def rows(self, here: Terms) -> Array:
+        """Rates of all rows by joint rates, shape (n + k, n)."""
+        return np.concatenate([self._drives, here.rows]) if self._passive else self._drives
+
+    def rates(self, here: Terms) -> Array:
+        """Of all rows, shape (n + k,)."""
+        qd = here.qd
+        return np.concatenate([qd, here.rows @ qd]) if self._passive else qd
+
+    def seconds(self, here: Terms, a: Array) -> Array:
+        """Accelerations of all rows, shape (n + k,)."""
+        return np.concatenate([a, here.rows @ a + here.drift]) if self._passive else a
+
+    # States.
+
+    def arrive(self, q: Array, qd: Array) -> Terms:
+        """Terms of a state that is new, after the impact that it may begin with."""
+        return self._struck(self._anew(self.at(q, qd)))
+
+    def _anew(self, here: Terms) -> Terms:
+        """Look which rows move, and which way."""
+        rates = self.rates(here)
+        self._still = np.abs(rates) <= STILL * np.abs(self.rows(here) * here.qd).max(1)
+        self._states = np.where(self._still, 0.0, np.sign(rates)).astype(np.int8)
+        self._law = None
+        return here
+
+    def _struck(self, here: Terms) -> Terms:
+        """After the impact of the joints that go beyond their stops; the same where none does."""
+        q, qd = here.q, here.qd
+        up, down = q >= self._high, q <= self._low
+        if not ((up & (qd > 0.0)) | (down & (qd < 0.0))).any():
+            return here
+        j = np.flatnonzero(up | down)
+        across = _inverse(here.mass)[:, j]
+        low, high = np.where(down[j], -math.inf, 0.0), np.where(up[j], math.inf, 0.0)
+        # Friction, which is bounded, does not hold against an impact.
+        impulse, states = resisting(across[j], qd[j], low, high, np.zeros(len(j), np.int8))
+        qd = qd - across @ impulse
+        qd[j[states == 0]] = 0.0
+        qd[up] = np.minimum(qd[up], 0.0)
+        qd[down] = np.maximum(qd[down], 0.0)
+        return self._anew(self.at(q, qd))
+
+    # Laws.
+
+    def law(self, here: Terms, effort: Array, wrench: Array | None) -> Law:
+        """What holds from here on, under efforts, shape (n,), and a wrench, shape (6,)."""
+        law = self._law
+        if law is not None:
+            self._load(law, here, effort, wrench)
+            # Forces of rows that depend on the held ones stay as they are, within their bounds.
+            if not len(law.held) or ((law.low <= law.force) & (law.force <= law.high)).all():
+                return law
+        n, still = len(here.q), self._still
+        slides = np.flatnonzero(self._rubs & ~still)
+        signs = self._states[slides].astype(np.float64)
+        pull = np.zeros(len(self._dry))
+        pull[slides] = self._dry[slides] * signs
+        law = self._law = Law(pull, np.zeros(len(self._dry), bool), slides, signs)
+        self._load(law, here, effort, wrench)
+        up = (here.q >= self._high) & (here.qd == 0.0)
+        down = (here.q <= self._low) & (here.qd == 0.0)
+        resists = still & self._rubs
+        resists[:n] |= up | down
+        if resists.any():
+            low, high = -self._dry, self._dry.copy()
+            high[:n][up] = math.inf
+            low[:n][down] = -math.inf
+            self._hold(law, here, np.flatnonzero(resists), low, high)
+            self._load(law, here, effort, wrench)
+        law.moves = np.flatnonzero(~law.still[:n])
+        law.floor = np.minimum(self._low, here.q)[law.moves]
+        law.ceiling = np.maximum(self._high, here.q)[law.moves]
+        return law
+
+    def _hold(self, law: Law, here: Terms, z: Indices, low: Array, high: Array) -> None:
+        """Say which of the rows z, which do not move, are held.
+
+        :param law: of all other rows.
+        :param low: bounds of all rows' forces, shape (n + k,).
+        """
+        rows = self.rows(here)[z]
+        inverse = _inverse(here.mass)
+        motion = self.seconds(here, law.first)[z]
+        force, states = resisting(rows @ inverse @ rows.T, motion, low[z], high[z], self._states[z])
+        self._states[z] = states
+        stays = np.flatnonzero(states == 0)
+        # A row that depends on others does not hold: its force is constant, and it is still.
+        own = stays[independent(rows[stays], inverse)]
+        law.still[z[stays]] = True
+        for i in np.flatnonzero(states):
+            law.still[z[i]] = len(independent(rows[[*own, i]], inverse)) == len(own)
+        force[own] = 0.0
+        law.pull[z] = force
+        slides = z[~law.still[z] & self._rubs[z]]
+        law.slides = np.concatenate([law.slides, slides])
+        law.signs = np.concatenate([law.signs, self._states[slides]])
+        law.held = z[own]
+        law.low, law.high = low[law.held], high[law.held]
+
+    def _load(self, law: Law, here: Terms, effort: Array, wrench: Array | None) -> None:
+        law.given, law.wrench = effort - self._offset, wrench
+        law.effort = law.given - law.pull[: len(effort)]
+        law.first, law.force = self.accelerate(law, here)
+
+    def accelerate(self, law: Law, here: Terms) -> tuple[Array, Array]:
+        """Accelerations at a state, shape (n,), and the forces that hold, shape (h,)."""
+        n, h = len(law.effort), len(law.held)
+        rest = law.effort - here.bias
+        if law.wrench is not None:
+            rest = rest + law.wrench @ here.twists
+        if self._passive:
+            rest = rest - (self._inner * (here.rows @ here.qd) + law.pull[n:]) @ here.rows
+        if self._damped:
+            rest = rest - self._viscous * here.qd
+        if not h:
+            _, result, bad = dposv(here.mass, rest)
+            if bad:
+                raise ValueError("the mass matrix is not positive")
+            return result, _NONE
+        rows = self.rows(here)[law.held]
+        matrix = np.zeros((n + h, n + h))
+        matrix[:n, :n] = here.mass
+        matrix[:n, n:] = rows.T
+        matrix[n:, :n] = rows
+        if self._passive:
+            drift = np.concatenate([np.zeros(n), here.drift])[law.held]
+        else:
+            drift = np.zeros(h)
+        result = np.linalg.solve(matrix, np.concatenate([rest, -drift]))
+        result[law.held[law.held < n]] = 0.0
+        return result[:n], result[n:]
+
+    def stepper(self, here: Terms, law: Law, span: float) -> Stepper:
+        """The method of a part of a step, with the viscous friction at its start."""
+        if not self._damped:
+            return undamped(span)
+        damping = self._damping(here)
+        if span * dposv(here.mass, damping)[1].trace() < STIFF:
+            return undamped(span)
+        free = self._drives
+        if len(law.held):
+            # Rates that the held rows leave.
+            free = np.linalg.svd(self.rows(here)[law.held])[2][len(law.held) :].T
+            free[law.held[law.held < len(free)]] = 0.0
+        root = np.linalg.inv(np.linalg.cholesky(free.T @ here.mass @ free))
+        decays, turned = np.linalg.eigh(root @ (free.T @ damping @ free) @ root.T)
+        modes = free @ root.T @ turned
+        return damped(span, modes, modes.T @ here.mass, np.maximum(decays, 0.0))
+
+    def _damping(self, here: Terms) -> Array:
+        """Viscous friction of all joints, by joint rates, shape (n, n)."""
+        inner: Array = (here.rows.T * self._inner) @ here.rows
+        return np.diag(self._viscous) + inner
+
+    def crawl(self, here: Terms, law: Law, span: float) -> Terms:
+        """A part of a step by Moreau's implicit time stepping, of order one.
+
+        For what changes faster than can be told: friction so stiff that its transients have passed.
+        It needs no law to last, always has a result, and takes energy away.
+        """
+        n = len(here.q)
+        inverse = _inverse(here.mass + span * self._damping(here))
+        rest = law.given - here.bias + (0.0 if law.wrench is None else law.wrench @ here.twists)
+        rates = inverse @ (here.mass @ here.qd + span * rest)
+        up, down = here.q >= self._high, here.q <= self._low
+        low, high = -span * self._dry, span * self._dry
+        high[:n][up] = math.inf
+        low[:n][down] = -math.inf
+        resists = self._rubs.copy()
+        resists[:n] |= up | down
+        z = np.flatnonzero(resists)
+        rows = self.rows(here)[z]
+        states = np.zeros(len(z), np.int8)
+        if len(z):
+            force, states = resisting(
+                rows @ inverse @ rows.T, rows @ rates, low[z], high[z], states
+            )
+            rates = rates - inverse @ (rows.T @ force)
+            rates[z[(states == 0) & (z < n)]] = 0.0
+        self._law = None
+        self._still[:] = False
+        self._still[z] = states == 0
+        self._states[z] = states
+        low, high = np.minimum(self._low, here.q), np.maximum(self._high, here.q)
+        return self._struck(self.at(np.clip(here.q + span * rates, low, high), rates))
+
+    # Changes.
+
+    def change(
+        self, here: Terms, end: Terms, law: Law, span: float, exact: float
+    ) -> tuple[float, Flags | None]:
+        """When a law ends, s after its start, and by which signals; the span and None: it lasts.
+
+        Signals fall to zero where it ends: distances of joints to their stops above and below,
+        rates of rows that slide, and of forces that hold to their bounds.
+
+        :param exact: how exactly the time is found, part of the span; and signals, of their size.
+        """
+        moves = law.moves
+        force = self.accelerate(law, end)[1] if len(law.held) else _NONE
+
+        def signals(q: Array, rates: Array, force: Array) -> Array:
+            q = q[moves]
+            parts = [law.ceiling - q, q - law.floor]
+            if len(law.slides):
+                parts.append(law.signs * rates[law.slides])
+            if len(law.held):
+                parts += [law.high - force, force - law.low]
+            return np.concatenate(parts)
+
+        def slopes(qd: Array, seconds: Array) -> Array:
+            qd, change = qd[moves], (force - law.force) / span
+            return np.concatenate([-qd, qd, law.signs * seconds[law.slides], -change, change])
+
+        rates, seconds = self.rates(here), self.seconds(here, law.first)
+        after = signals(end.q, self.rates(end), force)
+        # A curve that bends up is above its tangent.
+        tangent = signals(here.q + span * here.qd, rates + span * seconds, force)
+        suspects = np.flatnonzero((after <= 0.0) | (tangent < 0.0))
+        if not len(suspects):
+            return span, None
+        before = signals(here.q, rates, law.force)
+        size = np.maximum(
+            exact * np.maximum(np.abs(before), np.abs(after)),
+            self._rounding(here, law, force, span),
+        )
+        fall = span * slopes(here.qd, seconds)
+        last = span * slopes(end.qd, self.seconds(end, self.accelerate(law, end)[0]))
+        times = np.where((np.abs(after) <= size) & (after <= before), span, math.inf)
+        for i in suspects[times[suspects] > span]:
+            times[i] = span * first_fall(before[i], fall[i], after[i], last[i], size[i])
+        first = min(span, float(times.min()))
+        # What ends as good as together ends together: joints that reach their stops at once.
+        hit = times <= first + exact * span
+        return first, hit if hit.any() else None
+
+    def _rounding(self, here: Terms, law: Law, force: Array, span: float) -> Array:
+        """What rounding makes of the signals of :meth:`change`."""
+        rows = self.rows(here)[law.slides]
+        own = np.einsum("ij,jk,ik->i", rows, _inverse(here.mass), rows) * self._dry[law.slides]
+        q = 1e-3 * np.abs(here.q[law.moves])
+        force = np.maximum(np.abs(force), np.abs(law.force))
+        rates = np.abs(rows) @ np.abs(here.qd) + span * own
+        return STILL * np.concatenate([q, q, rates, force, force])
+
+    def settle(self, end: Terms, law: Law, hit: Flags | None, passed: bool) -> Terms:
+        """The state at a part's end: what came to rest rests, a joint at a stop stands there.
+
+        :param hit: the signals that have ended the law.
+        :param passed: whether time has passed under it: what it let go moves.
+        """
+        n, h, m = len(end.q), len(law.held), len(law.slides)
+        if passed:
+            self._still = law.still
+            self._states[law.still] = 0
+        if hit is None and not (self._passive and h):
+            return end
+        q, qd, held = end.q, end.qd, law.held
+        if hit is not None:
+            self._law = None
+            moves = law.moves
+            up, down, ends, most, least = np.split(hit, np.cumsum([len(moves), len(moves), m, h]))
+            stopped = law.slides[ends]
+            held = np.concatenate([held, stopped])
+            self._still = self._still.copy()
+            self._still[stopped] = True
+            self._states[stopped] = 0
+            self._states[law.held[most]] = 1
+            self._states[law.held[least]] = -1
+            q = q.copy()
+            q[moves[up]], q[moves[down]] = law.ceiling[up], law.floor[down]
+            # A joint may be back at its stop before it could leave it.
+            back = (up & (qd[moves] <= 0.0)) | (down & (qd[moves] >= 0.0))
+            held = np.concatenate([held, moves[back]])
+        # Rows of passive joints that are held would drift.
+        rows = self.rows(end)[held]
+        across = np.linalg.solve(end.mass, rows.T)
+        qd = qd - across @ np.linalg.lstsq(rows @ across, rows @ qd, rcond=DEPENDENT)[0]
+        qd[held[held < n]] = 0.0
+        if (q != end.q).any() or (qd != end.qd).any():
+            end = self.at(q, qd)
+        return self._struck(end)
+
+
+def _inverse(matrix: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrix), np.float64)

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands ``pkm-twin export ...``: a robot as files of other software."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from pkm_twin.apps.options import RobotName
+from pkm_twin.console import refuse_existing
+from pkm_twin.files import replace_file
+from pkm_twin.machine.robot import Robot
+
+app = typer.Typer(help="Write a robot as files of other software.", no_args_is_help=True)
+
+SHARE = 0.5
+"""Of the effort that the weight leaves at home: what a planner may accelerate with."""
+
+
+@app.command()
+def moveit(
+    robot: RobotName,
+    out: Annotated[Path, typer.Option(help="folder of the package, made anew")],
+    kinematics_plugin: Annotated[
+        str, typer.Option(help="inverse kinematics of the actuated joints", metavar="NAME")
+    ] = "",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
+) -> None:
+    """Write a MoveIt configuration: URDF, SRDF, limits, controllers, kinematics and a launch file.
+
+    Plans go to delta_dynamics, which fills them with effort for the controller. Goals in joint
+    space need nothing else; goals of the platform's pose need a kinematics plugin.
+    """
+    from pkm_twin import load
+    from pkm_twin.export.moveit import moveit_package
+
+    loaded = load(robot)
+    files = moveit_package(loaded, _accelerations(loaded), kinematics_plugin)
+    for name in files:
+        refuse_existing(out / name, overwrite)
+    for name, text in files.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        replace_file(out / name, text.encode())
+        typer.echo(out / name)
+
+
+def _accelerations(robot: Robot) -> list[float]:
+    """What each drive can do by itself at home beside the weight, shape (n,).
+
+    Infinite without effort limits.
+    """
+    from delta_dynamics import inverse_dynamics, mass_matrix
+
+    limits = robot.limits.effort
+    if limits is None:
+        return [np.inf] * len(robot.joint_names)
+    q = robot.inverse(robot.home())
+    weight = np.abs(inverse_dynamics(robot, q, 0.0 * q, 0.0 * q))
+    inertia = np.diag(mass_matrix(robot, q))
+    with np.errstate(divide="ignore"):
+        return list(SHARE * np.maximum(limits - weight, 0.0) / inertia)

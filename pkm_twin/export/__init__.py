@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot as files of other software."""

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A MoveIt configuration of a robot: a ROS package with its URDF, SRDF and settings.
+
+MoveIt knows trees. Its planning group is the actuated joints, for goals in joint space; the passive
+joints of the tree are declared passive, so that nobody waits for their states. Goals of the
+platform's pose need inverse kinematics that knows the loops: a plugin of one's own, by name. A
+numeric solver only solves the chain of the tree that leads to the platform, a group of its own
+where that chain has a drive (a Delta's has none).
+
+May import: numpy, PyYAML, the standard library, pkm_twin's core.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.robot_urdf import robot_urdf
+from pkm_twin.machine.urdf_write import GROUND, PLATFORM
+
+Array = NDArray[np.float64]
+
+GROUP: Final = "actuated"
+"""The planning group."""
+LIMB: Final = "limb"
+"""The chain from the ground to the platform, for the numeric solver."""
+NUMERIC: Final = "kdl_kinematics_plugin/KDLKinematicsPlugin"
+CONTROLLER: Final = "delta_dynamics"
+"""The node whose action fills goals with effort, as MoveIt's controller."""
+
+
+def moveit_package(
+    robot: Robot, accelerations: Sequence[float], kinematics: str = ""
+) -> dict[str, str]:
+    """The files of a package ``ROBOT_moveit_config`` by their paths in it.
+
+    :param accelerations: greatest ones of the actuated joints, rad/s2 or m/s2, shape (n,).
+    :param kinematics: plugin of the planning group's inverse kinematics; empty: none.
+    :raises ParameterError: the robot has a ``joint_map``: plans are in the numbers of the URDF.
+    """
+    if not robot.controller.plain or robot.controller.names != tuple(robot.joint_names):
+        raise ParameterError(
+            "joint_map", list(robot.controller.names), "none: MoveIt plans in the URDF's numbers"
+        )
+    name = re.sub(r"\W", "_", robot.name or robot.mechanism)
+    urdf = robot_urdf(robot, hardware="")
+    groups = srdf(robot, urdf)
+    package = f"{name}_moveit_config"
+    texts = {
+        f"config/{name}.urdf": urdf,
+        f"config/{name}.srdf": groups,
+        "config/joint_limits.yaml": _yaml(_joint_limits(robot, accelerations)),
+        "config/kinematics.yaml": _yaml(_kinematics(kinematics, f'name="{LIMB}"' in groups)),
+        "config/moveit_controllers.yaml": _yaml(_controllers(robot)),
+        "config/ompl_planning.yaml": _yaml(PLANNING),
+        "launch/move_group.launch.py": LAUNCH.format(name=name, package=package),
+        "package.xml": PACKAGE.format(name=name, package=package),
+        "CMakeLists.txt": CMAKE.format(package=package),
+    }
+    return dict(sorted(texts.items()))
+
+
+def srdf(robot: Robot, urdf: str) -> str:
+    """Groups, passive joints, the home state, and the links that always touch.
+
+    :param urdf: the robot's, whose links and joints are named.
+    """
+    tree = ET.fromstring(urdf)  # noqa: S314, made here
+    root = ET.Element("robot", name=tree.get("name", ""))
+    joints = list(robot.joint_names)
+    group = ET.SubElement(root, "group", name=GROUP)
+    for joint in joints:
+        ET.SubElement(group, "joint", name=joint)
+    if _drives_of_chain(tree, joints):
+        limb = ET.SubElement(root, "group", name=LIMB)
+        ET.SubElement(limb, "chain", base_link=GROUND, tip_link=PLATFORM)
+    home = ET.SubElement(root, "group_state", name="home", group=GROUP)
+    for joint, value in zip(joints, robot.inverse(robot.home()).tolist(), strict=True):
+        ET.SubElement(home, "joint", name=joint, value=f"{value:.12g}")
+    ET.SubElement(
+        root, "virtual_joint", name="ground", type="fixed", parent_frame="world", child_link=GROUND
+    )
+    for joint in robot.passive_joints:
+        ET.SubElement(root, "passive_joint", name=joint)
+    for first, second in _touching(tree):
+        ET.SubElement(root, "disable_collisions", link1=first, link2=second, reason="Adjacent")
+    ET.indent(root)
+    return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _drives_of_chain(tree: ET.Element, actuated: Sequence[str]) -> list[str]:
+    """Actuated joints between the ground and the platform."""
+    above = {_ends(joint)[1]: joint for joint in tree.findall("joint")}
+    found, link = [], PLATFORM
+    while link in above:
+        found += [name] if (name := above[link].get("name", "")) in actuated else []
+        link = _ends(above[link])[0]
+    return found
+
+
+def _touching(tree: ET.Element) -> list[tuple[str, str]]:
+    """Pairs of links that a joint, or a loop that the tree cuts, holds together."""
+    held = [_ends(element) for tag in ("joint", "constraint") for element in tree.findall(tag)]
+    return list(dict.fromkeys((min(pair), max(pair)) for pair in held))
+
+
+def _ends(element: ET.Element) -> tuple[str, str]:
+    """Parent and child link."""
+    ends = (element.find(tag) for tag in ("parent", "child"))
+    parent, child = ("" if end is None else end.get("link", "") for end in ends)
+    return parent, child
+
+
+def _joint_limits(robot: Robot, accelerations: Sequence[float]) -> dict[str, Any]:
+    velocities = robot.limits.velocity
+    limits = {}
+    for k, joint in enumerate(robot.joint_names):
+        velocity = np.inf if velocities is None else float(velocities[k])
+        acceleration = float(accelerations[k])
+        limits[joint] = {
+            "has_velocity_limits": velocity < np.inf,
+            "max_velocity": velocity if velocity < np.inf else 0.0,
+            "has_acceleration_limits": acceleration < np.inf,
+            "max_acceleration": acceleration if acceleration < np.inf else 0.0,
+        }
+    return {
+        "default_velocity_scaling_factor": 0.1,
+        "default_acceleration_scaling_factor": 0.1,
+        "joint_limits": limits,
+    }
+
+
+def _kinematics(plugin: str, numeric: bool) -> dict[str, Any]:
+    settings = {"kinematics_solver_search_resolution": 0.005, "kinematics_solver_timeout": 0.05}
+    solvers = {LIMB: NUMERIC if numeric else "", GROUP: plugin}
+    return {group: {"kinematics_solver": s, **settings} for group, s in solvers.items() if s}
+
+
+def _controllers(robot: Robot) -> dict[str, Any]:
+    return {
+        "moveit_controller_manager": (
+            "moveit_simple_controller_manager/MoveItSimpleControllerManager"
+        ),
+        "moveit_simple_controller_manager": {
+            "controller_names": [CONTROLLER],
+            CONTROLLER: {
+                "action_ns": "follow_joint_trajectory",
+                "type": "FollowJointTrajectory",
+                "default": True,
+                "joints": list(robot.joint_names),
+            },
+        },
+    }
+
+
+def _yaml(data: dict[str, Any]) -> str:
+    return yaml.safe_dump(data, sort_keys=False)
+
+
+PLANNING: Final[dict[str, Any]] = {
+    "planning_plugins": ["ompl_interface/OMPLPlanner"],
+    "request_adapters": [
+        "default_planning_request_adapters/ResolveConstraintFrames",
+        "default_planning_request_adapters/ValidateWorkspaceBounds",
+        "default_planning_request_adapters/CheckStartStateBounds",
+        "default_planning_request_adapters/CheckStartStateCollision",
+    ],
+    "response_adapters": [
+        "default_planning_response_adapters/AddTimeOptimalParameterization",
+        "default_planning_response_adapters/ValidateSolution",
+    ],
+    "planner_configs": {"RRTConnect": {"type": "geometric::RRTConnect", "range": 0.0}},
+    GROUP: {"default_planner_config": "RRTConnect", "planner_configs": ["RRTConnect"]},
+}
+
+LAUNCH: Final = """# Made by pkm-twin export moveit {name}.
+from moveit_configs_utils import MoveItConfigsBuilder
+from moveit_configs_utils.launches import generate_move_group_launch
+
+
+def generate_launch_description():
+    config = (
+        MoveItConfigsBuilder("{name}", package_name="{package}")
+        .robot_description(file_path="config/{name}.urdf")
+        .robot_description_semantic(file_path="config/{name}.srdf")
+        .joint_limits(file_path="config/joint_limits.yaml")
+        .robot_description_kinematics(file_path="config/kinematics.yaml")
+        .trajectory_execution(file_path="config/moveit_controllers.yaml")
+        .planning_pipelines(pipelines=["ompl"])
+        .to_moveit_configs()
+    )
+    return generate_move_group_launch(config)
+"""
+
+PACKAGE: Final = """<?xml version="1.0"?>
+<package format="3">
+  <name>{package}</name>
+  <version>0.1.0</version>
+  <description>MoveIt configuration of {name}, made by pkm-twin export moveit {name}</description>
+  <maintainer email="user@example.org">you</maintainer>
+  <license>Apache-2.0</license>
+  <buildtool_depend>ament_cmake</buildtool_depend>
+  <exec_depend>moveit_configs_utils</exec_depend>
+  <exec_depend>moveit_kinematics</exec_depend>
+  <exec_depend>moveit_planners_ompl</exec_depend>
+  <exec_depend>moveit_ros_move_group</exec_depend>
+  <exec_depend>moveit_simple_controller_manager</exec_depend>
+  <exec_depend>pkm_twin</exec_depend>
+  <export>
+    <build_type>ament_cmake</build_type>
+  </export>
+</package>
+"""
+
+CMAKE: Final = """cmake_minimum_required(VERSION 3.22)
+project({package} NONE)
+find_package(ament_cmake REQUIRED)
+install(DIRECTORY config launch DESTINATION share/${{PROJECT_NAME}})
+ament_package()
+"""

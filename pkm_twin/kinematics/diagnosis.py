@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Why a machine's mobility is not the number of its actuated joints.
+
+Conditions that hold nearly are made to hold exactly, from the least deviations on: where that gives
+the right mobility, those of them without which it does not are the cause, by name and deviation.
+Else what moves although the actuated joints are held is named, or which of them cannot move.
+
+May import: numpy, pkm_twin's machine, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from pkm_twin.errors import MobilityError, ParameterError
+from pkm_twin.kinematics.conditions import Condition, Conditions
+from pkm_twin.kinematics.engine import RANK, Engine
+from pkm_twin.kinematics.spins import idle_bodies, null
+from pkm_twin.machine.graph import Array, Graph
+
+TOLERANCES: Final = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 1e-2)
+"""Deviations up to which conditions are made to hold, rad and parts of the machine's size."""
+MOST: Final = 5
+"""Most causes that an error names."""
+_TRIED: Final = 40
+"""Most conditions that are tried one by one."""
+_NONE: Final = 1e-6
+"""Motions that are less are none."""
+_CLEAR: Final = 1e-5
+"""Singular values below this share of the greatest are those of deviations."""
+
+
+def mobility_error(engine: Engine) -> MobilityError:
+    """The error of a machine whose actuated joints do not determine it, with the causes."""
+    # What nearly holds takes freedoms away; where there are too many, none is lost.
+    lost = engine.mobility.freedoms < engine.joints
+    causes = near_conditions(engine.graph) if lost else []
+    texts = [c.text for c in causes[:MOST]]
+    if len(causes) > MOST:
+        texts.append(f"and {len(causes) - MOST} deviations more")
+    if not causes:
+        texts = [*_loose(engine), *_locked(engine)]
+    return MobilityError(engine.joints, engine.mobility.freedoms, texts)
+
+
+def singular_home(engine: Engine, rank: int, beside: int) -> ParameterError:
+    """The error of a machine whose home is a singularity, with what can move in it alone."""
+    motion, ju = engine.regular_state()
+    del motion
+    here = null(engine.scaled_at_home()[0], _NONE)
+    there = null(ju, _NONE)
+    # What is free at home and not beside it.
+    extra = here - there @ (there.T @ here)
+    names = (
+        _owners(engine, extra) if here.shape[1] > there.shape[1] else list(engine.graph.actuated)
+    )
+    return ParameterError(
+        "joints", f"rank {rank} of the closures at home, {beside} beside it",
+        f"a home that is no singularity: move it, as {', '.join(names[:8])} can move in it without "
+        "the others",
+    )  # fmt: skip
+
+
+def near_conditions(graph: Graph) -> list[Condition]:
+    """Conditions that, were they exact, would give the mobility that the actuated joints need.
+
+    :returns: the least set that is found, the largest deviation first; empty where there is none.
+    """
+    tried = 0
+    for tolerance in TOLERANCES:
+        conditions = Conditions(graph, tolerance)
+        missed = sorted(conditions.missed, key=lambda c: c.size)
+        if len(missed) == tried:
+            continue
+        tried = len(missed)
+        if not is_right(conditions.idealized()):
+            continue
+        dropped: list[Condition] = []
+        for condition in missed[:_TRIED]:
+            if is_right(conditions.idealized([*dropped, condition])):
+                dropped.append(condition)
+        left = [c for c in missed if not any(c is d for d in dropped)]
+        return sorted(left, key=lambda c: -c.size)
+    return []
+
+
+def is_right(graph: Graph | None) -> bool:
+    """Whether at home the actuated joints determine the machine and move independently."""
+    if graph is None:
+        return False
+    engine = Engine(graph, ())
+    ju, _ = engine.scaled_at_home()
+    return null(ju, _NONE).shape[1] == 0 and engine.mobility.freedoms == engine.joints
+
+
+def is_clear(graph: Graph) -> bool:
+    """Whether no closure at home holds by a small deviation alone, be it of rounding."""
+    both = np.hstack(Engine(graph, ()).scaled_at_home())
+    values = np.linalg.svd(both, compute_uv=False) if both.size else np.zeros(0)
+    share = values / max(1.0, float(values.max(initial=0.0)))
+    return not ((share > RANK) & (share < _CLEAR)).any()
+
+
+def _loose(engine: Engine) -> list[str]:
+    """What moves while the actuated joints are held, in words."""
+    motion, ju = engine.regular_state()
+    free = null(ju, _NONE)
+    if not free.shape[1]:
+        return []
+    graph = engine.graph
+    spinning = [s for s in idle_bodies(graph, motion, free) if graph.platform not in s[0]]
+    texts = []
+    for bodies, _, _ in spinning:
+        at = [j.name for j in graph.joints.values() if (j.inner in bodies) != (j.outer in bodies)]
+        texts.append(f"{' with '.join(bodies)} can turn alone, at {' and '.join(at)}")
+    ways = np.array([way for _, _, way in spinning]).reshape(-1, free.shape[1])
+    names = _owners(engine, free @ null(ways, _NONE))
+    if names:
+        texts.append(f"with the actuated joints held, {', '.join(names)} can move")
+    return texts
+
+
+def _locked(engine: Engine) -> list[str]:
+    """Actuated joints that cannot move, or only together."""
+    ju, jq = engine.scaled_at_home()
+    unknown = ju.shape[1]
+    moves = null(np.hstack([ju, jq]), _NONE)[unknown:]
+    names = np.array(engine.graph.actuated)
+    rank = int(np.linalg.matrix_rank(moves, _NONE)) if moves.size else 0
+    if rank == engine.joints:
+        return []
+    sizes = np.linalg.norm(moves, axis=1) if moves.size else np.zeros(engine.joints)
+    still = names[sizes < _NONE].tolist()
+    tied = [n for n in names if n not in still]
+    texts = [f"{', '.join(still)} cannot move"] if still else []
+    if len(tied) > rank:
+        texts.append(f"{', '.join(tied)} have {rank} independent motions")
+    return texts
+
+
+def _owners(engine: Engine, motions: Array) -> list[str]:
+    """Joints, and bodies that only rods hold, in motions of shape (unknown rates, count)."""
+    parts = np.abs(motions).max(1, initial=0.0) > _NONE
+    owners: Sequence[str] = engine.tree.owners
+    found = dict.fromkeys(o for o, part in zip(owners, parts, strict=True) if part)
+    return [name.removeprefix("free body ") for name in found]

@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers of a robot's file that are possible and hardly meant, as millimetres for metres are.
+
+Each is compared with the machine itself, so that small and large machines are judged alike. What
+no machine can have is rejected by the schema; what is here is taken as it stands, with a warning.
+
+May import: numpy, this package, kinematics, the standard library.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.kinematics.conditions import merged
+from pkm_twin.kinematics.singularity import singularity_at_home
+from pkm_twin.machine.graph import BASE, Array, Graph, Joint
+from pkm_twin.machine.robot import Robot
+
+LARGEST: Final = 20.0
+"""Extent of a machine, m, from which on its lengths look like millimetres."""
+SMALLEST: Final = 2e-3
+"""Extent below which its lengths look like kilometres, or like nothing known, m."""
+GYRATION: Final = 2.0
+"""A body's radius of gyration at most, in parts of the machine's extent."""
+DENSEST: Final = 4000.0
+"""All masses over the cube of the extent at most, kg/m3: between solid aluminium and steel."""
+LIGHTEST: Final = 0.01
+"""The same at least, kg/m3."""
+FAR: Final = 2.0
+"""How far a centre of mass is from the body's joints at most, in parts of the extent."""
+TURNS: Final = 4.0 * math.pi
+"""Limits of a joint that turns at most, rad."""
+GRAVITY: Final = (1.0, 25.0)
+"""Gravity between that of the Moon and that of Jupiter, m/s2; or none."""
+LOADED: Final = 50.0
+"""A payload at most, in parts of all masses that move."""
+ROTOR: Final = 100.0
+"""A rotor's inertia at the joint, as a mass, at most in parts of all masses that move."""
+LEG: Final = 0.05
+"""A leg of no length is one between joints that are farther apart than this part of the extent."""
+INDEX: Final = 0.005
+"""Singularity index at home below which a small motion may meet a singularity."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An implausible number: its ``field``, the ``quantity`` that was made of it, and its bound.
+
+    ``likely``: what it would mean, in a few words.
+    """
+
+    field: str
+    quantity: str
+    value: float
+    bound: float
+    unit: str
+    likely: str
+
+    @property
+    def text(self) -> str:
+        """All in a line."""
+        side = "above" if self.value > self.bound else "below"
+        numbers = f"{self.value:.4g} {self.unit}".strip()
+        bound = f"{self.bound:.4g} {self.unit}".strip()
+        return f"{self.field}: {self.quantity} {numbers}, {side} {bound}: {self.likely}"
+
+
+def findings(robot: Robot) -> tuple[Finding, ...]:
+    """What is implausible in a robot's numbers; empty where nothing is."""
+    graph = robot.graph
+    found = [
+        *_size(graph), *_masses(robot, graph), *_bodies(robot, graph), *_drives(robot, graph),
+        *_gravity(robot), *_home(graph),
+    ]  # fmt: skip
+    # Copies of a limb say the same.
+    alike: dict[tuple[Any, ...], list[Finding]] = {}
+    for one in found:
+        alike.setdefault((one.quantity, one.likely, f"{one.value:.6g}"), []).append(one)
+    return tuple(_joined(group) for group in alike.values())
+
+
+def _joined(group: list[Finding]) -> Finding:
+    first = group[0]
+    others = "" if len(group) == 1 else f" (and {len(group) - 1} more)"
+    return Finding(
+        f"{first.field}{others}", first.quantity, first.value, first.bound, first.unit, first.likely
+    )
+
+
+def _size(graph: Graph) -> Iterator[Finding]:
+    extent = _extent(graph)
+    if extent > LARGEST:
+        yield Finding(
+            "geometry", "extent of the machine", extent, LARGEST, "m", "lengths in millimetres?"
+        )
+    elif 0.0 < extent < SMALLEST:
+        yield Finding(
+            "geometry",
+            "extent of the machine",
+            extent,
+            SMALLEST,
+            "m",
+            "lengths in another unit than metres?",
+        )
+
+
+def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
+    total = _total(graph)
+    if not total > 0.0:
+        return
+    # As dense as a box of the machine's extent would be: grams or tonnes change it a thousandfold.
+    density = total / max(_extent(graph), 1e-9) ** 3 if _extent(graph) else 0.0
+    if density > DENSEST:
+        yield Finding(
+            "masses",
+            "all that moves over the cube of the extent",
+            density,
+            DENSEST,
+            "kg/m3",
+            f"{total:.4g} kg in all; masses in grams?",
+        )
+    elif 0.0 < density < LIGHTEST:
+        yield Finding(
+            "masses",
+            "all that moves over the cube of the extent",
+            density,
+            LIGHTEST,
+            "kg/m3",
+            f"{total:.4g} kg in all; masses in tonnes?",
+        )
+    lead = merged(graph)
+    with_platform = [b for b in graph.bodies if lead[b] == lead[graph.platform]]
+    if not any(graph.bodies[b].mass for b in with_platform) and not robot.payload.mass:
+        yield Finding(
+            f"{graph.platform}: mass",
+            "mass of the platform",
+            0.0,
+            1e-3 * total,
+            "kg",
+            "left out? then torques lack its weight and inertia",
+        )
+    load = robot.payload
+    if load.mass > LOADED * total:
+        yield Finding(
+            "payload.mass",
+            "payload",
+            load.mass,
+            LOADED * total,
+            "kg",
+            f"{total:.4g} kg move it; a mass in grams?",
+        )
+
+
+def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
+    extent = _extent(graph) or graph.size
+    load = robot.payload
+    parts = [
+        (name, b.mass, b.inertia, _nearest(graph, name, b.com)) for name, b in graph.bodies.items()
+    ]
+    parts.append(("payload", load.mass, load.inertia, float(np.linalg.norm(load.com))))
+    for name, mass, inertia, far in parts:
+        if not mass > 0.0:
+            continue
+        radius = math.sqrt(max(float(np.linalg.eigvalsh(inertia)[-1]), 0.0) / mass)
+        if radius > GYRATION * extent:
+            squares = "g mm2" if radius > 3e3 * extent else "kg mm2"
+            yield Finding(
+                f"{name}: inertia",
+                "radius of gyration",
+                radius,
+                GYRATION * extent,
+                "m",
+                f"inertia in {squares}?",
+            )
+        if far > FAR * extent:
+            what = "its joints" if name != "payload" else "the reference point"
+            yield Finding(
+                f"{name}: com",
+                f"distance of the centre of mass from {what}",
+                far,
+                FAR * extent,
+                "m",
+                "a place in millimetres, or in other axes?",
+            )
+
+
+def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
+    total = _total(graph) + robot.payload.mass
+    positions, home = robot.limits.position, graph.home.tolist()
+    for k, name in enumerate(graph.actuated):
+        joint = graph.joints[name]
+        unit = robot.joint_units[k]
+        turns = unit == "rad"
+        if positions is not None:
+            low, high = (float(v) for v in positions[k])
+            widest = max((abs(v) for v in (low, high) if math.isfinite(v)), default=0.0)
+            if turns and widest > TURNS:
+                yield Finding(
+                    f"{name}: limits.position",
+                    "limit",
+                    widest,
+                    TURNS,
+                    "rad",
+                    f"{widest / (2 * math.pi):.3g} turns; degrees?",
+                )
+            elif not low <= home[k] <= high:
+                bound = low if home[k] < low else high
+                yield Finding(
+                    f"{name}: home",
+                    "home outside the limits",
+                    home[k],
+                    bound,
+                    unit,
+                    "left out, or counted from elsewhere than the limits?",
+                )
+        if not turns and not joint.home and name in robot.without_home:
+            length = _leg(graph, joint)
+            if length > LEG * graph.size:
+                yield Finding(
+                    f"{name}: home",
+                    "length of the leg at home by its joint",
+                    0.0,
+                    length,
+                    "m",
+                    "home left out? without it the joint counts from home",
+                )
+        weight = joint.rotor_inertia / (graph.size**2 if turns else 1.0)
+        if total > 0.0 and weight > ROTOR * total:
+            yield Finding(
+                f"{name}: rotor_inertia",
+                "rotor as a mass at the machine's extent",
+                weight,
+                ROTOR * total,
+                "kg",
+                "an inertia in kg mm2 or g cm2?",
+            )
+
+
+def _gravity(robot: Robot) -> Iterator[Finding]:
+    size = float(np.linalg.norm(robot.gravity))
+    if size > GRAVITY[1]:
+        times = f"{size / 9.81:.4g} times the Earth's; in mm/s2 or cm/s2?"
+        yield Finding("gravity", "gravity", size, GRAVITY[1], "m/s2", times)
+    elif 0.0 < size < GRAVITY[0]:
+        yield Finding("gravity", "gravity", size, GRAVITY[0], "m/s2", "in km/s2?")
+    elif size == 1.0:
+        yield Finding("gravity", "gravity", size, 1.62, "m/s2", "in units of the Earth's?")
+
+
+def _home(graph: Graph) -> Iterator[Finding]:
+    try:
+        index = singularity_at_home(graph)
+    except (PkmTwinError, np.linalg.LinAlgError):
+        return
+    if index < INDEX:
+        yield Finding(
+            "home",
+            "singularity index",
+            index,
+            INDEX,
+            "",
+            "a small motion may meet a singularity; is another home meant?",
+        )
+
+
+def _extent(graph: Graph) -> float:
+    """Extent of the joints and rods, m; where they are one point, of most bodies about it."""
+    points = [j.at for j in graph.joints.values() if j.kind != "translation"]
+    points += [end for rod in graph.rods.values() for end in rod.ends]
+    points.append(graph.origin)
+    extent = float(np.ptp(np.array(points), axis=0).max())
+    about = [float(np.linalg.norm(b.com - graph.origin)) for b in graph.bodies.values() if b.mass]
+    # Half of the bodies may have a wrong place.
+    extent = max(extent, 2.0 * float(np.median(about)) if about else 0.0)
+    return extent if extent > 1e-9 else 0.0
+
+
+def _total(graph: Graph) -> float:
+    return sum(b.mass for b in graph.bodies.values()) + sum(r.mass for r in graph.rods.values())
+
+
+def _nearest(graph: Graph, body: str, point: Array) -> float:
+    """Distance of a point from the nearest joint of a body, m; 0 where it has none."""
+    points = graph.joint_points(body)
+    return min((float(np.linalg.norm(point - p)) for p in points), default=0.0)
+
+
+def _leg(graph: Graph, slide: Joint) -> float:
+    """Length between the joints beyond a slide that stand along its axis, m; 0 for no leg."""
+    if BASE in (slide.inner, slide.outer):
+        return 0.0
+    lengths = [0.0]
+    for a in graph.joints.values():
+        for b in graph.joints.values():
+            if slide.inner in (a.inner, a.outer) and slide.outer in (b.inner, b.outer):
+                apart = b.at - a.at
+                along = abs(float(apart @ slide.axes[0]))
+                if slide not in (a, b) and along > 0.99 * float(np.linalg.norm(apart)):
+                    lengths.append(along)
+    return max(lengths)

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers of a file that are hardly meant: each kind by name, none of them in a sound machine."""
+
+import copy
+import json
+import warnings
+
+import numpy as np
+import pytest
+import yaml
+
+import pkm_twin
+from pkm_twin.errors import ParameterError, RobotWarning
+from pkm_twin.machine.plausibility import findings
+from pkm_twin.mechanisms.machine import Machine
+from test.support.robots import SHIPPED, partly_long
+
+from .descriptions import DESCRIPTIONS
+from .random_machines import NAMES, changed, plain, variant
+from .sketches import SKETCHES
+
+
+def machine(data):
+    return Machine.from_data({"mechanism": "machine"} | data, "machine")
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_no_shipped_robot_has_an_implausible_number(name):
+    assert findings(SHIPPED[name]) == ()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_sound_machine_has_an_implausible_number(name, rng):
+    assert findings(machine(plain(name))) == ()
+    assert [f.text for f in findings(machine(variant(name, rng)))] == []
+
+
+@pytest.mark.parametrize("name", DESCRIPTIONS)
+def test_no_description_has_an_implausible_number(name):
+    assert findings(machine(DESCRIPTIONS[name]())) == ()
+
+
+@pytest.mark.parametrize("name", partly_long(SKETCHES, "delta", "four_bar"))
+def test_no_sound_urdf_has_an_implausible_number(name, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pkm_twin.load(SKETCHES[name]().save(tmp_path))
+
+
+def scaled(data, factor):
+    """Lengths in another unit."""
+    for body in data["bodies"].values():
+        body["com"] = (factor * np.array(body["com"])).tolist()
+    for joint in data["joints"].values():
+        joint["at"] = (factor * np.array(joint["at"])).tolist()
+    data["origin"] = (factor * np.array(data["origin"])).tolist()
+
+
+def weighed(data, factor):
+    for body in data["bodies"].values():
+        body["mass"] *= factor
+        body["inertia"] = (factor * np.array(body["inertia"])).tolist()
+
+
+def millimetres(data):
+    scaled(data, 1e3)
+
+
+def microns(data):
+    scaled(data, 1e-4)
+
+
+def grams(data):
+    weighed(data, 1e3)
+
+
+def tonnes(data):
+    weighed(data, 1e-4)
+
+
+def square_millimetres(data):
+    data["bodies"]["crank_2"]["inertia"] = (1e6 * np.array(tensor(data, "crank_2"))).tolist()
+
+
+def heavy_inertia(data):
+    data["bodies"]["crank_2"].update(mass=1.0, inertia=[5e6, 5e6, 5e6])
+
+
+def far_centre(data):
+    data["bodies"]["coupler_1"]["com"][0] += 120.0
+
+
+def degrees(data):
+    data["joints"]["motor_1"]["limits"] = {"position": [-90.0, 90.0]}
+
+
+def outside(data):
+    data["joints"]["motor_3"]["limits"] = {"position": [2.0, 3.0]}
+    data["joints"]["motor_3"]["home"] = 1.0
+
+
+def feather(data):
+    data["bodies"]["platform"] = {}
+
+
+def brick(data):
+    data["payload"] = {"mass": 500.0, "com": [0.0, 0.0, 0.0], "inertia": [1.0, 1.0, 1.0]}
+
+
+def far_payload(data):
+    data["payload"] = {"mass": 0.5, "com": [0.0, 0.0, 40.0], "inertia": [1e-3, 1e-3, 1e-3]}
+
+
+def gram_centimetres(data):
+    data["joints"]["motor_2"]["rotor_inertia"] = 800.0
+
+
+def millimetre_gravity(data):
+    data["gravity"] = [0.0, -981000.0, 0.0]
+
+
+def earths(data):
+    data["gravity"] = [0.0, 0.0, -1.0]
+
+
+def tensor(data, body):
+    inertia = np.array(data["bodies"][body]["inertia"])
+    return np.diag(inertia) if inertia.ndim == 1 else inertia
+
+
+KINDS = {
+    millimetres: ("geometry", "m"),
+    microns: ("geometry", "m"),
+    grams: ("masses", "kg/m3"),
+    tonnes: ("masses", "kg/m3"),
+    square_millimetres: ("crank_2: inertia", "m"),
+    heavy_inertia: ("crank_2: inertia", "m"),
+    far_centre: ("coupler_1: com", "m"),
+    degrees: ("motor_1: limits.position", "rad"),
+    outside: ("motor_3: home", "rad"),
+    feather: ("platform: mass", "kg"),
+    brick: ("payload.mass", "kg"),
+    far_payload: ("payload: com", "m"),
+    gram_centimetres: ("motor_2: rotor_inertia", "kg"),
+    millimetre_gravity: ("gravity", "m/s2"),
+    earths: ("gravity", "m/s2"),
+}
+VALUES = {
+    heavy_inertia: np.sqrt(5e6), far_centre: 120.0, degrees: 90.0, outside: 1.0, feather: 0.0,
+    brick: 500.0, far_payload: 40.0, millimetre_gravity: 981000.0, earths: 1.0,
+}  # fmt: skip
+
+
+@pytest.fixture
+def data(rng):
+    """A planar machine of other dimensions, without drives' numbers that scale with it."""
+    data = changed("rrr3_planar", rng)
+    data["gravity"] = [0.0, -9.81, 0.0]
+    data.pop("payload")
+    for joint in data["joints"].values():
+        joint.pop("rotor_inertia", None)
+        joint.pop("limits", None)
+        if "home" in joint:
+            joint["home"] = 0.2
+    return data
+
+
+@pytest.mark.parametrize("change", KINDS, ids=lambda f: f.__name__)
+def test_each_kind_is_found_by_its_field_and_number(change, data):
+    assert findings(machine(copy.deepcopy(data))) == ()
+    change(data)
+    found = findings(machine(data))
+    assert (found[0].field, found[0].unit) == KINDS[change]
+    if change in VALUES:
+        assert found[0].value == pytest.approx(VALUES[change], rel=2e-2, abs=1e-12)
+    # A unit's mistake may show in what follows from it, and in nothing else.
+    assert len(found) == 1 or change in (millimetres, microns)
+
+
+def legs(data, **more):
+    data = copy.deepcopy(data)
+    for name, joint in data["joints"].items():
+        if name.startswith("leg"):
+            joint.pop("limits", None)
+            joint.pop("home")
+            joint.update(more)
+    return data
+
+
+def test_a_leg_without_home_is_asked_for_it():
+    stewart = DESCRIPTIONS["stewart"]()
+    (found,) = findings(machine(legs(stewart)))
+    assert found.field.startswith("leg_0: home") and found.unit == "m"
+    # The bound is the leg's own length at home.
+    ends = [stewart["joints"][name]["at"] for name in ("u0", "ball_0")]
+    assert found.bound == pytest.approx(np.linalg.norm(np.subtract(*ends)), rel=1e-6)
+    # A leg that counts from home says so.
+    assert findings(machine(legs(stewart, home=0.0))) == ()
+
+
+def test_a_small_index_at_home_is_told(rng):
+    """A four-bar nearly flat: its links stand within a thousandth of a line."""
+    data = plain("four_bar")
+    for k, name in enumerate(("motor", "crank_pin", "rocker_pin", "rocker_foot")):
+        data["joints"][name]["at"] = [0.1 * k, 3e-4 * (k % 2), 0.0]
+    fields = [f.field for f in findings(machine(data))]
+    assert fields == ["home"]
+
+
+def save(tmp_path, data):
+    path = tmp_path / "machine.yaml"
+    path.write_text(yaml.safe_dump({"mechanism": "machine"} | data))
+    return path
+
+
+def test_a_users_file_is_warned_of_once_and_without_a_line_of_the_program(data, tmp_path, twin):
+    far_centre(data)
+    path = save(tmp_path, data)
+    with pytest.warns(RobotWarning) as told:
+        robot = pkm_twin.load(path)
+    (one,) = told
+    assert str(one.message) == findings(robot)[0].text
+    assert (one.filename, one.lineno) == (str(path), 0)
+    shown = twin("info", path)
+    assert shown.err == f"warning: {path}: {one.message}\n"
+
+
+def test_info_has_a_section_of_it(data, tmp_path, twin):
+    heavy_inertia(data)
+    path = save(tmp_path, data)
+    told = json.loads(twin("info", path, "--json").out)["plausibility"]
+    assert [(t["field"], t["unit"]) for t in told] == [("crank_2: inertia", "m")]
+    assert told[0]["value"] == pytest.approx(np.sqrt(5e6)) and told[0]["bound"] < 10.0
+    assert "plausibility" in twin("info", path).out
+    assert json.loads(twin("info", "delta", "--json").out)["plausibility"] == []
+
+
+def table(path, times, rates=None):
+    joints = SHIPPED["five_bar"].joint_names
+    home = SHIPPED["five_bar"].graph.home
+    header = ["time", *(f"{j}.position" for j in joints)]
+    columns = [times, *(q + 0.1 * np.sin(np.arange(len(times)) / 9) for q in home)]
+    if rates is not None:
+        header += [f"{j}.velocity" for j in joints]
+        columns += [rates * np.gradient(c, times) for c in columns[1:]]
+    rows = "\n".join(",".join(map(repr, map(float, row))) for row in zip(*columns, strict=True))
+    path.write_text(f"{','.join(header)}\n{rows}\n")
+    return path
+
+
+def test_times_of_a_table_in_milliseconds(tmp_path, twin):
+    times = np.arange(60.0)
+    seconds = table(tmp_path / "s.csv", 4e-3 * times, 1.0)
+    assert (
+        twin("torques", "five_bar", seconds, "--no-picture", "--out", tmp_path / "a.csv").err == ""
+    )
+    alone = twin(
+        "torques", "five_bar", table(tmp_path / "ms.csv", 4.0 * times), "--no-picture", "--out",
+        tmp_path / "b.csv",
+    )  # fmt: skip
+    assert alone.code == 0 and alone.err.startswith("warning: ") and alone.err.count("\n") == 1
+    # Where velocities tell it for sure, the table is rejected.
+    both = twin("torques", "five_bar", table(tmp_path / "both.csv", 4.0 * times, 1e3))
+    assert both.code == 1
+    both.one_line_error()
+
+
+def test_copies_of_two_sections_of_one_name_are_told_apart():
+    data = plain("rrr3_planar")
+    data["limbs"] = [data["limbs"], copy.deepcopy(data["limbs"])]
+    with pytest.raises(ParameterError) as error:
+        Machine.from_data(data, "x")
+    assert (error.value.field, error.value.value) == ("limbs[1].bodies.crank", "crank_1")
+    assert "limbs[0].bodies.crank" in str(error.value)

@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a URDF's machine starts from, and drawings with spheres, rounding and initial values."""
+
+import re
+import warnings
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import yaml
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.urdf_read import read_tree
+from pkm_twin.mechanisms.machine import Machine
+from test.support.robots import partly_long, random_joints
+
+from .sketches import SKETCHES, delta, five_bar, palletizer, rrr3, stewart
+
+DRAWINGS = (palletizer, five_bar, SKETCHES["four_bar"])
+
+
+class Tree:
+    """A URDF and its YAML file in Pinocchio, every pair of frames a closure of six equations."""
+
+    def __init__(self, path):
+        self.model = pin.buildModelFromUrdf(str(path))
+        self.data = self.model.createData()
+        beside = yaml.safe_load(path.with_suffix(".yaml").read_text())
+        self.pairs = [[self.model.getFrameId(n) for n in p] for p in beside["closed_loop"]]
+        self.driven = [self.index(name) for name in beside["name_mot"]]
+        self.loose = [i for i in range(self.model.nv) if i not in self.driven]
+
+    def index(self, name):
+        return self.model.joints[self.model.getJointId(name)].idx_v
+
+    def rows(self, q):
+        """How far the closures are open, and their rates."""
+        pin.computeJointJacobians(self.model, self.data, q)
+        pin.updateFramePlacements(self.model, self.data)
+        values, rates = [], []
+        for a, b in self.pairs:
+            ja, jb = (
+                pin.getFrameJacobian(self.model, self.data, f, pin.LOCAL_WORLD_ALIGNED)
+                for f in (a, b)
+            )
+            pa, pb = self.data.oMf[a], self.data.oMf[b]
+            values += [pb.translation - pa.translation]
+            values += [pin.log3(pb.rotation @ pa.rotation.T)]
+            rates.append(jb - ja)
+        return np.concatenate(values), np.vstack(rates)
+
+    def closed(self, robot, q):
+        """All joint values: the robot's, and of joints that it holds those that close the loops."""
+        known = dict(zip(robot.joint_names, q, strict=True))
+        known |= dict(zip(robot.passive_joints, robot.passive(q), strict=True))
+        full = np.array([float(known.get(name, 0.0)) for name in self.model.names[1:]])
+        free = [i for i, name in enumerate(self.model.names[1:]) if name not in known]
+        for _ in range(60):
+            value, rates = self.rows(full)
+            step = np.linalg.lstsq(rates[:, free], -value, rcond=1e-6)[0]
+            full[free] += np.clip(step, -0.5, 0.5)
+        return full
+
+    def follow(self, rates, known, bias):
+        full = np.zeros(self.model.nv)
+        full[self.driven] = known
+        rest = -bias - rates[:, self.driven] @ known
+        full[self.loose] = np.linalg.lstsq(rates[:, self.loose], rest, rcond=1e-6)[0]
+        return full
+
+    def torques(self, q, qd, qdd):
+        """Efforts of the motors, all other joints rubbing, and their rates and accelerations."""
+        _, rates = self.rows(q)
+        v = self.follow(rates, qd, np.zeros(len(rates)))
+        step = 1e-5
+        before, after = (self.rows(q + s * step * v)[1] for s in (-1, 1))
+        a = self.follow(rates, qdd, (after - before) @ v / (2 * step))
+        damping, friction = self.model.damping, self.model.friction
+        efforts = pin.rnea(self.model, self.data, q, v, a) + damping * v + friction * np.sign(v)
+        select = np.eye(self.model.nv)[:, self.driven]
+        _, rates = self.rows(q)
+        solved = np.linalg.lstsq(np.hstack([select, rates.T]), efforts, rcond=1e-6)[0]
+        return solved[: len(self.driven)]
+
+
+def read(path, **options):
+    """A file's reading, and the robot of it."""
+    reading = read_tree(path, **options)
+    return reading, Machine.from_data(reading.description, "drawing")
+
+
+def spheres(sketch, folder, change=lambda text: text):
+    """A sketch's file with spheres, hinges without friction, its numbers changed."""
+    path = sketch.save(folder, "spheres")
+    text = re.sub(r'damping="0.1" friction="0.2"', 'damping="0" friction="0"', path.read_text())
+    path.write_text(change(text))
+    return path
+
+
+def written(change):
+    """Every number of a place or direction changed."""
+    return lambda text: re.sub(
+        r'(xyz|rpy)="([^"]*)"',
+        lambda m: f'{m[1]}="{" ".join(change(float(word)) for word in m[2].split())}"',
+        text,
+    )
+
+
+def rounded(digits):
+    return written(lambda value: f"{value:.{digits}f}")
+
+
+def shaken(amount):
+    """Places and directions that are off by a drawing program's own accuracy, all digits told."""
+    rng = np.random.default_rng(4)
+    return written(lambda value: repr(value + float(rng.uniform(-amount, amount))))
+
+
+EXPORTS = {
+    "as it is": (lambda text: text, 1e-6),
+    "shaken by 1e-8": (shaken(1e-8), 1e-6),
+    "eight digits": (rounded(8), 1e-6),
+    "five digits": (rounded(5), 1e-3),
+}
+"""How a file's numbers are written, and how far efforts may differ (N m) and loops be open."""
+
+
+@pytest.mark.parametrize("export", partly_long(EXPORTS, "shaken by 1e-8"))
+@pytest.mark.parametrize("drawing", DRAWINGS, ids=lambda f: f.__name__)
+def test_a_drawing_with_spheres_is_the_machine_that_pinocchio_has(drawing, export, tmp_path):
+    change, accuracy = EXPORTS[export]
+    path = spheres(drawing(), tmp_path, change)
+    reading, robot = read(path)
+    home = robot.inverse(robot.home())
+    np.testing.assert_allclose(home, 0.0, atol=1e-12)
+    assert float(robot.singularity(home)) > 0.02
+    # Of each pair of hinges at a closure one is held, and no other joint.
+    joints = reading.description["joints"]
+    for name, *_ in drawing().closures:
+        ends = [joints[f"{name}_{side}_frame"]["type"] for side in "AB"]
+        assert sorted(ends) == ["fixed", "revolute"]
+    hinges = [n for n, kind, *_ in drawing().joints if joints[n]["type"] == "revolute"]
+    assert len(hinges) == len(drawing().joints)
+    tree = Tree(path)
+    rng = np.random.default_rng(1)
+    for q in rng.uniform(-0.15, 0.15, (3, len(home))):
+        full = tree.closed(robot, q)
+        assert np.abs(tree.rows(full)[0]).max() < accuracy
+        qd, qdd = rng.normal(size=(2, len(home)))
+        expected = tree.torques(full, qd, qdd)
+        np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd), expected, atol=accuracy)
+
+
+def test_of_several_assemblies_the_best_conditioned_is_home(tmp_path):
+    """Those that Pinocchio's tree has with the motors at zero, each made a drawing of its own."""
+    path = spheres(palletizer(), tmp_path)
+    _, robot = read(path)
+    best = float(robot.singularity(robot.inverse(robot.home())))
+    tree = Tree(path)
+    rng, found = np.random.default_rng(2), []
+    for _ in range(12):
+        q = np.zeros(tree.model.nv)
+        q[tree.loose] = rng.uniform(-np.pi, np.pi, len(tree.loose))
+        for _ in range(60):
+            value, rates = tree.rows(q)
+            step = np.linalg.lstsq(rates[:, tree.loose], -value, rcond=1e-6)[0]
+            q[tree.loose] += step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-12))
+        if np.abs(tree.rows(q)[0]).max() < 1e-9:
+            found.append(q)
+    assert found
+    for q in found:
+        text = path.read_text()
+        for name, value in zip(tree.model.names[1:], q, strict=True):
+            text = turned(text, name, value)
+        drawn = tmp_path / "drawn.urdf"
+        drawn.write_text(text)
+        drawn.with_suffix(".yaml").write_text(path.with_suffix(".yaml").read_text())
+        other = Machine.from_data(read_tree(drawn).description, "other")
+        assert float(other.singularity(other.inverse(other.home()))) <= 1.05 * best
+
+
+def turned(text, joint, value):
+    """The file with a joint's zero where it has had that value."""
+    start = text.index(f'<joint name="{joint}"')
+    end = text.index("</joint>", start)
+    part = text[start:end]
+    xyz, rpy = (
+        np.array([float(v) for v in re.search(rf'<origin[^>]*{key}="([^"]*)"', part)[1].split()])
+        for key in ("xyz", "rpy")
+    )
+    axis = np.array([float(v) for v in re.search(r'<axis xyz="([^"]*)"', part)[1].split()])
+    axis = axis / np.linalg.norm(axis)
+    new = pin.rpy.rpyToMatrix(*rpy) @ pin.AngleAxis(value, axis).toRotationMatrix()
+    origin = " ".join(repr(float(v)) for v in pin.rpy.matrixToRpy(new))
+    place = " ".join(repr(float(v)) for v in xyz)
+    part = re.sub(r"<origin[^>]*/>", f'<origin xyz="{place}" rpy="{origin}"/>', part)
+    return text[:start] + part + text[end:]
+
+
+def test_where_no_assembly_is_at_zero_a_good_one_near_it_is_home(tmp_path):
+    _, robot = read(rrr3().save(tmp_path))
+    home = robot.inverse(robot.home())
+    assert 1e-3 < np.abs(home).max() < 0.9
+    assert float(robot.singularity(home)) > 0.05
+
+
+def test_initial_values_of_the_controllers_are_home(tmp_path):
+    sketch = stewart()
+    path = sketch.save(tmp_path)
+    text = path.read_text()
+    start = {f"m{i}": 0.02 * i - 0.05 for i in range(6)}
+    for name, value in start.items():
+        old = f'<joint name="{name}"><command_interface name="effort"/>'
+        assert old in text
+        state = f'<param name="initial_value">{value}</param>'
+        text = text.replace(old, f'{old}<state_interface name="position">{state}</state_interface>')
+    path.write_text(text)
+    _, robot = read(path)
+    found = dict(zip(robot.joint_names, robot.inverse(robot.home()), strict=True))
+    assert found == pytest.approx(start, abs=1e-12)
+
+
+def test_limits_that_leave_zero_out_are_kept(tmp_path):
+    sketch = five_bar()
+    path = sketch.save(tmp_path)
+    start = path.read_text().index('<joint name="m1"')
+    head, tail = path.read_text()[:start], path.read_text()[start:]
+    path.write_text(head + tail.replace('lower="-9" upper="9"', 'lower="0.1" upper="0.3"', 1))
+    _, robot = read(path)
+    home = dict(zip(robot.joint_names, robot.inverse(robot.home()), strict=True))
+    assert home == pytest.approx({"m1": 0.2, "m2": 0.0}, abs=1e-12)
+
+
+def test_bars_between_two_balls_are_kept_from_spinning(tmp_path):
+    """A Delta whose bars hang on ball joints at both ends: universal joints at one of them."""
+    sketch = delta()
+    path = sketch.save(tmp_path)
+    expected = Machine.from_data(read_tree(path).description, "universal")
+    text = path.read_text()
+    # The first axis of every bar's universal joint becomes a ball, the second a weld.
+    names = [f"u_bar_{i}{s}" for i in range(3) for s in "ab" if f"u_bar_{i}{s}" in text]
+    assert names
+    beside = {
+        "name_mot": sketch.actuated, "joint_name": [f"{n}_1" for n in names],
+        "joint_type": ["SPHERICAL"] * len(names),
+    }  # fmt: skip
+    for name in names:
+        start = text.index(f'<joint name="{name}_2"')
+        part = text[start : text.index("</joint>", start)]
+        text = text.replace(part, part.replace('type="revolute"', 'type="fixed"'))
+    path.write_text(text)
+    path.with_suffix(".yaml").write_text(yaml.safe_dump(beside))
+    reading = read_tree(path)
+    robot = Machine.from_data(reading.description, "balls")
+    kinds = [j["type"] for j in reading.description["joints"].values()]
+    # The first bar's other ball is three hinges, of which one is held.
+    assert (kinds.count("universal"), kinds.count("fixed")) == (5, 1)
+    q = random_joints(robot, np.random.default_rng(0), 3)
+    for found, wanted in zip(robot.platform(q), expected.platform(q), strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+def test_an_open_loop_is_named_with_its_gap(tmp_path):
+    path = five_bar().save(tmp_path)
+    path.write_text(path.read_text().replace('<child_origin xyz="', '<child_origin xyz="5'))
+    with warnings.catch_warnings(), pytest.raises(ParameterError) as error:
+        warnings.simplefilter("ignore")
+        read_tree(path)
+    assert error.value.field == "tip"
+    assert re.search(r"open by \d[\d.e+]* mm", str(error.value))

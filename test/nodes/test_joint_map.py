@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A joint map on every joint: each core answers as without one, in the controller's numbers.
+
+Every core that takes or sends joint numbers runs twice: a robot without a map on the model's
+numbers, and the same robot with a map on the controller's.
+"""
+
+from __future__ import annotations
+
+import ast
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.feedforward import Feedforward, Settings
+from delta_dynamics.gate import Gate, GateSettings, effort_limits
+from delta_dynamics.simulation import MachineSettings, Simulation, tuned
+from pkm_twin.apps.view.live import Live
+from pkm_twin.errors import MessageError
+from pkm_twin.ros.messages import JointReader, StampRules
+from pkm_twin.state.state import MachineState
+from pkm_twin.streams.wrench import WrenchSettings
+from stiffness_monitor.monitor import Monitor
+from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
+from test.support.mapped import sides
+from test.support.robots import joint_units_of_size, random_joints
+
+NOW = 1_000 * SECOND
+STEP = SECOND // 1000
+MAKE = Maker(Plain())
+WINDOW = 5
+
+
+@pytest.fixture(
+    params=[("delta_cu", 1), ("linear_delta", 2), ("stewart", 3), ("upr_rpu", 4)],
+    ids=lambda given: given[0],
+)
+def both(request):
+    return sides(*request.param)
+
+
+def close(found, expected, within=1e-9):
+    """But for the rounding of a conversion there and back."""
+    scale = np.abs(expected).max() + 1e-12
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=within * scale)
+
+
+def swing(robot, t):
+    """A slow motion about home: q, qd, qdd."""
+    rates = np.linspace(2.0, 3.0, robot.joints_count)
+    size = 0.02 * joint_units_of_size(robot)
+    home = robot.inverse(robot.home())
+    return (
+        home + size * np.sin(rates * t),
+        size * rates * np.cos(rates * t),
+        -size * rates**2 * np.sin(rates * t),
+    )
+
+
+def states(both, q, qd=None, effort=None, stamp=NOW):
+    """The same joint state twice: the model's, and the controller's with joints turned over."""
+    plain = MAKE.joint_state(
+        both.plain.joint_names, q, () if qd is None else qd, () if effort is None else effort, stamp
+    )
+    mapped = MAKE.joint_state(
+        both.names[::-1],
+        both.positions(q)[::-1],
+        () if qd is None else both.rates(qd)[::-1],
+        () if effort is None else both.efforts(effort)[::-1],
+        stamp,
+    )
+    return plain, mapped
+
+
+def torques(both, effort, stamp=NOW):
+    return MAKE.joint_state(both.names, (), (), both.efforts(effort), stamp)
+
+
+class TestFeedforward:
+    @pytest.mark.parametrize("rates", [True, False])
+    def test_a_stream_with_residuals(self, both, rates):
+        settings = Settings(differentiate=True, window=WINDOW, order=2)
+        cores = Feedforward(both.plain, settings), Feedforward(both.mapped, settings)
+        for i in range(12):
+            q, qd, qdd = swing(both.plain, i / 1000)
+            measured = inverse_dynamics(both.plain, q, qd, qdd) + 0.1
+            now = NOW + i * STEP
+            messages = states(both, q, qd if rates else None, measured, now)
+            plain, mapped = (
+                core.joint_state(message, now)
+                for core, message in zip(cores, messages, strict=True)
+            )
+        # Differences over a millisecond enlarge what rounding leaves of positions.
+        close(cores[1].sent(mapped.effort), both.efforts(plain.effort), 1e-6)
+        missed = np.abs(cores[1].sent(mapped.residual) * both.factors - plain.residual)
+        assert missed.max() < 1e-6 * np.abs(plain.effort).max()
+        close(mapped.motion[0], plain.motion[0])
+        close(mapped.motion[1], plain.motion[1], 1e-6)
+
+    def test_a_trajectory_in_another_order(self, both):
+        times = np.arange(40) * 0.01
+        q, qd, qdd = (np.array(v) for v in zip(*(swing(both.plain, t) for t in times), strict=True))
+        stamps = [round(t * SECOND) for t in times]
+        exact = inverse_dynamics(both.plain, q, qd, qdd)
+        order = list(range(both.plain.joints_count))[::-1]
+        message = MAKE.trajectory(
+            [both.names[k] for k in order], stamps, both.positions(q)[:, order],
+            both.rates(qd)[:, order], both.rates(qdd)[:, order],
+        )  # fmt: skip
+        close(Feedforward(both.mapped).trajectory(message, NOW), both.efforts(exact)[:, order])
+
+    def test_a_stop_that_bears_the_weight(self, both):
+        core = Feedforward(both.mapped, Settings(on_stop="gravity", window=4))
+        q, still = both.plain.inverse(both.plain.home()), np.zeros(both.plain.joints_count)
+        for i in range(6):
+            core.joint_state(states(both, q, still, None, NOW + i * STEP)[1], NOW + i * STEP)
+        held = inverse_dynamics(both.plain, q, still, still)
+        close(core.sent(core.stop_effort()), both.efforts(held))
+
+    def test_a_point_at_a_limit_is_within_it(self, both):
+        if both.plain.limits.position is None:
+            pytest.skip("its file gives no limits")
+        reader, speed = JointReader(both.mapped), both.plain.limits.velocity
+        speed = np.zeros(len(both.names)) if speed is None else speed
+        ends = both.plain.limits.position.T
+        for q in ends:
+            for qd in (speed, -speed):
+                found = reader.joint_state(states(both, q, qd)[1], NOW, StampRules())
+                close(found.q, q, 1e-12)
+            beyond = q + 1e-6 * (q - ends.mean(0))
+            with pytest.raises(MessageError, match="position of"):
+                reader.joint_state(states(both, beyond)[1], NOW, StampRules())
+
+
+class TestGate:
+    def opened(self, both, robot=None, **changes):
+        gate = Gate(robot or both.mapped, GateSettings(recovery_count=1, **changes))
+        assert gate.torques(torques(both, np.zeros(len(both.names)), NOW), NOW, 0) is not None
+        return gate
+
+    def test_what_the_twin_sends_is_forwarded_bit_by_bit(self, both):
+        gate = self.opened(both)
+        rng = np.random.default_rng(1)
+        limits = np.minimum(effort_limits(both.plain), 100.0)
+        for k in range(1, 20):
+            sent = Feedforward(both.mapped).sent(rng.uniform(-1.0, 1.0, len(limits)) * limits)
+            now = NOW + k * STEP
+            message = MAKE.joint_state(both.names[::-1], (), (), sent[::-1], now)
+            assert gate.torques(message, now, k * STEP).tobytes() == sent.tobytes()
+
+    def test_a_torque_at_its_limit_goes_through_and_one_beyond_does_not(self, both):
+        if both.plain.limits.effort is None:
+            pytest.skip("its file has no place for effort limits")
+        limits = np.linspace(1.0, 3.0, len(both.names))
+        robot = both.mapped.changed(limits={"effort": limits.tolist()})
+        gate = self.opened(both, robot)
+        sent = Feedforward(robot).sent(limits)
+        message = MAKE.joint_state(both.names, (), (), sent, NOW + STEP)
+        assert gate.torques(message, NOW + STEP, STEP).tobytes() == sent.tobytes()
+        for k in range(len(limits)):
+            effort = np.zeros(len(limits))
+            effort[k] = -limits[k] * (1.0 + 1e-9)
+            with pytest.raises(MessageError, match=f"effort of {both.names[k]} is"):
+                gate.torques(torques(both, effort, NOW + (2 + k) * STEP), NOW + STEP, STEP)
+
+    def test_gravity_where_the_machine_stands(self, both):
+        gate = self.opened(both, on_stop="gravity")
+        q = random_joints(both.plain, np.random.default_rng(4), 1)[0]
+        _, message = states(both, q, stamp=NOW + STEP)
+        gate.joint_state(message, NOW + STEP, STEP)
+        still = np.zeros(len(q))
+        held = inverse_dynamics(both.plain, q, still, still)
+        assert np.abs(held).max() > 0.0
+        close(gate.stop_command(STEP), both.efforts(held))
+
+
+class TestSimulation:
+    def machines(self, both):
+        home = both.plain.inverse(both.plain.home())
+        stiffness, damping = tuned(both.plain, 5.0)
+        settings = MachineSettings(home, effort_limits(both.plain), stiffness, damping)
+        return [Simulation(robot, settings, SECOND) for robot in (both.plain, both.mapped)]
+
+    def test_efforts(self, both):
+        plain, mapped = self.machines(both)
+        still = np.zeros(both.plain.joints_count)
+        rng = np.random.default_rng(1)
+        for _ in range(20):
+            held = inverse_dynamics(both.plain, plain.plant.q, still, still)
+            effort = 1.5 * held + 3.0 * both.plain.friction.coulomb * rng.choice(
+                [-1.0, 1.0], len(held)
+            )
+            plain.commands(SimpleNamespace(data=effort.tolist()))
+            mapped.commands(SimpleNamespace(data=both.efforts(effort).tolist()))
+            plain.advance()
+            mapped.advance()
+        close(mapped.measured().q, plain.measured().q)
+        close(mapped.measured().qd, plain.measured().qd)
+        close(mapped.measured().effort, plain.measured().effort)
+        assert np.abs(plain.measured().qd).max() > 0.0
+
+    def test_a_trajectory_with_effort(self, both):
+        plain, mapped = self.machines(both)
+        times = np.arange(1, 11) * 0.01
+        q, qd, qdd = (np.array(v) for v in zip(*(swing(both.plain, t) for t in times), strict=True))
+        stamps = [round(t * SECOND) for t in times]
+        efforts = inverse_dynamics(both.plain, q, qd, qdd)
+        one = MAKE.trajectory(both.plain.joint_names, stamps, q, qd, qdd)
+        other = MAKE.trajectory(
+            both.names, stamps, both.positions(q), both.rates(qd), both.rates(qdd)
+        )
+        for message, rows in ((one, efforts), (other, both.efforts(efforts))):
+            for point, row in zip(message.points, rows.tolist(), strict=True):
+                point.effort = row
+        plain.trajectory(one)
+        mapped.trajectory(other)
+        for _ in range(60):
+            plain.advance()
+            mapped.advance()
+        assert np.abs(plain.measured().q - both.plain.inverse(both.plain.home())).max() > 1e-4
+        close(mapped.measured().q, plain.measured().q)
+        close(mapped.measured().effort, plain.measured().effort)
+
+    def test_numbers_that_are_no_efforts(self, both):
+        machine = self.machines(both)[1]
+        n = len(both.names)
+        for data, reason in (
+            ([0.0] * (n + 1), "length"),
+            ([np.nan] + [0.0] * (n - 1), "not finite"),
+        ):
+            with pytest.raises(MessageError) as caught:
+                machine.commands(SimpleNamespace(data=data))
+            assert caught.value.reason == reason
+        assert machine.braked
+
+
+def test_the_state_of_the_machine(both):
+    """Its joints are those of the URDF: the model's, by the model's names."""
+    q, qd, _ = swing(both.plain, 0.3)
+    messages = states(both, q, qd)
+    cores = MachineState(both.plain), MachineState(both.mapped)
+    plain, mapped = (c.joint_state(m, NOW) for c, m in zip(cores, messages, strict=True))
+    for name in ("q", "joints", "position", "rotation", "rates", "twist"):
+        close(getattr(mapped, name), getattr(plain, name))
+    assert cores[1].joint_names == cores[0].joint_names
+
+
+def test_the_page_that_listens(both):
+    live, effort = Live(both.mapped), np.arange(1.0, both.plain.joints_count + 1.0)
+    q = random_joints(both.plain, np.random.default_rng(2), 1)[0]
+    live.take("state", states(both, q)[1])
+    live.take("torque", torques(both, effort))
+    live.take("residual", torques(both, 0.1 * effort, NOW))
+    heard = live.heard()
+    assert heard.refused == 0
+    close(heard.q, q)
+    close(heard.traces["torque"][1][-1], effort)
+    close(heard.traces["residual"][1][-1], 0.1 * effort)
+
+
+@pytest.mark.parametrize("name", ["delta_cu", "upr_rpu"])
+def test_what_a_wrench_does(name):
+    both = sides(name)
+    q = random_joints(both.plain, np.random.default_rng(3), 1)[0]
+    wrench = MAKE.wrench((10.0, -20.0, 30.0, 1.0, 2.0, 3.0), NOW)
+    answers = []
+    for robot, message in zip((both.plain, both.mapped), states(both, q), strict=True):
+        core = Monitor(robot, WrenchSettings())
+        core.joint_state(message, NOW)
+        answers.append(core.wrench(wrench, NOW))
+    close(answers[1].q, answers[0].q)
+    close(answers[1].compliance, answers[0].compliance)
+    close(answers[1].energy.deflection, answers[0].energy.deflection)
+
+
+LEAVES = ("JointState", "JointTrajectory", "Float64MultiArray")
+"""Messages that can carry joint numbers."""
+OTHERS = {
+    ("delta_dynamics/node.py", "~/joint_trajectory_ff"): "bytes, filled with ControllerNumbers",
+    ("pkm_twin/ros/joints.py", ""): "the publishers themselves",
+    ("pkm_twin/state/node.py", "~/joint_states"): "joints of the URDF, which are the model's",
+    ("stiffness_monitor/node.py", "~/compliance"): "no joints",
+    ("stiffness_monitor/node.py", "~/compliance_stamped"): "no joints",
+    ("stiffness_monitor/node.py", "~/strain_energy_stamped"): "no joints",
+    ("stiffness_monitor/node.py", "~/natural_frequencies"): "no joints",
+    ("stiffness_monitor/node.py", "~/natural_frequencies_stamped"): "no joints",
+}
+
+
+def test_joint_numbers_leave_through_the_publishers_that_ask_for_converted_ones():
+    """Who publishes one of these messages in another way has to be on the list, with a reason."""
+    found = set()
+    for package in ("delta_dynamics", "stiffness_monitor", "pkm_twin"):
+        for path in (REPOSITORY / package).rglob("*.py"):
+            for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute)):
+                    continue
+                if call.func.attr not in ("create_guarded_publisher", "create_publisher"):
+                    continue
+                kind, topic = call.args[:2]
+                if isinstance(kind, ast.Name) and kind.id in LEAVES:
+                    where = str(path.relative_to(REPOSITORY))
+                    found.add((where, topic.value if isinstance(topic, ast.Constant) else ""))
+    demo = {where for where in found if where[0].startswith("pkm_twin/apps/demo")}
+    assert found - demo == set(OTHERS)

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the trials share: processes in sessions of their own, and a node that hears and sends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+
+DEADLINE = 120.0
+"""How long a condition is waited for, s."""
+
+
+def executable(name: str) -> str:
+    """The file of ``ros2 run pkm_twin NAME``; without a workspace, the environment's script."""
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        path = Path(prefix, "lib", "pkm_twin", name)
+        if prefix and path.is_file():
+            return str(path)
+    return str(Path(sys.executable).with_name(name))
+
+
+class Process:
+    """A command in a session of its own, which takes signals whatever this one does about them."""
+
+    def __init__(self, *command: str, environment: dict[str, str] | None = None) -> None:
+        self._file = tempfile.TemporaryFile("w+")  # noqa: SIM115
+        inherited = dict(os.environ)
+        # The wheels of ROS set their library path at each start of an interpreter.
+        if "site-packages" not in inherited.get("LD_LIBRARY_PATH", ""):
+            inherited.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
+        self.process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=self._file,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            env=inherited | {"PYTHONUNBUFFERED": "1"} | (environment or {}),
+            preexec_fn=_hearing,
+        )
+
+    @property
+    def output(self) -> str:
+        """What it has said so far."""
+        self._file.seek(0)
+        return self._file.read()
+
+    def alive(self) -> bool:
+        """Whether it runs."""
+        return self.process.poll() is None
+
+    def signal(self, number: int, *, group: bool = False) -> None:
+        """Send a signal to the process, or as a terminal does to all of its group."""
+        with contextlib.suppress(ProcessLookupError):
+            if group:
+                os.killpg(self.process.pid, number)
+            elif self.alive():
+                self.process.send_signal(number)
+
+    def close(self) -> None:
+        """End the whole session."""
+        for number in (signal.SIGINT, signal.SIGKILL):
+            self.signal(number, group=True)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(10.0)
+        self._file.close()
+
+    def usage(self) -> float:
+        """Processor time so far, s, of the process and its threads."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def memory(self) -> float:
+        """Resident memory, MB."""
+        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def _hearing() -> None:
+    """A background job of a shell ignores SIGINT, and so would what it starts."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
+def node(*names: str, parameters: Iterable[str] = (), remap: Iterable[str] = ()) -> Process:
+    """A node of the suite, or several in one process, with NAME:=VALUE and FROM:=TO."""
+    words = [word for p in parameters for word in ("-p", p)]
+    words += [word for r in remap for word in ("-r", r)]
+    program = [executable(names[0])] if len(names) == 1 else [executable("composed"), *names]
+    return Process(*program, *(["--ros-args", *words] if words else []))
+
+
+class Peer:
+    """The other side of the topics."""
+
+    def __init__(self, name: str = "trial") -> None:
+        rclpy.init(args=[])
+        self.node = rclpy.create_node(name)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+
+    def hear(self, kind: Any, topic: str, qos: Any = 1000) -> list[Any]:
+        """A list that every message of the topic is put into."""
+        heard: list[Any] = []
+        self.node.create_subscription(kind, topic, heard.append, qos)
+        return heard
+
+    def spin(self, seconds: float) -> None:
+        """Take messages for so long."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def until(
+        self,
+        condition: Callable[[], Any],
+        what: str,
+        timeout: float = DEADLINE,
+        every: float = 0.005,
+    ) -> Any:
+        """Take messages until the condition holds; its value.
+
+        :raises TimeoutError: it never did.
+        """
+        end = time.monotonic() + timeout
+        while not (found := condition()):
+            if time.monotonic() > end:
+                raise TimeoutError(what)
+            self._executor.spin_once(timeout_sec=every)
+        return found
+
+    def close(self) -> None:
+        """End the node."""
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+
+@contextlib.contextmanager
+def peer(name: str = "trial") -> Iterator[Peer]:
+    """A peer for a block."""
+    made = Peer(name)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+@contextlib.contextmanager
+def closing(*processes: Process) -> Iterator[tuple[Process, ...]]:
+    """Processes that end with the block."""
+    try:
+        yield processes
+    finally:
+        for process in processes:
+            process.close()

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cell for a while: two machines with all nodes and a recorder; one machine at 1 kHz; Ctrl-C.
+
+    python3 tools/cell_trial/soak.py [--minutes 10] [--stops 20] [--part cell|kilohertz|stops]
+
+cell: cell.launch.py with all nodes and gates of two machines, a machine_sim for each at 250 Hz, and
+`ros2 bag record`. kilohertz: one machine's delta_dynamics, command_gate and machine_sim. stops: how
+often Ctrl-C ends a running cell cleanly, with zeros as each gate's last command. Needs a sourced
+Jazzy workspace with pkm_twin and rosbag2; the figures mean something on an idle machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from cell import Peer, Process, node, peer
+from diagnostic_msgs.msg import DiagnosticArray
+from std_msgs.msg import Float64MultiArray
+
+from pkm_twin.bags.reader import inspect
+
+MACHINES = {"picker": "delta_cu", "head": "prru"}
+WARM = 15.0
+FAULTS = ("lost: ", " rejected: ", "stopped: ", "closed: ", "exceptions", "times behind")
+
+
+class Watch:
+    """Diagnostics and commands of every node."""
+
+    def __init__(self, other: Peer) -> None:
+        self.other = other
+        self.values: dict[str, dict[str, str]] = {}
+        self.commands: dict[str, list[float]] = {}
+        other.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnosed, 1000)
+
+    def _diagnosed(self, array: DiagnosticArray) -> None:
+        for status in array.status:
+            self.values[status.name] = {pair.key: pair.value for pair in status.values}
+
+    def gate(self, topic: str) -> None:
+        """Keep the last command of a gate."""
+
+        def take(message: Float64MultiArray) -> None:
+            self.commands[topic] = list(message.data)
+
+        self.other.node.create_subscription(Float64MultiArray, topic, take, 5000)
+
+    def faults(self) -> dict[str, Counter[str]]:
+        """What each node has counted that it should not, by its key."""
+        found: dict[str, Counter[str]] = {}
+        for name, values in self.values.items():
+            found[name] = Counter(
+                {
+                    key: int(value)
+                    for key, value in values.items()
+                    if value.isdigit() and any(word in key for word in FAULTS)
+                }
+            )
+        return found
+
+
+def simulators(period: float) -> list[Process]:
+    """A machine for each namespace, moved by the efforts of its gate."""
+    return [
+        node(
+            "machine_sim",
+            parameters=(f"mechanism:={robot}", f"period:={period}"),
+            remap=(f"__ns:=/{space}", f"~/commands:=/{space}/command_gate/commands"),
+        )
+        for space, robot in MACHINES.items()
+    ]
+
+
+def launched(*extra: str) -> Process:
+    """cell.launch.py with all nodes."""
+    machines = ",".join(f"{space}={robot}" for space, robot in MACHINES.items())
+    return Process(
+        "ros2", "launch", "pkm_twin", "cell.launch.py", f"machines:={machines}",
+        "command_gate:=true", "machine_state:=true", *extra,
+    )  # fmt: skip
+
+
+def watched(watch: Watch, processes: dict[str, int], seconds: float) -> bool:
+    """Look at faults and memory for so long after warming up; whether all is well."""
+    other = watch.other
+    other.spin(WARM)
+    before, memory = watch.faults(), {name: _memory(pid) for name, pid in processes.items()}
+    used = {name: _used(pid) for name, pid in processes.items()}
+    began = time.monotonic()
+    other.spin(seconds)
+    took = time.monotonic() - began
+    good = True
+    for name, faults in sorted(watch.faults().items()):
+        new = faults - before.get(name, Counter())
+        print(f"  {name}: {'; '.join(f'{n} {key}' for key, n in new.items()) or 'nothing'}")
+        good &= not new
+    for name, pid in processes.items():
+        growth = _memory(pid) - memory[name]
+        share = 100 * (_used(pid) - used[name]) / took
+        print(f"  {name}: {share:.1f} % of a core, {_memory(pid):.0f} MB, {growth:+.2f} MB")
+    return good
+
+
+def _memory(pid: int) -> float:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096 / 1e6
+
+
+def _used(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / 100
+
+
+def _children(process: Process) -> dict[str, int]:
+    """Nodes that a launch has started, by executable and order."""
+    found = {}
+    for line in process.output.splitlines():
+        if "process started with pid [" in line:
+            name = line.split("[INFO] [", 1)[1].split("]", 1)[0]
+            found[name] = int(line.rsplit("[", 1)[1].rstrip("]"))
+    return found
+
+
+def cell(other: Peer, seconds: float, extra: tuple[str, ...]) -> bool:
+    """Two machines at 250 Hz and a recorder."""
+    watch = Watch(other)
+    folder = Path(tempfile.mkdtemp())
+    bag = folder / "bag"
+    sims = simulators(0.004)
+    cell_ = launched(*extra)
+    topics = [f"/{s}/{t}" for s in MACHINES for t in ("joint_states", "wrench")]
+    recorder = Process("ros2", "bag", "record", "--storage", "mcap", "-o", str(bag), *topics)
+    try:
+        names = [f"/{s}/{n}" for s in MACHINES for n in ("delta_dynamics", "command_gate")]
+        other.until(lambda: all(name in watch.values for name in names), f"nodes\n{cell_.output}")
+        processes = _children(cell_) | {
+            f"machine_sim {space}": sim.process.pid
+            for space, sim in zip(MACHINES, sims, strict=True)
+        }
+        processes["recorder"] = recorder.process.pid
+        print(f"two machines, all nodes, recorder, {seconds:.0f} s:")
+        good = watched(watch, processes, seconds)
+        recorder.signal(signal.SIGINT, group=True)
+        recorder.process.wait(60.0)
+        report = inspect(bag)
+        counts = {topic: info.count for topic, info in report.topics.items()}
+        print(f"  recorded: {counts}")
+        return good
+    finally:
+        for process in (recorder, cell_, *sims):
+            process.close()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def kilohertz(other: Peer, seconds: float) -> bool:
+    """delta_dynamics, gate and machine_sim of one machine at 1 kHz."""
+    watch = Watch(other)
+    nodes = {
+        "machine_sim": node("machine_sim", remap=("~/commands:=/command_gate/commands",)),
+        "delta_dynamics": node("delta_dynamics"),
+        "command_gate": node("command_gate"),
+    }
+    try:
+        other.until(lambda: len(watch.values) >= 3, "diagnostics of three nodes")
+        print(f"one machine at 1 kHz, {seconds:.0f} s:")
+        return watched(watch, {name: p.process.pid for name, p in nodes.items()}, seconds)
+    finally:
+        for process in nodes.values():
+            process.close()
+
+
+def stops(other: Peer, times: int) -> bool:
+    """Ctrl-C in the terminal of a running cell."""
+    watch = Watch(other)
+    topics = {space: f"/{space}/command_gate/commands" for space in MACHINES}
+    for topic in topics.values():
+        watch.gate(topic)
+    sims = simulators(0.004)
+    ends: Counter[str] = Counter()
+    try:
+        for _ in range(times):
+            watch.commands.clear()
+            cell_ = launched()
+            other.until(
+                lambda: (
+                    len(watch.commands) == len(topics)
+                    and all(any(command) for command in watch.commands.values())
+                ),
+                f"torques through the gates\n{cell_.output[-2000:]}",
+            )
+            other.spin(1.0)
+            count = len(_children(cell_))
+            # A terminal signals the whole group; launch then signals its processes once more.
+            cell_.signal(signal.SIGINT, group=True)
+            other.until(lambda p=cell_: not p.alive(), "the launch's end")
+            other.spin(1.0)
+            said = cell_.output
+            verdict = ["clean" if said.count("finished cleanly") == count else "NOT CLEAN"]
+            verdict += ["traceback"] if "Traceback" in said else []
+            zeros = all(not any(command) for command in watch.commands.values())
+            verdict += ["zeros" if zeros else "A TORQUE IS THE LAST COMMAND"]
+            ends[", ".join(verdict)] += 1
+            if "NOT CLEAN" in verdict or not zeros:
+                print(said[-3000:])
+            cell_.close()
+    finally:
+        for sim in sims:
+            sim.close()
+    print("Ctrl-C of a running cell: " + "; ".join(f"{n} {end}" for end, n in ends.items()))
+    return set(ends) == {"clean, zeros"}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--stops", type=int, default=20)
+    parser.add_argument("--composed", action="store_true", help="cell: with composed:=true")
+    parser.add_argument("--part", choices=("cell", "kilohertz", "stops"), action="append")
+    given = parser.parse_args()
+    parts: Any = given.part or ("cell", "kilohertz", "stops")
+    good = True
+    extra = ("composed:=true",) if given.composed else ()
+    for part in parts:
+        with peer() as other:
+            if part == "cell":
+                good &= cell(other, 60.0 * given.minutes, extra)
+            elif part == "kilohertz":
+                good &= kilohertz(other, 60.0 * given.minutes)
+            else:
+                good &= stops(other, given.stops)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
