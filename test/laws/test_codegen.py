@@ -11,10 +11,10 @@ import pytest
 from pkm_twin.codegen import expressions as ex
 from pkm_twin.codegen import kernels
 from pkm_twin.codegen.cholesky import FLOOR, traces_over
-from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.codegen.lu import SparseLU, independent_rows
-from pkm_twin.codegen.plain import PlainCode
+from pkm_twin.codegen.kernels import Code, Kernel
+from pkm_twin.codegen.lu import SparseLU, independent_rows, pivot_order
 from pkm_twin.codegen.program import Program
+from test.support.plain import PlainKernel
 from test.support.robots import every_robot, load, random_joints
 
 NONE = np.zeros(0)
@@ -31,9 +31,9 @@ def program(write, size):
 def both(write, x, key):
     """What compiled and plain code give for samples x, shape (count, size)."""
     made = program(write, x.shape[1])
-    (fast,), status = Kernel(lambda: made, key)(NONE, x)
+    (fast,), status = Kernel(Code(lambda: made, key))(NONE, x)
     assert status is None
-    (slow,), codes = PlainCode(made).run(NONE, [x], len(x), 1)
+    (slow,), codes = PlainKernel(made).run([x])
     assert not codes[:, 0].any()
     return fast, slow
 
@@ -109,7 +109,7 @@ def test_both_back_ends_agree_and_one_sample_has_the_bits_of_its_batch(name, rng
     for kernel in (robot.engine.forward, robot.engine.jacobian):
         outputs, status = kernel(NONE, q)
         assert status is None
-        slow, codes = PlainCode(kernel.program).run(NONE, [q], len(q), 4)
+        slow, codes = PlainKernel(kernel.program, kernel.geometry).run([q], 4)
         good = codes[:, 0] == 0.0
         assert good.any()
         for fast, plain in zip(outputs, slow, strict=True):
@@ -128,7 +128,7 @@ def test_sparse_factors_solve_as_numpy_does(size, rng):
         full += np.eye(size)[rng.permutation(size)] * 3.0
         right = rng.normal(size=size)
         objects = full.astype(object)
-        lu = SparseLU(objects, full[None])
+        lu = SparseLU(objects, pivot_order(full[None]))
         np.testing.assert_allclose(
             lu.solve(right).astype(float), np.linalg.solve(full, right), rtol=1e-9, atol=1e-10
         )

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.passive import passive_program
 from pkm_twin.machine.graph import BASE
 from test.support.bodies import bodies
+from test.support.plain import PlainKernel
 from test.support.robots import (
     every_robot,
     finite_difference,
@@ -214,9 +214,10 @@ def test_an_arm_without_loops_has_no_passive_joints():
     q = np.linspace(0.1, 0.5, 8).reshape(4, 2)
     assert robot.passive(q).shape == (4, 0) and robot.passive(q[0]).shape == (0,)
     assert robot.passive_rates(q, q).shape == (4, 0)
-    plain = PlainCode(robot.engine.kernel("passive", passive_program).program)
+    kernel = robot.engine.kernel("passive", passive_program)
+    plain = PlainKernel(kernel.program, kernel.geometry)
     for samples in (q, q[:1]):
-        (found,), status = plain.run(np.zeros(0), [samples], len(samples), 1)
+        (found,), status = plain.run([samples])
         assert found.shape == (len(samples), 0) and not status[:, 0].any()
 
 

@@ -16,14 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin import Robot
 from pkm_twin.codegen.kernels import STEPS
-from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine, Traced
 from pkm_twin.machine.graph import BASE, Joint
+from test.support.plain import PlainKernel
 
 Array = NDArray[np.float64]
-
-_NONE = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ def bodies(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Bodies:
         left = np.flatnonzero(np.isnan(outputs[:, 0]))
         if len(left):
             picked = [value[left] for value in inputs]
-            (outputs[left],), _ = _code(robot.engine, where).run(_NONE, picked, len(left), steps)
+            (outputs[left],), _ = _code(robot.engine, where).run(picked, steps)
     assert np.isfinite(outputs).all()
     rows = outputs.reshape(*batch, len(points), 21 + 6 * n)
     place, change, turned, omega, alpha = (
@@ -168,9 +166,10 @@ def rubs(robot: Robot, moved: Bodies, q: Array, qd: Array) -> list[Rub]:
 
 
 @lru_cache(maxsize=8)
-def _code(engine: Engine, points: tuple[tuple[str, tuple[float, ...]], ...]) -> PlainCode:
+def _code(engine: Engine, points: tuple[tuple[str, tuple[float, ...]], ...]) -> PlainKernel:
     """The plain back end: nothing to compile, and the back end that the laws do not use else."""
-    return PlainCode(_program(Traced(engine), [(body, np.array(p)) for body, p in points]))
+    program = _program(Traced(engine), [(body, np.array(p)) for body, p in points])
+    return PlainKernel(program, engine.geometry)
 
 
 def _program(t: Traced, points: list[tuple[str, Array]]) -> Program:
