@@ -88,6 +88,21 @@ def source(
     return "\n".join(lines)
 
 
+def functions(
+    results: Sequence[Expression],
+    inputs: Mapping[str, int],
+    known: Mapping[int, str] | None = None,
+) -> tuple[Callable[..., tuple[Any, ...]], Callable[..., tuple[Any, ...]]]:
+    """The function of :func:`source` on floats, and the same on arrays."""
+    code = compile(source(results, inputs, known), "<program>", "exec")
+    made = []
+    for library in (_ONE, _MANY):
+        space: dict[str, Any] = dict(library)
+        exec(code, space)  # noqa: S102
+        made.append(space["program"])
+    return made[0], made[1]
+
+
 class PlainCode:
     """A program as two functions, one of floats and one of arrays over the samples."""
 
@@ -100,21 +115,21 @@ class PlainCode:
         self._names = list(names)
         prepared = [*program.prepared, program.missed]
         given = {PARAMETERS: program.parameters, GEOMETRY: program.geometry}
-        self._prepare = self._compiled(prepared, given)[0]
+        self._prepare = functions(prepared, given)[0]
         self._known = {e.number: f"{PARAMETERS}[{k}]" for k, e in enumerate(program.prepared)}
         results = [e for row in program.outputs.values() for e in row]
         self._judged = 0
         if equations is not None:
             results += [equations.residual, *equations.branch]
             self._judged = 1 + len(equations.branch)
-        self._results = self._compiled(results, names, self._known)
+        self._results = functions(results, names, self._known)
         self._correction = self._begun = self._start = None
         if equations is not None:
-            self._correction = self._compiled(equations.results, names, self._known)
+            self._correction = functions(equations.results, names, self._known)
             begun = [*equations.home, *equations.origin]
-            self._begun = self._compiled(begun, names, self._known)
+            self._begun = functions(begun, names, self._known)
             if equations.start is not None:
-                self._start = self._compiled(equations.start, names, self._known)
+                self._start = functions(equations.start, names, self._known)
 
     def prepare(self, p: Array) -> Array:
         """What hangs on parameters alone, of machines (k, parameters): shape (k, prepared + 1)."""
@@ -126,20 +141,6 @@ class PlainCode:
             except (ZeroDivisionError, ValueError, OverflowError):
                 rows.append((math.nan,) * (len(self.program.prepared) + 1))
         return np.array(rows, np.float64).reshape(len(p), -1)
-
-    @staticmethod
-    def _compiled(
-        results: Sequence[Expression],
-        inputs: Mapping[str, int],
-        known: Mapping[int, str] | None = None,
-    ) -> tuple[Callable[..., tuple[Any, ...]], Callable[..., tuple[Any, ...]]]:
-        code = compile(source(results, inputs, known), "<program>", "exec")
-        functions = []
-        for library in (_ONE, _MANY):
-            space: dict[str, Any] = dict(library)
-            exec(code, space)  # noqa: S102
-            functions.append(space["program"])
-        return functions[0], functions[1]
 
     def run(
         self, p: Array, inputs: Sequence[Array], count: int, steps: int

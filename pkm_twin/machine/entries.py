@@ -7,15 +7,22 @@ May import: numpy, this package, the standard library.
 from __future__ import annotations
 
 import copy
+import dataclasses
 import re
-from collections.abc import Iterator, Mapping
-from typing import Any, Final, TypeVar
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import numpy as np
+
+from pkm_twin.codegen.expressions import plain
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import Graph
-from pkm_twin.machine.robot import Robot
 
-R = TypeVar("R", bound=Robot)
+if TYPE_CHECKING:
+    from pkm_twin.machine.graph import Graph
+    from pkm_twin.machine.robot import Robot
+
+R = TypeVar("R", bound="Robot")
+T = TypeVar("T")
 _PART: Final = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 Key = str | int
 
@@ -23,6 +30,13 @@ Key = str | int
 def keys_of(path: str) -> list[Key]:
     """The keys and places of a dotted path: ``joints.arm.at[2]`` has four."""
     return [name or int(place) for name, place in _PART.findall(path)]
+
+
+def full_keys(path: str) -> list[Key]:
+    """The same, of an inertia's principal moment ``inertia[0]`` as of its matrix."""
+    keys = keys_of(path)
+    moment = keys[-2:-1] == ["inertia"] and isinstance(keys[-1], int)
+    return [*keys, keys[-1]] if moment else keys
 
 
 def entries(robot: Robot) -> dict[str, tuple[float, str]]:
@@ -50,14 +64,53 @@ def given(data: Any) -> Any:
     return {key: given(value) for key, value in data.items() if value is not None}
 
 
+def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -> T:
+    """A section with other numbers or expressions at some places; nothing is checked.
+
+    :param section: a dataclass, mapping, sequence or array.
+    :param changes: by keys and places, as a file has them.
+    :param path: of the section, for the error.
+    :raises ParameterError: a place where there is no number.
+    """
+    below: dict[Key, dict[tuple[Key, ...], Any]] = {}
+    for (key, *rest), value in changes.items():
+        below.setdefault(key, {})[tuple(rest)] = value
+    held: Any = section
+    names: dict[Any, Any] = {}
+    whole = dataclasses.is_dataclass(section)
+    if dataclasses.is_dataclass(section):
+        names = {f.metadata.get("key") or f.name: f.name for f in dataclasses.fields(section)}
+        held = {name: getattr(section, name) for name in names.values()}
+    result: Any = list(held) if isinstance(held, tuple) else copy.copy(held)
+    result = held.astype(object) if isinstance(held, np.ndarray) else result
+    for key, deeper in below.items():
+        here = f"{path}[{key}]" if isinstance(key, int) else f"{path}.{key}" if path else key
+        name = names.get(key, key)
+        try:
+            old = held[name]
+        except (KeyError, IndexError, TypeError):
+            old = None
+        leaf = () in deeper
+        if isinstance(old, bool | str | None) or leaf != np.isscalar(old):
+            raise ParameterError(here, None, "a number that the robot's file gives")
+        result[name] = deeper[()] if leaf else placed(old, deeper, here)
+    if whole:
+        made = object.__new__(type(section))
+        vars(made).update(result)
+        return made
+    if isinstance(held, np.ndarray):
+        result = plain(result)
+        result.setflags(write=False)
+    return result  # type: ignore[no-any-return]
+
+
 def data_of(robot: Robot, values: Mapping[str, float] | None = None) -> dict[str, Any]:
     """What the robot's file gives, as plain data, with other numbers by dotted path.
 
     :raises ParameterError: a path that there is not.
     """
-    data: dict[str, Any] = copy.deepcopy(given(robot.parameter_sections()))
-    for path, value in (values or {}).items():
-        put(data, path, value)
+    made = robot.numbered(values) if values else robot
+    data: dict[str, Any] = copy.deepcopy(given(made.parameter_sections()))
     return data
 
 
@@ -92,6 +145,21 @@ def number_at(data: Any, path: str) -> Any:
     except (KeyError, IndexError, TypeError):
         raise ParameterError(path, None, "a number that the robot's file gives") from None
     return data
+
+
+def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
+    """A number of plain data.
+
+    :raises ParameterError: there is none.
+    """
+    try:
+        for key in keys:
+            data = data[key]
+    except (KeyError, IndexError, TypeError):
+        data = None
+    if isinstance(data, bool) or not isinstance(data, int | float):
+        raise ParameterError(path, None, "a number that the robot's file gives")
+    return float(data)
 
 
 def has_entry(data: Any, path: str) -> bool:

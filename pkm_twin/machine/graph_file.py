@@ -6,17 +6,19 @@ May import: numpy, this package, errors, the standard library.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
+from pkm_twin.machine.entries import number_in, placed
 from pkm_twin.machine.graph import (
     Body,
     Graph,
@@ -31,6 +33,7 @@ from pkm_twin.machine.sections import check_angles, length, mass
 from pkm_twin.machine.shared import Key
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +121,9 @@ class DriveSpec:
         if slides != (self.lead is not None):
             what = "lead, m a turn" if slides else "ratio, turns a turn"
             raise ParameterError(path, None, f"{what}, for this type of joint")
-        factor = 2 * math.pi / self.lead if self.lead is not None else float(self.ratio or 0.0)
-        return self.inertia * factor**2
+        factor: Any = self.ratio if self.lead is None else 2 * math.pi / self.lead
+        reflected: float = self.inertia * (factor * factor)
+        return reflected
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +240,10 @@ class Source:
     azimuth: float = 0.0
 
 
-_RUBS: Final = ("viscous", "coulomb", "offset")
+PER_COPY: Final = (
+    ["rotor_inertia"], ["friction", "viscous"], ["friction", "coulomb"], ["friction", "offset"],
+)  # fmt: skip
+"""Keys of a limb's numbers that may be lists, one number a copy."""
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
 """The three mappings of a graph, and the schema of their entries."""
 _TURNED: Final = ("com", "at", "axis", "axes", "ends")
@@ -314,7 +321,7 @@ def _copies(entry: Any, count: int, path: str) -> list[Any]:
     result = [entry] * count
     if not isinstance(entry, Mapping):
         return result
-    for keys in (("rotor_inertia",), *(("friction", what) for what in _RUBS)):
+    for keys in PER_COPY:
         value: Any = entry
         for key in keys:
             value = value.get(key) if isinstance(value, Mapping) else None
@@ -331,7 +338,7 @@ def _copies(entry: Any, count: int, path: str) -> list[Any]:
     return result
 
 
-def _turned(entry: Any, azimuth: float, own: set[str], number: int) -> Any:
+def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
     """A copy of a limb's entry, turned about base z, its own bodies' names with their number."""
     rotation = rotation_about_z(azimuth)
     new: dict[str, Any] = {}
@@ -349,6 +356,45 @@ def _turned(entry: Any, azimuth: float, own: set[str], number: int) -> Any:
     else:
         new["between"] = tuple(f"{b}_{number}" if b in own else b for b in entry.between)
     return dataclasses.replace(entry, **new)
+
+
+def numbered_entry(
+    entry: T, keys: tuple[str | int, ...], value: Any, azimuth: float, path: str
+) -> T:
+    """An entry with another number or expression; nothing is checked.
+
+    :param keys: of the number in the entry; ``azimuth``: the limb's own, by which it is turned on.
+    :param azimuth: the entry's vectors are turned by this: the number is that before the turn.
+    """
+    if keys == ("azimuth",):
+        turned: T = _turned(entry, value - azimuth, set(), 0)
+        return turned
+    if keys == ("home",) and isinstance(entry, JointSpec) and entry.home is None:
+        entry = dataclasses.replace(entry, home=0.0)
+    if not (azimuth and keys[0] in (*_TURNED, "inertia", "member")):
+        made = placed(entry, {keys: value}, path)
+    else:
+        whole = placed(_turned(entry, -azimuth, set(), 0), {keys: value}, path)
+        back = _turned(whole, azimuth, set(), 0)
+        made = copy.copy(entry)
+        vars(made)[str(keys[0])] = getattr(back, str(keys[0]))
+    if keys == ("rotor_inertia",):
+        vars(made)["drive"] = None
+    return made
+
+
+def number_of_entry(entry: Any, keys: tuple[str | int, ...], azimuth: float, path: str) -> float:
+    """The number that :func:`numbered_entry` replaces.
+
+    :raises ParameterError: there is none.
+    """
+    if keys == ("azimuth",):
+        return azimuth
+    if azimuth:
+        entry = _turned(entry, -azimuth, set(), 0)
+    if keys == ("home",) and entry.home is None:
+        return 0.0
+    return number_in(schema.plain(entry), keys, path)
 
 
 def graph_of_entries(data: Mapping[str, Any], specs: Mapping[str, Mapping[str, Any]]) -> Graph:

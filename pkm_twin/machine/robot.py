@@ -33,6 +33,7 @@ from pkm_twin.kinematics.passive import (
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
+from pkm_twin.machine.entries import data_of, full_keys, number_in, placed
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
@@ -488,6 +489,21 @@ class Robot:
         """
         del numbers
         return self
+
+    def numbered(self: R, values: Mapping[str, Any]) -> R:
+        """A copy with other numbers or expressions at dotted paths of its file; nothing is checked.
+
+        :raises ParameterError: a path that there is not.
+        """
+        made = placed(self, {tuple(full_keys(path)): value for path, value in values.items()})
+        return self._with(**{f.name: getattr(made, f.name) for f in dataclasses.fields(self)})
+
+    def number(self, path: str) -> float:
+        """The number of the robot's file at a dotted path, as :meth:`numbered` takes it.
+
+        :raises ParameterError: a path that there is not.
+        """
+        return number_in(data_of(self), full_keys(path), path)
 
     def _with(self: R, **values: Any) -> R:
         """A copy with other fields, or other values that are derived; nothing is checked."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -23,7 +23,7 @@ from pkm_twin.kinematics.engine import choose_coordinates
 from pkm_twin.kinematics.motion import matrices, numbers
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
-from pkm_twin.machine.entries import given
+from pkm_twin.machine.entries import full_keys, given, placed
 from pkm_twin.machine.graph import (
     BASE,
     Body,
@@ -33,10 +33,13 @@ from pkm_twin.machine.graph import (
 )
 from pkm_twin.machine.graph_file import (
     KINDS,
+    PER_COPY,
     JointSpec,
     LimitSpec,
     Source,
     graph_of_entries,
+    number_of_entry,
+    numbered_entry,
     written_out,
 )
 from pkm_twin.machine.joint_map import JointMapEntry
@@ -87,26 +90,15 @@ class Machine(Robot):
         specs, sources = written_out(data)
         graph = graph_of_entries(data, specs)
         graph.check()
-        drives = graph.actuated
-        if len(drives) > MOST_JOINTS:
-            raise ParameterError("joints", len(drives), f"at most {MOST_JOINTS} actuated joints")
+        if len(graph.actuated) > MOST_JOINTS:
+            raise ParameterError(
+                "joints", len(graph.actuated), f"at most {MOST_JOINTS} actuated joints"
+            )
         names = data.get("pose")
         if names is None:
             names = choose_coordinates(graph)
         coordinates = schema.checked(schema.words(*COORDINATES), "pose", names)
-        limits = [specs["joints"][j].limits or LimitSpec() for j in drives]
-        n = len(drives)
-        sections = {
-            "friction": friction_of(n)(
-                viscous=array([graph.joints[j].viscous for j in drives]),
-                coulomb=array([graph.joints[j].coulomb for j in drives]),
-                offset=array([_offset(specs["joints"][j]) for j in drives]),
-            ),
-            "limits": limits_of(n)(
-                position=_together([v.position for v in limits], [-math.inf, math.inf]),
-                velocity=_together([v.velocity for v in limits], math.inf),
-                effort=_together([v.effort for v in limits], math.inf),
-            ),
+        sections = _drives(graph, specs["joints"]) | {
             "payload": schema.build(Payload, data.get("payload") or {}, "payload"),
             "joint_map": schema.checked(
                 schema.mapping(JointMapEntry), "joint_map", data.get("joint_map") or {}
@@ -145,6 +137,54 @@ class Machine(Robot):
         graph = graph_of_entries(data, written_out(data)[0])
         graph.check()
         return graph
+
+    def numbered(self, values: Mapping[str, Any]) -> Machine:
+        """Paths of entries, ``joints.ball_1.at[0]``, or of a limb's, ``limbs.joints.ball.at[0]``.
+
+        A limb's number is that of all its copies, in the axes of azimuth zero; of an azimuth, the
+        copy is turned on.
+        """
+        specs = {kind: dict(entries) for kind, entries in self.specs.items()}
+        rest, origin = {}, self.described.origin
+        for path, value in values.items():
+            keys = full_keys(path)
+            found = list(self._named(keys))
+            for kind, name, where, azimuth in found:
+                specs[kind][name] = numbered_entry(specs[kind][name], where, value, azimuth, path)
+            if not found and keys[0] == "origin":
+                origin = placed({"origin": origin}, {tuple(keys): value})["origin"]
+            elif not found:
+                rest[path] = value
+        described = dataclasses.replace(
+            graph_of_entries({"platform": self.described.platform}, specs), origin=origin
+        )
+        made = super().numbered(rest)
+        return made._with(described=described, specs=specs, **_drives(described, specs["joints"]))
+
+    def number(self, path: str) -> float:
+        """Of a limb's numbers those of its first copy."""
+        for kind, name, where, azimuth in self._named(full_keys(path)):
+            return number_of_entry(self.specs[kind][name], where, azimuth, path)
+        return super().number(path)
+
+    def _named(self, keys: list[str | int]) -> Iterator[tuple[str, str, Key, float]]:
+        """The entries that a path is about: kind, name, keys in it, and the limb's azimuth."""
+        for (kind, name), source in self.sources.items():
+            if keys[:2] == [kind, name]:
+                yield kind, name, tuple(keys[2:]), 0.0
+            own = len(source.path)
+            if source.path[0] != "limbs":
+                continue
+            if keys[: own - 2] == list(source.path[:-2]) and keys[own - 2 :] == [
+                "azimuths", source.copy
+            ]:  # fmt: skip
+                yield kind, name, ("azimuth",), source.azimuth
+            if keys[:own] == list(source.path):
+                where = keys[own:]
+                listed = where[:-1] in PER_COPY
+                if listed and where.pop() != source.copy:
+                    continue
+                yield kind, name, tuple(where), source.azimuth
 
     @property
     def coordinates(self) -> tuple[Coordinate, ...]:  # type: ignore[override]
@@ -377,6 +417,25 @@ class Machine(Robot):
             )
         beams = tuple(beam for beam in self.beams if beam.name in sections)
         return Structure(beams, sections, compliances)
+
+
+def _drives(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
+    """Friction and limits of the actuated joints."""
+    drives = graph.actuated
+    limits = [joints[j].limits or LimitSpec() for j in drives]
+    n = len(drives)
+    return {
+        "friction": friction_of(n)(
+            viscous=array([graph.joints[j].viscous for j in drives]),
+            coulomb=array([graph.joints[j].coulomb for j in drives]),
+            offset=array([_offset(joints[j]) for j in drives]),
+        ),
+        "limits": limits_of(n)(
+            position=_together([v.position for v in limits], [-math.inf, math.inf]),
+            velocity=_together([v.velocity for v in limits], math.inf),
+            effort=_together([v.effort for v in limits], math.inf),
+        ),
+    }
 
 
 def _behind_gear(reflected: Shared, rotor: float) -> Callable[[Array], Mapping[Key, float]]:
