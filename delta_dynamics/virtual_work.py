@@ -74,18 +74,18 @@ def torques(robot: Robot) -> Kernel:
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Generalised mass matrix on the actuated joints, payload included, shape (..., n, n)."""
     # A simulation asks for one sample, several thousand times a second.
-    flat = robot.call_one("mass matrix", lambda: _masses_kernel(robot), robot.inertial, q)
+    flat = robot.call_one("mass matrix", lambda: masses_kernel(robot), robot.inertial, q)
     if flat is not None:
         return flat.reshape(robot.joints_count, -1)
     return _mass_matrix(robot, q, robot.inertial)
 
 
-def _masses_kernel(robot: Robot) -> Kernel:
+def masses_kernel(robot: Robot) -> Kernel:
     return robot.massive().kernel("mass matrix", _masses)
 
 
 def _mass_matrix(robot: Robot, q: ArrayLike, p: Array) -> Array:
-    (flat,), status = _masses_kernel(robot)(p, q)
+    (flat,), status = masses_kernel(robot)(p, q)
     if status is not None:
         robot.refuse_joints(status, q, (q,))
     n = robot.joints_count

@@ -7,16 +7,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pkm_twin.design.variants import variants
     from pkm_twin.machine.catalogue import load, robot_names
     from pkm_twin.machine.robot import Robot
 
-__all__ = ["Robot", "load", "robot_names"]
+__all__ = ["Robot", "load", "robot_names", "variants"]
 __version__ = "0.1.0"
 
 _HOMES = {
     "Robot": "pkm_twin.machine.robot",
     "load": "pkm_twin.machine.catalogue",
     "robot_names": "pkm_twin.machine.catalogue",
+    "variants": "pkm_twin.design.variants",
 }
 """Loaded when they are asked for: a command or a node answers signals before it loads numpy."""
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 import copy
 import dataclasses
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
 from pkm_twin.codegen.expressions import plain
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine import schema
 
 if TYPE_CHECKING:
     from pkm_twin.machine.graph import Graph
@@ -102,6 +103,29 @@ def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -
         result = plain(result)
         result.setflags(write=False)
     return result  # type: ignore[no-any-return]
+
+
+def check_number(section: Any, keys: Sequence[Key], path: str) -> None:
+    """Judge a number of a section as a file's is, with what its section says of it.
+
+    :raises ParameterError: by the path.
+    """
+    inner, left = section, list(keys)
+    while left:
+        if dataclasses.is_dataclass(inner):
+            fields = {f.metadata.get("key") or f.name: f for f in dataclasses.fields(inner)}
+            field = fields[str(left[0])]
+            value = getattr(inner, field.name)
+            if not dataclasses.is_dataclass(value) and not isinstance(value, Mapping):
+                field.metadata["check"](path, schema.plain(value))
+                verify = getattr(inner, "verify", None)
+                if verify is not None:
+                    verify(path)
+                return
+            inner = value
+        else:
+            inner = inner[left[0]]
+        left.pop(0)
 
 
 def data_of(robot: Robot, values: Mapping[str, float] | None = None) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from pkm_twin.kinematics.passive import (
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
-from pkm_twin.machine.entries import data_of, full_keys, number_in, placed
+from pkm_twin.machine.entries import check_number, full_keys, number_in, placed
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
@@ -62,6 +62,12 @@ BEYOND: Final = 3.0
 """Code of a pose beyond a singularity, after those of programs."""
 
 _NONE: Final = np.zeros(0)
+
+Run = Callable[..., tuple[list[Array], Array | None]]
+
+
+def _alone(kernel: Kernel, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
+    return kernel(_NONE, *inputs)
 
 
 @dataclass(frozen=True)
@@ -447,19 +453,20 @@ class Robot:
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a pose beyond a singularity, or in one.
         """
-        q, codes = self._inverse(pose)
+        q, codes = self.judged_inverse(pose, _alone)
         if codes is not None:
             self._refuse_pose(codes, pose)
         return q
 
     def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
         """Joint positions (..., n), NaN where a pose is none of the machine's; which are good."""
-        q, codes = self._inverse(pose)
+        q, codes = self.judged_inverse(pose, _alone)
         good = np.ones(q.shape[:-1], bool) if codes is None else np.asarray(codes[..., 0] == 0.0)
         return np.where(good[..., None], q, np.nan), good
 
     @cached_property
-    def _inverse_kernel(self) -> Kernel:
+    def inverse_kernel(self) -> Kernel:
+        """Pose to joints of some assembly, in closed form where there is one."""
         if not self.has_inverse:
             return self.engine.inverse
 
@@ -503,7 +510,19 @@ class Robot:
 
         :raises ParameterError: a path that there is not.
         """
-        return number_in(data_of(self), full_keys(path), path)
+        keys = full_keys(path)
+        sections = {f.name for f in dataclasses.fields(self) if "check" in f.metadata}
+        known = keys and keys[0] in sections
+        return number_in(
+            schema.plain(getattr(self, str(keys[0]))) if known else None, keys[1:], path
+        )
+
+    def check_number(self, path: str) -> None:
+        """Judge a number of :meth:`numbered` as a file's is.
+
+        :raises ParameterError: by the path.
+        """
+        check_number(self, full_keys(path), path)
 
     def _with(self: R, **values: Any) -> R:
         """A copy with other fields, or other values that are derived; nothing is checked."""
@@ -511,16 +530,18 @@ class Robot:
         vars(made).update(self.__getstate__() | values)
         return made
 
-    def _inverse(self, pose: ArrayLike) -> tuple[Array, Array | None]:
+    def judged_inverse(self, pose: ArrayLike, run: Run) -> tuple[Array, Array | None]:
         """Joints; and None or codes (1 unreachable, 2 not finite, BEYOND), limb, amount.
 
         The joints of a pose may belong to another assembly too: ``forward`` decides.
+
+        :param run: evaluates a kernel on inputs, to outputs and status.
         """
-        q, codes = self._candidates(pose)
+        q, codes = self._candidates(pose, run)
         tried = q
         if codes is not None:
             tried = np.where(codes[..., :1] == 0.0, q, self.graph.home)
-        (found, _, _), _ = self.engine.forward(_NONE, tried)
+        (found, _, _), _ = run(self.engine.forward, tried)
         # What is infinite or NaN is no pose.
         with np.errstate(invalid="ignore"):
             apart = found - np.asarray(pose, np.float64)
@@ -546,9 +567,9 @@ class Robot:
         """What makes pose coordinates of unit one, shape (m,)."""
         return np.array([1.0 if c.entries else 1.0 / self.graph.size for c in self.coordinates])
 
-    def _candidates(self, pose: ArrayLike) -> tuple[Array, Array | None]:
-        """Joints that reach the pose in some assembly; and codes as :meth:`_inverse`."""
-        outputs, status = self._inverse_kernel(_NONE, pose)
+    def _candidates(self, pose: ArrayLike, run: Run) -> tuple[Array, Array | None]:
+        """Joints that reach the pose in some assembly; and codes as :meth:`judged_inverse`."""
+        outputs, status = run(self.inverse_kernel, pose)
         q = outputs[0]
         if len(outputs) == 1:
             if status is None:

@@ -65,7 +65,7 @@ def robot_description(robot: Robot) -> dict[str, Any]:
     if all(name in POSE for name in pose):
         data["pose"] = pose
     load = robot.payload
-    if load.mass > 0.0:
+    if load.mass > 0.0 or load.inertia.any():
         data["payload"] = {
             "mass": load.mass, "com": load.com.tolist(), "inertia": load.inertia.tolist()
         }  # fmt: skip

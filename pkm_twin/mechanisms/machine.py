@@ -23,7 +23,7 @@ from pkm_twin.kinematics.engine import choose_coordinates
 from pkm_twin.kinematics.motion import matrices, numbers
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
-from pkm_twin.machine.entries import full_keys, given, placed
+from pkm_twin.machine.entries import check_number, full_keys, given, number_in, placed
 from pkm_twin.machine.graph import (
     BASE,
     Body,
@@ -161,9 +161,22 @@ class Machine(Robot):
         made = super().numbered(rest)
         return made._with(described=described, specs=specs, **_drives(described, specs["joints"]))
 
+    def check_number(self, path: str) -> None:
+        """As a file's, in each of the entries that have it."""
+        keys = full_keys(path)
+        named = list(self._named(keys))
+        for kind, name, where, _ in named:
+            if where != ("azimuth",):
+                check_number(self.specs[kind][name], where, path)
+        if not named and keys[0] != "origin":
+            super().check_number(path)
+
     def number(self, path: str) -> float:
         """Of a limb's numbers those of its first copy."""
-        for kind, name, where, azimuth in self._named(full_keys(path)):
+        keys = full_keys(path)
+        if keys[0] == "origin":
+            return number_in(self.described.origin.tolist(), keys[1:], path)
+        for kind, name, where, azimuth in self._named(keys):
             return number_of_entry(self.specs[kind][name], where, azimuth, path)
         return super().number(path)
 

@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many machines that differ in numbers of their file, asked at once.
+
+They share the programs of one robot; only what hangs on their numbers is computed for each. Where a
+machine does not have what a program takes for constant, a zero or a parallel axis, it is asked
+through a program of its own structure.
+
+May import: numpy, pkm_twin's core, delta_dynamics, stiffness_monitor, the standard library.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from delta_dynamics.virtual_work import masses_kernel, torques
+from pkm_twin.codegen.arrays import doubles
+from pkm_twin.codegen.kernels import MISSED, Code, Kernel
+from pkm_twin.design.numbers import FileNumbers, ProgramNumbers
+from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.machine.entries import with_entries
+from pkm_twin.machine.geometry import pattern_of
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.tree import Tree
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+CORNERS: Final = 5
+"""Most numbers of a section of which every combination of least and greatest is looked at."""
+NEAR: Final = 1e-3
+"""How far beside home a machine has to be assembled too, rad, or part of the machine's size."""
+
+
+class Variants:
+    """Machines of one robot with other numbers, see :func:`variants`.
+
+    Methods are like those of one robot, with an axis over the k machines in front of the result.
+    An input whose first axis has length k, and which has one axis more than a sample, is by
+    machine; every other input is that of all machines. (To give all machines the same k samples,
+    shape them (1, k, ...).) What a machine cannot do is NaN.
+    """
+
+    def __init__(self, robot: Robot, numbers: Mapping[str, ArrayLike]) -> None:
+        self.robot = robot
+        self.paths = tuple(numbers)
+        arrays = [np.asarray(value, np.float64) for value in numbers.values()]
+        for path, array in zip(self.paths, arrays, strict=True):
+            if array.ndim > 1:
+                raise ParameterError(path, list(array.shape), "a number, or one a machine")
+        try:
+            rows = np.broadcast_arrays(*arrays) if arrays else [np.zeros(1)]
+        except ValueError:
+            sizes = {path: len(a) for path, a in zip(self.paths, arrays, strict=True) if a.ndim}
+            raise ParameterError("numbers", sizes, "as many of each, one a machine") from None
+        self.values: Array = np.stack([np.atleast_1d(row) for row in rows], -1)
+        """Of the paths, shape (k, paths)."""
+        self._function = FileNumbers(robot, self.paths)
+        self._own: dict[int, Robot | PkmTwinError] = {}
+        self._patterns: dict[int, str] = {}
+        self._prepared: dict[int, tuple[Code, Array]] = {}
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, index: int) -> Robot:
+        """One of the machines, as a robot.
+
+        :raises PkmTwinError: there is no such machine, as of a file with its numbers.
+        """
+        k = range(len(self))[index]
+        if k not in self._own:
+            try:
+                given = dict(zip(self.paths, self.values[k].tolist(), strict=True))
+                self._own[k] = with_entries(self.robot, given)
+            except PkmTwinError as error:
+                self._own[k] = error
+        found = self._own[k]
+        if isinstance(found, PkmTwinError):
+            raise found
+        return found
+
+    def __iter__(self) -> Iterator[Robot]:
+        return (self[k] for k in range(len(self)))
+
+    @cached_property
+    def valid(self) -> Mask:
+        """Which machines can be assembled at home and beside it, shape (k,)."""
+        home, graph = self.robot.graph.home, self.robot.graph
+        reach = [graph.size if graph.joints[name].slides else 1.0 for name in graph.actuated]
+        steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
+        away = NEAR * np.array([0.0 * steps, steps, -steps]) * reach
+        (poses, *_), good = self._run(_forward, (home + away)[None])
+        sound = good.reshape(len(self), -1) & np.isfinite(poses).reshape(len(self), 3, -1).all(-1)
+        return np.asarray(sound.all(1))
+
+    def reason(self, index: int) -> str:
+        """Why a machine is not valid; empty for one that is."""
+        if self.valid[index]:
+            return ""
+        try:
+            _ = self[index]
+        except PkmTwinError as error:
+            return str(error)
+        return "no assembly at home, or none beside it"
+
+    def inverse_dynamics(
+        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
+    ) -> Array:
+        """Efforts, shape (k, ..., n), see :func:`delta_dynamics.inverse_dynamics`."""
+        load = np.zeros(6) if wrench is None else wrench
+        return self._run(_torques, q, qd, qdd, load)[0][0]
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """Shape (k, ..., n, n), see :func:`delta_dynamics.mass_matrix`."""
+        flat = self._run(_masses, q)[0][0]
+        n = self.robot.joints_count
+        return flat.reshape(*flat.shape[:-1], n, n)
+
+    def forward(self, q: ArrayLike) -> Array:
+        """Poses, shape (k, ..., m), see :meth:`Robot.forward`."""
+        return self._run(_forward, q)[0][0]
+
+    def inverse(self, pose: ArrayLike) -> Array:
+        """Joint positions, shape (k, ..., n), see :meth:`Robot.inverse`."""
+        names = {id(self.robot.engine.forward): _forward}
+
+        def run(kernel: Kernel, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
+            outputs, good = self._run(names.get(id(kernel), _inverse), *inputs)
+            status = np.where(good, 0.0, 1.0)
+            return outputs, None if good.all() else np.concatenate([status, status], -1)
+
+        q, codes = self.robot.judged_inverse(pose, run)
+        return q if codes is None else np.where(codes[..., :1] == 0.0, q, np.nan)
+
+    def platform(self, q: ArrayLike) -> tuple[Array, Array]:
+        """Positions (k, ..., 3) and rotations (k, ..., 3, 3), see :meth:`Robot.platform`."""
+        _, position, rotation = self._run(_forward, q)[0]
+        return position, rotation.reshape(*rotation.shape[:-1], 3, 3)
+
+    def singularity(self, q: ArrayLike) -> Array:
+        """Shape (k, ...), see :meth:`Robot.singularity`."""
+        return np.asarray(self._run(_singularity, q)[0][0][..., 0], np.float64)
+
+    @cached_property
+    def _numbers(self) -> ProgramNumbers:
+        """Inputs of programs; NaN of a machine whose file's numbers are out of range."""
+        found = self._function(self.values)
+        out = self._out_of_range
+        found.geometry[out] = np.nan
+        return found
+
+    @cached_property
+    def _out_of_range(self) -> Mask:
+        """Machines with numbers that no file may have."""
+        out = np.asarray(~np.isfinite(self.values).all(1))
+        sections: dict[str, list[int]] = {}
+        for column, path in enumerate(self.paths):
+            sections.setdefault(path.rpartition(".")[0], []).append(column)
+        for columns in sections.values():
+            rows = self.values[:, columns]
+            known = rows[~out]
+            if not len(known):
+                continue
+            paths = [self.paths[column] for column in columns]
+            # What bounds numbers of a section together is convex: corners that hold do.
+            ends = list(zip(known.min(0).tolist(), known.max(0).tolist(), strict=True))
+            if len(columns) <= CORNERS and all(
+                self._fits(paths, row) for row in itertools.product(*ends)
+            ):
+                continue
+            for k in np.flatnonzero(~out):
+                out[k] = not self._fits(paths, rows[k].tolist())
+        return out
+
+    def _fits(self, paths: Sequence[str], values: Sequence[float]) -> bool:
+        """Whether a file may have these numbers."""
+        try:
+            made = self.robot.numbered(dict(zip(paths, values, strict=True)))
+            for path in paths:
+                made.check_number(path)
+        except PkmTwinError:
+            return False
+        return True
+
+    def _prepare(self, ask: _Ask, robot: Robot) -> tuple[Code, Array]:
+        """A robot's program, and what hangs on each machine's numbers, shape (k, prepared + 1)."""
+        code = ask(robot)[0].code
+        found = self._prepared.get(id(code))
+        if found is None:
+            numbers = self._numbers
+            own = code.parameters - numbers.geometry.shape[1]
+            p = numbers.inertial if own else np.zeros((len(self), 0))
+            found = code, code.prepare(np.concatenate([p, numbers.geometry], 1))
+            self._prepared[id(code)] = found
+        return found
+
+    def _run(self, ask: _Ask, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
+        """Outputs (k, ..., size) each, and which are good, shape (k, ..., 1)."""
+        code, prepared = self._prepare(ask, self.robot)
+        rows, batch = self._laid_out(code, inputs)
+        k, count = len(self), math.prod(batch)
+        fits = prepared[:, -1] <= MISSED
+        if fits.all():
+            outputs, status = code.run_each(prepared, *rows)
+            good = np.ones((k, count), bool) if status is None else status[..., 0] == 0.0
+        else:
+            outputs = [np.full((k, count, size), np.nan) for size in code.sizes[1]]
+            good = np.zeros((k, count), bool)
+            for one, rest, own in self._by_structure(ask):
+                picked = [row[own] if len(row) > 1 else row for row in rows]
+                found, status = one.run_each(rest[own], *picked)
+                for table, values in zip(outputs, found, strict=True):
+                    table[own] = values
+                good[own] = True if status is None else status[..., 0] == 0.0
+        shaped = [values.reshape(k, *batch, values.shape[-1]) for values in outputs]
+        return shaped, np.asarray(good).reshape(k, *batch, 1)
+
+    def _laid_out(
+        self, code: Code, inputs: Sequence[ArrayLike]
+    ) -> tuple[list[Array], tuple[int, ...]]:
+        """Inputs as :meth:`Code.run_each` takes them, and the batch axes."""
+        k = len(self)
+        arrays, shapes = [doubles(value) for value in inputs], []
+        for array, size in zip(arrays, code.sizes[0], strict=True):
+            if array.ndim == 0 or array.shape[-1] != size:
+                raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
+            each = array.ndim > 1 and array.shape[0] == k
+            # All machines are given the same k samples by a shape that begins with 1.
+            shapes.append((each, array.shape[1 if each or array.shape[:2] == (1, k) else 0 : -1]))
+        batch = np.broadcast_shapes(*(shape for _, shape in shapes))
+        rows = []
+        for array, (each, shape) in zip(arrays, shapes, strict=True):
+            machines, size, one = k if each else 1, array.shape[-1], math.prod(shape) == 1
+            values = array.reshape(machines, *([1] * (len(batch) - len(shape))), *shape, size)
+            if not one:
+                values = np.broadcast_to(values, (machines, *batch, size))
+            values = values.reshape(machines, 1 if one else math.prod(batch), size)
+            rows.append(np.ascontiguousarray(values))
+        return rows, batch
+
+    def _by_structure(self, ask: _Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
+        """Programs with the machines that each is right for: one program a structure."""
+        left = ~self._out_of_range
+        robots = itertools.chain([self.robot], self._built(left))
+        for robot in robots:
+            code, prepared = self._prepare(ask, robot)
+            fits = left & (prepared[:, -1] <= MISSED)
+            yield code, prepared, np.flatnonzero(fits)
+            left &= ~fits
+
+    def _built(self, left: Mask) -> Iterator[Robot]:
+        """The first of the machines that are left, as robots; it looks again after each."""
+        while left.any():
+            first, *others = np.flatnonzero(left).tolist()
+            try:
+                robot = self[first]
+                if _layout(robot) == _layout(self.robot):
+                    yield robot
+            except PkmTwinError:
+                # Machines with the same zeros and parallels can be built as little.
+                pattern = self._pattern(first)
+                for other in others:
+                    left[other] = self._pattern(other) != pattern
+            left[first] = False
+
+    def _pattern(self, k: int) -> str:
+        """Text of a machine's zeros and parallels."""
+        if k not in self._patterns:
+            given = dict(zip(self.paths, self.values[k].tolist(), strict=True))
+            try:
+                self._patterns[k] = pattern_of(Tree(self.robot.numbered(given).make_graph()))
+            except PkmTwinError:
+                self._patterns[k] = "none"
+        return self._patterns[k]
+
+
+_Ask = Callable[[Robot], tuple[Kernel, Array]]
+_NONE: Final = np.zeros(0)
+
+
+def _layout(robot: Robot) -> list[tuple[str, str]]:
+    """Bodies with the joints that carry them: the order of the inertial inputs."""
+    return [(link.body, str(link.joint)) for link in robot.engine.tree.links.values()]
+
+
+def _forward(robot: Robot) -> tuple[Kernel, Array]:
+    return robot.engine.forward, _NONE
+
+
+def _inverse(robot: Robot) -> tuple[Kernel, Array]:
+    return robot.inverse_kernel, _NONE
+
+
+def _singularity(robot: Robot) -> tuple[Kernel, Array]:
+    return robot.singularity_kernel(), _NONE
+
+
+def _torques(robot: Robot) -> tuple[Kernel, Array]:
+    return torques(robot), robot.inertial
+
+
+def _masses(robot: Robot) -> tuple[Kernel, Array]:
+    return masses_kernel(robot), robot.inertial
+
+
+def variants(robot: Robot, numbers: Mapping[str, ArrayLike]) -> Variants:
+    """Machines that differ from a robot in numbers of its file.
+
+    :param numbers: by dotted path as docs/parameters.md has it (``geometry.arm_length``,
+        ``joints.ball_1.at[0]``; ``limbs.joints.ball.at[0]`` for all copies of a limb), each an
+        array of one number a machine, shape (k,), or one number for all; SI units.
+    :raises ParameterError: a path that there is not, or arrays of several lengths.
+    """
+    return Variants(robot, numbers)
