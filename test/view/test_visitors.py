@@ -155,16 +155,42 @@ def test_other_kinds_of_messages_do_nothing(page):
     attack(page, KINDS)
 
 
+def test_buttons_and_menus_do_what_they_are_for(page):
+    """A bag plays to its end, whatever else is sent meanwhile."""
+    bag = page.bag
+    messages = [
+        update(bag._speed, {"value": "4"}),
+        update(bag._play, {"value": True}),
+        update(bag._speed, {"value": "fast"}),
+        update(bag._time, {"value": "now"}),
+    ]
+
+    async def talk():
+        async with open_socket(page) as socket:
+            for message in (CAMERA, *messages):
+                await socket.send(msgspec.msgpack.encode(message))
+            await until(page, lambda: bag.busy)
+            await until(page, lambda: not bag.busy)
+
+    asyncio.run(talk())
+    assert bag._speed.value == "4"
+    assert bag._time.value == 1.0
+
+
 def test_a_value_beyond_the_ends_is_the_end(page):
-    time_slider = page.bag._time
+    slider, rows = page.bag._time, page.bag._timeline.q
 
     async def talk():
         async with open_socket(page) as socket:
             await socket.send(msgspec.msgpack.encode(CAMERA))
-            await socket.send(msgspec.msgpack.encode(update(time_slider, {"value": 1e300})))
-            last = page.bag._timeline.q[-1]
-            await until(page, lambda: np.array_equal(page.state.q, last))
-            assert time_slider.value == time_slider.max
+            for value, row, taken in (
+                (0.5, 5, 0.5),
+                (1e300, -1, slider.max),
+                (-2.0, 0, slider.min),
+            ):
+                await socket.send(msgspec.msgpack.encode(update(slider, {"value": value})))
+                await until(page, lambda row=row: np.array_equal(page.state.q, rows[row]))
+                assert slider.value == taken
 
     asyncio.run(talk())
 
