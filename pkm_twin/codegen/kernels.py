@@ -35,6 +35,8 @@ GOOD: Final = 0.0
 REFUSED: Final = 1.0
 NOT_FINITE: Final = 2.0
 
+MOST: Final = 1_000_000
+"""Upper limit of the numbers in an input, an output or the parameters."""
 _WRITERS: Final = ("codegen", "machine", "kinematics", "mechanisms", "streams")
 """Folders beside this one whose sources write programs."""
 _F8: Final = np.dtype(np.float64)
@@ -157,11 +159,11 @@ class Kernel:
                 return _header(self.program), PlainCode(self.program), None
             name = cache.digest(self._key, _sources(), llvm.IDENTITY)
             stored = cache.read(name)
-            if stored is None:
+            if stored and _sound(stored[0]) and cache.is_object(stored[1], llvm.SYMBOL):
+                header, code = stored
+            else:
                 header, code = _header(self.program), llvm.compile_object(llvm.emit(self.program))
                 cache.write(name, header, code)
-            else:
-                header, code = stored
             address = llvm.load_object(code)
             return header, llvm.PROTOTYPE(address), llvm.LOCKED(address)
 
@@ -300,3 +302,11 @@ def _header(program: Program) -> dict[str, Any]:
         "parameters": program.parameters,
         "stepped": program.equations is not None,
     }
+
+
+def _sound(header: dict[str, Any]) -> bool:
+    """Whether a stored header is one that `_header` can have written."""
+    match header:
+        case {"inputs": [*taken], "outputs": [*given], "parameters": count, "stepped": bool()}:
+            return all(type(k) is int and 0 <= k < MOST for k in (*taken, *given, count))
+    return False

@@ -5,7 +5,6 @@ import re
 import warnings
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import yaml
 
@@ -16,6 +15,8 @@ from pkm_twin.mechanisms.machine import Machine
 from test.support.robots import partly_long, random_joints
 
 from .sketches import SKETCHES, delta, five_bar, palletizer, rrr3, stewart
+
+pin = pytest.importorskip("pinocchio")
 
 DRAWINGS = (palletizer, five_bar, SKETCHES["four_bar"])
 
