@@ -3,8 +3,11 @@
 
 import math
 
-import h5py
 import pytest
+
+pytest.importorskip("h5py")
+
+import h5py
 
 from pkm_twin.atlas.soundness import SEALED, seal
 from pkm_twin.atlas.store import AtlasError, open_atlas

@@ -14,9 +14,11 @@ from pkm_twin.machine.urdf_read import read_tree
 from pkm_twin.mechanisms.machine import Machine
 from test.support.robots import partly_long, random_joints
 
-from .sketches import SKETCHES, delta, five_bar, palletizer, rrr3, stewart
+pytest.importorskip("pinocchio")
 
-pin = pytest.importorskip("pinocchio")
+import pinocchio as pin
+
+from .sketches import SKETCHES, delta, five_bar, palletizer, rrr3, stewart
 
 DRAWINGS = (palletizer, five_bar, SKETCHES["four_bar"])
 

@@ -5,12 +5,14 @@ import asyncio
 import math
 import time
 
-import msgspec
 import numpy as np
 import pytest
 
 pytest.importorskip("viser")
+pytest.importorskip("msgspec")
+pytest.importorskip("websockets")
 
+import msgspec
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
