@@ -81,6 +81,7 @@ def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
 
 
 def masses_kernel(robot: Robot) -> Kernel:
+    """The program of :func:`mass_matrix`: q to its entries, row by row."""
     return robot.massive().kernel("mass matrix", _masses)
 
 

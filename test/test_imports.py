@@ -37,7 +37,7 @@ MAY = {
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
     "pkm_twin.atlas": NODE | TWINS | {"pkm_twin.console"},
-    "pkm_twin.apps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.atlas"},
+    "pkm_twin.apps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.atlas", "pkm_twin.export"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
 CIRCLES = {frozenset({"pkm_twin.machine", "pkm_twin.kinematics"})}

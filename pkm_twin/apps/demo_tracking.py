@@ -8,8 +8,8 @@ trajectory by itself, brakes on before: so it does the same on every computer, w
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 from rclpy.executors import SingleThreadedExecutor
@@ -43,24 +43,26 @@ TWIN: Final = "/delta_dynamics/joint_trajectory"
 
 
 class _Watch:
-    """When the machine began to move, and how far its clock is, ns."""
+    """How far the machine's clock is, ns, whether it stands, and whether its path is over."""
 
     def __init__(self) -> None:
         self.newest = 0
-        self.since: int | None = None
+        self.stands = self.done = False
+        self._since: int | None = None
 
     def take(self, state: JointState) -> None:
         """A joint state: a machine with its brakes on has no rate at all."""
         self.newest = stamp_of(state.header)
-        if not any(state.velocity):
-            self.since = None
-        elif self.since is None:
-            self.since = self.newest
+        self.stands = not any(state.velocity)
+        if self._since is None and not self.stands:
+            self._since = self.newest
+        if self._since is not None:
+            self.done |= self.newest > self._since + 1.1 * DURATION * SECOND
 
-    @property
-    def done(self) -> bool:
-        """Whether the path is over."""
-        return self.since is not None and self.newest > self.since + 1.1 * DURATION * SECOND
+    def begin(self) -> None:
+        """Watch another path, from the start."""
+        self.stands = self.done = False
+        self._since = None
 
 
 def run(
@@ -71,46 +73,53 @@ def run(
     recorder.listen(prefix(spread), {"/joint_states": STATE, INPUT: TRAJECTORY})
     watch = _Watch()
     states = node.create_subscription(JointState, "/joint_states", watch.take, DEPTH)
+    answers: list[JointTrajectory] = []
+    heard = node.create_subscription(JointTrajectory, f"{TWIN}_ff", answers.append, 10)
     depth = QoSProfile(depth=1)
-    topics = {t: node.create_publisher(JointTrajectory, t, depth) for t in (INPUT, TWIN)}
+    twin, machine = (node.create_publisher(JointTrajectory, t, depth) for t in (TWIN, INPUT))
     reset = node.create_client(Trigger, "/machine_sim/reset")
     module = [sys.executable, "-m"]
-    # Trajectories alone are asked of it.
-    twin = [*module, "delta_dynamics.node", "--ros-args", "-r", f"{TWIN}_ff:={INPUT}"]
-    twin += ["-r", "joint_states:=/delta_dynamics/joint_states", "-p", f"mechanism:={ROBOT}"]
-    machine = [*module, "delta_dynamics.sim_node", "--ros-args", "-p", f"mechanism:={ROBOT}"]
-    machine += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
+    # Trajectories alone are asked of the twin.
+    asked = [*module, "delta_dynamics.node", "--ros-args", "-p", f"mechanism:={ROBOT}"]
+    asked += ["-r", "joint_states:=/delta_dynamics/joint_states"]
+    moved = [*module, "delta_dynamics.sim_node", "--ros-args", "-p", f"mechanism:={ROBOT}"]
+    moved += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
     # A loaded computer catches up in bursts.
-    machine += ["-p", f"spread:={spread}", "-p", f"{QUEUE}:={DEPTH}"]
+    moved += ["-p", f"spread:={spread}", "-p", f"{QUEUE}:={DEPTH}"]
     console.print(f"machine_sim at {100 * spread:g} % spread: PD, then with feedforward")
-    with process(machine) as first, process(twin) as second:
+    plain = _trajectory()
+    with process(moved) as first, process(asked) as second:
 
         def await_that(condition: Callable[[], bool], what: str) -> None:
             wait_for(executor, condition, what, first)
 
+        def answered() -> bool:
+            # Asked again and again: who hears a node is not at once heard by it.
+            if not answers:
+                twin.publish(plain)
+            return bool(answers)
+
         await_that(lambda: watch.newest > 0, "machine_sim")
-        wait_for(executor, lambda: _matched(node, topics), "delta_dynamics", second)
-        for publisher in topics.values():
+        wait_for(executor, answered, "delta_dynamics", second)
+        # The machine and the recorder.
+        await_that(lambda: machine.get_subscription_count() >= 2, "machine_sim")
+        for trajectory in (plain, answers[0]):
             await_that(reset.service_is_ready, "machine_sim's reset")
             done = reset.call_async(Trigger.Request())
             await_that(done.done, "machine_sim's reset")
-            watch.since = watch.newest
-            await_that(lambda: watch.since is None, "the machine at its start")
-            publisher.publish(_trajectory())
+            watch.begin()
+            await_that(lambda: watch.stands, "the machine at its start")
+            watch.begin()
+            machine.publish(trajectory)
             await_that(lambda: watch.done, "the path's end")
     # What the recorder has not taken yet.
     drain(executor, recorder)
     recorder.stop()
-    node.destroy_subscription(states)
+    for subscription in (states, heard):
+        node.destroy_subscription(subscription)
     node.destroy_client(reset)
-    for publisher in topics.values():
+    for publisher in (twin, machine):
         node.destroy_publisher(publisher)
-
-
-def _matched(node: Any, topics: Mapping[str, Any]) -> bool:
-    """Every trajectory has its way: to the machine and the recorder from here and from the twin."""
-    heard = [publisher.get_subscription_count() for publisher in topics.values()]
-    return bool(heard[0] >= 2 and heard[1] >= 1 and node.count_publishers(INPUT) >= 2)
 
 
 def _trajectory() -> JointTrajectory:

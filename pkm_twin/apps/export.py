@@ -40,9 +40,9 @@ def moveit(
     loaded = load(robot)
     files = moveit_package(loaded, _accelerations(loaded), kinematics_plugin)
     for name in files:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
         refuse_existing(out / name, overwrite)
     for name, text in files.items():
-        (out / name).parent.mkdir(parents=True, exist_ok=True)
         replace_file(out / name, text.encode())
         typer.echo(out / name)
 

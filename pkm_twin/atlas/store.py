@@ -17,7 +17,7 @@ import re
 import socket
 import sys
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final
 import numpy as np
 
 from pkm_twin.atlas.extras import require
+from pkm_twin.atlas.soundness import SEALED, nonsense, seal, seal_holds
 from pkm_twin.atlas.sweep import Chunk, Sweep, Values
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.files import replace_file
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 _MARK: Final = "sweep.json"
 _LOCK: Final = "lock"
 _JOINED: Final = "joined.tmp"
+_STORED: Final = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+"""How fields are stored; level 1, as numbers with all their digits gain little by more."""
 _OWN: Final = re.compile(r"sweep\.json|lock|\d{8}\.npz|[\w.]+\.tmp")
 """Names of what a run writes into its folder."""
 
@@ -275,6 +278,7 @@ def join(sweep: Sweep, parts: Parts, out: Path) -> None:
                     raise
             if sink.error is not None:
                 raise sink.error
+            seal(file)
             os.fsync(file.fileno())
         os.replace(hidden, out)
     finally:
@@ -285,7 +289,7 @@ def _join(sweep: Sweep, parts: Parts, sink: _Sink) -> None:
     h5netcdf = require("h5netcdf", "atlas")
     with h5netcdf.File(sink, "w") as file:
         file.dimensions = sweep.sizes
-        for key, value in sweep.attributes.items():
+        for key, value in (sweep.attributes | SEALED).items():
             file.attrs[key] = value
         for name, coordinate in sweep.coordinates.items():
             _write(file, name, coordinate.dims, coordinate.values, coordinate.attrs)
@@ -293,8 +297,12 @@ def _join(sweep: Sweep, parts: Parts, sink: _Sink) -> None:
         others = [name for name, c in sweep.coordinates.items() if c.dims != (name,)]
         for name, field in sweep.fields.items():
             fill = np.nan if np.dtype(field.dtype).kind == "f" else None
-            target = file.create_variable(name, field.dims, field.dtype, fillvalue=fill)
-            target.attrs.update(field.attrs)
+            sizes = [sweep.sizes[dim] for dim in field.dims]
+            chunks = (1, min(sweep.rows_a_chunk, sizes[1]), *sizes[2:])
+            target = file.create_variable(
+                name, field.dims, field.dtype, fillvalue=fill, chunks=chunks, **_STORED
+            )
+            target.attrs.update(_typed(field.attrs, field.dtype))
             own = [o for o in others if set(sweep.coordinates[o].dims) <= set(field.dims)]
             if own:
                 target.attrs["coordinates"] = " ".join(own)
@@ -320,9 +328,18 @@ def _write(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any)
         for index in np.ndindex(array.shape):
             variable[index] = str(array[index])
     else:
-        variable = file.create_variable(name, dims, array.dtype)
+        filters = {"fletcher32": True} if array.size and array.ndim else {}
+        variable = file.create_variable(name, dims, array.dtype, **filters)
         variable[...] = array
-    variable.attrs.update(attrs)
+    variable.attrs.update(_typed(attrs, array.dtype))
+
+
+def _typed(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
+    """Attributes, bounds in the type of their variable, as the CF conventions want them."""
+    return {
+        key: np.asarray(value, dtype)[()] if key.startswith("valid_") else value
+        for key, value in attrs.items()
+    }
 
 
 def _opened(xarray: Any, path: Path) -> Dataset:
@@ -350,9 +367,11 @@ def _damage(error: Exception) -> str:
 
 
 def open_atlas(path: Path) -> Dataset:
-    """A stored atlas; large fields are read when they are used.
+    """A stored atlas, its checksum and the ranges of its numbers checked.
 
-    :raises AtlasError: no atlas.
+    Large fields are read part by part for it, and again when they are used.
+
+    :raises AtlasError: no atlas, a damaged one, or one with numbers that cannot be.
     """
     xarray = require("xarray", "atlas")
     require("h5netcdf", "atlas")
@@ -361,11 +380,26 @@ def open_atlas(path: Path) -> Dataset:
             raise AtlasError(path, "no such file")
         if not path.is_file():
             raise AtlasError(path, "no regular file")
+        # Before HDF5 sees the file: damage may end the process there.
+        whole = seal_holds(path)
+    if whole is False:
+        raise AtlasError(path, "damaged, or changed by another program: its checksum differs")
     data = _opened(xarray, path)
-    missing = [name for name in _ATTRIBUTES if name not in data.attrs]
-    if missing:
+    try:
+        missing = [name for name in _ATTRIBUTES if name not in data.attrs]
+        if missing:
+            what = f"no atlas, or one of another version: it has no {missing[0]!r}"
+            raise AtlasError(path, what)
+        if whole is None and SEALED.keys() <= data.attrs.keys():
+            what = "damaged, or written by another program: its checksum is missing"
+            raise AtlasError(path, what)
+        with reading(path):
+            wrong = nonsense(data)
+        if wrong:
+            raise AtlasError(path, f"damaged or no atlas: {wrong}")
+    except AtlasError:
         data.close()
-        raise AtlasError(path, f"no atlas, or one of another version: it has no {missing[0]!r}")
+        raise
     return data
 
 

@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
+POSITIVE: Final = {"valid_min": 0.0}
+SHARE: Final = {"units": "1", "valid_min": 0.0, "valid_max": 1.0}
+FLAG: Final = {"valid_min": 0, "valid_max": 1}
+"""Attributes by what a variable can be (CF conventions, 2.5.1): checked when a file is opened."""
+
 Array = NDArray[np.float64]
 Values = dict[str, NDArray[Any]]
 
@@ -33,7 +38,7 @@ class Variable:
 
     dims: tuple[str, ...]
     values: NDArray[Any]
-    attrs: Mapping[str, str]
+    attrs: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class Field:
     """A large array that is computed chunk by chunk; its first two dimensions are the grid's."""
 
     dims: tuple[str, ...]
-    attrs: Mapping[str, str]
+    attrs: Mapping[str, Any]
     dtype: str = "f8"
 
 

@@ -11,6 +11,8 @@ import json
 import logging
 import os
 import stat
+import struct
+import sys
 import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,7 +21,9 @@ from typing import Any, Final
 
 VARIABLE: Final = "PKM_TWIN_CACHE"
 """Names the folder; empty switches the cache off."""
-_MARK: Final = b"pkm_twin compiled program 1\n"
+_MARK: Final = b"pkm_twin compiled program 2\n"
+_ELF: Final = struct.Struct("<4s36xQ10xHH2x")
+"""Magic bytes, then where the table of sections begins, the size of an entry, their number."""
 _LARGEST: Final = 64 * 1024 * 1024
 _LOG: Final = logging.getLogger("pkm_twin")
 
@@ -62,14 +66,17 @@ def digest(*parts: str) -> str:
 
 
 def read(name: str) -> tuple[dict[str, Any], bytes] | None:
-    """Header and code of a stored program; None if there is none, or a damaged one."""
+    """Header and code of a stored program; None if there is none, or it must not be run.
+
+    It must be this user's own, whole, and sealed under this very name.
+    """
     place = folder()
     if place is None:
         return None
     try:
         # A FIFO in its place would wait for a writer, a device never end.
         with open(os.open(place / name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            if not _own(os.fstat(file.fileno())):
                 return None
             data = file.read(_LARGEST)
     except OSError:
@@ -81,8 +88,35 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
     ):
         return None
     head, _, code = data[seal:].partition(b"\n")
-    header: dict[str, Any] = json.loads(head)
+    try:
+        header = json.loads(head)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(header, dict) or header.pop("name", None) != name:
+        return None
     return header, code
+
+
+def _own(status: os.stat_result) -> bool:
+    """Whether a file is a regular one that this user alone can have written."""
+    return (
+        stat.S_ISREG(status.st_mode)
+        and status.st_uid == os.geteuid()
+        and not status.st_mode & 0o022
+    )
+
+
+def is_object(code: bytes, symbol: str) -> bool:
+    """Whether code is an object file with this symbol, none of it missing.
+
+    LLVM's linker ends the process on anything else. On Linux LLVM writes ELF-64 (System V ABI,
+    chapter 4) with the table of sections last; elsewhere the name alone is looked for.
+    """
+    if symbol.encode() not in code or len(code) < _ELF.size:
+        return False
+    magic, table, size, count = _ELF.unpack_from(code)
+    elf = magic == b"\x7fELF" and table + size * count == len(code)
+    return bool(elf or sys.platform != "linux")
 
 
 def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
@@ -90,7 +124,7 @@ def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
     place = folder()
     if place is None:
         return
-    body = json.dumps(header).encode() + b"\n" + code
+    body = json.dumps({**header, "name": name}).encode() + b"\n" + code
     temporary: str | None = None
     try:
         handle, temporary = tempfile.mkstemp(dir=place)

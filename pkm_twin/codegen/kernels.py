@@ -36,6 +36,8 @@ GOOD: Final = 0.0
 REFUSED: Final = 1.0
 NOT_FINITE: Final = 2.0
 
+MOST: Final = 1_000_000
+"""Upper limit of the numbers in an input, an output or the parameters."""
 _WRITERS: Final = ("codegen", "machine", "kinematics", "mechanisms", "streams")
 """Folders beside this one whose sources write programs."""
 MISSED: Final = 1e-24
@@ -164,11 +166,11 @@ class Code:
                 return _header(self.program), plain.prepare, plain, None
             name = cache.digest(self._key, _sources(), llvm.IDENTITY)
             stored = cache.read(name)
-            if stored is None:
+            if stored and _sound(stored[0]) and cache.is_object(stored[1], llvm.SYMBOL):
+                header, code = stored
+            else:
                 header, code = _header(self.program), llvm.compile_object(llvm.emit(self.program))
                 cache.write(name, header, code)
-            else:
-                header, code = stored
             prepare, address = llvm.load_object(code)
             prepare = llvm.LOCKED(prepare)
             return header, prepare, llvm.PROTOTYPE(address), llvm.LOCKED(address)
@@ -428,3 +430,18 @@ def _header(program: Program) -> dict[str, Any]:
         "prepared": len(program.prepared),
         "stepped": program.equations is not None,
     }
+
+
+def _sound(header: dict[str, Any]) -> bool:
+    """Whether a stored header is one that `_header` can have written."""
+    match header:
+        case {
+            "inputs": [*taken],
+            "outputs": [*given],
+            "parameters": p,
+            "prepared": k,
+            "stepped": s,
+        }:
+            sizes = (*taken, *given, p, k)
+            return type(s) is bool and all(type(n) is int and 0 <= n < MOST for n in sizes)
+    return False

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Programs: expressions, both back ends, the sparse factors, and the cache of compiled code."""
 
+import hashlib
+import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -198,6 +201,82 @@ def test_the_cache_is_an_optimisation(tmp_path):
     out, lines = finished(start(blocked))
     assert out == first[0]
     assert len(lines) == 1 and "compiled programs are not kept" in lines[0]
+
+
+def other_name(path, other):
+    """A sound program of another kernel, copied to this one's place."""
+    shutil.copy(other, path)
+
+
+def other_mode(path, _):
+    path.chmod(0o622)
+
+
+def other_owner(path, _):
+    if os.geteuid() == 0:
+        os.chown(path, 12345, -1)
+
+
+def sealed(change):
+    """A stored program, changed and then sealed again."""
+
+    def harm(path, _):
+        mark, body = path.read_bytes().split(b"\n", 1)
+        head, code = body[32:].split(b"\n", 1)
+        head, code = change(json.loads(head), code)
+        body = head + b"\n" + code
+        path.write_bytes(mark + b"\n" + hashlib.sha256(body).digest() + body)
+
+    return harm
+
+
+def with_header(**values):
+    return sealed(lambda head, code: (json.dumps({**head, **values}).encode(), code))
+
+
+def with_code(change):
+    return sealed(lambda head, code: (json.dumps(head).encode(), change(code)))
+
+
+HARM = [
+    other_name,
+    other_mode,
+    other_owner,
+    sealed(lambda _, code: (b"{", code)),
+    sealed(lambda _, code: (b"[" * 100_000, code)),
+    sealed(lambda _, code: (b"[]", code)),
+    sealed(lambda _, code: (b"{}", code)),
+    with_header(inputs=[1e3]),
+    with_header(outputs=3),
+    with_header(outputs=[-1]),
+    with_header(parameters=10**12),
+    with_header(stepped=None),
+    with_code(lambda code: b""),
+    with_code(lambda code: b"kernel" * 1000),
+    with_code(lambda code: code[: len(code) // 2]),
+    with_code(lambda code: code[:64] + bytes(len(code) - 64)),
+    with_code(lambda code: code.replace(b"kernel", b"colonel"[:6])),
+]
+
+
+@compiled
+@pytest.mark.parametrize("harm", HARM)
+def test_a_stored_program_that_must_not_run_is_rebuilt(tmp_path, monkeypatch, harm):
+    monkeypatch.setenv("PKM_TWIN_CACHE", str(tmp_path))
+    made = [program(lambda x, k=k: [k * x[0]], 1) for k in (2.0, 3.0)]
+
+    def outputs():
+        return [Kernel(lambda m=m: m, f"times {id(m)}")(NONE, [1.0])[0][0][0] for m in made]
+
+    assert outputs() == [2.0, 3.0]
+    paths = sorted(tmp_path.iterdir())
+    whole = [path.read_bytes() for path in paths]
+    harm(*paths)
+    assert outputs() == [2.0, 3.0]
+    assert [path.read_bytes() for path in paths] == whole
+    assert {(path.stat().st_mode & 0o777, path.stat().st_uid) for path in paths} == {
+        (0o600, os.geteuid())
+    }
 
 
 def test_traces_over_sparse_matrices(rng):

@@ -197,7 +197,7 @@ def test_refused_by_name(case, tmp_path):
 
 def test_without_the_package_it_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ParameterError, match=r"without the mujoco package.*pkm_twin\[mjcf\]"):
+    with pytest.raises(ParameterError, match=r"without the mujoco package.*\[mjcf\]"):
         read_urdf(five_bar(tmp_path))
 
 

@@ -5,7 +5,6 @@ import re
 import warnings
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import yaml
 
@@ -14,6 +13,10 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.machine.urdf_read import read_tree
 from pkm_twin.mechanisms.machine import Machine
 from test.support.robots import partly_long, random_joints
+
+pytest.importorskip("pinocchio")
+
+import pinocchio as pin
 
 from .sketches import SKETCHES, delta, five_bar, palletizer, rrr3, stewart
 

@@ -436,13 +436,14 @@ class TestProcess:
     ):
         code = f"""
 import os, time
+import numpy as np
 import delta_dynamics.node as node
 original = node.DeltaDynamics.{callback}
 def interrupted(self, *arguments):
     os.kill(os.getpid(), {int(number)})
     time.sleep(0.05)
     # The topics are there until the callback is over, and for the node's last words.
-    self._torques.publish(node.JointState())
+    self._torques.publish(0, np.zeros(3))
 node.DeltaDynamics.{callback} = interrupted
 node.main()
 """

@@ -497,7 +497,7 @@ class TestRefusedSamples:
         bad = {"ahead": 99} | bad
         ahead = bad.pop("ahead")
         robot = ROBOT.changed(limits={"effort": 60.0})
-        robot = limitless if bad.get("position") == UNREACHABLE else robot
+        robot = limitless if bad.get("position") is UNREACHABLE else robot
         twin = core(robot, trip_count=10**6, limit_policy="reject", recovery_count=1)
         answers(twin, make, range(10))
         stamp = NOW + (9 + ahead) * STEP

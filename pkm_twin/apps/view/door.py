@@ -24,6 +24,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from pkm_twin.errors import ParameterError, PkmTwinError, install
 
+UNKNOWN: Final = f"this version of viser is not known here: {install('view')}"
 LEAST_TOKEN: Final = 16
 """Characters of a token: fewer could be guessed."""
 POLICY: Final = (
@@ -183,7 +184,7 @@ def behind(door: Door, listening: socket.socket) -> Iterator[None]:
     finally:
         library.serve = plain  # type: ignore[misc]
     if made != [port]:
-        raise PkmTwinError(f"this version of viser is not known here: {install('view')}")
+        raise PkmTwinError(UNKNOWN)
 
 
 def _cookie(port: int) -> str:

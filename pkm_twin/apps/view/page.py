@@ -24,9 +24,12 @@ from pkm_twin.apps.view.door import Door, behind
 from pkm_twin.apps.view.model import Model, Range, State
 from pkm_twin.apps.view.scene import DRIVE, Scene
 from pkm_twin.apps.view.stage import Stage
+from pkm_twin.apps.view.visitors import guard
+from pkm_twin.errors import one_line
 
 Array = NDArray[np.float64]
 
+_LOG: Final = logging.getLogger("pkm_twin")
 PERIOD: Final = 0.05
 """How often what moves by itself is drawn, s."""
 
@@ -46,6 +49,7 @@ def serving(door: Door, listening: socket.socket) -> Iterator[Any]:
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()), behind(door, listening):
         server = Server(host=door.host, port=listening.getsockname()[1], verbose=False)
+        guard(server)
     try:
         yield server
     finally:
@@ -73,6 +77,7 @@ class Page:
         self.stage = Stage(server, Scene(model.robot), model.start.q, lowest)
         self.moving: list[Moving] = []
         self._asked: dict[str, Callable[[], None]] = {}
+        self._failures: set[str] = set()
         self._wake = threading.Event()
         self._tops = np.array([r.high for r in model.wrench_ranges])
         server.gui.configure_theme(
@@ -111,10 +116,20 @@ class Page:
         """Do what was asked for, and draw what moved by itself."""
         while self._asked:
             _, call = self._asked.popitem()
-            call()
+            self._attempt(call)
         for item in self.moving:
             if item.busy:
-                item.step()
+                self._attempt(item.step)
+
+    def _attempt(self, call: Callable[[], None]) -> None:
+        """Make a call; one that fails is logged, once a reason, and the page goes on for all."""
+        try:
+            call()
+        except Exception as error:
+            reason = f"{type(error).__name__}: {one_line(str(error))}"
+            if reason not in self._failures:
+                self._failures.add(reason)
+                _LOG.warning("view: a change was not made: %s", reason)
 
     def become(self, state: State) -> None:
         """Show another state; one with a refusal leaves the sliders where they were put."""
@@ -157,16 +172,16 @@ class Page:
 
     def _move_joint(self, k: int) -> None:
         q = self.state.q.copy()
-        q[k] = _read(self._joints[k])
+        q[k] = self._joints[k].value
         self.become(self.model.to_joints(self.state, q))
 
     def _move_pose(self, k: int) -> None:
         pose = self.state.pose.copy()
-        pose[k] = _read(self._pose[k])
+        pose[k] = self._pose[k].value
         self.become(self.model.to_pose(self.state, pose))
 
     def _load(self, _: int) -> None:
-        wrench = [_read(handle) for handle in self._wrench]
+        wrench = [handle.value for handle in self._wrench]
         self.become(self.model.loaded(self.state, wrench))
 
     def _unload(self) -> None:
@@ -195,13 +210,7 @@ class Page:
 
     def draw_deflected(self, deflection: Array, shares: dict[str, float], dominant: str) -> None:
         """The state with a deflection (6,), m and rad, base axes, enlarged as the slider says."""
-        self.stage.draw(self.state.q, deflection * _read(self._enlarge), shares, dominant)
-
-
-def _read(handle: Any) -> float:
-    """A slider's value: what a visitor sends need not be within its ends."""
-    value = float(handle.value)
-    return float(min(max(value, handle.min), handle.max))
+        self.stage.draw(self.state.q, deflection * self._enlarge.value, shares, dominant)
 
 
 def _put(handles: Sequence[Any], values: Array) -> None:

@@ -26,7 +26,7 @@ from delta_dynamics.isotropy import (
     max_driving_force,
 )
 from pkm_twin.atlas.grids import circles, ladder, turns, workspace_box
-from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
+from pkm_twin.atlas.sweep import FLAG, POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import distance_unit, reachable, singularity_at, try_inverse
 from pkm_twin.machine.robot import Robot
@@ -72,18 +72,20 @@ class IsotropySweep(Sweep):
         sphere = (*self.axes, *_SPHERE)
         share = "eta_KE, the platform's part of the kinetic energy"
         return {
-            "eta": Field(sphere, {"units": "1", "long_name": share}),
-            "force": Field(sphere, {"units": unit, "long_name": "F_max, largest driving force"}),
-            "eta_least": Field(self.axes, {"units": "1", "long_name": f"least {share}, exact"}),
-            "eta_greatest": Field(
-                self.axes, {"units": "1", "long_name": f"greatest {share}, exact"}
+            "eta": Field(sphere, {**SHARE, "long_name": share}),
+            "force": Field(
+                sphere, {**POSITIVE, "units": unit, "long_name": "F_max, largest driving force"}
             ),
+            "eta_least": Field(self.axes, {**SHARE, "long_name": f"least {share}, exact"}),
+            "eta_greatest": Field(self.axes, {**SHARE, "long_name": f"greatest {share}, exact"}),
             "singularity": Field(
                 self.axes,
-                {"units": "1", "long_name": "distance to a singularity: 0 in one, 1 at best"},
+                {**SHARE, "long_name": "distance to a singularity: 0 in one, 1 at best"},
             ),
             "within_limits": Field(
-                self.axes, {"long_name": "1 where the pose keeps all limits of the machine"}, "i1"
+                self.axes,
+                {**FLAG, "long_name": "1 where the pose keeps all limits of the machine"},
+                "i1",
             ),
         }
 

@@ -28,7 +28,7 @@ from pkm_twin.atlas.grids import (
     largest_cylinder,
     turns,
 )
-from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
+from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import distance_unit
 from pkm_twin.machine.graph import BASE
@@ -64,7 +64,8 @@ class ModesSweep(Sweep):
     kind: ClassVar[str] = "modes"
     fields: ClassVar[Mapping[str, Field]] = {
         "frequency": Field(
-            (*_GRID, "mode"), {"units": "Hz", "long_name": "natural frequency, actuators locked"}
+            (*_GRID, "mode"),
+            {**POSITIVE, "units": "Hz", "long_name": "natural frequency, actuators locked"},
         )
     }
 
@@ -86,7 +87,13 @@ class ModesSweep(Sweep):
             "element": _names("element", self.elements, "bodies, and joints with elasticity"),
             "parameter": _names("parameter", self.robot.pose_names, "parameters of a pose"),
             "line": Variable(
-                ("edge", "end"), self.edges, {"long_name": "indices of the nodes that it joins"}
+                ("edge", "end"),
+                self.edges,
+                {
+                    "long_name": "indices of the nodes that it joins",
+                    "valid_min": 0,
+                    "valid_max": len(self.nodes) - 1,
+                },
             ),
         }
 
@@ -130,7 +137,9 @@ class ModesSweep(Sweep):
                 ("parameter",), self.middle, {"units": units, "long_name": "pose of the shapes"}
             ),
             "shape_frequency": Variable(
-                ("mode",), found.frequencies, {"units": "Hz", "long_name": "frequency of the shape"}
+                ("mode",),
+                found.frequencies,
+                {**POSITIVE, "units": "Hz", "long_name": "frequency of the shape"},
             ),
             "position": Variable(
                 ("node", "axis"), found.positions, {"units": "m", "long_name": "node at rest"}
@@ -144,12 +153,12 @@ class ModesSweep(Sweep):
             "strain_share": Variable(
                 part,
                 found.energies.strain,
-                {"units": "1", "long_name": "part of the mode's strain energy"},
+                {**SHARE, "long_name": "part of the mode's strain energy"},
             ),
             "kinetic_share": Variable(
                 part,
                 found.energies.kinetic,
-                {"units": "1", "long_name": "part of the mode's kinetic energy"},
+                {**SHARE, "long_name": "part of the mode's kinetic energy"},
             ),
         }
 

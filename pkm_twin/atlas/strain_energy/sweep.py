@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.atlas.grids import circles, cylinder, height_range, ladder, nice, turns
-from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
+from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.compliance import strain_energy
@@ -72,12 +72,17 @@ class StrainEnergySweep(Sweep):
 
     kind: ClassVar[str] = "strain-energy"
     fields: ClassVar[Mapping[str, Field]] = {
-        "energy": Field(_GRID, {"units": "J", "long_name": "total strain energy"}),
+        "energy": Field(_GRID, {**POSITIVE, "units": "J", "long_name": "total strain energy"}),
         "factor": Field(
-            (*_GRID, "element"), {"units": "1", "long_name": "strain-energy factor, U_e / U"}
+            (*_GRID, "element"), {**SHARE, "long_name": "strain-energy factor, U_e / U"}
         ),
         "dominant": Field(
-            _GRID, {"long_name": "index of the element with the largest factor, -1 outside"}, "i1"
+            _GRID,
+            {
+                "long_name": "index of the element with the largest factor, -1 outside",
+                "valid_min": -1,
+            },
+            "i1",
         ),
     }
 
@@ -161,7 +166,7 @@ class StrainEnergySweep(Sweep):
             ("volume_factor", volume, weight, "mean over the volume of z, beta and gamma"),
         ):
             values = np.array([math.fsum(row) for row in sums]) / count
-            attrs = {"units": "1", "long_name": f"global strain-energy factor, {what}"}
+            attrs = {**SHARE, "long_name": f"global strain-energy factor, {what}"}
             result[name] = Variable(("element",), values, attrs)
         return result
 

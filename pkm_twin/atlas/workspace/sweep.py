@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.atlas.grids import FULL, circles, largest_cylinder, workspace_box
-from pkm_twin.atlas.sweep import Chunk, Field, Sweep, Values, Variable
+from pkm_twin.atlas.sweep import FLAG, POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.clearance import clearance, has_clearance
 from pkm_twin.kinematics.workspace import (
@@ -85,11 +85,13 @@ class WorkspaceSweep(Sweep):
     def fields(self) -> Mapping[str, Field]:  # type: ignore[override]
         """Reach, singularity measure, passive angle and clearance where the machine tells them."""
         fields = {
-            "reachable": Field(self.dims, {"long_name": "1 where all limits are kept"}, "i1"),
+            "reachable": Field(
+                self.dims, {**FLAG, "long_name": "1 where all limits are kept"}, "i1"
+            ),
             "singularity": Field(
                 self.dims,
                 {
-                    "units": "1",
+                    **SHARE,
                     "long_name": "distance to a singularity: 0 in one, 1 at best; reachable poses",
                 },
             ),
@@ -97,7 +99,11 @@ class WorkspaceSweep(Sweep):
         if has_joint_angles(self.robot):
             fields["joint_angle"] = Field(
                 self.dims,
-                {"units": "rad", "long_name": "largest passive joint angle; reachable poses"},
+                {
+                    **POSITIVE,
+                    "units": "rad",
+                    "long_name": "largest passive joint angle; reachable poses",
+                },
             )
         if has_clearance(self.robot):
             # Also where limbs meet, so that the file shows what interference takes away.
@@ -237,14 +243,14 @@ class WorkspaceSweep(Sweep):
             result["volume"] = Variable(
                 (),
                 np.array(count * math.prod(steps)),
-                {"units": units, "long_name": "volume of the reachable poses"},
+                {**POSITIVE, "units": units, "long_name": "volume of the reachable poses"},
             )
         if has_clearance(self.robot):
             share = (otherwise - count) / otherwise if otherwise else math.nan
             result["interference"] = Variable(
                 (),
                 np.array(share),
-                {"units": "1", "long_name": "share of otherwise reachable poses where limbs meet"},
+                {**SHARE, "long_name": "share of otherwise reachable poses where limbs meet"},
             )
         if self.upright:
             result |= self._regular()
@@ -259,7 +265,9 @@ class WorkspaceSweep(Sweep):
         unit = distance_unit(self.robot)
         result = {
             "circle": Variable(
-                ("height",), reach.radius, {"units": unit, "long_name": "largest circle, radius"}
+                ("height",),
+                reach.radius,
+                {**POSITIVE, "units": unit, "long_name": "largest circle, radius"},
             )
         }
         for name, value, u in (

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a browser may change on the page: the values of its inputs, within what each can take.
+
+All browsers share one page, and viser writes whatever property a message names. Every other
+message of a browser but its camera's is dropped here: the page has no use for one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pkm_twin.apps.view.door import UNKNOWN
+from pkm_twin.errors import PkmTwinError
+
+
+def guard(server: Any) -> None:
+    """Let only values that inputs can take pass to a viser server that was just made.
+
+    :raises PkmTwinError: the viser that is installed works in another way.
+    """
+    from viser import _messages as messages
+
+    try:
+        handlers = server._websock_server._incoming_handlers
+        take, inputs = server.gui._handle_gui_updates, server.gui._gui_input_handle_from_uuid
+    except AttributeError:
+        raise PkmTwinError(UNKNOWN) from None
+    handlers.clear()
+
+    async def update(client: int, message: Any) -> None:
+        match message.uuid, message.updates:
+            case str(uuid), {"value": value, **others} if not others:
+                taken = acceptable(inputs[uuid], value) if uuid in inputs else None
+                if taken is not None:
+                    message.updates = {"value": taken}
+                    await take(client, message)
+
+    server._websock_server.register_handler(messages.GuiUpdateMessage, update)
+
+
+def acceptable(handle: Any, value: Any) -> Any:
+    """The value that an input takes for one that a browser sends, or None.
+
+    Sliders take finite numbers, limited to their ends; menus one of their options; checkboxes and
+    buttons true or false.
+    """
+    now = handle.value
+    if isinstance(now, bool) or isinstance(value, bool):
+        return value if type(value) is type(now) else None
+    if isinstance(now, str):
+        return value if value in getattr(handle, "options", ()) else None
+    if not isinstance(value, (int, float)) or not math.isfinite(value):
+        return None
+    return float(min(max(value, handle.min), handle.max))
