@@ -381,7 +381,10 @@ class Robot:
 
     @property
     def element_names(self) -> tuple[str, ...]:
-        """Names of the elastic elements; errors as :meth:`structure`."""
+        """Names that ``element_compliance`` may have, bars first; errors as :meth:`structure`.
+
+        Energies and factors have an order of their own, which comes with them as ``elements``.
+        """
         return self.structure().elements
 
     def check_elements(self) -> None:
