@@ -8,7 +8,14 @@ from pkm_twin.kinematics.workspace import (
     regular_workspace,
 )
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
-from stiffness_monitor.compliance import StrainEnergy, compliance, stiffness, strain_energy
+from stiffness_monitor.compliance import (
+    PlatformResponse,
+    StrainEnergy,
+    compliance,
+    platform_response,
+    stiffness,
+    strain_energy,
+)
 from stiffness_monitor.correction import Correction, setpoint_correction
 from stiffness_monitor.response import ElementResponse, element_response
 from stiffness_monitor.uncertainty import compliance_deviation
@@ -18,6 +25,7 @@ __all__ = [
     "Correction",
     "Departure",
     "ElementResponse",
+    "PlatformResponse",
     "RegularWorkspace",
     "StiffnessAlarm",
     "StrainEnergy",
@@ -25,6 +33,7 @@ __all__ = [
     "compliance",
     "compliance_deviation",
     "element_response",
+    "platform_response",
     "reachable",
     "regular_workspace",
     "setpoint_correction",

@@ -14,12 +14,11 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import eigh, solve_triangular  # type: ignore[import-untyped]
+from scipy.linalg import cholesky, eigh, solve_triangular  # type: ignore[import-untyped]
 
-from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.errors import ParameterError, SingularityError
+from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 from stiffness_monitor.beams import System, assemble
-from stiffness_monitor.statics import checked_poses, stiffness_root
 from stiffness_monitor.structure import structural_model
 
 Array = NDArray[np.float64]
@@ -73,10 +72,10 @@ def natural_frequencies(
     :raises SingularityError: a pose in which the frame is a mechanism, with locked actuators.
     :raises ValueError: a wrong last axis, a value that is not finite, too many modes.
     """
-    poses = checked_poses(robot, pose)
-    result = np.empty((*poses.shape[:-1], count))
-    for index in np.ndindex(*poses.shape[:-1]):
-        system = _system(robot, poses[index], elements)
+    q = _joints(robot, pose)
+    result = np.empty((*q.shape[:-1], count))
+    for index in np.ndindex(*q.shape[:-1]):
+        system = _system(robot, q[index], elements)
         result[index] = _solve(system, count, index, vectors=False)[0]
     return result
 
@@ -89,8 +88,8 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param elements: beam elements a member.
     """
-    poses = checked_poses(robot, pose)
-    batch = poses.shape[:-1]
+    q = _joints(robot, pose)
+    batch = q.shape[:-1]
     frequencies: list[Array] = []
     positions: list[Array] = []
     shapes: list[Array] = []
@@ -99,7 +98,7 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     if not np.prod(batch, dtype=int):
         raise ValueError("modes of no pose")
     for index in np.ndindex(*batch):
-        system = _system(robot, poses[index], elements)
+        system = _system(robot, q[index], elements)
         values, vectors = _solve(system, count, index, vectors=True)
         frequencies.append(values)
         positions.append(system.positions)
@@ -129,16 +128,40 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
 def has_modes(robot: Robot) -> bool:
     """Whether the robot's file has what natural frequencies need."""
     try:
+        robot.massive()
         robot.structure()
     except ParameterError:
         return False
     return True
 
 
-def _system(robot: Robot, pose: Array, elements: int) -> System:
+def _joints(robot: Robot, pose: ArrayLike) -> Array:
+    """Joint positions of poses, of a robot with masses and elastic members."""
+    robot.massive()
+    _ = robot.elastic
+    return robot.inverse(pose)
+
+
+def _system(robot: Robot, q: Array, elements: int) -> System:
     if elements < 1:
         raise ParameterError("elements", elements, "1 or more")
-    return assemble(structural_model(robot, pose), elements, KEPT)
+    return assemble(structural_model(robot, q), elements, KEPT)
+
+
+def _stiffness_root(system: System, index: tuple[int, ...]) -> Array:
+    """Lower Cholesky factor of the stiffness; not positive definite is a mechanism.
+
+    :raises SingularityError: by the sample's index.
+    """
+    measure = 0.0
+    try:
+        root: Array = cholesky(system.stiffness, lower=True, check_finite=False)
+        measure = float((np.diag(root) ** 2 / np.diag(system.stiffness)).min())
+    except np.linalg.LinAlgError:
+        pass
+    if not measure > SINGULARITY_BOUND:
+        raise SingularityError("the elastic frame of the pose", index, measure, SINGULARITY_BOUND)
+    return root
 
 
 def _solve(
@@ -152,7 +175,7 @@ def _solve(
     size = len(system.mass)
     if not 1 <= count <= size:
         raise ValueError(f"count is {count}; the frame has {size} modes")
-    root = stiffness_root(system, index)
+    root = _stiffness_root(system, index)
     half = solve_triangular(root, system.mass, lower=True, check_finite=False)
     matrix = solve_triangular(root, half.T, lower=True, check_finite=False)
     chosen = (size - count, size - 1)

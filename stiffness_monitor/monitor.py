@@ -17,7 +17,7 @@ from pkm_twin.ros.messages import SECOND, WrenchSample, as_message_error
 from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.pairing import PairingCore
 from pkm_twin.streams.wrench import Mount, Recent, WrenchSettings
-from stiffness_monitor.compliance import StrainEnergy, compliance, strain_energy
+from stiffness_monitor.compliance import PlatformResponse, platform_response
 
 Array = NDArray[np.float64]
 Settings = WrenchSettings
@@ -28,17 +28,21 @@ Settings = WrenchSettings
 class Answer:
     """What one wrench did to the platform.
 
-    ``compliance`` (6, 6), ``energy.deflection`` (6,) and ``wrench`` (6,) in fixed axes at the
-    platform's origin; ``rotation`` (3, 3) turns platform axes into fixed ones.
+    ``energy`` and ``wrench`` (6,) in fixed axes at the platform's origin; ``rotation`` (3, 3) turns
+    platform axes into fixed ones.
     """
 
     stamp: int
     q: Array
     pose: Array
     wrench: Array
-    compliance: Array
-    energy: StrainEnergy
+    energy: PlatformResponse
     rotation: Array
+
+    @property
+    def compliance(self) -> Array:
+        """Of the platform, shape (6, 6)."""
+        return self.energy.compliance
 
 
 @dataclass
@@ -87,8 +91,8 @@ class Monitor(PairingCore):
             return None
         q = self._nearest(sample.stamp)
         answer: Answer = as_message_error(self._answer, sample, mount, q)
-        deflection = answer.energy.deflection
-        if not (np.isfinite(answer.compliance).all() and np.isfinite(deflection).all()):
+        found = answer.energy
+        if not (np.isfinite(found.compliance).all() and np.isfinite(found.deflection).all()):
             raise MessageError("non-finite result", "the model gave a value that is not finite")
         self.pace.answered(sample.stamp)
         return answer
@@ -97,9 +101,8 @@ class Monitor(PairingCore):
         pose = self.robot.forward(q)
         _, rotation = self.robot.platform(q)
         fixed = self._wrench_reader.at_reference(sample, mount, rotation)
-        energy = strain_energy(self.robot, pose, fixed)
-        matrix = compliance(self.robot, pose)
-        return Answer(sample.stamp, q, pose, fixed, matrix, energy, rotation)
+        energy = platform_response(self.robot, q, fixed)
+        return Answer(sample.stamp, q, pose, fixed, energy, rotation)
 
     def _nearest(self, stamp: int) -> Array:
         """Joint positions of the state nearest in time."""

@@ -11,15 +11,14 @@ import math
 import sys
 from array import array
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TransformStamped, WrenchStamped
-from numpy.typing import NDArray
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
+from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
@@ -80,13 +79,18 @@ class StiffnessMonitor(health.TwinNode):
             self, robot, settings.stamp_rules,
             (settings.base_frame, self._platform_frame or settings.platform_frame),
         )  # fmt: skip
-        self._compliance = self.create_guarded_publisher(Float64MultiArray, "~/compliance")
         # What has no stamp, or texts for numbers, has a sibling that plots can draw.
-        self._compliance_stamped = self.create_guarded_publisher(JointState, "~/compliance_stamped")
-        self._energy = self.create_guarded_publisher(DiagnosticArray, "~/strain_energy")
-        self._energy_stamped = self.create_guarded_publisher(JointState, "~/strain_energy_stamped")
-        self._dominant = self.create_guarded_publisher(String, "~/dominant_element")
-        self._deflection = self.create_guarded_publisher(TransformStamped, "~/deflection")
+        self._outputs = [
+            (self.create_guarded_publisher(kind, topic), make)
+            for topic, kind, make in (
+                ("~/compliance", Float64MultiArray, _matrix),
+                ("~/compliance_stamped", JointState, self._entries),
+                ("~/strain_energy", DiagnosticArray, self._energies),
+                ("~/strain_energy_stamped", JointState, self._factors),
+                ("~/dominant_element", String, lambda answer: String(data=answer.energy.dominant)),
+                ("~/deflection", TransformStamped, self._transform),
+            )
+        ]
         self._known = 0
         """Stamp of the joint state whose frequencies were published last."""
         rate = self.declare(
@@ -191,26 +195,10 @@ class StiffnessMonitor(health.TwinNode):
         answer = self._monitor.wrench(message, self.now())
         if answer is None:
             return
-        stamp = Time(nanoseconds=answer.stamp).to_msg()
-        base = self._monitor.settings.base_frame
-        self._compliance.publish(_matrix(answer.compliance))
-        entries = answer.compliance[UPPER].tolist()
-        self._compliance_stamped.publish(_named(stamp, base, ENTRIES, entries))
-        energy = DiagnosticArray(status=[self._status(answer)])
-        energy.header.stamp = stamp
-        energy.header.frame_id = base
-        self._energy.publish(energy)
-        found = answer.energy
-        self._energy_stamped.publish(
-            _named(stamp, base, found.elements, found.factors.tolist(), found.energies.tolist())
-        )
-        self._dominant.publish(String(data=answer.energy.dominant))
-        deflection = _transform(answer)
-        deflection.header.stamp = stamp
-        frame = self._platform_frame or self._monitor.settings.platform_frame
-        deflection.header.frame_id = frame
-        deflection.child_frame_id = f"{frame}_deflected"
-        self._deflection.publish(deflection)
+        for publisher, make in self._outputs:
+            # Most of the time goes into messages: only those that have a subscriber are made.
+            if publisher.get_subscription_count():
+                publisher.publish(make(answer))
         for take in (self._correction.take, self._alarm.take):
             try:
                 take(answer)
@@ -238,11 +226,21 @@ class StiffnessMonitor(health.TwinNode):
             MultiArrayDimension(label="frequency", size=len(values), stride=len(values))
         ]
         self._frequencies.publish(message)
-        stamp = Time(nanoseconds=self._known).to_msg()
         names = [f"mode_{k + 1}" for k in range(len(values))]
-        self._frequencies_stamped.publish(_named(stamp, "", names, values.tolist()))
+        self._frequencies_stamped.publish(_named(_header(self._known, ""), names, values.tolist()))
 
-    def _status(self, answer: Answer) -> DiagnosticStatus:
+    def _in_base(self, answer: Answer) -> Header:
+        return _header(answer.stamp, self._monitor.settings.base_frame)
+
+    def _entries(self, answer: Answer) -> JointState:
+        return _named(self._in_base(answer), ENTRIES, answer.compliance[UPPER].tolist())
+
+    def _factors(self, answer: Answer) -> JointState:
+        found = answer.energy
+        factors, energies = found.factors.tolist(), found.energies.tolist()
+        return _named(self._in_base(answer), found.elements, factors, energies)
+
+    def _energies(self, answer: Answer) -> DiagnosticArray:
         """Factors, energy, pose and frame; factors are absent where no load makes energy."""
         robot, energy = self._monitor.robot, answer.energy
         pairs: dict[str, str] = {}
@@ -254,50 +252,53 @@ class StiffnessMonitor(health.TwinNode):
         pose = answer.pose.tolist()
         pairs |= {name: repr(x) for name, x in zip(robot.pose_names, pose, strict=True)}
         pairs["frame"] = self._monitor.settings.base_frame
-        return DiagnosticStatus(
+        status = DiagnosticStatus(
             level=health.OK,
             name=f"{self.get_name()}: strain energy",
             message=energy.dominant,
             hardware_id=robot.name,
             values=[KeyValue(key=key, value=value) for key, value in pairs.items()],
         )
+        return DiagnosticArray(header=self._in_base(answer), status=[status])
+
+    def _transform(self, answer: Answer) -> TransformStamped:
+        """From the platform to the deflected platform, in the platform's axes."""
+        shift = answer.rotation.T @ answer.energy.deflection[:3]
+        turn = answer.rotation.T @ answer.energy.deflection[3:]
+        angle = math.sqrt(float(turn @ turn))
+        # sin(x/2)/x goes to 1/2: deflections are so small that the quotient would lose digits.
+        scale = 0.5 if angle < 1e-6 else math.sin(angle / 2) / angle
+        frame = self._platform_frame or self._monitor.settings.platform_frame
+        message = TransformStamped(
+            header=_header(answer.stamp, frame), child_frame_id=f"{frame}_deflected"
+        )
+        move, rotation = message.transform.translation, message.transform.rotation
+        move.x, move.y, move.z = shift.tolist()
+        rotation.x, rotation.y, rotation.z = (scale * turn).tolist()
+        rotation.w = math.cos(angle / 2)
+        return message
+
+
+def _header(stamp: int, frame: str) -> Header:
+    return Header(stamp=Time(nanoseconds=stamp).to_msg(), frame_id=frame)
 
 
 def _named(
-    stamp: Any,
-    frame: str,
-    names: Sequence[str],
-    values: Sequence[float],
-    efforts: Sequence[float] = (),
+    header: Header, names: Sequence[str], values: Sequence[float], efforts: Sequence[float] = ()
 ) -> JointState:
     """Numbers by name, stamped: the message of names and numbers that plots know."""
-    message = JointState(name=list(names), position=array("d", values), effort=array("d", efforts))
-    message.header.stamp, message.header.frame_id = stamp, frame
-    return message
+    return JointState(
+        header=header, name=list(names), position=array("d", values), effort=array("d", efforts)
+    )
 
 
-def _matrix(values: NDArray[np.float64]) -> Float64MultiArray:
-    rows, columns = values.shape
-    message = Float64MultiArray(data=array("d", values.ravel()))
+def _matrix(answer: Answer) -> Float64MultiArray:
+    rows, columns = answer.compliance.shape
+    message = Float64MultiArray(data=array("d", answer.compliance.ravel()))
     message.layout.dim = [
         MultiArrayDimension(label="row", size=rows, stride=rows * columns),
         MultiArrayDimension(label="col", size=columns, stride=columns),
     ]
-    return message
-
-
-def _transform(answer: Answer) -> TransformStamped:
-    """From the platform to the deflected platform, in the platform's axes."""
-    shift = answer.rotation.T @ answer.energy.deflection[:3]
-    turn = answer.rotation.T @ answer.energy.deflection[3:]
-    angle = math.sqrt(float(turn @ turn))
-    # sin(x/2)/x goes to 1/2: deflections are so small that the quotient would lose digits.
-    scale = 0.5 if angle < 1e-6 else math.sin(angle / 2) / angle
-    message = TransformStamped()
-    move, rotation = message.transform.translation, message.transform.rotation
-    move.x, move.y, move.z = shift.tolist()
-    rotation.x, rotation.y, rotation.z = (scale * turn).tolist()
-    rotation.w = math.cos(angle / 2)
     return message
 
 

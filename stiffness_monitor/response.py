@@ -8,11 +8,9 @@ elements (columns G of their own stiffness on the frame's coordinates) and the p
 
 (Woodbury), all at s = 1, and dC/ds_e = Z_e' Z_e with the rows e of Z = (I + M S)^-1 A': twice the
 element's strain energy at unit loads, which is Castigliano's theorem. A pose is solved once,
-whatever the factors. Where elements stand in series in limbs (2UPR-RPU paper, equation 34), with
-their compliances R_e R_e' on a limb's wrench amplitudes, A = C J C_i^-1 R and
-M = R' C_i^-1 R - R' C_i^-1 J' C J C_i^-1 R.
+whatever the factors.
 
-May import: numpy, scipy, pkm_twin's core, this package, the standard library; never rclpy.
+May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -22,15 +20,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_triangular  # type: ignore[import-untyped]
 
-from pkm_twin.codegen.arrays import doubles, one_vector, vectors
+from pkm_twin.codegen.arrays import one_vector, vectors
 from pkm_twin.machine.robot import Robot
-from stiffness_monitor.beams import System, assemble
-from stiffness_monitor.compliance import compliance
-from stiffness_monitor.elements import limb_kernel
-from stiffness_monitor.statics import checked_poses, stiffness_root
-from stiffness_monitor.structure import structural_model
+from stiffness_monitor.compliance import platform_response
+from stiffness_monitor.frame import PLATFORM
+from stiffness_monitor.programs import elastic_of
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -108,78 +103,22 @@ def element_response(robot: Robot, pose: ArrayLike) -> ElementResponse:
     :raises UnreachableError: a pose that is none of the mechanism's.
     :raises SingularityError: a compliance that is not positive definite.
     """
-    poses = doubles(pose, "the pose")
-    if robot.element_names:
-        return _of_limbs(robot, poses)
-    poses = checked_poses(robot, poses)
-    batch = poses.shape[:-1]
-    if not np.prod(batch, dtype=int):
-        raise ValueError("elements of no pose")
-    found = [
-        _of_frame(assemble(structural_model(robot, poses[index]), 1), index)
-        for index in np.ndindex(*batch)
-    ]
-    first = found[0]
-    arrays = [
-        np.reshape([getattr(one, name) for one in found], (*batch, *getattr(first, name).shape))
-        for name in ("compliance", "reach", "rest")
-    ]
-    return ElementResponse(first.names, first.owner, *arrays)
-
-
-def _of_limbs(robot: Robot, poses: Array) -> ElementResponse:
-    """By the closed form's limbs and elements."""
-    whole = compliance(robot, poses)
-    (rows,), _ = limb_kernel(robot)(robot.elastic_parameters, poses)
-    batch, names = rows.shape[:-1], robot.element_names
-    # Of every limb 18 numbers and four an element.
-    count = (rows.shape[-1] - 4 * len(names)) // 18
-    each = len(names) // count
-    limbs = rows.reshape(*batch, count, 18 + 4 * each)
-    wrenches = limbs[..., :18].reshape(*batch, count, 3, 6)
-    roots = _roots(limbs[..., 18:].reshape(*batch, count, each, 4))
-    # Columns of a limb: three an element.
-    own = np.moveaxis(roots, -3, -2).reshape(*batch, count, 3, 3 * each)
-    held = np.linalg.inv(own @ np.swapaxes(own, -1, -2))
-    carried = np.swapaxes(wrenches, -1, -2) @ held @ own
-    size = 3 * each * count
-    flat = np.moveaxis(carried, -3, -2).reshape(*batch, 6, size)
-    rest = -np.swapaxes(flat, -1, -2) @ whole @ flat
-    for k in range(count):
-        at = slice(3 * each * k, 3 * each * (k + 1))
-        rest[..., at, at] += np.swapaxes(own[..., k, :, :], -1, -2) @ (held @ own)[..., k, :, :]
-    return ElementResponse(names, np.repeat(np.arange(len(names)), 3), whole, whole @ flat, rest)
-
-
-def _roots(entries: Array) -> Array:
-    """R of R R' = [[c11, 0, 0], [0, c22, c23], [0, c23, c33]], shape (..., 3, 3)."""
-    c11, c22, c23, c33 = np.moveaxis(entries, -1, 0)
-    result = np.zeros((*entries.shape[:-1], 3, 3))
-    result[..., 0, 0], result[..., 1, 1] = np.sqrt(c11), np.sqrt(c22)
-    result[..., 2, 1] = np.divide(c23, result[..., 1, 1], out=np.zeros_like(c23), where=c22 > 0.0)
-    result[..., 2, 2] = np.sqrt(np.maximum(c33 - result[..., 2, 1] ** 2, 0.0))
-    return result
-
-
-def _of_frame(system: System, index: tuple[int, ...]) -> ElementResponse:
-    """By the finite elements of one pose."""
-    root = stiffness_root(system, index)
-    names = system.elastic
-    blocks, owner = [], []
-    for part in system.parts:
-        if part.name not in names:
-            continue
-        values, vectors = np.linalg.eigh(part.stiffness)
-        kept = values > 1e-12 * values[-1]
-        block = np.zeros((len(root), int(kept.sum())))
-        block[part.own] = part.map.T @ (vectors[:, kept] * np.sqrt(values[kept]))
-        blocks.append(block)
-        owner += [names.index(part.name)] * block.shape[1]
-    load = np.zeros((len(root), 6))
-    load[:6] = np.eye(6)
-    solved = solve_triangular(root, np.hstack([load, *blocks]), lower=True, check_finite=False)
-    platform, elements = solved[:, :6], solved[:, 6:]
+    elastic = elastic_of(robot)
+    q = robot.inverse(pose)
+    whole = platform_response(robot, q, np.zeros(6)).compliance
+    (entries, *places), _ = elastic.columns(elastic.parameters, q)
+    rows, columns, owner = (np.atleast_2d(p)[0].astype(int) for p in places)
+    size = rows.max() + 1
+    both = np.zeros((*q.shape[:-1], size, PLATFORM + len(owner)))
+    # Unit wrenches of the platform, then the columns.
+    both[..., :PLATFORM, :PLATFORM] = np.eye(PLATFORM)
+    both[..., rows, PLATFORM + columns] = entries
+    own = both[..., PLATFORM:]
+    root = np.linalg.cholesky(own @ np.swapaxes(own, -1, -2))
+    solved = np.linalg.solve(root, both)
+    platform, elements = solved[..., :PLATFORM], solved[..., PLATFORM:]
+    turned = np.swapaxes(elements, -1, -2)
     return ElementResponse(
-        names, np.array(owner, np.intp), platform.T @ platform, platform.T @ elements,
-        np.eye(elements.shape[1]) - elements.T @ elements,
+        elastic.names, owner, whole, np.swapaxes(platform, -1, -2) @ elements,
+        np.eye(len(owner)) - turned @ elements,
     )  # fmt: skip

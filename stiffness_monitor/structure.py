@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The structural model of a robot in a pose: elastic beams, joints, rigid bodies, locked actuators.
+"""The structural model of a robot: elastic beams, joints, rigid bodies, locked actuators.
 
 It follows from the graph: every beam and every body that is no beam hangs on its parent through
 the joint between them, whose freedoms let go and whose compliances give; the platform keeps its six
 displacements, and what closes a loop between bodies that hang already is a closure.
+
+What hangs on what is decided once, at home: that is the plan. In it a point or direction is a pair
+of its body and its vector at home, a section is its beam's name, and a compliance is 0, infinite or
+the joint's name and the entry. :func:`posed` puts numbers, or expressions, in their place.
 
 May import: numpy, pkm_twin's core, the standard library; never rclpy.
 """
@@ -11,53 +15,74 @@ May import: numpy, pkm_twin's core, the standard library; never rclpy.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.expressions import maximum, sign, sqrt
 from pkm_twin.kinematics.motion import reaction_directions
-from pkm_twin.machine.graph import BASE, Joint, Rod
-from pkm_twin.machine.members import Beam, Section, Structure
+from pkm_twin.machine.graph import BASE, Graph, Joint
+from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.outline import Posture
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Vector product of two vectors, shape (3,): numpy's costs ten times as much."""
-    ax, ay, az = a.tolist()
-    bx, by, bz = b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-
-
-def size(vector: Array) -> float:
-    """Length of a vector, shape (3,)."""
-    return math.sqrt(float(vector @ vector))
-
+Vector = Any
+"""In a plan the body and the vector at home, in a pose three numbers or expressions."""
+Turn = Callable[[str, Array], Any]
 
 RIGID: Final = (0.0,) * 6
 """Compliance of a joint that holds all six directions."""
 FREE: Final = math.inf
 
 
+def cross(a: Any, b: Any) -> Any:
+    """Vector product of two vectors, shape (3,): numpy's costs ten times as much."""
+    ax, ay, az = a.tolist()
+    bx, by, bz = b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def size(vector: Any) -> Any:
+    """Length of a vector, shape (3,)."""
+    return sqrt(vector @ vector)
+
+
+def local_axes(along: Any) -> Any:
+    """Right-handed axes whose first is the unit vector ``along``; columns, shape (3, 3).
+
+    Without a case that divides by next to nothing (Duff et al. 2017).
+    """
+    x, y, z = along.tolist()
+    side = 1.0 - 2.0 * maximum(0.0, -1.0 * sign(z))
+    a = -1.0 / (side + z)
+    b = x * y * a
+    return np.array(
+        [[x, 1.0 + side * (x * x * a), b], [y, side * b, side + y * y * a], [z, -side * x, -y]]
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Support:
-    """How one end of a member stands on a body.
+    """How one end of a member, or a body, stands on another.
 
     ``joint``: its name; joints of one name are one element of the energy shares. ``body``: the
-    base, the platform, a rigid body, or a member, whose nearest end is meant. ``axes``: the
-    joint's axes as columns, shape (3, 3). ``compliance``: along them three m/N, about them three
-    rad/(N m); 0 rigid, infinite free.
+    base, the platform, a rigid body, or a member, then at its start (``end`` 0) or its end (1).
+    ``axes``: the joint's axes as columns, shape (3, 3); None in a plan: the member's own.
+    ``compliance``: along them three m/N, about them three rad/(N m); 0 rigid, infinite free.
+    ``screws``: axes about which it turns freely while it goes so far along them, m a rad.
     """
 
     joint: str
     body: str
-    axes: Array
-    compliance: tuple[float, ...] = RIGID
+    axes: Any
+    compliance: tuple[Any, ...] = RIGID
+    end: int = 0
+    screws: tuple[tuple[int, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +90,30 @@ class Member:
     """A straight beam from ``start`` to ``end``, shape (3,), m.
 
     ``body`` is the name that it has in the energy shares: two rods can be one forearm. A member
-    whose ``outer`` is None ends free, and others can stand there.
+    whose ``outer`` is None ends free, and others can stand there. ``strut``: held by a ball joint
+    at each end, so that a load at its ends goes along it. ``constant``: its length where that is
+    the same in every pose.
     """
 
     name: str
     body: str
-    section: Section
-    start: Array
-    end: Array
+    section: Any
+    start: Vector
+    end: Vector
     inner: Support
     outer: Support | None
+    strut: bool = False
+    constant: float | None = None
+
+    @cached_property
+    def length(self) -> Any:
+        """Length in a pose, m."""
+        return size(self.end - self.start) if self.constant is None else self.constant
+
+    @cached_property
+    def axes(self) -> Any:
+        """Its own axes in a pose as columns, the first along it."""
+        return local_axes((self.end - self.start) * (1.0 / self.length))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,16 +121,16 @@ class Carried:
     """A rigid body that stands on another at ``at``, m."""
 
     name: str
-    at: Array
+    at: Vector
     support: Support
 
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """A joint at ``at`` between two bodies that both hang already."""
+    """A joint at ``at`` between two bodies that both hang already; ``inner`` as a support's."""
 
-    at: Array
-    inner: str
+    at: Vector
+    inner: tuple[str, int]
     support: Support
 
 
@@ -112,185 +151,253 @@ class RigidBody:
 
 @dataclass(frozen=True, eq=False)
 class StructuralModel:
-    """The elastic machine in one pose; ``origin``: the platform's reference point, shape (3,)."""
+    """The elastic machine; ``origin``: the platform's reference point, shape (3,)."""
 
-    origin: Array
+    origin: Vector
     platform: str
     parts: tuple[Member | Carried, ...]
-    closures: tuple[Closure, ...]
-    bodies: tuple[RigidBody, ...]
+    closures: tuple[Closure, ...] = ()
+    bodies: tuple[RigidBody, ...] = ()
+
+    @property
+    def members(self) -> tuple[Member, ...]:
+        """The beams among the parts."""
+        return tuple(part for part in self.parts if isinstance(part, Member))
+
+    @property
+    def supports(self) -> tuple[Support, ...]:
+        """All joints: those of the parts in order, then those that close loops."""
+        found: list[Support | None] = []
+        for part in self.parts:
+            found += [part.support] if isinstance(part, Carried) else [part.inner, part.outer]
+        return tuple(s for s in (*found, *(c.support for c in self.closures)) if s is not None)
 
 
-def structural_model(robot: Robot, pose: Array) -> StructuralModel:
-    """The model in a pose, shape (m,).
+def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
+    """The model at joint positions, shape (n,), on numbers.
 
     :raises ParameterError: the robot's file lacks a section that elasticity needs.
-    :raises UnreachableError: no pose of the robot.
+    :raises UnreachableError: no assembly of the robot; a singularity as ``forward``.
     """
-    return _Builder(robot, robot.elastic, robot.inverse(pose)).build()
+    structure, posture = robot.elastic, Posture(robot, q)
+
+    def turn(body: str, vector: Array) -> Array:
+        return np.asarray(posture.rotations[body] @ vector, np.float64)
+
+    model = posed(
+        plan_of(robot.graph, structure), posture.place, turn, structure.sections.__getitem__,
+        lambda joint, k: float(structure.compliances[joint][k]),
+    )  # fmt: skip
+    return replace(model, bodies=tuple(_masses(robot, posture.place, turn)))
 
 
-class _Builder:
-    def __init__(self, robot: Robot, structure: Structure, q: Array) -> None:
-        self.robot, self.structure, self.graph = robot, structure, robot.graph
-        posture = Posture(robot, q)
-        self.rotations, self.place = posture.rotations, posture.place
+def posed(
+    plan: StructuralModel,
+    place: Callable[[str, Array], Any],
+    turn: Turn,
+    section: Callable[[str], Any],
+    compliance: Callable[[str, int], Any],
+) -> StructuralModel:
+    """A plan in a pose, on numbers or on expressions.
+
+    :param place: where a point of a body is, given at home. ``turn``: where a direction points.
+    :param section: of a beam by its name. ``compliance``: of a joint by its name and entry.
+    """
+
+    def stood(support: Support, own: Any = None) -> Support:
+        values = (v if isinstance(v, float) else compliance(*v) for v in support.compliance)
+        axes = own if support.axes is None else _axes(support.axes, turn)
+        return replace(support, axes=axes, compliance=tuple(values))
+
+    def part_of(part: Member | Carried) -> Member | Carried:
+        if isinstance(part, Carried):
+            return replace(part, at=place(*part.at), support=stood(part.support))
+        made = replace(
+            part, start=place(*part.start), end=place(*part.end), section=section(part.section)
+        )
+        outer = None if made.outer is None else stood(made.outer, made.axes)
+        return replace(made, inner=stood(made.inner, made.axes), outer=outer)
+
+    return replace(
+        plan,
+        origin=place(*plan.origin),
+        parts=tuple(part_of(part) for part in plan.parts),
+        closures=tuple(
+            replace(c, at=place(*c.at), support=stood(c.support)) for c in plan.closures
+        ),
+    )
+
+
+def _axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
+    """Columns of three directions.
+
+    Of two axes that a joint turns about, at right angles or not: the first axis, the one
+    perpendicular to it in the plane of both, and that plane's normal.
+    """
+    columns = [turn(*one) for one in given]
+    if len(columns) == 2:
+        normal = cross(*columns)
+        normal = normal * (1.0 / size(normal))
+        columns = [columns[0], cross(normal, columns[0]), normal]
+    return np.array(columns).T
+
+
+def plan_of(graph: Graph, structure: Structure) -> StructuralModel:
+    """What hangs on what, by the graph at home."""
+    return _Planner(graph, structure).plan()
+
+
+class _Planner:
+    def __init__(self, graph: Graph, structure: Structure) -> None:
+        self.graph, self.structure = graph, structure
         self.beam_of = {part: beam for beam in structure.beams for part in beam.parts}
-        self.hanging = {BASE, self.graph.platform}
+        self.beam_of.pop(graph.platform, None)
+        self.points: dict[str, list[Array]] = {BASE: [np.zeros(3)], graph.platform: [graph.origin]}
+        """Where others can stand, at home, of all that hangs."""
         self.parts: list[Member | Carried] = []
-        self.closures: list[Closure] = []
 
-    def build(self) -> StructuralModel:
+    def plan(self) -> StructuralModel:
         left = [joint for joint in self.graph.joints.values() if not joint.given]
-        rods = [
-            (b, self.graph.rods[b.parts[0]])
-            for b in self.structure.beams
-            if b.parts[0] in self.graph.rods
-        ]
-        while left:
+        rods = [beam for beam in self.structure.beams if beam.parts[0] in self.graph.rods]
+        while True:
             # Bodies that one joint alone leads to come first, then whatever hangs.
-            ready = [j for j in left if (self._hangs(j.inner) != self._hangs(j.outer))]
+            ready = [j for j in left if self._hangs(j.inner) != self._hangs(j.outer)]
             if not ready:
                 break
-            joint = ready[0]
-            left.remove(joint)
-            self._hang(joint, left)
-            for beam, rod in list(rods):
-                if self._hangs(rod.inner) and self._hangs(rod.outer):
-                    rods.remove((beam, rod))
-                    self._rod(beam, rod)
-        for joint in left:
-            if self._inside(joint):
-                continue
-            support = Support(self._name(joint), self._part(joint.outer), *self._frame(joint))
-            self.closures.append(
-                Closure(self.place(joint.outer, joint.at), self._part(joint.inner), support)
+            left.remove(ready[0])
+            self._hang(ready[0], left)
+            for beam in list(rods):
+                if self._hangs(beam.inner[0]) and self._hangs(beam.outer[0]):
+                    rods.remove(beam)
+                    self._rod(beam)
+        closures = tuple(
+            Closure(
+                (joint.outer, joint.at), self._stand(joint.inner, joint.at),
+                self._support(joint, joint.outer, joint.at),
             )
-        for beam, rod in rods:
-            self._rod(beam, rod)
-        origin = self.place(self.graph.platform, self.graph.origin)
-        return StructuralModel(
-            origin, self.graph.platform, tuple(self.parts), tuple(self.closures),
-            tuple(self._masses()),
+            for joint in left
+            if not self._inside(joint)
         )  # fmt: skip
+        for beam in rods:
+            self._rod(beam)
+        graph = self.graph
+        origin = (graph.platform, graph.origin)
+        return StructuralModel(origin, graph.platform, tuple(self.parts), closures)
 
     def _inside(self, joint: Joint) -> bool:
         """Whether a joint is within one beam: a telescope's."""
         a, b = self.beam_of.get(joint.inner), self.beam_of.get(joint.outer)
         return a is not None and a is b
 
-    def _hangs(self, body: str) -> bool:
-        return body in self.hanging
-
     def _part(self, body: str) -> str:
         beam = self.beam_of.get(body)
         return body if beam is None else beam.name
 
-    def _name(self, joint: Joint) -> str:
-        return joint.label or joint.name
+    def _hangs(self, body: str) -> bool:
+        return self._part(body) in self.points
 
-    def _frame(self, joint: Joint) -> tuple[Array, tuple[float, ...]]:
-        """Axes of a joint in the pose as columns, and its compliance with its freedoms."""
+    def _stand(self, body: str, at: Array) -> tuple[str, int]:
+        """What stands at a place on a body, and at which end."""
+        part = self._part(body)
+        if part not in self.points:
+            raise ValueError(f"{part} hangs nowhere")
+        return part, int(np.argmin([size(point - at) for point in self.points[part]]))
+
+    def _support(self, joint: Joint, body: str, at: Array) -> Support:
+        part, end = self._stand(body, at)
+        name = joint.label or joint.name
         directions = reaction_directions(joint)
-        axes = np.column_stack([self.rotations[d.body] @ d.vector for d in directions])
-        values = list(self.structure.compliances.get(self._name(joint), RIGID))
-        values = [0.0 if v == FREE else float(v) for v in values]
-        if len(joint.axes) == 2:
-            first = self.rotations[joint.inner] @ joint.axes[0]
-            second = self.rotations[joint.outer] @ joint.axes[1]
-            normal = cross(first, second)
-            normal /= size(normal)
-            # The freedoms span the plane of both axes, right-angled or not.
-            turned = np.column_stack([first, cross(normal, first), normal])
-            order = _matching(axes, turned)
-            axes = turned
+        vectors = np.array([d.vector for d in directions])
+        axes: tuple[tuple[str, Array], ...] = tuple((d.body, d.vector) for d in directions)
+        values, screws = self._compliance(name), []
+        if joint.type.count == 2:
+            axes = (joint.inner, joint.axes[0]), (joint.outer, joint.axes[1])
+            # Which given direction each is nearly along.
+            order = np.abs(vectors @ _axes(axes, lambda _, vector: vector)).argmax(0).tolist()
             values = [values[k] for k in order] + [values[3 + k] for k in order]
             values[3] = values[4] = FREE
         elif not joint.actuated:
             for freedom in joint.freedoms:
-                k = int(np.argmax([abs(float(d.vector @ freedom.axis)) for d in directions]))
-                values[3 * freedom.turns + k] = FREE
-        return axes, tuple(values)
+                k = int(np.abs(vectors @ freedom.axis).argmax())
+                if freedom.turns and freedom.slide:
+                    screws.append((k, freedom.slide))
+                else:
+                    values[3 * freedom.turns + k] = FREE
+        return Support(name, part, axes, tuple(values), end, tuple(screws))
+
+    def _compliance(self, name: str) -> list[Any]:
+        """Of a joint in a plan; infinite in a file says what its freedoms say."""
+        values = enumerate(self.structure.compliances.get(name, RIGID))
+        return [(name, k) if 0.0 < value < FREE else 0.0 for k, value in values]
 
     def _hang(self, joint: Joint, left: list[Joint]) -> None:
         known, new = joint.inner, joint.outer
         if not self._hangs(known):
             known, new = new, known
-        support = Support(self._name(joint), self._part(known), *self._frame(joint))
-        at = self.place(new, joint.at)
         beam = self.beam_of.get(new)
         if beam is None:
-            self.hanging.add(new)
-            self.parts.append(Carried(new, at, support))
+            self.parts.append(Carried(new, (new, joint.at), self._support(joint, known, joint.at)))
+            self.points[new] = [joint.at]
             return
-        ends = [self.place(*beam.inner), self.place(*beam.outer)]
-        if size(ends[1] - at) < size(ends[0] - at):
+        ends = [beam.inner, beam.outer]
+        if size(ends[1][1] - joint.at) < size(ends[0][1] - joint.at):
             ends.reverse()
-        self.hanging.update(beam.parts)
+        support = self._support(joint, known, ends[0][1])
         for part in [j for j in left if self._inside(j)]:
             if self.beam_of[part.inner] is beam:
                 left.remove(part)
-        outer: Support | None = None
+        closing = None
         for other in left:
             for body, there in ((other.inner, other.outer), (other.outer, other.inner)):
                 if body in beam.parts and self._hangs(there) and there not in beam.parts:
-                    place = self.place(body, other.at)
-                    near = size(place - ends[1]) < size(place - ends[0])
-                    if outer is None and near:
-                        outer = Support(self._name(other), self._part(there), *self._frame(other))
-                        closing = other
-        if outer is not None:
-            left.remove(closing)
-        section = self.structure.sections[beam.name]
-        start, end = ends
-        self.parts.append(Member(beam.name, beam.element, section, start, end, support, outer))
+                    near = size(other.at - ends[1][1]) < size(other.at - ends[0][1])
+                    if closing is None and near:
+                        closing = other, there
+        outer = None
+        if closing is not None:
+            left.remove(closing[0])
+            outer = self._support(*closing, ends[1][1])
+        self._member(beam, ends, support, outer)
 
-    def _rod(self, beam: Beam, rod: Rod) -> None:
-        """On a ball joint at each end; it would spin idly, so the inner one holds that spin."""
-        start, end = self.place(*beam.inner), self.place(*beam.outer)
-        w = (end - start) / size(end - start)
-        t = np.eye(3)[int(np.argmin(np.abs(w)))]
-        if rod.pair is not None:
-            t = self.rotations[rod.outer] @ rod.pair
-        e = cross(t, w)
-        e /= size(e)
-        axes = np.column_stack([w, e, cross(w, e)])
-        supports = []
-        for name, body, spin in zip(
-            rod.joint_names, (rod.inner, rod.outer), (0.0, FREE), strict=True
-        ):
-            held = [float(v) for v in self.structure.compliances.get(name, RIGID)[:3]]
-            supports.append(Support(name, self._part(body), axes, (*held, spin, FREE, FREE)))
-        section = self.structure.sections[beam.name]
-        inner, outer = supports
-        self.parts.append(Member(beam.name, beam.element, section, start, end, inner, outer))
-
-    def _masses(self) -> Sequence[RigidBody]:
-        """Of bodies that are no beams, and of the payload."""
-        result = []
-        carried = {n for beam in self.structure.beams for n in (*beam.parts, *beam.carries)}
-        for name, body in self.graph.bodies.items():
-            if name in carried or not body.mass > 0.0:
-                continue
-            turned = self.rotations[name]
-            result.append(
-                RigidBody(
-                    name,
-                    body.mass,
-                    self.place(name, body.com),
-                    turned @ body.inertia @ turned.T,
-                    name,
-                )
+    def _member(self, beam: Beam, ends: list[Any], inner: Support, outer: Support | None) -> None:
+        strut = beam.parts[0] in self.graph.rods
+        length = float(size(ends[1][1] - ends[0][1]))
+        if not length > 0.0:
+            raise ValueError(f"{beam.name} has no length")
+        self.points[beam.name] = [point for _, point in ends]
+        known = strut or ends[0][0] == ends[1][0]
+        self.parts.append(
+            Member(
+                beam.name, beam.element, beam.name, ends[0], ends[1], inner, outer, strut,
+                length if known else None,
             )
-        load, platform = self.robot.payload, self.graph.platform
-        if load.mass > 0.0:
-            turned = self.rotations[platform]
-            at = self.place(platform, self.graph.origin + load.com)
-            inertia = turned @ load.inertia @ turned.T
-            result.append(RigidBody("payload", load.mass, at, inertia, platform))
-        return result
+        )  # fmt: skip
+
+    def _rod(self, beam: Beam) -> None:
+        """On a ball joint at each end; it would spin idly, so the inner one holds that spin."""
+        rod = self.graph.rods[beam.parts[0]]
+        supports = []
+        for name, (body, at), spin in zip(
+            rod.joint_names, (beam.inner, beam.outer), (0.0, FREE), strict=True
+        ):
+            values = (*self._compliance(name)[:3], spin, FREE, FREE)
+            part, end = self._stand(body, at)
+            supports.append(Support(name, part, None, values, end))
+        self._member(beam, [beam.inner, beam.outer], *supports)
 
 
-def _matching(given: Array, turned: Array) -> list[int]:
-    """Which given axis is each of other ones nearly along."""
-    return [int(k) for k in np.abs(given.T @ turned).argmax(0)]
+def _masses(robot: Robot, place: Callable[[str, Array], Array], turn: Turn) -> list[RigidBody]:
+    """Of bodies that are no beams, and of the payload."""
+    graph, load = robot.graph, robot.payload
+    beams = {n for beam in robot.elastic.beams for n in (*beam.parts, *beam.carries)}
+    found = [
+        (name, body.mass, body.com, body.inertia, name)
+        for name, body in graph.bodies.items()
+        if name not in beams
+    ]
+    found.append(("payload", load.mass, graph.origin + load.com, load.inertia, graph.platform))
+    return [
+        RigidBody(name, mass, place(on, com), turn(on, turn(on, inertia).T), on)
+        for name, mass, com, inertia, on in found
+        if mass > 0.0
+    ]

@@ -324,7 +324,6 @@ def compliance(
     from pkm_twin.apps.limits import beyond_limits as find_beyond
     from pkm_twin.apps.limits import refuse_beyond
     from pkm_twin.machine.uncertainty import deviation
-    from stiffness_monitor import compliance as matrix
     from stiffness_monitor import compliance_deviation, strain_energy
 
     machine = load(robot)
@@ -340,7 +339,8 @@ def compliance(
         _, beyond = find_beyond(machine, machine.inverse(pose))
         if not beyond_limits:
             refuse_beyond(beyond)
-        c, energy = matrix(machine, pose), strain_energy(machine, pose, load_case)
+        energy = strain_energy(machine, pose, load_case)
+        c = energy.compliance
     except PkmTwinError:
         raise
     except ValueError as error:  # finite numbers, but so large that the result is not

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Traces over inverses of sparse symmetric matrices, as straight-line expressions.
+"""Sparse symmetric matrices that are not negative, as straight-line expressions.
 
 May import: numpy, this package, the standard library.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from pkm_twin.codegen.expressions import Objects, maximum
@@ -19,11 +19,62 @@ Entries = dict[tuple[int, int], Any]
 """Lower triangle, by row and column, row >= column."""
 
 
+class SparseCholesky:
+    """L D L' without pivoting, which a positive matrix does not need, in the order of least degree.
+
+    Row and column k of the factors are those of ``order[k]`` of the matrix. ``factors``: L below
+    its diagonal; ``below``: by column the rows where it is not zero; ``pivots``: D.
+
+    :param matrix: lower triangle with its whole diagonal; what is left out is zero.
+    :param scale: what pivots are compared with, of the matrix' diagonal.
+    :param last: how many of the first ones come last, in their order.
+    """
+
+    def __init__(self, matrix: Mapping[tuple[int, int], Any], scale: Sequence[Any], last: int = 0):
+        n = len(scale)
+        self.order = _order(matrix, n, last)
+        self.place = {index: k for k, index in enumerate(self.order)}
+        left: Entries = {}
+        for (a, b), value in matrix.items():
+            i, j = self.place[a], self.place[b]
+            left[max(i, j), min(i, j)] = value
+        self.factors: Entries = {}
+        self.pivots: list[Any] = []
+        self.below: list[list[int]] = []
+        for j, index in enumerate(self.order):
+            self.pivots.append(maximum(left[j, j], FLOOR * scale[index]))
+            column = [i for i in range(j + 1, n) if (i, j) in left]
+            inverse = 1.0 / self.pivots[j]
+            for i in column:
+                self.factors[i, j] = left[i, j] * inverse
+            for i in column:
+                for k in column:
+                    if k <= i:
+                        left[i, k] = left.get((i, k), 0.0) - self.factors[i, j] * left[k, j]
+            self.below.append(column)
+
+
+def _order(matrix: Mapping[tuple[int, int], Any], n: int, last: int) -> list[int]:
+    """Least degree first, but the first ``last`` come last."""
+    near: dict[int, set[int]] = {a: set() for a in range(n)}
+    for a, b in matrix:
+        if a != b:
+            near[a].add(b)
+            near[b].add(a)
+    order = []
+    while len(near) > last:
+        best = min((a for a in near if a >= last), key=lambda a: (len(near[a]), a))
+        order.append(best)
+        around = near.pop(best)
+        for a in around:
+            near[a] = (near[a] | around) - {a, best}
+    return [*order, *near]
+
+
 def traces_over(numerators: Sequence[Objects], matrix: Objects) -> list[Any]:
     """Trace of matrix^-1 numerator of each: what x' numerator x sums up to at x' matrix x = 1.
 
-    By L D L' without pivoting, which a positive matrix does not need, in the order of least degree;
-    of the inverse only the entries in the pattern of L (Takahashi, Fagan, Chen 1973). Where the
+    Of the inverse only the entries in the pattern of L (Takahashi, Fagan, Chen 1973). Where the
     matrix has no inverse the result is large and finite.
 
     :param numerators: symmetric, not negative, shape (n, n) each, expressions or numbers; the
@@ -32,10 +83,14 @@ def traces_over(numerators: Sequence[Objects], matrix: Objects) -> list[Any]:
     """
     n = len(matrix)
     numerator = sum(numerators[1:], numerators[0])
-    order = _order(numerator, matrix)
-    place = {index: k for k, index in enumerate(order)}
-    factors, pivots = _factors(numerator, matrix, order)
-    below = [[i for i in range(j + 1, n) if (i, j) in factors] for j in range(n)]
+    lower = {
+        (a, b): matrix[a][b]
+        for a in range(n)
+        for b in range(a + 1)
+        if a == b or not (is_zero(matrix[a][b]) and is_zero(numerator[a][b]))
+    }
+    whole = SparseCholesky(lower, [numerator[a][a] for a in range(n)])
+    factors, below = whole.factors, whole.below
     inverse: Entries = {}
 
     def entry(i: int, j: int) -> Any:
@@ -47,11 +102,11 @@ def traces_over(numerators: Sequence[Objects], matrix: Objects) -> list[Any]:
             for k in below[j]:
                 total = total - entry(i, k) * factors[k, j]
             inverse[i, j] = total
-        diagonal = 1.0 / pivots[j]
+        diagonal = 1.0 / whole.pivots[j]
         for k in below[j]:
             diagonal = diagonal - factors[k, j] * inverse[k, j]
         inverse[j, j] = diagonal
-    return [_product(each, entry, place) for each in numerators]
+    return [_product(each, entry, whole.place) for each in numerators]
 
 
 def _product(numerator: Objects, entry: Callable[[int, int], Any], place: dict[int, int]) -> Any:
@@ -63,48 +118,3 @@ def _product(numerator: Objects, entry: Callable[[int, int], Any], place: dict[i
             if not is_zero(numerator[a][b]):
                 result = result + 2.0 * (numerator[a][b] * entry(place[a], place[b]))
     return result
-
-
-def _order(numerator: Objects, matrix: Objects) -> list[int]:
-    """Least degree first, in the pattern of both."""
-    n = len(matrix)
-    near = {
-        a: {
-            b
-            for b in range(n)
-            if b != a and not (is_zero(matrix[a][b]) and is_zero(numerator[a][b]))
-        }
-        for a in range(n)
-    }
-    order = []
-    while near:
-        best = min(near, key=lambda a: (len(near[a]), a))
-        order.append(best)
-        around = near.pop(best)
-        for a in around:
-            near[a] = (near[a] | around) - {a, best}
-    return order
-
-
-def _factors(numerator: Objects, matrix: Objects, order: list[int]) -> tuple[Entries, list[Any]]:
-    """L below its diagonal, in the pattern of both matrices, and D."""
-    n = len(order)
-    left: Entries = {}
-    for j, b in enumerate(order):
-        for i in range(j, n):
-            a = order[i]
-            if i == j or not (is_zero(matrix[a][b]) and is_zero(numerator[a][b])):
-                left[i, j] = matrix[a][b]
-    factors: Entries = {}
-    pivots: list[Any] = []
-    for j, index in enumerate(order):
-        pivots.append(maximum(left[j, j], FLOOR * numerator[index][index]))
-        column = [i for i in range(j + 1, n) if (i, j) in left]
-        inverse = 1.0 / pivots[j]
-        for i in column:
-            factors[i, j] = left[i, j] * inverse
-        for i in column:
-            for k in column:
-                if k <= i:
-                    left[i, k] = left.get((i, k), 0.0) - factors[i, j] * left[k, j]
-    return factors, pivots

@@ -48,6 +48,14 @@ class Section:
         return math.pi / 64 * (self.outer_diameter**4 - self.inner_diameter**4)
 
     @property
+    def rigidities(self) -> tuple[float, float, float, float]:
+        """EA (N), GJ and EI (N m2), and 12 E I over the shear rigidity (m2)."""
+        bending = self.youngs_modulus * self.second_moment
+        across = 12 * bending * self.shear_factor / (self.shear_modulus * self.area)
+        twisting = self.shear_modulus * 2 * self.second_moment
+        return self.youngs_modulus * self.area, twisting, bending, across
+
+    @property
     def rotary_inertia(self) -> float:
         """Moment of inertia per length about a diameter, kg m; about the axis twice that."""
         return self.mass_per_length * self.second_moment / self.area
@@ -150,16 +158,20 @@ class Structure:
     """Beams with their sections, and the compliance of joints, all by name.
 
     A joint's six compliances are along and about the directions of its reactions: m/N, rad/(N m);
-    what is not named is rigid. Freedoms of passive joints are free whatever stands here.
+    what is not named is rigid. Freedoms of passive joints are free whatever stands here. ``order``:
+    all names that the energy shares have, where a mechanism has an order of its own.
     """
 
     beams: tuple[Beam, ...]
     sections: Mapping[str, Section]
     compliances: Mapping[str, Sequence[float]]
+    order: tuple[str, ...] = ()
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Names of what is elastic, as the energy shares have them: bars, then joints."""
+        """Names of what is elastic: bars, then joints."""
+        if self.order:
+            return self.order
         soft = [
             name
             for name, values in self.compliances.items()
@@ -184,7 +196,7 @@ class Structure:
             name: [factors.get(name, 1.0) * value for value in values]
             for name, values in self.compliances.items()
         }
-        return Structure(self.beams, sections, compliances)
+        return replace(self, sections=sections, compliances=compliances)
 
 
 def disc(mass: float, radius: float) -> Array:

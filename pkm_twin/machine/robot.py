@@ -84,17 +84,6 @@ class Inverse:
     measure: Any | None = None
 
 
-@dataclass(frozen=True)
-class LimbElements:
-    """A limb's three unit wrenches at the platform's reference point, base axes, and its elements.
-
-    An element's compliance on their amplitudes (f1, f2, m): c11, c22, c23, c33; the rest is zero.
-    """
-
-    wrenches: Sequence[Sequence[Any]]
-    elements: Sequence[tuple[Any, Any, Any, Any]]
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Robot:
     """A parallel kinematic machine of n actuated joints and m pose coordinates.
@@ -209,18 +198,6 @@ class Robot:
     def beams(self) -> tuple[Beam, ...]:
         """The bars that limb interference and elasticity are about; none: not known."""
         return ()
-
-    element_names: ClassVar[tuple[str, ...]] = ()
-    """Elements that :meth:`limb_elements` tells in closed form, limb by limb; else none."""
-
-    @property
-    def elastic_parameters(self) -> Array:
-        """Run-time inputs of :meth:`limb_elements`."""
-        raise NotImplementedError
-
-    def limb_elements(self, pose: Any, p: Any) -> Sequence[LimbElements]:
-        """Limbs in closed form, of the pose and the elastic parameters, where there are names."""
-        raise NotImplementedError
 
     def limit_angles(self, pose: ArrayLike) -> Array | None:
         """Angles that ``limits.joint_angle`` bounds, shape (..., k), rad; None where it is none."""
@@ -417,15 +394,22 @@ class Robot:
         """Elastic beams and joints with the elements' factors; errors as :meth:`structure`."""
         return self.structure().scaled(self.element_compliance)
 
+    @property
+    def element_names(self) -> tuple[str, ...]:
+        """Names that ``element_compliance`` may have, bars first; errors as :meth:`structure`.
+
+        Energies and factors have an order of their own, which comes with them as ``elements``.
+        """
+        return self.structure().elements
+
     def check_elements(self) -> None:
         """Refuse factors of elements that there are not.
 
         :raises ParameterError: by the name, or nothing is elastic.
         """
         for name in self.element_compliance:
-            known = self.element_names or self.structure().elements
-            if name not in known:
-                raise UnknownNameError(f"element_compliance.{name}", name, known)
+            if name not in self.element_names:
+                raise UnknownNameError(f"element_compliance.{name}", name, self.element_names)
 
     @cached_property
     def joints_count(self) -> int:

@@ -54,7 +54,7 @@ from pkm_twin.machine.graph import BASE, MIN_LENGTH, Body, Direction, Graph, Joi
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Section, Structure, compliances, disc, modulus
 from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import Inverse, LimbElements, Robot
+from pkm_twin.machine.robot import Inverse, Robot
 from pkm_twin.machine.sections import length, mass, shared_middle
 from pkm_twin.machine.shared import Shared, shared_body, shared_number
 
@@ -201,9 +201,6 @@ class UprRpu(Robot):
     )  # fmt: skip
     has_start: ClassVar[bool] = True
     has_inverse: ClassVar[bool] = True
-    element_names: ClassVar[tuple[str, ...]] = tuple(
-        f"{limb}{element}" for limb in (1, 2, 3) for element in "RBU"
-    )
 
     @property
     def size(self) -> float:
@@ -515,19 +512,14 @@ class UprRpu(Robot):
         """Bars between base and platform, joints elastic in their own axes, drives locked.
 
         A bar reaches from B to A, as in the paper, and its mass with it: a telescope's tubes that
-        overlap are not told apart.
-
-        :raises ParameterError: the file has no inertia.
+        overlap are not told apart. Without inertia bars have no mass.
         """
-        m, j, inertia = self.members, self.joints_compliance, self.inertia
-        if inertia is None:
-            raise ParameterError(
-                "inertia", None, "a section with density, platform_mass and more, for modes"
-            )
+        m, j = self.members, self.joints_compliance
+        density = 0.0 if self.inertia is None else self.inertia.density
         sections = {
             beam.name: Section(
                 m.youngs_modulus, m.shear_modulus, float(d), 0.0,
-                inertia.density * math.pi / 4 * float(d) ** 2, m.shear_factor,
+                density * math.pi / 4 * float(d) ** 2, m.shear_factor,
             )
             for beam, d in zip(self.beams, m.diameter, strict=True)
         }  # fmt: skip
@@ -535,96 +527,8 @@ class UprRpu(Robot):
         for limb in "12":
             compliances[f"{limb}U"] = j.upr_universal.tolist()
             compliances[f"{limb}R"] = j.upr_revolute.tolist()
-        return Structure(self.beams, sections, compliances)
-
-    @cached_property
-    def elastic_parameters(self) -> Array:
-        """Run-time inputs of :meth:`limb_elements`."""
-        m, j = self.members, self.joints_compliance
-        area, second = np.pi * m.diameter**2 / 4, np.pi * m.diameter**4 / 64
-        joints = np.concatenate([j.upr_revolute, j.upr_universal, j.rpu_universal, j.rpu_revolute])
-        return schema.frozen(
-            np.concatenate(
-                [
-                    1 / (m.youngs_modulus * area),
-                    m.shear_factor / (m.shear_modulus * area),
-                    1 / (m.youngs_modulus * second),
-                    1 / (m.shear_modulus * 2 * second),
-                    # Free axes carry no load; their entries are never read.
-                    np.where(np.isinf(joints), 0.0, joints),
-                    [self.element_compliance.get(name, 1.0) for name in self.element_names],
-                ]
-            )
-        )
-
-    def limb_elements(self, pose: Any, p: Any) -> list[LimbElements]:
-        """Unit wrenches of each limb and the compliances of R joint, bar and U joint on them.
-
-        Wrenches: f1 along the limb, f2 along y through B (UPR) or along X through A (RPU), the
-        couple m about tau (2UPR-RPU paper, equations 1 and 19). Each joint's compliance is that of
-        its own directions, with f1, f2 and m projected to its centre (equations 5 to 14, 21 to 25).
-        """
-        a, b = self._radii
-        z, beta, gamma = pose
-        cb, sb, cg, sg = cos(beta), sin(beta), cos(gamma), sin(gamma)
-        rho = z / cb
-        bars, joints = np.reshape(p[:12], (4, 3)), np.reshape(p[12:36], (4, 6))
-        factors = np.reshape(p[36:45], (3, 3))
-        limbs = []
-
-        def wrench(fx: Any, fy: Any, ft: Any, mx: Any, my: Any, mt: Any) -> list[Any]:
-            """Given along X, y and tau."""
-            return [
-                fx,
-                cb * fy - sb * ft,
-                sb * fy + cb * ft,
-                mx,
-                cb * my - sb * mt,
-                sb * my + cb * mt,
-            ]
-
-        for i in range(3):
-            across, up = self._limb(i, rho, beta, gamma)
-            size = sqrt(across * across + up * up)
-            across, up = across / size, up / size
-            axial, shear, bend_rate, twist_rate = (bars[k][i] for k in range(4))
-            if i == 2:
-                # The couple's parts along the limb's bending axis and along the limb itself.
-                bend, turn, revolute, universal = -across, up, joints[3], joints[2]
-                wrenches = [wrench(0, across, up, a * up, 0, 0), wrench(1, 0, 0, 0, 0, -a)]
-                sideways, about = revolute[0], revolute[4]
-                c1, c2 = across * across * universal[1] + up * up * universal[2], universal[0]
-            else:
-                side = -1.0 if i == 0 else 1.0
-                bend, turn, revolute, universal = across, -up, joints[0], joints[1]
-                rx, rt = side * a * cg, -side * a * sg
-                wrenches = [
-                    wrench(across, 0, up, 0, rt * across - rx * up, 0),
-                    wrench(0, 1, 0, rho, 0, side * b),
-                ]
-                sideways, about = revolute[1], revolute[3]
-                c1, c2 = across * across * universal[0] + up * up * universal[2], universal[1]
-            wrenches.append(wrench(0, 0, 0, 0, 0, 1))
-            bending = bend_rate * size
-            # Force f2 acts at one end of the limb, the joint R stands at the other: moment -L f2.
-            elements = [
-                (
-                    revolute[2], sideways + size * size * about, -size * bend * about,
-                    bend * bend * about + turn * turn * revolute[5],
-                ),
-                (
-                    axial * size, shear * size + bending * size * size / 3.0,
-                    -0.5 * bend * bending * size,
-                    bend * bend * bending + turn * turn * twist_rate * size,
-                ),
-                (c1, c2, 0.0, universal[5]),
-            ]  # fmt: skip
-            scaled = [
-                (factor * c11, factor * c22, factor * c23, factor * c33)
-                for factor, (c11, c22, c23, c33) in zip(factors[i], elements, strict=True)
-            ]
-            limbs.append(LimbElements(wrenches, scaled))
-        return limbs
+        order = tuple(f"{limb}{element}" for limb in "123" for element in "RBU")
+        return Structure(self.beams, sections, compliances, order)
 
 
 def _joint(

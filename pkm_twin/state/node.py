@@ -38,8 +38,7 @@ from pkm_twin.state.scene import Load, Scales, Scene
 from pkm_twin.state.state import MachineState, State
 from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
-from stiffness_monitor.compliance import compliance, kernels, strain_energy
-from stiffness_monitor.statics import frame_deflections
+from stiffness_monitor.compliance import kernels, member_deflections, platform_response
 
 LIFETIME = 1.0
 """How long what a load does is drawn after the last marker, s."""
@@ -258,15 +257,14 @@ class MachineStateNode(health.TwinNode):
             return None
         robot = self._core.robot
         try:
-            pose = robot.forward(state.q)
-            energy = strain_energy(robot, pose, wrench)
+            found = platform_response(robot, state.q, wrench)
             return Load(
                 wrench,
-                compliance(robot, pose),
-                energy.deflection,
-                dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
-                str(energy.dominant),
-                frame_deflections(robot, pose, wrench),
+                found.compliance,
+                found.deflection,
+                dict(zip(found.elements, found.factors.tolist(), strict=True)),
+                str(found.dominant),
+                member_deflections(robot, state.q, wrench),
             )
         except (PkmTwinError, ValueError) as error:
             self.log_throttled("load", f"~/markers: without the load: {error}")

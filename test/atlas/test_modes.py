@@ -99,7 +99,7 @@ def test_lines_join_the_whole_frame(name, small_atlases):
 
 def test_the_rim_of_a_platform_does_not_cross_itself_in_any_order_of_the_members():
     robot = load("delta_cu")
-    model = structural_model(robot, robot.home())
+    model = structural_model(robot, robot.graph.home)
     found = modes(robot, robot.home(), 1)
     shuffled = replace(model, parts=(*model.parts[::2], *model.parts[1::2]))
     lines = structure_edges(shuffled, found.nodes)

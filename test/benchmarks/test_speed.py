@@ -12,7 +12,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
-from stiffness_monitor import strain_energy
+from stiffness_monitor import platform_response
 from test.benchmarks.round_trip import TWIN, Client, start, stop
 from test.nodes.harness import Domain
 from test.support.robots import parameters_of, random_joints
@@ -49,15 +49,13 @@ def test_inverse_dynamics(benchmark, name, count):
 
 
 @pytest.mark.parametrize("count", BATCHES)
-def test_strain_energy(benchmark, count):
-    robot = load("upr_rpu")
-    rng = np.random.default_rng(1)
-    pose = np.array([-0.6, 0.0, 0.0]) + rng.uniform(-0.1, 0.1, (count, 3))
-    wrench = rng.normal(0, 100, (count, 6))
-    if count == 1:
-        pose, wrench = pose[0], wrench[0]
-    benchmark.extra_info.update(what="strain_energy(upr_rpu)", samples=count)
-    run(benchmark, count, strain_energy, robot, pose, wrench)
+@pytest.mark.parametrize("name", ["delta_cu", "prru", "upr_rpu"])
+def test_platform_response(benchmark, name, count):
+    robot = load(name)
+    q, *_ = motion(robot, count)
+    wrench = np.random.default_rng(2).normal(0, 100, (*q.shape[:-1], 6))
+    benchmark.extra_info.update(what=f"platform_response({name})", samples=count)
+    run(benchmark, count, platform_response, robot, q, wrench)
 
 
 @pytest.mark.parametrize("name", ["delta", "delta_cu"])

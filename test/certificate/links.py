@@ -105,7 +105,7 @@ def compare_links(name: str) -> Links:
     """All comparisons of one pose by its name."""
     robot = with_rigid_joints()
     pose = np.array(POSES[name])
-    frame = structural_model(robot, pose)
+    frame = structural_model(robot, robot.inverse(pose))
     with tempfile.TemporaryDirectory() as folder:
         coarse, fine = (solid_compliance(frame, Path(folder), mesh) for mesh in (MESH, FINE))
         held = solid_compliance(frame, Path(folder), FINE, rigid_ends=True)

@@ -13,15 +13,16 @@ from scipy.optimize import brentq
 
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.members import Section, cowper
-from stiffness_monitor.beams import (
-    assemble,
-    body_mass,
-    element_matrices,
+from stiffness_monitor.beams import assemble, body_mass, element_matrices, member_matrices
+from stiffness_monitor.frame import Frame, rigid_offset
+from stiffness_monitor.structure import (
+    RIGID,
+    Member,
+    RigidBody,
+    StructuralModel,
+    Support,
     local_axes,
-    member_matrices,
-    rigid_offset,
 )
-from stiffness_monitor.structure import RIGID, Member, RigidBody, StructuralModel, Support
 
 PLATFORM = "platform"
 
@@ -265,10 +266,10 @@ def test_springs_at_the_root_are_in_series_with_the_bar(rng):
 
 def padded(small, large):
     """The small system's stiffness, with ones for coordinates that it does not have."""
-    size = len(small.mass)
     result = np.eye(len(large.mass))
-    # The root's six come after platform and inside; those of the tip are the platform's.
-    result[:size, :size] = small.stiffness
+    # The root's six come between platform and inside; those of the tip are the platform's.
+    own = np.r_[0:6, 12 : len(result)]
+    result[np.ix_(own, own)] = small.stiffness
     return result
 
 
@@ -322,7 +323,7 @@ def random_frame(rng):
                 TUBE,
                 knee + 0.1 * rng.normal(size=3),
                 end,
-                Support("knee", f"thigh {leg}", axes(), (0.0, *spring[1:5], FREE)),
+                Support("knee", f"thigh {leg}", axes(), (0.0, *spring[1:5], FREE), 1),
                 Support("foot", PLATFORM, axes(), (spring[0], 0.0, 0.0, FREE, 0.0, spring[5])),
             ),
         ]
@@ -416,6 +417,21 @@ def test_frames_are_symmetric_and_energies_add_up(rng):
     assert kinetic.sum() == pytest.approx(shape @ system.mass @ shape)
 
 
+def test_columns_add_up_to_the_stiffness(rng):
+    for _ in range(3):
+        frame = random_frame(rng)
+        bare = [replace(m, section=m.section.rigidities) for m in frame.members]
+        made = Frame(replace(frame, parts=tuple(bare)))
+        columns = [c for bar in made.bars for c in made.columns(bar)] + made.springs
+        found = np.zeros((made.size, made.size))
+        for column in columns:
+            row = np.zeros(made.size)
+            row[list(column.row)] = list(column.row.values())
+            found += column.rigidity * np.outer(row, row)
+        expected = assemble(frame, 1).stiffness
+        assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+
+
 def test_named_nodes_move_with_what_they_stand_on(rng):
     frame = random_frame(rng)
     system = assemble(frame, 3)
@@ -446,14 +462,11 @@ def test_mass_of_a_frame_is_that_of_its_bodies(rng):
     for k in range(3):
         push = np.zeros(len(system.mass))
         push[k] = 1.0
-        at = 6
-        for member in frame.parts:
-            axes = local_axes(
-                (member.end - member.start) / np.linalg.norm(member.end - member.start)
-            )
-            push[at : at + 3] = axes[k]
-            push[at + 6 + k] = push[at + 12 + k] = 1.0
-            at += 18
+        # Starts, loose along the base's axes; ends and then what is inside along the member's own.
+        for i, member in enumerate(frame.members):
+            push[6 + 12 * i + k] = 1.0
+            for at in (12 + 12 * i, 6 + 12 * len(frame.members) + 6 * i):
+                push[at : at + 3] = member.axes[k]
         assert push @ system.mass @ push == pytest.approx(bars + 3.0)
         assert push @ system.stiffness @ push == pytest.approx(0.0, abs=1e-3)
 

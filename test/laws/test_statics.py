@@ -1,23 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of compliance and strain energy by finite elements, over all robots with elastic members."""
+"""Laws of compliance and strain energy, over all robots with elastic members."""
 
 from __future__ import annotations
-
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from stiffness_monitor import compliance, stiffness, strain_energy
-from stiffness_monitor.compliance import kernels
-from stiffness_monitor.statics import frame_energies, stiffness_root
-from test.support.robots import ELASTIC, load, parameters_of, random_joints
-
-FRAMES = [name for name in ELASTIC if not load(name).element_names]
-"""Robots whose compliance comes from finite elements, not from a closed form."""
-NAMES = pytest.mark.parametrize("name", FRAMES)
+from stiffness_monitor import compliance, platform_response, stiffness, strain_energy
+from stiffness_monitor.compliance import kernels, member_deflections
+from test.support.robots import ELASTIC, elastic, load, parameters_of, random_joints
 
 
 def random_wrenches(rng, *shape):
@@ -28,22 +21,6 @@ def random_poses(robot, rng, count):
     return robot.forward(random_joints(robot, rng, count))
 
 
-def test_energies_are_those_of_the_strain_energy_method(variant, rng):
-    """Finite elements and closed form: the nine elements of the 2UPR-RPU, one by one."""
-    joints = {}
-    for key, values in parameters_of("upr_rpu")["joints_compliance"].items():
-        joints[key] = [v * float(10 ** rng.uniform(0, 3)) for v in values]
-    robot, _ = variant("upr_rpu", joints_compliance=joints)
-    poses = rng.uniform([-0.8, -0.35, -0.35], [-0.45, 0.35, 0.35], (12, 3))
-    wrench = random_wrenches(rng, 12)
-    names, deflection, energies = frame_energies(robot, poses, wrench)
-    expected = strain_energy(robot, poses, wrench)
-    assert deflection == pytest.approx(expected.deflection, rel=1e-8, abs=1e-18)
-    assert sorted(names) == sorted(expected.elements)
-    ours = energies[:, [names.index(name) for name in expected.elements]]
-    assert ours == pytest.approx(expected.energies, rel=1e-7, abs=1e-12 * expected.total.max())
-
-
 def stiffened(data):
     """Parameters with every modulus doubled and every compliance halved."""
     if isinstance(data, list):
@@ -51,10 +28,14 @@ def stiffened(data):
     if not isinstance(data, dict):
         return data
     times = {"youngs_modulus": 2.0, "shear_modulus": 2.0, "drive_compliance": 0.5}
-    return {k: times[k] * v if k in times else stiffened(v) for k, v in data.items()}
+    times |= dict.fromkeys(parameters_of("upr_rpu")["joints_compliance"], 0.5)
+    return {
+        k: (times[k] * np.asarray(v)).tolist() if k in times else stiffened(v)
+        for k, v in data.items()
+    }
 
 
-@NAMES
+@elastic
 class TestEveryRobot:
     def test_compliance_is_symmetric_positive_definite_and_the_deflection_of_unit_wrenches(
         self, name, rng
@@ -122,6 +103,45 @@ class TestEveryRobot:
         one = strain_energy(robot, robot.home(), np.zeros(6))
         assert (one.dominant, one.tie, one.total) == ("none", False, 0.0)
 
+    def test_poses_and_joints_are_answered_alike(self, name, rng):
+        """And q has batch axes of its own, beside the wrench's."""
+        robot = load(name)
+        q, wrench = random_joints(robot, rng, 3), random_wrenches(rng, 2)
+        found = platform_response(robot, q[:, None], wrench)
+        expected = strain_energy(robot, robot.forward(q)[:, None], wrench)
+        assert found.compliance.shape == (3, 2, 6, 6)
+        assert found.energies.shape == (3, 2, len(found.elements))
+        assert found.deflection == pytest.approx(expected.deflection, rel=1e-9, abs=1e-16)
+        assert found.factors == pytest.approx(expected.factors, abs=1e-10)
+        assert (found.compliance[:, 0] == found.compliance[:, 1]).all()
+        assert not found.compliance.flags.writeable
+        matrix = compliance(robot, robot.forward(q))
+        assert matrix.flags.writeable
+        assert matrix == pytest.approx(found.compliance[:, 0], rel=1e-8, abs=1e-12 * matrix.max())
+
+    def test_members_bend_from_end_to_end(self, name, rng):
+        """Their ends go with what they stand on; a batch is a loop."""
+        robot = load(name)
+        q, wrench = random_joints(robot, rng, 2), random_wrenches(rng, 2)
+        many = member_deflections(robot, q, wrench)
+        moved = platform_response(robot, q, wrench).deflection
+        place, _ = robot.platform(q)
+        if name != "upr_rpu":  # its joints at the platform give
+            for k in range(2):
+                rigid = [
+                    (points[k, -1], shifts[k, -1]) for points, shifts in many.values()
+                    if np.allclose(
+                        shifts[k, -1],
+                        moved[k, :3] + np.cross(moved[k, 3:], points[k, -1] - place[k]),
+                        rtol=1e-9, atol=1e-15,
+                    )
+                ]  # fmt: skip
+                assert len(rigid) >= len(robot.joint_names)
+        for member, (points, shifts) in many.items():
+            one = member_deflections(robot, q[1], wrench[1])[member]
+            assert (points[1] == one[0]).all()
+            assert (shifts[1] == one[1]).all()
+
     def test_a_stiffer_material_takes_less_energy_at_the_same_shares(self, name, tmp_path):
         """All moduli doubled: half the compliance."""
         path = tmp_path / "stiffer.yaml"
@@ -157,7 +177,9 @@ class TestEveryRobot:
             assert [len(row) for row in outputs] == list(kernel.sizes[1])
 
 
-@pytest.mark.parametrize("name", [name for name in FRAMES if "members" in parameters_of(name)])
+@pytest.mark.parametrize(
+    "name", [name for name in ELASTIC if name != "upr_rpu" and "members" in parameters_of(name)]
+)
 def test_a_file_without_members_has_no_compliance(name, tmp_path):
     data = parameters_of(name)
     del data["members"]
@@ -173,16 +195,29 @@ def test_a_file_without_members_has_no_compliance(name, tmp_path):
             ask()
 
 
-@pytest.mark.parametrize("left", [0.0, 1e-12, 1e-10, -1e-12])
-def test_a_frame_that_hardly_holds_is_singular(left):
-    """Not only where no factor is found: rounding alone may let one through."""
-    system = SimpleNamespace(stiffness=np.array([[2.0, 1.0 - left], [1.0 - left, 0.5]]))
+def test_a_frame_that_is_a_mechanism_is_refused_by_its_sample(variant):
+    """Parallelograms without width let the platform turn."""
+    robot, _ = variant("delta", members={"parallelogram_width": 1e-6})
+    q = np.tile(robot.graph.home, (2, 1))
     with pytest.raises(SingularityError) as caught:
-        stiffness_root(system, (3,))
-    assert caught.value.index == (3,)
-    sound = SimpleNamespace(stiffness=np.array([[2.0, 1.0 - 1e-6], [1.0 - 1e-6, 0.5]]))
-    root = stiffness_root(sound, ())
-    np.testing.assert_allclose(root @ root.T, sound.stiffness)
+        platform_response(robot, q, np.zeros(6))
+    assert caught.value.index == (0,)
+    with pytest.raises(SingularityError):
+        member_deflections(robot, q[0], np.zeros(6))
+
+
+def test_other_numbers_take_the_same_program():
+    """Moduli, diameters and compliances are inputs; what is rigid is not."""
+    robot = load("upr_rpu")
+    joints = {
+        k: (np.multiply(3.0, v)).tolist()
+        for k, v in parameters_of("upr_rpu")["joints_compliance"].items()
+    }
+    other = robot.changed(members={"diameter": [0.07, 0.08, 0.09]}, joints_compliance=joints)
+    program = kernels(robot)[1]
+    assert kernels(other)[1] is program
+    joints["rpu_universal"][0] = 0.0
+    assert kernels(robot.changed(joints_compliance=joints))[1] is not program
 
 
 def test_equal_limbs_tie_under_an_axial_load():

@@ -372,20 +372,31 @@ import numpy as np
 from pkm_twin import load
 from pkm_twin.codegen import kernels
 from pkm_twin.errors import UnreachableError
-from stiffness_monitor import compliance, strain_energy
+from stiffness_monitor import compliance, platform_response, strain_energy
+from stiffness_monitor.compliance import member_deflections
 robot = load("upr_rpu")
 poses = np.array(json.loads(sys.stdin.read()))
 q = robot.inverse(poses)
 wrench = np.array([30.0, -50, -40, 10, -20, 50])
 energy = strain_energy(robot, poses, wrench)
 angles = robot.limit_angles(poses)
+frames = {}
+for name in ("delta_cu", "prru"):
+    frame = load(name)
+    near = frame.graph.home + 0.02 * np.sin(np.arange(12.0).reshape(4, 3))
+    found = platform_response(frame, near, wrench)
+    bent = member_deflections(frame, near, wrench)
+    frames |= {f"{name} response": (1e9 * found.compliance).tolist(),
+        f"{name} factors": found.factors.tolist(),
+        f"{name} deflection": (1e6 * found.deflection).tolist(),
+        f"{name} members": [(1e6 * moved).tolist() for _, moved in bent.values()]}
 faults = []
 for l in ([0.9, 0.3, 0.6], [0.1, 0.1, 0.5], [0.6, 0.6, 2.0], [-1.0, 1, 1]):
     try:
         robot.forward(l)
     except UnreachableError as error:
         faults.append([robot.limb_names.index(error.limb), error.miss])
-print(json.dumps({
+print(json.dumps(frames | {
     "compiled": kernels.compiled(), "q": q.tolist(), "pose": robot.forward(q).tolist(),
     "rates": robot.jacobian(q).tolist(), "twist": robot.platform_jacobian(q).tolist(),
     "compliance": (1e9 * compliance(robot, poses)).tolist(), "factors": energy.factors.tolist(),

@@ -5,12 +5,16 @@ import numpy as np
 import pytest
 import yaml
 
-from pkm_twin.errors import ParameterError
+from pkm_twin.apps.certificate.description import expand
+from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics.clearance import clearance
-from pkm_twin.machine.catalogue import config_folder
+from pkm_twin.machine.catalogue import config_folder, robot_of_data
 from pkm_twin.machine.entries import with_entries
-from stiffness_monitor import compliance, strain_energy
+from stiffness_monitor import compliance, platform_response, strain_energy
+from stiffness_monitor.beams import assemble
 from stiffness_monitor.modes import natural_frequencies
+from stiffness_monitor.structure import structural_model
+from test.machine.random_machines import plain
 from test.support.robots import load
 
 POSES = [[0.02, 0.03, -0.33], [-0.05, 0.0, -0.36]]
@@ -141,3 +145,28 @@ def test_factors_of_elements_stand_in_what_is_written_out(delta_in_the_graph_for
     np.testing.assert_allclose(
         compliance(again, POSES[0]), compliance(expected, POSES[0]), atol=1e-9 * size
     )
+
+
+def test_a_frame_that_is_singular_at_home_is_answered_elsewhere():
+    """A four-bar on elastic joints alone, some directions rigid: closures hold more at home."""
+    data = expand(plain("four_bar"))
+    soft = {
+        "motor": [8e-9, 4e-8, 0, 9e-6, 0, 1e-6],
+        "crank_pin": [1e-8, 0, 0, 0, 0, 9e-6],
+        "rocker_foot": [3e-9, 3e-9, 4e-8, 7e-6, 6e-7, 2e-7],
+        "rocker_pin": [2e-8, 8e-8, 0, 4e-7, 9e-7, 0],
+    }
+    for name, values in soft.items():
+        data["joints"][name]["compliance"] = values
+    robot = robot_of_data(data, "four_bar")
+    home = robot.graph.home
+    with pytest.raises(SingularityError) as caught:
+        platform_response(robot, np.stack((home + 0.1, home)), np.ones(6))
+    assert caught.value.index == (1,)
+    near = np.array([[0.1], [-0.2]]) + home
+    found = platform_response(robot, near, np.ones(6))
+    for q, matrix in zip(near, found.compliance, strict=True):
+        whole = assemble(structural_model(robot, q), 1).stiffness
+        expected = np.linalg.inv(whole)[:6, :6]
+        scale = np.sqrt(np.diag(expected))
+        assert np.abs((matrix - expected) / np.outer(scale, scale)).max() < 1e-8

@@ -8,6 +8,7 @@ from delta_dynamics import energy, inverse_dynamics, least_norm_reactions, mass_
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.robot_urdf import robot_description
+from stiffness_monitor import platform_response
 
 GRAVITY = 9.81
 SCREW, CARRIAGE, ROTOR = 4e-5, 2.5, 1.2e-5
@@ -105,6 +106,31 @@ def test_a_driven_screw_keeps_the_balance_of_power(at, rng):
     rate = (total(1e-4) - total(-1e-4)) / 2e-4
     power = (inverse_dynamics(robot, q, qd, qdd) * qd)[:, 0]
     np.testing.assert_allclose(power, rate, atol=1e-7 * np.abs(power).max())
+
+
+@pytest.mark.parametrize("lead", [0.01, -0.6])
+def test_its_frame_gives_along_the_axis_as_a_screw_that_twists(lead):
+    """Push at the carriage: screw and nut are stretched, and twisted by the thread's moment."""
+    data = robot_description(slide(lead))
+    data["origin"] = [0, 0, 0.4]
+    modulus, shear, outer = 200e9, 80e9, 0.02
+    tube = {"youngs_modulus": modulus, "shear_modulus": shear, "outer_diameter": outer}
+    data["bodies"]["screw"]["member"] = {
+        "from": [0, 0, 0], "to": [0, 0, 0.4], "section": tube | {"inner_diameter": 0.0}
+    }  # fmt: skip
+    joints = data["joints"]
+    joints["motor"]["compliance"] = [0, 0, 0, 3e-4, 0, 0]
+    joints["nut"]["compliance"] = [2e-9, 1e-9, 1e-9, 5e-5, 0, 0]
+    joints["rail"]["compliance"] = [0, 1e-9, 1e-9, 4e-5, 1e-6, 1e-6]
+    robot = robot_of_data(data, "elastic slide")
+    area, polar, pitch = np.pi / 4 * outer**2, np.pi / 32 * outer**4, lead / (2 * np.pi)
+    expected = 0.4 / (modulus * area) + 2e-9
+    expected += pitch**2 * (0.4 / (shear * polar) + 3e-4 + 5e-5 + 4e-5)
+    found = platform_response(robot, [[0.0], [7.0]], [0, 0, 10.0, 0, 0, 0])
+    np.testing.assert_allclose(found.compliance[:, 2, 2], expected, rtol=1e-9)
+    shares = dict(zip(found.elements, found.energies[0] / found.total[0], strict=True))
+    np.testing.assert_allclose(shares["rail"], pitch**2 * 4e-5 / expected, rtol=1e-9)
+    np.testing.assert_allclose(shares["motor"], pitch**2 * 3e-4 / expected, rtol=1e-9)
 
 
 def test_it_is_written_out_and_read_again(rng):

@@ -13,7 +13,7 @@ from pkm_twin.state.scene import Load, Scales, Scene, heat
 from pkm_twin.state.state import MachineState
 from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor import compliance, strain_energy
-from stiffness_monitor.statics import frame_deflections
+from stiffness_monitor.compliance import member_deflections
 from test.nodes.harness import SECOND, Maker, Plain
 from test.support.robots import ELASTIC, load
 
@@ -49,7 +49,7 @@ def loaded(robot, state, wrench=WRENCH):
         energy.deflection,
         dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
         str(energy.dominant),
-        frame_deflections(robot, pose, wrench),
+        member_deflections(robot, state.q, wrench),
     )
 
 
@@ -206,7 +206,7 @@ class TestScene:
             steps = np.diff(points, axis=0)
             assert np.ptp(steps, axis=0).max() < 1e-12
         # Twice the load bends twice as much.
-        twice = frame_deflections(robot, robot.forward(state.q), 2.0 * WRENCH)
+        twice = member_deflections(robot, state.q, 2.0 * WRENCH)
         for name, (_, moved) in load.members.items():
             assert np.allclose(twice[name][1], 2.0 * moved, rtol=1e-9, atol=1e-18)
 

@@ -11,7 +11,7 @@ from pkm_twin.machine.robot_urdf import robot_urdf
 from pkm_twin.state.scene import Load, Scales, Scene
 from pkm_twin.state.state import MachineState
 from stiffness_monitor import compliance, strain_energy
-from stiffness_monitor.statics import frame_deflections
+from stiffness_monitor.compliance import member_deflections
 from test.nodes.harness import SECOND, Maker, Ros, counts_of, one_line_refusal, stamp_of, values_of
 from test.support.robots import load
 
@@ -107,7 +107,7 @@ def expected():
         energy.deflection,
         dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
         str(energy.dominant),
-        frame_deflections(ROBOT, POSE, wrench),
+        member_deflections(ROBOT, state.q, wrench),
     )
     return state, Scene(ROBOT, Scales(deflection=500.0)).shapes(state, load)
 

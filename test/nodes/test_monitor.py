@@ -2,6 +2,7 @@
 """The stiffness core: a wrench and the pose beside it, to compliance and strain energy."""
 
 import math
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pkm_twin.errors import MessageError, SingularityError
-from stiffness_monitor import compliance, monitor, strain_energy
+from stiffness_monitor import compliance, monitor, platform_response
 from stiffness_monitor.monitor import Monitor, Settings
 from test.nodes.harness import SECOND, Maker, Plain
 from test.support.robots import load
@@ -51,8 +52,9 @@ class TestAnswers:
         assert answer.stamp == NOW
         assert np.allclose(answer.pose, POSE, atol=1e-12)
         assert (answer.wrench == WRENCH).all()
-        assert (answer.compliance == compliance(ROBOT, answer.pose)).all()
-        expected = strain_energy(ROBOT, answer.pose, WRENCH)
+        assert np.allclose(answer.compliance, compliance(ROBOT, POSE), rtol=1e-9)
+        expected = platform_response(ROBOT, Q, WRENCH)
+        assert (answer.compliance == expected.compliance).all()
         assert (answer.energy.factors == expected.factors).all()
         assert answer.energy.dominant == expected.dominant
         assert np.allclose(answer.energy.deflection, answer.compliance @ WRENCH, rtol=1e-9)
@@ -215,12 +217,13 @@ class TestRejects:
             raise error
 
         twin = watching(make)
-        monkeypatch.setattr(monitor, "compliance", fail)
+        monkeypatch.setattr(monitor, "platform_response", fail)
         assert reject(twin.wrench, make.wrench(WRENCH, NOW), NOW)[0] == reason
 
     def test_a_compliance_that_is_not_finite(self, make, monkeypatch):
         twin = watching(make)
-        monkeypatch.setattr(monitor, "compliance", lambda *a: np.full((6, 6), np.nan))
+        found = replace(platform_response(ROBOT, Q, WRENCH), compliance=np.full((6, 6), np.nan))
+        monkeypatch.setattr(monitor, "platform_response", lambda *a: found)
         assert reject(twin.wrench, make.wrench(WRENCH, NOW), NOW)[0] == "non-finite result"
 
 

@@ -12,7 +12,7 @@ from pkm_twin.apps.nodes import MODULES
 from pkm_twin.state.scene import Load, Scene
 from pkm_twin.state.state import MachineState
 from stiffness_monitor import compliance, strain_energy
-from stiffness_monitor.statics import frame_deflections
+from stiffness_monitor.compliance import member_deflections
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
 from test.nodes.test_tables import rows
 from test.support.robots import load
@@ -77,7 +77,7 @@ def test_rviz_knows_every_kind_of_marker():
             energy.deflection,
             dict(zip(energy.elements, energy.factors.tolist(), strict=True)),
             str(energy.dominant),
-            frame_deflections(robot, robot.home(), wrench),
+            member_deflections(robot, robot.graph.home, wrench),
         ),
     )
     assert set(markers["Namespaces"]) == {shape.group for shape in shapes}

@@ -19,8 +19,7 @@ from scipy.linalg import qr
 
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.members import Section
-from stiffness_monitor.beams import local_axes
-from stiffness_monitor.structure import StructuralModel
+from stiffness_monitor.structure import StructuralModel, local_axes
 
 CCX = shutil.which("ccx")
 ABSENT = "no CalculiX (ccx) on this machine"

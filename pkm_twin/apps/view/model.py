@@ -22,7 +22,7 @@ from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
 from pkm_twin.kinematics.workspace import has_joint_angles
 from pkm_twin.machine.robot import Robot
-from stiffness_monitor import StrainEnergy, strain_energy
+from stiffness_monitor import PlatformResponse, platform_response
 
 Array = NDArray[np.float64]
 Grade = Literal["good", "warn", "bad"]
@@ -78,7 +78,7 @@ class Numbers:
     clearance_grade: Grade
     effort: Array | None
     beyond_effort: tuple[str, ...]
-    energy: StrainEnergy | None
+    energy: PlatformResponse | None
     why: dict[str, str]
 
 
@@ -101,7 +101,7 @@ class Model:
         rest = np.zeros(robot.joints_count)
         for name, call in (
             ("effort", lambda: inverse_dynamics(robot, state.q, rest, rest)),
-            ("energy", lambda: strain_energy(robot, state.pose, np.zeros(6))),
+            ("energy", lambda: platform_response(robot, state.q, np.zeros(6))),
         ):
             try:
                 call()
@@ -165,8 +165,7 @@ class Model:
         if "energy" in self._why:
             return Range("deflection enlarged", "times", 0.0, 1.0, 0.01)
         full = np.diag([r.high for r in self.wrench_ranges])[:3]
-        poses = np.broadcast_to(self.start.pose, (3, len(self.start.pose)))
-        moved = np.asarray(strain_energy(self.robot, poses, full).deflection)
+        moved = platform_response(self.robot, self.start.q, full).deflection
         scale = np.repeat([1.0, self.robot.size], 3)
         largest = float(np.abs(moved * scale).max())
         top = _round(VISIBLE * self.robot.graph.size / largest)
@@ -235,7 +234,7 @@ class Model:
             why["effort"] = one_line(str(error))
         try:
             if "energy" not in why:
-                energy = strain_energy(robot, state.pose, state.wrench)
+                energy = platform_response(robot, state.q, state.wrench)
         except (PkmTwinError, ValueError) as error:
             why["energy"] = one_line(str(error))
         position, rotation = robot.platform(state.q)

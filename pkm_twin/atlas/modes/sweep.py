@@ -34,7 +34,7 @@ from pkm_twin.kinematics.workspace import distance_unit
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
-from stiffness_monitor.structure import Member, StructuralModel, structural_model
+from stiffness_monitor.structure import StructuralModel, structural_model
 
 Array = NDArray[np.float64]
 
@@ -172,7 +172,7 @@ def structure_edges(model: StructuralModel, nodes: tuple[str, ...]) -> NDArray[n
     :param nodes: names as :func:`stiffness_monitor.modes.modes` gives them: the platform's origin,
         then ``<member> <k>/<elements>``.
     """
-    members = [part for part in model.parts if isinstance(part, Member)]
+    members = model.members
     of: dict[str, list[int]] = {member.name: [] for member in members}
     for index, name in enumerate(nodes[1:], start=1):
         of[name.rpartition(" ")[0]].append(index)
@@ -233,7 +233,7 @@ def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:
     # Names and lines are the same in every pose: members keep their divisions.
     pose = grid.polar_pose(heights[layers // 2], 0.0, 0.0)
     found = modes(robot, pose, COUNT)
-    edges = structure_edges(structural_model(robot, pose), found.nodes)
+    edges = structure_edges(structural_model(robot, robot.inverse(pose)), found.nodes)
     return ModesSweep(
         robot,
         heights,

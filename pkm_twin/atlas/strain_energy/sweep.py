@@ -102,7 +102,7 @@ class StrainEnergySweep(Sweep):
             "azimuth": Variable(
                 ("azimuth",), self.turn, {"units": "rad", "long_name": "from beta to gamma"}
             ),
-            "element": Variable(("element",), np.array(self.robot.element_names, "U"), {}),
+            "element": Variable(("element",), np.array(ELEMENTS, "U"), {}),
             "radius": Variable(
                 ("z",), self.radii, {"units": "rad", "long_name": "largest circle of tilts"}
             ),
@@ -131,9 +131,8 @@ class StrainEnergySweep(Sweep):
     def evaluate(self, chunk: Chunk) -> Values:
         """Energies of the chunk, and its part of the global factors."""
         rows, kept = chunk.stop - chunk.start, self._inside(chunk)
-        names = self.robot.element_names
         energy = np.full((rows, self.azimuths), np.nan)
-        factor = np.full((rows, self.azimuths, len(names)), np.nan)
+        factor = np.full((rows, self.azimuths, len(ELEMENTS)), np.nan)
         dominant = np.full((rows, self.azimuths), -1, np.int8)
         tilt = self.tilts[chunk.start : chunk.start + kept]
         if kept:
@@ -181,12 +180,12 @@ def strain_energy_sweep(
     are divided alike, so that about as many poses lie inside; -0.6 m stays a height.
 
     :param wrench: P1, P2 or P3 of the paper, or six numbers, N and N m.
-    :raises ParameterError: a robot without elastic members, a wrench that is none, or a robot
-        that has no regular workspace.
+    :raises ParameterError: a robot whose elastic elements are not :data:`ELEMENTS`, a wrench that
+        is none, or a robot that has no regular workspace.
     """
-    if not robot.element_names:
+    if robot.element_names != ELEMENTS:
         raise ParameterError(
-            "mechanism", robot.mechanism, "a mechanism with elastic members (upr_rpu)"
+            "mechanism", robot.mechanism, "elastic limbs of R joint, bar and U joint (upr_rpu)"
         )
     load = checked_wrench(wrench)
     cylinder(robot, "strain energy over tilts")

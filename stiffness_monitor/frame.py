@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coordinates and elastic columns of a frame in a pose, on numbers and on expressions alike.
+
+Every displacement of a member's ends is written as that of the body it stands on plus what its
+joint lets through: u_end = X u_body + A s. So releases and springs need no constraint equations:
+a free direction is a coordinate s, an elastic one a coordinate s with a spring, a rigid one none.
+
+Stiffness is a sum of columns d b b': of a spring, and of a beam's six ways to deform, which are
+stretch, twist, and in both planes a bend to a circle and one to an S. Each has the energy
+d (b . x)^2 / 2.
+
+Displacements are in the order x y z rx ry rz (m, rad). SI units.
+
+May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.codegen.lu import independent_rows, is_zero
+from pkm_twin.machine.graph import BASE
+from stiffness_monitor.structure import (
+    FREE,
+    RIGID,
+    Carried,
+    Member,
+    StructuralModel,
+    Support,
+)
+
+Array = NDArray[np.float64]
+Row = dict[int, Any]
+"""Entries of a linear form of the coordinates that are not zero."""
+
+PLATFORM: Final = 6
+"""The platform's displacements are the first six coordinates."""
+PLANES: Final = ((1, 5, 1.0), (2, 4, -1.0))
+"""Of bending: deflection, turn, and its sign: in the plane x z a positive one lowers the slope."""
+
+
+class Node(NamedTuple):
+    """A point at ``at``, whose displacement (6,) is ``map`` times the coordinates ``own``."""
+
+    own: Sequence[int]
+    map: Any
+    at: Any
+
+
+class Column(NamedTuple):
+    """A way to deform of one element: its amount by the coordinates, and its rigidity."""
+
+    element: str
+    row: Row
+    rigidity: Any
+
+
+class Bar(NamedTuple):
+    """A member with its ends' displacements along its own axes."""
+
+    member: Member
+    ends: tuple[Node, ...]
+
+
+def rigid_offset(arm: Any) -> Any:
+    """Displacement of a point of a rigid body by that of another, ``arm`` away; shape (6, 6)."""
+    x, y, z = arm.tolist()
+    turned = [[1.0, 0, 0, 0, z, -y], [0, 1.0, 0, -z, 0, x], [0, 0, 1.0, y, -x, 0]]
+    return np.array([*turned, *np.eye(6)[3:].tolist()])
+
+
+def turned(axes: Any, displacements: Any) -> Any:
+    """Displacements, shape (6, k), whose both halves are multiplied by a matrix (3, 3)."""
+    return (axes @ displacements.reshape(2, 3, -1)).reshape(6, -1)
+
+
+def combined(*terms: tuple[Iterable[int], Iterable[Any]]) -> Row:
+    """The sum of linear forms, each of coordinates and their factors."""
+    row: Row = {}
+    for own, values in terms:
+        for k, value in zip(own, values, strict=True):
+            if not is_zero(value):
+                row[k] = row[k] + value if k in row else value
+    return row
+
+
+def deformations(
+    length: Any, stretch: Any, twist: Any, bend: Any, shear: Any
+) -> list[tuple[dict[int, Any], Any]]:
+    """Ways to deform of a beam along x: forms of its ends' 12 displacements, and rigidities.
+
+    Stretch, twist, then of both planes circle and S. With phi = 12 E I / (G A_shear L^2) these
+    diagonalise Timoshenko's matrix (Friedman and Kosmatka 1993, equation 14).
+
+    :param stretch: EA. ``twist``: GJ. ``bend``: EI. ``shear``: phi L^2.
+    """
+    per = 1.0 / length
+    found = [({0: -1.0, 6: 1.0}, stretch * per), ({3: -1.0, 9: 1.0}, twist * per)]
+    bow = 3.0 * bend * per / (1.0 + shear * per * per)
+    for v, r, side in PLANES:
+        found.append(({r: -side, 6 + r: side}, bend * per))
+        found.append(({v: 2.0 * per, 6 + v: -2.0 * per, r: side, 6 + r: side}, bow))
+    return found
+
+
+def bent(share: float, length: Any, phi: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    """How far a beam is from its chord, and how it turns from it, by circle and S of a plane."""
+    arc, bow = 0.5 * share * (1.0 - share), 1.0 / (1.0 + phi)
+    across = -arc * length, arc * (1.0 - 2.0 * share) * length * bow
+    return across, (share - 0.5, 0.5 - 6.0 * arc * bow)
+
+
+class Frame:
+    """The coordinates of a model in a pose.
+
+    ``nodes``: what others stand on, by name and end. ``bars``: members. ``springs``: columns of
+    joints. ``held``: linear forms that are zero, of closures; coordinates from ``last`` on are
+    closures'.
+
+    :param static: for loads on the platform alone: a strut is stretched and no more.
+    """
+
+    def __init__(self, model: StructuralModel, *, static: bool = False) -> None:
+        self.size, self.static = PLATFORM, static
+        self.nodes: dict[tuple[str, int], Node] = {
+            (BASE, 0): Node((), np.zeros((6, 0)), np.zeros(3)),
+            (model.platform, 0): Node(range(PLATFORM), np.eye(6), model.origin),
+        }
+        self.bars: list[Bar] = []
+        self.springs: list[Column] = []
+        self.held: list[Row] = []
+        for part in model.parts:
+            if isinstance(part, Carried):
+                self.nodes[part.name, 0] = self._stood(part.support, part.at)
+            else:
+                self._bar(part)
+        self.last = self.size
+        for closure in model.closures:
+            self._close(closure.support, closure.inner, closure.at)
+
+    def _new(self, count: int) -> range:
+        self.size += count
+        return range(self.size - count, self.size)
+
+    def _moved(self, body: str, end: int, at: Any) -> Node:
+        """The point of a body that is at a place."""
+        if (body, end) not in self.nodes:
+            raise ValueError(f"{body} hangs nowhere")
+        node = self.nodes[body, end]
+        return Node(node.own, rigid_offset(at - node.at) @ node.map, at)
+
+    def _let(self, support: Support) -> tuple[range, Array]:
+        """New coordinates of what a joint lets through, along its axes, shape (6, count)."""
+        kinds = [k for k, compliance in enumerate(support.compliance) if not is_zero(compliance)]
+        lets = [np.eye(6)[k] for k in kinds]
+        lets += [pitch * np.eye(6)[k] + np.eye(6)[3 + k] for k, pitch in support.screws]
+        own = self._new(len(lets))
+        self.springs += [
+            Column(support.joint, {index: 1.0}, 1.0 / support.compliance[k])
+            for index, k in zip(own, kinds, strict=False)
+            if support.compliance[k] != FREE
+        ]
+        return own, np.array(lets).reshape(-1, 6).T
+
+    def _stood(self, support: Support, at: Any) -> Node:
+        """A point that stands on a body by a joint."""
+        node = self._moved(support.body, support.end, at)
+        own, lets = self._let(support)
+        return Node((*node.own, *own), np.hstack((node.map, turned(support.axes, lets))), at)
+
+    def _close(self, support: Support, inner: tuple[str, int], at: Any) -> None:
+        """Two points that stand on bodies and move apart by what a joint lets through."""
+        first, second = self._moved(*inner, at), self._moved(support.body, support.end, at)
+        own, lets = self._let(support)
+        minus, plus = (turned(support.axes.T, node.map) for node in (first, second))
+        self.held += [
+            combined((first.own, -minus[k]), (second.own, plus[k]), (own, -lets[k]))
+            for k in range(6)
+        ]
+
+    def _bar(self, member: Member) -> None:
+        ends = []
+        pairs = (member.inner, member.start), (member.outer, member.end)
+        for k, (support, at) in enumerate(pairs):
+            if support is None:
+                node = Node(self._new(6), turned(member.axes, np.eye(6)), at)
+                ends.append(node._replace(map=np.eye(6)))
+            else:
+                if self.static and member.strut:
+                    support = replace(support, compliance=(support.compliance[0], *RIGID[1:]))
+                node = self._stood(support, at)
+                ends.append(node._replace(map=turned(member.axes.T, node.map)))
+            self.nodes[member.name, k] = node
+        self.bars.append(Bar(member, tuple(ends)))
+
+    def columns(self, bar: Bar) -> list[Column]:
+        """Of a member whose section is the rigidities of :func:`deformations`."""
+        member, ends = bar
+        ways = deformations(member.length, *member.section)
+        return [
+            Column(
+                member.body,
+                combined(
+                    *((ends[k // 6].own, f * ends[k // 6].map[k % 6]) for k, f in form.items())
+                ),
+                rigidity,
+            )
+            for form, rigidity in (ways[:1] if self.static and member.strut else ways)
+        ]
+
+    def table(self) -> Any:
+        """What closures hold, shape (rows, size)."""
+        table = np.zeros((len(self.held), self.size), dtype=object)
+        for line, row in zip(table, self.held, strict=True):
+            line[list(row)] = list(row.values())
+        return table
+
+    def dependents(self, tables: Array) -> tuple[list[int], list[int]]:
+        """Rows that say all that closures hold, and as many coordinates that follow from the rest.
+
+        Dependent equations, of an overconstrained machine, count once.
+
+        :param tables: in some poses, shape (k, rows, size).
+        :raises ValueError: they hold the platform itself.
+        """
+        rows = independent_rows(tables[..., PLATFORM:])
+        if len(independent_rows(tables)) > len(rows):
+            raise ValueError("closures hold the platform itself: its compliance is not positive")
+        # First what closures let through, which is in one equation or two alone.
+        weight = np.where(np.arange(PLATFORM, self.size) < self.last, 1.0, 10.0)
+        chosen = independent_rows((tables[:, rows, PLATFORM:] * weight).swapaxes(-1, -2))
+        return rows, [PLATFORM + k for k in chosen]
