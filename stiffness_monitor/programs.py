@@ -60,7 +60,9 @@ class Elastic:
         rows = [structure.sections[member.section].rigidities for member in self.plan.members]
         values = [structure.compliances[name][k] for name, k in self.soft]
         self.parameters = np.array([*np.ravel(rows), *values], np.float64)
-        self._key = hashlib.sha256(repr((robot.graph.key, _text(self.plan), self.names)).encode()).hexdigest()
+        self._key = hashlib.sha256(
+            repr((robot.graph.key, _text(self.plan), self.names)).encode()
+        ).hexdigest()
 
     def posed(self, motion: Motion, p: Any) -> StructuralModel:
         """The plan in a motion, with the parameters ``p``."""

@@ -6,6 +6,7 @@ May import: numpy, llvmlite if present, this package, the standard library.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import threading
@@ -40,6 +41,8 @@ MOST: Final = 1_000_000
 """Upper limit of the numbers in an input, an output or the parameters."""
 _WRITERS: Final = ("codegen", "machine", "kinematics", "mechanisms", "streams")
 """Folders beside this one whose sources write programs."""
+SMALL: Final = 4096
+"""Samples of a batch whose results are made in one block of memory."""
 MISSED: Final = 1e-24
 """Sum of squares by which a geometry may miss what a program takes for constant: rounding."""
 _F8: Final = np.dtype(np.float64)
@@ -137,6 +140,10 @@ def _caller(inputs: int) -> Callable[..., Any]:
     return make
 
 
+def _axes(array: Array) -> int:
+    return array.ndim
+
+
 class Code:
     """One program over batches, of one machine or of many.
 
@@ -204,6 +211,11 @@ class Code:
         return result.reshape(*p.shape[:-1], -1)
 
     @property
+    def functions(self) -> tuple[Any, Any] | None:
+        """The code for batches and that for one sample, which holds the interpreter's lock."""
+        return None if self._loaded[3] is None else self._loaded[2:]
+
+    @property
     def parameters(self) -> int:
         """How many parameters there are."""
         return int(self._loaded[0]["parameters"])
@@ -219,8 +231,14 @@ class Code:
         :raises ValueError: an input that is no real numbers, or whose last axis has another size.
         """
         arrays = self._checked(inputs)
-        if all(array.ndim == 1 for array in arrays):
+        whole = max(arrays, key=_axes, default=_NO_GEOMETRY)
+        if whole.ndim == 1:
             return self.run_one(prepared, arrays)
+        shape = whole.shape[:-1]
+        if all(a.ndim == 1 or (a.shape[:-1] == shape and a.flags.c_contiguous) for a in arrays):
+            quick = self._quick(prepared, arrays, shape)
+            if quick is not None:
+                return quick, None
         batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
         count = math.prod(batch)
         if count == 0:
@@ -235,6 +253,28 @@ class Code:
         outputs, status = self._solved(prepared.reshape(1, -1), rows, count)
         shaped = [output.reshape(*batch, output.shape[-1]) for output in outputs]
         return shaped, None if status is None else status.reshape(*batch, 2)
+
+    def _quick(
+        self, prepared: Array, arrays: Sequence[Array], shape: tuple[int, ...]
+    ) -> list[Array] | None:
+        """Outputs of a batch as it lies in memory; None where a sample is not good at once."""
+        header, _, code, locked = self._loaded
+        count = math.prod(shape)
+        if locked is None or not 0 < count <= SMALL:
+            return None
+        sizes = header["outputs"]
+        # One block for all: what it costs to make an array counts here.
+        block = np.empty(count * (sum(sizes) + 2))
+        words = [1, count, 1, prepared.ctypes.data, 0]
+        for array in arrays:
+            words += [array.ctypes.data, 0 if array.ndim == 1 else array.shape[-1], 0]
+        outputs, place, end = [], block.ctypes.data, 0
+        for size in sizes:
+            start, end = end, end + count * size
+            outputs.append(block[start:end].reshape(*shape, size))
+            words.append(place + 8 * start)
+        words.append(place + 8 * end)
+        return None if code((ctypes.c_int64 * len(words))(*words)) else outputs
 
     def run_each(self, prepared: Array, *inputs: Array) -> tuple[list[Array], Array | None]:
         """The same of many machines.
@@ -420,6 +460,42 @@ class Kernel:
     def first_of_one(self, p: Array) -> Callable[..., Array | None]:
         """The first output of one sample, see :meth:`Code.first_of_one`."""
         return self.code.first_of_one(self.prepared(p))
+
+
+class BoundCall:
+    """A kernel on arrays of its own: shape (size,) each, or (samples, size) for several samples.
+
+    :param p: the program's own parameters, shape (k,).
+    """
+
+    def __init__(self, kernel: Kernel, p: Array, samples: int = 1) -> None:
+        self._kernel, self._p = kernel, p
+        taken, given = kernel.sizes
+        shape = () if samples == 1 else (samples,)
+        self.inputs = [np.zeros((*shape, size)) for size in taken]
+        self.outputs = [np.zeros((*shape, size)) for size in given]
+        self._status, self._prepared = np.zeros((samples, 2)), kernel.prepared(p)
+        words = [1, samples, 1, self._prepared.ctypes.data, 0]
+        for array, size in zip(self.inputs, taken, strict=True):
+            words += [array.ctypes.data, size, 0]
+        words += [array.ctypes.data for array in [*self.outputs, self._status]]
+        self._words = np.array(words, np.int64)
+        self._address = self._words.ctypes.data
+        # Other threads may run while many samples are computed; one is over before they could.
+        code = kernel.code.functions
+        self._code = None if code is None else code[samples == 1]
+
+    def __call__(self) -> int:
+        """Compute the outputs: 0, or the greatest status of a sample."""
+        if self._code is not None and not self._code(self._address):
+            return 0
+        outputs, status = self._kernel(self._p, *self.inputs)
+        for array, values in zip(self.outputs, outputs, strict=True):
+            array[...] = values
+        if status is None:
+            return 0
+        known = all(np.isfinite(array).all() for array in self.inputs)
+        return int(status[..., 0].max()) if known else int(NOT_FINITE)
 
 
 def _header(program: Program) -> dict[str, Any]:

@@ -14,7 +14,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Final, TypeVar
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,6 +49,9 @@ from pkm_twin.machine.uncertainty import (
     check_uncertainty,
     factors_of,
 )
+
+if TYPE_CHECKING:
+    from delta_dynamics.loop import TorqueLoop
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -713,6 +717,15 @@ class Robot:
         (measure,), status = self.singularity_kernel()(_NONE, q)
         good = np.ones(measure.shape[:-1], bool) if status is None else status[..., 0] == 0.0
         return np.where(good, measure[..., 0], 0.0), np.asarray(good)
+
+    def torque_loop(self, samples: int = 1) -> TorqueLoop:
+        """Inverse dynamics for a control loop, on arrays that stay where they are.
+
+        Write ``q, qd, qdd, wrench``, call, read ``tau`` and the status that the call returns; see
+        :class:`delta_dynamics.loop.TorqueLoop`.
+        """
+        made: TorqueLoop = import_module("delta_dynamics.loop").TorqueLoop(self, samples)
+        return made
 
     @cached_property
     def passive_joints(self) -> tuple[str, ...]:
