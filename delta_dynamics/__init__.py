@@ -3,6 +3,7 @@
 
 from delta_dynamics.base_parameters import BaseParameters, base_parameters
 from delta_dynamics.contact import Contact, ContactMonitor
+from delta_dynamics.derivatives import TorqueDerivatives, torque_derivatives, torque_gradient
 from delta_dynamics.isotropy import (
     Extremes,
     JointMotion,
@@ -47,6 +48,7 @@ __all__ = [
     "PayloadEstimator",
     "Reactions",
     "Terms",
+    "TorqueDerivatives",
     "base_parameters",
     "dynamics_terms",
     "energy",
@@ -69,5 +71,7 @@ __all__ = [
     "sphere_directions",
     "spread",
     "tilted_pose",
+    "torque_derivatives",
     "torque_deviation",
+    "torque_gradient",
 ]

@@ -68,7 +68,7 @@ def torques(robot: Robot) -> Kernel:
 
     :raises ParameterError: a robot whose file gives no masses.
     """
-    return robot.massive().kernel("torques", _torques)
+    return robot.massive().kernel("torques", torque_program)
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
@@ -288,7 +288,8 @@ def begun(t: Traced) -> tuple[Layout, list[Objects]]:
     return layout, layout.split(t.tape.inputs(PARAMETERS, layout.size))
 
 
-def _torques(t: Traced) -> Program:
+def torque_program(t: Traced) -> Program:
+    """The program of :func:`torques`, to write others with."""
     layout, (bodies, rods, gravity, viscous, coulomb, offset, rotors, passive) = begun(t)
     n = t.joints
     qd, qdd, wrench = t.tape.inputs("qd", n), t.tape.inputs("qdd", n), t.tape.inputs("wrench", 6)

@@ -42,11 +42,12 @@ class Tape:
 
     :param reference: values of the geometry in a known case: what hangs on it alone has a value
         there, and :func:`snapped` may take it for a constant.
+    :param free: nothing is taken for a constant, as where the geometry is differentiated by.
     """
 
-    def __init__(self, reference: Sequence[float] = ()) -> None:
+    def __init__(self, reference: Sequence[float] = (), *, free: bool = False) -> None:
         self._known: dict[tuple[Any, ...], Expression] = {}
-        self.reference = reference
+        self.reference, self.free = reference, free
         self.assumed: list[tuple[Expression, float]] = []
         """Expressions of parameters that are taken for a constant."""
 
@@ -331,6 +332,8 @@ def snapped(value: Any) -> Any:
     An expression of parameters that is so in the known case is taken for the constant; the tape
     notes that it was.
     """
+    if isinstance(value, Expression) and value.tape.free:
+        return value
     known = reference(value)
     for target in (0.0, 1.0, -1.0):
         if abs(known - target) < SNAP:

@@ -22,8 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics.virtual_work import masses_kernel, torques
 from pkm_twin.codegen.arrays import doubles
 from pkm_twin.codegen.kernels import MISSED, Code, Kernel
-from pkm_twin.design.numbers import FileNumbers, ProgramNumbers
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.kinematics.numbers import FileNumbers, ProgramNumbers
 from pkm_twin.machine.entries import with_entries
 from pkm_twin.machine.geometry import pattern_of
 from pkm_twin.machine.robot import Robot

@@ -21,13 +21,14 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.derivatives import adjoints
 from pkm_twin.codegen.expressions import GEOMETRY, Expression, Numbers, Objects, Tape, snapped_all
 from pkm_twin.codegen.kernels import Code, Kernel
 from pkm_twin.codegen.lu import Order, SparseLU, independent_rows, pivot_order
 from pkm_twin.codegen.program import UNKNOWNS, Equations, Program
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics import pose as poses
-from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
+from pkm_twin.kinematics.motion import Motion, Row, cross, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine.geometry import geometry_of, graph_on, pattern_of
 from pkm_twin.machine.graph import Array, Graph
@@ -413,15 +414,18 @@ class Engine:
 
     # As programs.
 
-    def kernel(self, name: str, write: Callable[[Traced], Program], extra: str = "") -> Kernel:
+    def kernel(
+        self, name: str, write: Callable[[Traced], Program], extra: str = "", *, free: bool = False
+    ) -> Kernel:
         """The compiled program of that name on this geometry, the same object every time.
 
         :param extra: text of what the program hangs on beside the machine's structure.
+        :param free: the program takes no number of the geometry for constant.
         """
         known = self._kernels.get(name)
         if known is None:
             key = f"{name} {extra} {self.structure}"
-            known = self._kernels[name] = Kernel(_code(key, self, write), self.geometry)
+            known = self._kernels[name] = Kernel(_code(key, self, write, free), self.geometry)
             if not known.holds:
                 # It takes for constant what is none here: a program of this geometry's own.
                 exact = f"{key} {self.graph.key}"
@@ -495,11 +499,12 @@ def _reciprocal(matrix: Array) -> float:
 class Traced:
     """A machine's motion on expressions of its geometry: what programs are written with."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, *, free: bool = False) -> None:
         self.engine = engine
-        self.tape = Tape(engine.geometry.tolist())
+        self.tape = Tape(engine.geometry.tolist(), free=free)
         given = self.tape.inputs(GEOMETRY, len(engine.geometry))
         own = len(given) - len(engine.closed.numbers)
+        self.geometry = given
         self.graph = graph_on(engine.graph, given[:own])
         self.closed = given[own:]
         """Numbers of the mechanism's closed forms."""
@@ -577,6 +582,37 @@ class Traced:
             part = value * scale
             total = total + part * part
         return self.tape.lift(total)
+
+    def gradient(self, sums: Sequence[tuple[Any, Any]], by: Sequence[Expression]) -> list[Any]:
+        """Derivatives by inputs of a sum of results times factors, the closures held closed.
+
+        The unknowns x follow from f(x, q, g) = 0: with J' m = ds/du, J = df/du, the derivative is
+        ds - m df (adjoint of the implicit function theorem).
+        """
+        found = adjoints(sums, [*by, *self.x])
+        direct, by_x = found[: len(by)], found[len(by) :]
+        multipliers = self.lu.solve_transposed(self._by_rates(by_x))
+        values = [self.rows[k].value for k in self.engine.kept]
+        through = adjoints(list(zip(values, multipliers, strict=True)), by)
+        return [a - b for a, b in zip(direct, through, strict=True)]
+
+    def _by_rates(self, by_x: Sequence[Any]) -> list[Any]:
+        """Derivatives by the unknown rates, of those by the unknowns: see ``Motion.retracted``."""
+        result: list[Any] = [0.0] * self.tree.unknown_rates
+        for link in self.tree.links.values():
+            for step in link.steps:
+                k, r = step.position, step.rate
+                if step.actuated:
+                    continue
+                if not (step.ball or step.free):
+                    result[r] = by_x[k]
+                    continue
+                w, v = self.x[k], np.array(self.x[k + 1 : k + 4], dtype=object)
+                dw, dv = by_x[k], np.array(by_x[k + 1 : k + 4], dtype=object)
+                result[r : r + 3] = list((w * dv - dw * v + cross(v, dv)) * 0.5)
+                if step.free:
+                    result[r + 3 : r + 6] = by_x[k + 4 : k + 7]
+        return result
 
     def set_rates(self, qd: Numbers) -> Objects:
         """Rates of everything by qd; returns those of the unknowns."""
@@ -780,11 +816,11 @@ def engine_of(
     return engine
 
 
-def _code(key: str, engine: Engine, write: Callable[[Traced], Program]) -> Code:
+def _code(key: str, engine: Engine, write: Callable[[Traced], Program], free: bool = False) -> Code:
     """The program of a key, written on an engine if nobody has it."""
     code = _codes.get(key)
     if code is None:
-        code = _codes.setdefault(key, Code(lambda: write(Traced(engine)), key))
+        code = _codes.setdefault(key, Code(lambda: write(Traced(engine, free=free)), key))
     return code
 
 

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.derivatives import tangents
 from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape
 from pkm_twin.codegen.plain import functions
 from pkm_twin.machine.geometry import geometry_of
@@ -50,9 +52,19 @@ class FileNumbers:
         inertial = layout.pack(graph, made.gravity, made.friction)
         inertial = inertial + layout.payload(load.mass, load.com, load.inertia)
         geometry = [*geometry_of(graph), *made.closed_numbers]
+        self._given = list(given)
         self._sizes = len(geometry), len(inertial)
         self._results: list[Expression] = [tape.lift(v) for v in (*geometry, *inertial)]
         _, self._run = functions(self._results, {GEOMETRY: len(paths)})
+
+    @cached_property
+    def slopes(self) -> tuple[Array, Array]:
+        """Derivatives of geometry and inertial inputs by the file's numbers, at its own values.
+
+        Shapes (geometry, paths) and (inertial, paths).
+        """
+        table = tangents(self._results, self._given)
+        return table[: self._sizes[0]], table[self._sizes[0] :]
 
     def __call__(self, values: Array) -> ProgramNumbers:
         """Of values, shape (k, paths); NaN where a machine's numbers lead to none."""

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Derivatives of torques against differences of sixth order, by the motion and by file numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics, torque_derivatives, torque_gradient
+from pkm_twin import Robot, variants
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.entries import entries
+from test.support.robots import every_robot, load
+
+POINTS = np.arange(-3.0, 4.0)
+WEIGHTS = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
+STEP = 1e-3
+ASIDE = ("limits", "joint_map", "uncertainty", "member", "section", "compliance", "radius", "ax")
+"""Words in paths of numbers that torques do not depend on, or that are scaled to one."""
+
+
+def motion(robot: Robot, rng):
+    """A state near home in motion, and a wrench."""
+    units = np.array([robot.graph.size if u == "m" else 1.0 for u in robot.joint_units])
+    q = robot.graph.home + 0.05 * rng.uniform(-1.0, 1.0, robot.joints_count) * units
+    return [q, *rng.normal(size=(2, robot.joints_count))], rng.normal(size=6)
+
+
+def close(found, expected, efforts):
+    """Equal but for what differences lose."""
+    size = max(np.abs(expected).max(), 1e-3 * np.abs(efforts).max())
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * size)
+
+
+@every_robot
+def test_by_the_motion(name, rng):
+    robot = load(name)
+    # Dry friction has a jump where a passive joint's rate changes its sign.
+    given, wrench = motion(robot, np.random.default_rng(5))
+    found = torque_derivatives(robot, *given, wrench)
+    efforts = inverse_dynamics(robot, *given, wrench)
+    for k, table in enumerate((found.q, found.qd, found.qdd)):
+        columns = []
+        for j in range(robot.joints_count):
+            moved = [np.tile(value, (len(POINTS), 1)) for value in given]
+            moved[k][:, j] += STEP * POINTS
+            columns.append(WEIGHTS @ inverse_dynamics(robot, *moved, wrench) / STEP)
+        close(table, np.transpose(columns), efforts)
+    assert found.by == {}
+
+
+@every_robot
+def test_by_numbers_of_the_file(name, rng):
+    robot = load(name)
+    given, wrench = motion(robot, rng)
+    known = {p: v for p, (v, _) in entries(robot).items() if v != 0.0}
+    paths = [p for p in known if not any(word in p for word in ASIDE) and "inertia[" not in p]
+    paths = rng.permutation(paths)[:8].tolist()
+    found = torque_derivatives(robot, *given, wrench, by=paths)
+    efforts = inverse_dynamics(robot, *given, wrench)
+    assert list(found.by) == paths
+    for path in paths:
+        step = STEP * abs(known[path])
+        many = variants(robot, {path: known[path] + step * POINTS})
+        if not many.valid.all():
+            # A closure that only this number's own value meets.
+            continue
+        expected = WEIGHTS @ many.inverse_dynamics(*given, wrench) / step
+        size = max(np.abs(expected).max(), 1e-6 * np.abs(efforts).max() / abs(known[path]))
+        np.testing.assert_allclose(found.by[path], expected, rtol=0, atol=1e-7 * size)
+
+
+@pytest.mark.parametrize("name", ["delta_cu", "stewart"])
+def test_a_gradient_is_the_weighted_sum_of_the_rows(name, rng):
+    robot = load(name)
+    (q, qd, qdd), wrench = motion(robot, rng)
+    batch = q + 1e-3 * rng.normal(size=(4, len(q)))
+    weights = rng.normal(size=(4, len(q)))
+    path = "payload.mass"
+    rows = torque_derivatives(robot, batch, qd, qdd, wrench, by=[path])
+    one = torque_gradient(robot, batch, qd, qdd, weights, wrench, by=[path])
+    assert rows.q.shape == (4, len(q), len(q)) and one.by[path].shape == (4,)
+    for what in ("q", "qd", "qdd"):
+        expected = np.einsum("kn,knj->kj", weights, getattr(rows, what))
+        np.testing.assert_allclose(getattr(one, what), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(one.by[path], np.sum(weights * rows.by[path], -1), rtol=1e-9)
+
+
+def test_a_path_that_there_is_not_is_rejected(rng):
+    robot = load("delta")
+    given, _ = motion(robot, rng)
+    with pytest.raises(ParameterError):
+        torque_derivatives(robot, *given, by=["geometry.leg"])
