@@ -22,9 +22,10 @@ MAY = {
     "pkm_twin.mechanisms": CORE,
     "pkm_twin.kinematics": CORE,
     "pkm_twin.export": CORE,
+    "pkm_twin.identification": CORE,
     "pkm_twin.streams": CORE | MESSAGES,
     "pkm_twin.state": CORE | MESSAGES | {"pkm_twin.streams"},
-    "delta_dynamics": CORE | MESSAGES | {"pkm_twin.streams"},
+    "delta_dynamics": CORE | MESSAGES | {"pkm_twin.streams", "pkm_twin.identification"},
     "stiffness_monitor": CORE | MESSAGES | {"pkm_twin.streams"},
 }
 """Of the project, beside themselves; nodes and cores of nodes may import streams and ros."""
