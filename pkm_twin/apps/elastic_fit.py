@@ -45,6 +45,10 @@ SCALE: Final = 50.0
 """How many times softer or stiffer than the file says a machine may be as a whole."""
 LIKE: Final = 0.5
 """Correlation of deflections and loads from which the one speaks of the other's scale."""
+VARIES: Final = 4.0
+"""Variance over that of the noise from which on a direction says something of the elements."""
+HIDDEN: Final = 0.5
+"""The same of the variation that the robot's file makes of the loads."""
 UNEXPLAINED: Final = 0.9
 """Part of the deflections' variation: a fit that leaves more explains nothing."""
 UNLIKE: Final = 0.3
@@ -310,13 +314,19 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
 def _part_left(part: _Part, factors: Array, zero: Array) -> float:
     """The part of the fitted deflections' variation that is left, beside noise between neighbours.
 
-    Over all measured directions, each by its own variation.
+    Over all measured directions that vary by more than their noise or would by the robot's file,
+    each by its own variation; zero where none does.
     """
     moved, _ = part.response.deflection(part.recording.wrench, factors)
     told = (part.recording.deflection - zero)[: part.split, part.measured]
     left = told - moved[: part.split, part.measured]
     size = np.nanmean((told - np.nanmean(told, 0)) ** 2, 0)
-    good = size > 0.0
+    noise = 0.5 * np.nanmean(np.diff(told, axis=0) ** 2, 0)
+    expected, _ = part.response.deflection(part.recording.wrench, np.ones(len(factors)))
+    due = np.nanvar(expected[: part.split, part.measured], 0)
+    good = (size > VARIES * noise) | (due > HIDDEN * noise)
+    if not good.any():
+        return 0.0
     return float(np.sqrt(np.mean(np.nanmean(left**2, 0)[good] / size[good])))
 
 
