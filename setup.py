@@ -27,6 +27,7 @@ setup(
         "pkm_twin.codegen",
         "pkm_twin.config",
         "pkm_twin.export",
+        "pkm_twin.identification",
         "pkm_twin.kinematics",
         "pkm_twin.machine",
         "pkm_twin.mechanisms",

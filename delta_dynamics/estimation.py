@@ -48,7 +48,7 @@ class Estimate:
     ``noise``: deviation of the efforts' residual by joint, (n,). ``directions``: how many
     combinations the data told. ``condition``: of the weighted regressor over those, columns
     scaled by the prior. ``weights``: of the samples, shape (samples, n). ``bound``: whether a
-    physical bound holds the values.
+    physical bound holds the values. ``inverse``: of the information, over those directions, (k, k).
     """
 
     values: Array
@@ -59,6 +59,15 @@ class Estimate:
     condition: float
     weights: Array
     bound: bool
+    inverse: Array
+
+    def response(self, table: Array, signal: Array) -> Array:
+        """What signals (samples, n, m) beside the target change in the parameters, shape (k, m).
+
+        :param table: that was fitted, shape (samples, n, k).
+        """
+        weighted = table * (self.weights / self.noise**2)[..., None]
+        return np.asarray(self.inverse @ np.tensordot(weighted, signal, ((0, 1), (0, 1))))
 
 
 def estimate(
@@ -110,15 +119,20 @@ def estimate(
     z, values, vectors, kept = told
     noise = np.sqrt(np.sum(weights * residual**2, 0) / np.maximum(np.sum(weights, 0) - k / n, 1.0))
     noise = np.maximum(noise, floor)
-    spread = _covariance(scaled, residual * weights, counts, noise, values, vectors, kept)
+    factor = _factor(scaled, residual * weights, counts, noise, values, vectors, kept)
+    spread = factor @ factor.T
     fitted = start + scales * z
     bound = not possible(fitted, cones)
     if bound:
-        fitted = _nearest(z, values, vectors, kept, start, scales, cones)
+        fitted = _nearest(z, factor, start, scales, cones)
+        # The bound is exact, but how far it moves the numbers beside it is an estimate.
+        moved = (fitted - start) / scales - z
+        spread = spread + np.outer(moved, moved)
     condition = float(np.sqrt(values[kept].max() / values[kept].min())) if kept.any() else np.inf
+    inner = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     return Estimate(
         fitted, scales[:, None] * spread * scales, scales, noise, int(kept.sum()), condition,
-        weights, bound,
+        weights, bound, scales[:, None] * inner * scales,
     )  # fmt: skip
 
 
@@ -143,11 +157,12 @@ def _directions(gram: Array, side: Array, least: float) -> tuple[Array, Array, A
     return vectors @ (inverse * (vectors.T @ side)), values, vectors, kept
 
 
-def _covariance(
+def _factor(
     scaled: Array, residual: Array, counts: Array, noise: Array, values: Array, vectors: Array,
     kept: Any,
 ) -> Array:  # fmt: skip
-    """Of the scaled parameters: of the data by the residual's own autocorrelation, and the prior's.
+    """Of the scaled parameters' covariance F F^T: the data's, by the residual's own
+    autocorrelation, then the prior's, shape (k, k).
 
     Filtered samples are not independent: the residual's covariance over time, also of two joints,
     stands between the two halves of the sandwich.
@@ -175,9 +190,7 @@ def _covariance(
     low, turned = np.linalg.eigh(inner * np.sqrt(np.outer(1 / inverse, 1 / inverse)))
     root = turned * np.sqrt(np.maximum(low, 1.0))
     root = np.sqrt(plain) @ root
-    data = vectors[:, kept] @ (root @ root.T) @ vectors[:, kept].T
-    rest = vectors[:, ~kept]
-    return np.asarray(data + rest @ rest.T, np.float64)
+    return np.concatenate([vectors[:, kept] @ root, vectors[:, ~kept]], 1)
 
 
 def possible(values: Array, cones: Cones) -> bool:
@@ -199,13 +212,14 @@ def _equilibrated(block: Array) -> Array:
     return scale[:, None] * block * scale
 
 
-def _nearest(
-    z: Array, values: Array, vectors: Array, kept: Any, start: Array, scales: Array, cones: Cones
-) -> Array:
-    """The possible parameters nearest to a solution, as the data and the prior measure it."""
-    information = np.where(kept, values, 1.0)
+def _nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) -> Array:
+    """The possible parameters nearest to a solution, in its standard deviations.
+
+    :param factor: of the scaled parameters' covariance, shape (k, k).
+    """
     if all(len(cone) == 1 and np.count_nonzero(cone) == 1 for _, cone in cones):
-        root = np.sqrt(information)[:, None] * vectors.T
+        sizes = np.linalg.norm(factor, axis=0)
+        root = np.linalg.inv(factor / sizes) / sizes[:, None]
         return _bounded(root, root @ z, start, scales, cones)
     try:
         cvxpy: Any = importlib.import_module("cvxpy")
@@ -215,7 +229,7 @@ def _nearest(
             f"needs cvxpy: {install('fit')}"
         ) from None
     # In deviations from the solution: each counts alike, however much the data know of it.
-    moved = scales[:, None] * vectors / np.sqrt(information)
+    moved = scales[:, None] * factor
     unknown = cvxpy.Variable(len(z))
     physical = start + scales * z + moved @ unknown
     limits = []

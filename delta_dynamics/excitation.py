@@ -30,12 +30,19 @@ Array = NDArray[np.float64]
 SAMPLES: Final = 120
 """States of a trial at which the information is taken."""
 DENSE: Final = 1200
-"""States at which the result's limits are looked at."""
+"""Least number of states at which limits are checked."""
+PER_PERIOD: Final = 20
+"""States in a period of the highest harmonic at which limits are checked."""
+PLAYED: Final = 10.0
+"""Least number of points in a period of the highest harmonic of a written trajectory."""
+BLOCK: Final = 4096
 THIN: Final = 4
 """Of the states, each of which the workspace is asked about."""
 SHRINK: Final = 0.85
 FREQUENCY: Final = 1.0
 """Highest frequency, Hz, of a robot whose file has no velocity limits."""
+SLOWEST: Final = 20.0
+"""How many times as fast as the lowest harmonic the highest one is at most."""
 FASTEST: Final = 5.0
 """Highest frequency, Hz, whatever the limits."""
 
@@ -44,12 +51,14 @@ FASTEST: Final = 5.0
 class Bounds:
     """What a trajectory keeps to. ``share``: of the file's limits, and of the position range.
 
-    ``acceleration``: of every joint, rad/s2 or m/s2, None: none. ``singularity``: least measure.
+    ``acceleration``: of every joint, rad/s2 or m/s2, None: none. ``singularity``: least index.
+    ``rate``: points a second of the written trajectory, which limit its highest frequency.
     """
 
     share: float = 0.9
     acceleration: float | None = None
     singularity: float = 0.1
+    rate: float = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +151,13 @@ def excite(
 
     :param duration: s. ``terms``: harmonics of each joint, at least 3.
     :param trials: how many trajectories are looked at; ``progress`` is called with the number.
-    :raises PkmTwinError: no trajectory at all keeps to the limits.
+    :raises PkmTwinError: no trajectory at all keeps to the limits, or the harmonics need more
+        points a second than it is written with.
     """
     robot, keep = judge.robot, bounds or Bounds()
     centre, reach = _range(robot, keep.share)
-    harmonics = _harmonics(robot, duration, terms, reach, keep.share)
+    harmonics = _harmonics(robot, duration, terms, reach, keep)
+    whole = _Fine.of(duration, harmonics)
     basis = _resting(harmonics)
     rng = np.random.default_rng(seed)
     shape = (len(centre), basis.shape[1])
@@ -158,7 +169,8 @@ def excite(
         amount = rng.normal(size=shape)
         free = amount if fresh or best is None else best[1] + step * amount
         pair = np.moveaxis((free @ basis.T).reshape(shape[0], 2, -1), 1, 0)
-        fitted = _within(robot, keep, duration, harmonics, centre, reach, pair, coarse)
+        small = whole.scaled(robot, keep, reach, pair)
+        fitted = _clear_of(robot, keep, duration, harmonics, centre, small, coarse)
         if fitted is not None:
             motion = _series(coarse, duration, harmonics, centre, fitted)
             values = judge.singular_values(*motion)
@@ -176,10 +188,14 @@ def excite(
             "no trajectory keeps to the limits and clear of singularities: a smaller --singularity "
             "or wider limits.position"
         )
-    dense = np.linspace(0.0, duration, DENSE, endpoint=False)
-    final = _within(robot, keep, duration, harmonics, centre, reach, best[2], dense)
-    assert final is not None  # noqa: S101
-    condition = judge.condition(*_series(dense, duration, harmonics, centre, final))
+    final = _clear_of(robot, keep, duration, harmonics, centre, best[2], whole.time, whole.margin)
+    if final is None:
+        raise PkmTwinError(
+            "the best trajectory leaves the limits between the states of the trials; try another "
+            "--seed or a smaller --singularity"
+        )
+    few = whole.time[:: -(-len(whole.time) // (2 * DENSE))]
+    condition = judge.condition(*_series(few, duration, harmonics, centre, final))
     return Excitation(duration, harmonics, centre, final[0], final[1], condition)
 
 
@@ -195,15 +211,24 @@ def _range(robot: Robot, share: float) -> tuple[Array, Array]:
     return (low + high) / 2, share * (high - low) / 2
 
 
-def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, share: float) -> Array:
+def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: Bounds) -> Array:
     """Different multiples of 1 / duration, up to where velocity and position limits meet."""
-    top = FREQUENCY
+    highest = keep.rate / PLAYED
+    if terms / duration > highest:
+        raise PkmTwinError(
+            f"{terms} harmonics in {duration:g} s reach {terms / duration:.3g} Hz; {keep.rate:g} "
+            f"points a second allow {highest:.3g} Hz: use fewer --harmonics, a longer --duration "
+            "or a higher --rate"
+        )
+    top = min(FREQUENCY, highest)
     if robot.limits.velocity is not None:
         velocity = np.where(np.isfinite(robot.limits.velocity), robot.limits.velocity, np.inf)
-        meeting = share * velocity / (2 * np.pi * reach)
-        top = float(np.min(meeting, initial=FASTEST))
-    most = max(terms, round(top * duration))
-    return np.unique(np.round(np.linspace(1, most, terms))).astype(np.float64)
+        meeting = keep.share * velocity / (2 * np.pi * reach)
+        top = float(np.min(meeting, initial=min(FASTEST, highest)))
+    most = max(terms, int(top * duration))
+    # In a long trajectory the slowest harmonic would take all of the position range.
+    least = max(1, min(round(most / SLOWEST), most - terms + 1))
+    return np.unique(np.round(np.linspace(least, most, terms))).astype(np.float64)
 
 
 def _resting(harmonics: Array) -> Array:
@@ -222,38 +247,61 @@ def _projected(rows: Array, basis: Array) -> Array:
     return basis - rows.T @ (rows @ basis)
 
 
-def _within(
-    robot: Robot,
-    keep: Bounds,
-    duration: float,
-    harmonics: Array,
-    centre: Array,
-    reach: Array,
-    pair: Array,
-    time: Array,
-) -> Array | None:
-    """The series made smaller until it keeps to all limits; None where it never does."""
-    q, qd, qdd = _series(time, duration, harmonics, np.zeros(len(centre)), pair)
-    use = [np.abs(q).max(0) / reach]
-    if robot.limits.velocity is not None:
-        use.append(np.abs(qd).max(0) / (keep.share * robot.limits.velocity))
-    if keep.acceleration is not None:
-        use.append(np.abs(qdd).max(0) / (keep.share * keep.acceleration))
-    size = 1.0 / np.max(use, 0, initial=1e-300)
-    if time.size == DENSE:
-        # What was within its limits stays as it is.
-        size = np.minimum(size, 1.0)
-    pair = pair * size[:, None]
+@dataclass(frozen=True, eq=False)
+class _Fine:
+    """States between which no joint leaves its limits.
+
+    ``margin``: what a trigonometric polynomial reaches at its samples is at least this part of what
+    it reaches between them (Ehlich, Zeller, 1964, doi:10.1007/BF01111276).
+    """
+
+    time: Array
+    margin: float
+    bases: tuple[Array, Array, Array]
+    """Of positions, rates and accelerations, (states, 2 h) each."""
+
+    @classmethod
+    def of(cls, duration: float, harmonics: Array) -> _Fine:
+        """By the highest harmonic."""
+        count = max(DENSE, PER_PERIOD * round(float(harmonics[-1])))
+        time = np.asarray(np.arange(count) * (duration / count), np.float64)
+        eye = np.eye(2 * len(harmonics)).reshape(-1, 2, len(harmonics))
+        q, qd, qdd = _series(time, duration, harmonics, np.zeros(len(eye)), np.moveaxis(eye, 1, 0))
+        return cls(time, float(np.cos(np.pi * harmonics[-1] / count)), (q, qd, qdd))
+
+    def scaled(self, robot: Robot, keep: Bounds, reach: Array, pair: Array) -> Array:
+        """A series (2, n, h) as large as limits of position, rate and acceleration allow."""
+        values = np.moveaxis(pair, 0, 1).reshape(pair.shape[1], -1)
+        peak = [np.abs(basis @ values.T).max(0) / self.margin for basis in self.bases]
+        use = [peak[0] / reach]
+        if robot.limits.velocity is not None:
+            use.append(peak[1] / (keep.share * robot.limits.velocity))
+        if keep.acceleration is not None:
+            use.append(peak[2] / (keep.share * keep.acceleration))
+        return np.asarray(pair / np.max(use, 0, initial=1e-300)[:, None], np.float64)
+
+
+def _clear_of(
+    robot: Robot, keep: Bounds, duration: float, harmonics: Array, centre: Array, pair: Array,
+    time: Array, margin: float = 1.0,
+) -> Array | None:  # fmt: skip
+    """The series made smaller until it keeps clear of everything; None where it never does."""
     for _ in range(20):
-        motion = _series(time, duration, harmonics, centre, pair)
-        if _clear(robot, keep, *motion):
+        blocks = (time[k : k + BLOCK] for k in range(0, len(time), BLOCK))
+        if all(
+            _clear(robot, keep, *_series(some, duration, harmonics, centre, pair), margin)
+            for some in blocks
+        ):
             return pair
         pair = SHRINK * pair
     return None
 
 
-def _clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array) -> bool:
-    """Assembly, singularity margin, workspace and efforts."""
+def _clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array, margin: float) -> bool:
+    """Assembly, singularity index, workspace and efforts.
+
+    :param margin: part of the effort limits up to which these states may go.
+    """
     measure, good = robot.try_singularity(q)
     if not good.all() or (measure < keep.singularity).any():
         return False
@@ -263,4 +311,4 @@ def _clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array) -> bool:
     if robot.limits.effort is None:
         return True
     efforts = inverse_dynamics(robot, q, qd, qdd)
-    return bool((np.abs(efforts) <= keep.share * robot.limits.effort).all())
+    return bool((np.abs(efforts) <= margin * keep.share * robot.limits.effort).all())

@@ -18,25 +18,23 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.estimation import Estimate, estimate
+from delta_dynamics.estimation import Estimate
 from delta_dynamics.file_parameters import FileParameters, file_parameters
-from delta_dynamics.fit_rows import LATE, Recorded, Rows, next_window, prior_scales, rows_of
+from delta_dynamics.fit_plausible import recording_fault
+from delta_dynamics.fit_rows import Recorded, Rows, next_window, rows_of
+from delta_dynamics.fit_solved import held_from, solve
+from delta_dynamics.fit_verdict import verdict_of
 from delta_dynamics.samples import Filtering
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
+from pkm_twin.identification.verdict import Verdict
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.shared import KINDS, Key, Kind, Shared
 
 Array = NDArray[np.float64]
 Status = Literal["fitted", "combination", "not excited"]
 
-HELD_OUT: Final = 1 / 3
-"""Part of each recording, its end, that is judged and not fitted."""
 SURE: Final = 0.2
 """A number that is known this much better than before is fitted."""
-SCALE: Final = 200.0
-"""How many times heavier or lighter than its file a machine may be as a whole."""
-LIKE: Final = 0.7
-"""Correlation of efforts, measured and by the file, from which the one tells the other's unit."""
 STAYS: Final = 1e-3
 """Change over the deviation before that says nothing."""
 UNSURE: Final = 0.98
@@ -47,8 +45,10 @@ UNSURE: Final = 0.98
 class Number:
     """One number of the file: where it stands, before and after, and its standard deviation.
 
-    ``share``: the deviation over that of before. ``status``: ``fitted``; ``combination``: known
-    only together with others; ``not excited``: the motion tells nothing, the file's value stays.
+    ``deviation``: NaN where it is withheld, as the model does not explain the recordings.
+    ``share``: that of the noise alone over that of before. ``status``: ``fitted``; ``combination``:
+    known only together with others; ``not excited``: the motion tells nothing, the file's value
+    stays.
     """
 
     key: Key
@@ -58,6 +58,11 @@ class Number:
     deviation: float
     share: float
     status: Status
+
+    @property
+    def spread(self) -> str:
+        """The standard deviation in words."""
+        return f"{self.deviation:.2g}" if np.isfinite(self.deviation) else "withheld"
 
     @property
     def name(self) -> str:
@@ -98,6 +103,10 @@ class Fit:
     samples: int
     delays: tuple[float, ...]
     """How late the efforts are against the positions, s, by recording."""
+    verdict: Verdict
+    """Whether the model explains the recordings."""
+    accepted: tuple[str, ...] = ()
+    """Why this machine cannot have made them, where they were fitted all the same."""
 
     def of(self, status: Status) -> tuple[Number, ...]:
         """The numbers of a status."""
@@ -109,34 +118,46 @@ def fit(
     recordings: Sequence[Recorded],
     what: Sequence[Kind] = KINDS,
     *,
+    accept: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Fit:
     """Fit some kinds of numbers of a robot's file.
 
     :param what: of ``friction``, ``rotor``, ``payload``, ``inertia``.
+    :param accept: fit recordings that this machine cannot have made, too.
     :param progress: called with the number of recordings that are worked on, twice each.
-    :raises PkmTwinError: recordings that are too short, or that show nothing.
+    :raises PkmTwinError: recordings that are too short, that show nothing, or that this machine
+        cannot have made.
     """
-    parameters = file_parameters(robot, what)
-    rows, filtering = [], []
-    start = parameters.values
+    everything, parameters = file_parameters(robot), file_parameters(robot, what)
+    chosen = np.concatenate([[g.kind in what] * len(g.names) for g in everything.groups])
+    whole, filtering = [], []
     for i, recording in enumerate(recordings):
-        made, how = rows_of(robot, parameters, recording, None)
-        rows.append(made)
+        made, how = _rows(robot, everything, recording)
+        whole.append(made)
         filtering.append(how)
         if progress is not None:
             progress(2 * i + 1)
-    for recording, made in zip(recordings, rows, strict=True):
-        _check_scale(recording.name, made.target + made.rest, made.rest + made.table @ start)
-    result, delays = _estimate(parameters, rows)
+    faults = []
+    for recording, made in zip(recordings, whole, strict=True):
+        fault = recording_fault(robot, everything, recording, made)
+        if fault is not None:
+            faults.append(f"{recording.name}: {fault}")
+    if faults and not accept:
+        raise PkmTwinError(f"{faults[0]}; --accept fits it all the same")
+    rows = [made.only(chosen, everything.values) for made in whole]
+    solved = solve(parameters, rows)
+    result, delays = solved.estimate, solved.delays
     other = []
     for i, (recording, how) in enumerate(zip(recordings, filtering, strict=True)):
-        other.append(rows_of(robot, parameters, recording, next_window(how.window))[0])
+        other.append(rows_of(robot, everything, recording, next_window(how.window))[0])
         if progress is not None:
             progress(2 * i + 2)
-    again, _ = _estimate(parameters, other)
-    result = _less_sure(result, again.values - result.values)
-    numbers = tuple(n for group in _numbers(parameters, result) for n in group)
+    again = solve(parameters, [made.only(chosen, everything.values) for made in other])
+    result = _less_sure(result, again.estimate.values - result.values)
+    verdict = verdict_of(robot, recordings, everything, chosen, whole, solved)
+    numbers = _numbers(parameters, result, verdict)
+    result = replace(result, covariance=verdict.widened(result.covariance))
     if not result.directions or all(n.status == "not excited" for n in numbers):
         raise PkmTwinError(
             f"no excitation: the motion tells nothing of {', '.join(what)}; a trajectory that "
@@ -144,62 +165,16 @@ def fit(
         )
     judged = []
     for recording, made in zip(recordings, rows, strict=True):
-        end = made.part(slice(_split(made), None))
+        end = made.part(slice(held_from(made), None))
         before, after = (end.rest + end.table @ v for v in (parameters.values, result.values))
         spread = np.sqrt(np.sum((end.table @ result.covariance) * end.table, -1).clip(0.0))
         measured = end.target + end.rest
         judged.append(Judged(recording.name, end.time, measured, before, after, spread))
     return Fit(
         robot, parameters, result, numbers, tuple(judged), tuple(filtering),
-        sum(made.outliers for made in rows), sum(_split(made) for made in rows), delays,
+        sum(made.outliers for made in rows), sum(held_from(made) for made in rows), delays,
+        verdict, tuple(faults),
     )  # fmt: skip
-
-
-def _check_scale(name: str, measured: Array, predicted: Array) -> None:
-    """Refuse efforts in another unit: alike but for a factor that no machine is off by.
-
-    :raises PkmTwinError: by recording.
-    """
-    both, own = float(np.sum(measured * predicted)), float(np.sum(predicted**2))
-    size = np.sqrt(own * float(np.sum(measured**2)))
-    if both > LIKE * size > 0.0 and not 1.0 / SCALE <= both / own <= SCALE:
-        raise PkmTwinError(
-            f"{name}: efforts are {both / own:.3g} times what the robot's file makes of the "
-            "motion: units? N m and N"
-        )
-
-
-def _split(rows: Rows) -> int:
-    return round((1.0 - HELD_OUT) * len(rows.time))
-
-
-def _estimate(
-    parameters: FileParameters, rows: Sequence[Rows]
-) -> tuple[Estimate, tuple[float, ...]]:
-    """Of the parameters, and how late the efforts of each recording are, s."""
-    used = [made.part(slice(0, _split(made))) for made in rows]
-    table, target, rest, counts = (
-        np.concatenate([getattr(made, name) for made in used])
-        for name in ("table", "target", "rest", "counts")
-    )
-    scales = prior_scales(parameters, table, target + rest)
-    # Late by a delay is less the delay times the change.
-    late = [
-        np.concatenate(
-            [-made.change if i == j else 0.0 * made.change for j, made in enumerate(used)]
-        )
-        for i in range(len(used))
-    ]
-    k = len(scales)
-    found = estimate(
-        np.concatenate([table, np.stack(late, -1)], -1), target,
-        np.append(parameters.values, np.zeros(len(used))),
-        np.append(scales, [LATE * made.period for made in used]), parameters.cones, counts,
-    )  # fmt: skip
-    own = replace(
-        found, values=found.values[:k], covariance=found.covariance[:k, :k], prior=found.prior[:k]
-    )
-    return own, tuple(found.values[k:].tolist())
 
 
 def _less_sure(result: Estimate, change: Array) -> Estimate:
@@ -207,11 +182,34 @@ def _less_sure(result: Estimate, change: Array) -> Estimate:
     return replace(result, covariance=result.covariance + np.outer(change, change))
 
 
-def _numbers(parameters: FileParameters, result: Estimate) -> list[tuple[Number, ...]]:
-    return [
-        _group(group, result, where)
-        for group, where in zip(parameters.groups, parameters.slices, strict=True)
-    ]
+def _rows(robot: Robot, everything: FileParameters, recording: Recorded) -> tuple[Rows, Filtering]:
+    """Rows of a recording; an error names it."""
+    try:
+        return rows_of(robot, everything, recording, None)
+    except (UnreachableError, SingularityError) as error:
+        raise PkmTwinError(
+            f"{recording.name}: {error} (positions of this machine, in rad and m?)"
+        ) from None
+
+
+def _numbers(parameters: FileParameters, result: Estimate, verdict: Verdict) -> tuple[Number, ...]:
+    """The file's numbers: known by the noise alone, their deviations by the verdict too."""
+    numbers = []
+    wide = verdict.widened(result.covariance)
+    for group, where in zip(parameters.groups, parameters.slices, strict=True):
+        own, all_in_all = (
+            _group(group, replace(result, covariance=one), where)
+            for one in (result.covariance, wide)
+        )
+        numbers += [
+            replace(n, deviation=w.deviation if n.status != "not excited" else n.deviation)
+            for n, w in zip(own, all_in_all, strict=True)
+        ]
+    if verdict.deviations == "withheld":
+        numbers = [
+            n if n.status == "not excited" else replace(n, deviation=np.nan) for n in numbers
+        ]
+    return tuple(numbers)
 
 
 def _group(group: Shared, result: Estimate, where: slice) -> tuple[Number, ...]:

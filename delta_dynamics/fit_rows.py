@@ -6,7 +6,7 @@ May import: numpy, scipy, pkm_twin's core, this package, the standard library.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -15,7 +15,8 @@ from scipy.ndimage import maximum_filter1d  # type: ignore[import-untyped]
 
 from delta_dynamics.estimation import estimate
 from delta_dynamics.file_parameters import FileParameters
-from delta_dynamics.regressor import parameter_values, regressor
+from delta_dynamics.fit_signals import Efforts, Signals, noise_of, signals_of
+from delta_dynamics.regressor import parameter_names, parameter_values, regressor
 from delta_dynamics.samples import (
     LEAST,
     WINDOWS,
@@ -41,6 +42,8 @@ LARGEST: Final = 1e9
 """Effort that no drive has, N m or N."""
 LATE: Final = 2.0
 """Samples by which efforts may well be late."""
+SHAKEN: Final = 3000
+"""Samples that show what the positions' noise does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,7 @@ class Rows:
     """Filtered rows of one recording: time (k,), table (k, n, parameters), target (k, n).
 
     ``rest``: what the parameters that stay need; ``counts``: what is judged; ``change``: of the
-    efforts in time, (k, n) each. ``period``: of the samples, s.
+    efforts in time, (k, n) each. ``period``: of the samples, s. ``signals``: of the same rows.
     """
 
     time: Array
@@ -76,13 +79,24 @@ class Rows:
     change: Array
     outliers: int
     period: float
+    signals: Signals
+
+    @property
+    def effort(self) -> Array:
+        """As measured, filtered, shape (k, n)."""
+        return self.target + self.rest
 
     def part(self, rows: slice) -> Rows:
         """Some of the rows."""
-        return Rows(
-            self.time[rows], self.table[rows], self.target[rows], self.rest[rows],
-            self.counts[rows], self.change[rows], self.outliers, self.period,
-        )  # fmt: skip
+        cut = ("time", "table", "target", "rest", "counts", "change")
+        return replace(self, **{name: getattr(self, name)[rows] for name in cut})
+
+    def only(self, columns: NDArray[np.bool_], values: Array) -> Rows:
+        """With some of the parameters, the others at these values, (parameters,)."""
+        stay = self.table[..., ~columns] @ values[~columns]
+        return replace(
+            self, table=self.table[..., columns], target=self.target - stay, rest=self.rest + stay
+        )
 
 
 def next_window(window: int) -> int:
@@ -120,8 +134,75 @@ def rows_of(
     time, table, target, rest, counts, change = (
         np.concatenate([one[k] for one in made]) for k in range(6)
     )
+    told = [part.rest + part.table @ first for part in parts]
+    rub = [_friction(robot, parameters, first, track.qd) for track in pieces]
+    left = [part.target - part.table @ first for part in parts]
+    shaken = _shaken(robot, parameters, r, (max(pieces, key=lambda t: len(t.time)), how), first)
+    noise = noise_of(left, shaken, pieces[0].period, how)
+    signals = signals_of(pieces, told, rub, how, noise)
     period = pieces[0].period
-    return Rows(time, table, target, rest, counts, change, outliers, period), how
+    return Rows(time, table, target, rest, counts, change, outliers, period, signals), how
+
+
+def efforts_of(
+    robot: Robot, parameters: FileParameters, carried: Robot | None, values: Array,
+    signals: Signals,
+) -> Efforts:  # fmt: skip
+    """What a motion beside a recording's needs at its rows, by all parameters of the file."""
+
+    def efforts(q: Array, qd: Array, qdd: Array) -> Array:
+        def block(rows: slice) -> Array:
+            motion = q[rows], qd[rows], qdd[rows], signals.wrench[rows]
+            table, rest = _columns(robot, parameters, carried, motion, signals.held[rows])
+            return np.asarray(rest + table @ values, np.float64)
+
+        return by_blocks(len(q), BLOCK, block)
+
+    return efforts
+
+
+def calm_table(
+    robot: Robot, parameters: FileParameters, carried: Robot | None, signals: Signals
+) -> Array:
+    """The parameters' columns at a recording's rows, without noise, (k, n, parameters)."""
+
+    def block(rows: slice) -> Array:
+        q, qd, qdd = (one[rows] for one in signals.motion)
+        motion = q, qd, qdd, signals.wrench[rows]
+        return _columns(robot, parameters, carried, motion, signals.held[rows])[0]
+
+    return by_blocks(len(signals.held), BLOCK, block)
+
+
+def _friction(robot: Robot, parameters: FileParameters, values: Array, qd: Array) -> Array:
+    """Of the drives, shape (samples, n)."""
+    pi = parameter_values(robot) + parameters.mixing @ (values - parameters.values)
+    by = dict(zip(parameter_names(robot), pi.tolist(), strict=True))
+    viscous, coulomb, offset = (
+        np.array([by[f"{joint}.{what}"] for joint in robot.joint_names])
+        for what in ("viscous", "coulomb", "offset")
+    )
+    return np.asarray(viscous * qd + coulomb * np.sign(qd) + offset, np.float64)
+
+
+def _shaken(
+    robot: Robot, parameters: FileParameters, r: Recorded, signals: tuple[Track, Filtering],
+    values: Array,
+) -> Array:  # fmt: skip
+    """What noise of the positions, as large as theirs, changes in the efforts, (samples, n)."""
+    track, how = signals
+    noise, rng = np.array(how.position_noise), np.random.default_rng(0)
+    edge = (how.window // 2 + 0.5) * track.period
+    inside = (r.time > track.time[0] - edge) & (r.time < track.time[-1] + edge)
+    some = np.flatnonzero(inside)[:SHAKEN]
+    time, q = r.time[some], r.q[some]
+    none, held = np.zeros((len(time), 6)), np.ones(len(time))
+    told = []
+    for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
+        pieces, _ = tracks(time, q + shake, np.zeros_like(q), none, held, how.window)
+        parts = [_piece(robot, parameters, r.carried, t, np.zeros(len(noise))) for t in pieces]
+        told.append(np.concatenate([part.rest + part.table @ values for part in parts]))
+    return np.asarray(told[1] - told[0], np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,24 +246,28 @@ def _check_efforts(robot: Robot, r: Recorded) -> None:
             )
 
 
+def _columns(
+    robot: Robot, parameters: FileParameters, carried: Robot | None,
+    motion: tuple[Array, Array, Array, Array], held: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """The parameters' columns of a motion (q, qd, qdd, wrench), and what the others need."""
+    pi = parameter_values(robot)
+    extra = np.zeros(len(pi)) if carried is None else parameter_values(carried) - pi
+    full = regressor(robot, *motion)
+    own = full @ parameters.mixing
+    rest = full @ pi - own @ parameters.values + held[:, None] * (full @ extra)
+    for where, group in zip(parameters.slices, parameters.groups, strict=True):
+        if group.kind == "payload":
+            own[..., where] *= held[:, None, None]
+    return own, rest
+
+
 def _piece(
     robot: Robot, parameters: FileParameters, carried: Robot | None, track: Track, slow: Array
 ) -> _Piece:
-    pi = parameter_values(robot)
-    extra = np.zeros(len(pi)) if carried is None else parameter_values(carried) - pi
-    loads = [
-        where
-        for where, group in zip(parameters.slices, parameters.groups, strict=True)
-        if group.kind == "payload"
-    ]
-
     def block(rows: slice) -> Array:
-        full = regressor(robot, track.q[rows], track.qd[rows], track.qdd[rows], track.wrench[rows])
-        own = full @ parameters.mixing
-        held = track.held[rows]
-        rest = full @ pi - own @ parameters.values + held[:, None] * (full @ extra)
-        for where in loads:
-            own[..., where] *= held[:, None, None]
+        motion = track.q[rows], track.qd[rows], track.qdd[rows], track.wrench[rows]
+        own, rest = _columns(robot, parameters, carried, motion, track.held[rows])
         return np.concatenate([own, rest[..., None]], -1)
 
     both = by_blocks(len(track.q), BLOCK, block)

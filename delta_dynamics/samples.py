@@ -178,11 +178,16 @@ def tracks(
 
 
 def low_pass(values: Array, period: float, how: Filtering) -> Array:
-    """Signals along the first axis, filtered without phase, thinned out, ends left out."""
+    """Signals along the first axis, filtered without phase, thinned out, ends left out.
+
+    With ``keep_every`` 0 all are kept, the ends too.
+    """
     if how.cutoff is None:
         return values
     sections = scipy.signal.butter(4, 2.0 * how.cutoff * period, output="sos")
     smooth = scipy.signal.sosfiltfilt(sections, values, axis=0)
+    if not how.keep_every:
+        return np.asarray(smooth, np.float64)
     # What the filter makes up at the ends dies out in a period of its cut-off.
     edge = min(int(1.0 / (how.cutoff * period)), len(values) // 4)
     return np.asarray(smooth[edge : len(values) - edge : how.keep_every], np.float64)

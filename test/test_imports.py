@@ -27,17 +27,20 @@ MAY = {
     "pkm_twin.mechanisms": CORE,
     "pkm_twin.export": CORE,
     "pkm_twin.design": CORE | TWINS,
+    "pkm_twin.identification": CORE,
     PURE: {"pkm_twin.machine"},
     "pkm_twin.streams": CORE | {PURE},
     "pkm_twin.state": STREAMS,
-    "delta_dynamics": STREAMS,
+    "delta_dynamics": STREAMS | {"pkm_twin.identification"},
     "stiffness_monitor": STREAMS,
     "pkm_twin.ros": STREAMS | {"pkm_twin.bags"},
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
     "pkm_twin.atlas": NODE | TWINS | {"pkm_twin.console"},
-    "pkm_twin.apps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.atlas", "pkm_twin.export"},
+    "pkm_twin.apps": NODE
+    | TWINS
+    | {"pkm_twin.console", "pkm_twin.atlas", "pkm_twin.export", "pkm_twin.identification"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
 CIRCLES = {frozenset({"pkm_twin.machine", "pkm_twin.kinematics"})}

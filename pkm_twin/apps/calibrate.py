@@ -22,11 +22,12 @@ from pkm_twin.apps.calibration import (
     calibrate,
     geometric,
 )
+from pkm_twin.apps.calibration_faults import Outlier
 from pkm_twin.apps.calibration_state import FRAME, TARGET, Errors, Poses, rotations
 from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
-from pkm_twin.apps.options import BeyondLimits, Json, RobotName
+from pkm_twin.apps.options import Accept, BeyondLimits, Json, RobotName
 from pkm_twin.console import file_name, print_json, progress, refuse_existing, table_console
 from pkm_twin.errors import ParameterError, UnknownNameError, one_line
 from pkm_twin.machine.edited import Fitted, edited_yaml, write_edited
@@ -35,6 +36,8 @@ from pkm_twin.machine.robot import Robot
 Array = NDArray[np.float64]
 
 ANGLES = ("roll", "pitch", "yaw")
+MOST_SHOWN = 10
+"""Outliers that are printed."""
 FARTHEST = 1e4
 """No instrument stands farther from what it measures, m."""
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -120,14 +123,20 @@ def calibrate_command(
         ),
     ] = 0.01,
     beyond_limits: BeyondLimits = False,
+    accept: Accept = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
     as_json: Json = False,
 ) -> None:
     """Fit a robot's geometry and joint offsets to poses that an instrument measured.
 
-    Weighted least squares on the machine's own closures, by their exact derivatives; what the poses
-    do not tell stays as the file has it, and is named. Every fourth pose is held out: the error
-    there, before and after, says what the calibration is worth.
+    Robust least squares on the machine's own closures, by their exact derivatives. A pose that does
+    not fit the others hardly counts and is named by its line. What the poses do not determine stays
+    as the file has it and is named. Every fourth pose is held out: the error there, before and
+    after, is the calibration's accuracy.
+
+    Poses that this machine cannot have been in are rejected with the reason, and so are poses in
+    another frame than the base's without --frame; --accept calibrates all the same and marks the
+    file.
     """
     from pkm_twin import load
 
@@ -152,8 +161,9 @@ def calibrate_command(
 
         result = calibrate(
             machine, measured, paths, offsets=offsets, frame=frame, target=target, prior=prior,
-            progress=step,
+            accept=accept, progress=step,
         )  # fmt: skip
+    marks = [*(f"accepted all the same: {fault}" for fault in result.faults), *notes]
     source = f"calibrated with {one_line(poses.name, 100)}"
     values = {
         p.name: Fitted(p.value, p.deviation, p.unit, source)
@@ -161,13 +171,17 @@ def calibrate_command(
         if p.name not in (*FRAME, *TARGET)
     }
     head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
-    write_edited(out, [*head, *notes], edited_yaml(machine, robot, values))
+    head += [f"Outlier, hardly counted: {_outlier_text(one)}." for one in result.outliers]
+    write_edited(out, [*head, *marks], edited_yaml(machine, robot, values))
     if as_json:
-        named = {"robot": machine.name, "out": str(out), "beyond_limits": notes}
+        named = {
+            "robot": machine.name, "out": str(out), "beyond_limits": notes,
+            "accepted": [str(fault) for fault in result.faults],
+        }  # fmt: skip
         print_json({**named, **as_data(result)})
         return
     _print(result)
-    for line in notes:
+    for line in marks:
         typer.echo(line)
     typer.echo(f"{out}: {len(values)} numbers")
 
@@ -187,6 +201,16 @@ def as_data(result: Calibration) -> dict[str, Any]:
             for p in result.parameters
         },
         "not_observed": list(result.unobserved),
+        "outliers": [
+            {
+                "row": one.index + 1,
+                "line": one.line,
+                "distance_m": one.distance,
+                "distance_rad": one.angle,
+                "sigmas": one.sigmas,
+            }
+            for one in result.outliers
+        ],
         "condition": result.condition,
         "noise_m": result.noise,
         "noise_rad": result.noise_angle,
@@ -228,9 +252,23 @@ def _print(result: Calibration) -> None:
     if result.noise_angle is not None:
         noise += f", {1e3 * result.noise_angle:.4f} mrad"
     typer.echo(f"noise that is left, an axis: {noise}; condition number {result.condition:.3g}")
-    for combination in result.unobserved:
-        text = " ".join(f"{weight:+.2f} {name}" for name, weight in combination.items())
-        typer.echo(f"not told by the poses, stays as the file has it: {text}")
+    for one in result.outliers[:MOST_SHOWN]:
+        typer.echo(f"outlier, hardly counted: {_outlier_text(one)}")
+    if len(result.outliers) > MOST_SHOWN:
+        typer.echo(f"{len(result.outliers) - MOST_SHOWN} more outliers: see --json")
+    open_lines = result.undetermined
+    if open_lines:
+        typer.echo("the poses do not determine, and the file's values stay:")
+    for line in open_lines:
+        typer.echo(f"  {line}")
+
+
+def _outlier_text(one: Outlier) -> str:
+    angle = "" if one.angle is None else f", {1e3 * one.angle:.3g} mrad"
+    return (
+        f"row {one.index + 1} (line {one.line}) is off by {1e3 * one.distance:.3g} mm{angle}, "
+        f"{one.sigmas:.3g} sigma"
+    )
 
 
 def _row(p: Parameter) -> tuple[str, ...]:

@@ -10,12 +10,23 @@ after are those of the loaded robots.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.apps.calibration_faults import (
+    MOVED,
+    Fault,
+    Outlier,
+    RejectedPosesError,
+    cost_of,
+    faults_of,
+    looks_placed,
+    outliers_of,
+    place_fault,
+)
 from pkm_twin.apps.calibration_state import (
     BESIDE,
     FRAME,
@@ -29,7 +40,9 @@ from pkm_twin.apps.calibration_state import (
     start_of,
     value_of,
 )
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
+from pkm_twin.identification.robust import Weighed, weighed
+from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.kinematics.maximal import GraphChange, Placement
 from pkm_twin.kinematics.sensitivity import platform_twists
 from pkm_twin.machine.entries import data_of, entries
@@ -37,8 +50,6 @@ from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import skew
 
 Array = NDArray[np.float64]
-Noise = tuple[float, float | None]
-"""Standard deviations: m an axis, and rad an axis where rotations were measured."""
 
 MOVES: Final = 1e-6
 """A number that moves the platform less than this, per unit, is no number of the geometry."""
@@ -51,12 +62,6 @@ SAME: Final = 1e-4
 SHOWN: Final = 0.1
 """Part of the greatest weight below which a number is not named in a combination."""
 STEPS: Final = 60
-WRONG: Final = 0.02
-"""Part of the machine's size that no fit may leave over: such poses are not its own."""
-TWISTED: Final = 0.05
-"""Angle an axis that no fit may leave over, rad: those are other angles, or other units."""
-FINEST: Final = 1e-9
-"""Noise that no instrument is below, m or rad."""
 POOR: Final = 0.25
 GOOD: Final = 0.75
 """Parts of what a linear machine would gain: below the one steps are damped more, above less."""
@@ -64,6 +69,10 @@ TRIALS: Final = 8
 """Dampings of a step that are tried."""
 CONVERGED: Final = 1e-3
 """Part of its deviation by which no parameter moves in the last step."""
+GAINED: Final = 1e-4
+"""Or by which the sum of squares over the noise falls."""
+CONTROLLER: Final = "controller units"
+"""Of a joint's sensor whose numbers are not the model's in rad or m."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
 
 
@@ -98,8 +107,30 @@ class Calibration:
     """Standard deviations of the measurement that the fit leaves, m an axis and rad an axis."""
     fitted: tuple[Errors, Errors]
     held_out: tuple[Errors, Errors]
-    """Before (frame and target of the measurement alone are fitted) and after."""
+    """Before (frame and target of the measurement alone are fitted) and after; no outliers."""
     steps: int
+    outliers: tuple[Outlier, ...] = ()
+    """Poses that do not fit the others, the worst first."""
+    faults: tuple[Fault, ...] = ()
+    """Why this machine was not in the poses, where they were accepted all the same."""
+    cost: float = 0.0
+    """Squares of the machine's changes over their prior standard deviations, summed."""
+    placed: bool = False
+    """Whether another place of the instrument may explain the poses better."""
+
+    @property
+    def _unknown(self) -> Array:
+        """Orthonormal directions, in units of the priors, that the poses do not tell, (p, u)."""
+        prior = np.array([p.prior for p in self.parameters])
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(prior, prior))
+        return np.asarray(vectors[:, values > KNOWN**2], np.float64)
+
+    @property
+    def undetermined(self) -> list[str]:
+        """What the poses do not determine, at most ten sentences: the file's values stay."""
+        names = [p.name for p in self.parameters]
+        prior = np.array([p.prior for p in self.parameters])
+        return undetermined(self.robot.graph, names, prior, self._unknown)
 
     @property
     def unobserved(self) -> tuple[dict[str, float], ...]:
@@ -108,10 +139,8 @@ class Calibration:
         What the file says stays along them; a number that is not observed may be in one whose
         other combinations are.
         """
-        prior = np.array([p.prior for p in self.parameters])
-        values, vectors = np.linalg.eigh(self.covariance / np.outer(prior, prior))
         found = []
-        for column in vectors[:, values > KNOWN**2].T:
+        for column in self._unknown.T:
             vector = column * np.sign(column[np.argmax(np.abs(column))])
             shown = np.abs(vector) > SHOWN * np.abs(vector).max()
             found.append(
@@ -163,16 +192,74 @@ def calibrate(
     frame: bool = False,
     target: bool = False,
     prior: float = 0.01,
+    accept: bool = False,
     progress: Callable[[int], None] = lambda _: None,
 ) -> Calibration:
     """Fit geometry, joint offsets and the instrument's frame and target to measured poses.
 
+    Poses that do not fit the others hardly count, and are named.
+
     :param paths: numbers of the robot's file, of :func:`geometric`.
     :param prior: standard deviation that lengths have without the poses, m; angles have it at the
         platform's radius.
-    :raises ParameterError: too few poses, poses of another machine or unit, poses that tell no
-        number, or a fit that does not settle.
+    :param accept: calibrate with poses that this machine was not in, too.
+    :raises ParameterError: too few poses, poses of another machine, unit or frame, poses that tell
+        no number, or a fit that does not settle.
     """
+    extra = [*(FRAME if frame else ()), *(TARGET if target else ())]
+    parameters = _parameters(robot, paths, offsets, extra, prior)
+
+    def fitted(frame: bool, parameters: Sequence[Parameter]) -> tuple[Calibration, State]:
+        return _calibrated(robot, poses, parameters, frame, prior, progress)
+
+    def placed() -> tuple[Calibration, State] | None:
+        """The same with the instrument's frame; None where that is no machine either."""
+        if frame:
+            return None
+        more = _parameters(robot, paths, offsets, [*FRAME, *extra], prior)
+        try:
+            other = fitted(True, more)
+        except PkmTwinError:
+            return None
+        return None if other[0].faults else other
+
+    try:
+        result, _ = fitted(frame, parameters)
+    except (_UnsettledError, UnreachableError) as error:
+        other = placed()
+        if other is None:
+            raise
+        raise RejectedPosesError(_place(other[1])) from error
+    if result.faults or result.cost > MOVED or result.placed:
+        other = placed()
+        if other is not None and (
+            result.faults or result.cost - other[0].cost > MOVED
+            or other[0].noise < 0.5 * result.noise
+        ):  # fmt: skip
+            result = replace(result, faults=(_place(other[1]), *result.faults))
+    if result.faults and not accept:
+        raise RejectedPosesError(result.faults[0])
+    return result
+
+
+class _UnsettledError(ParameterError):
+    """A fit that does not settle."""
+
+
+def _place(state: State) -> Fault:
+    tool = state.instrument
+    return place_fault(tool.place, tool.frame.as_rotvec())
+
+
+def _learnt(poses: Poses) -> NDArray[np.bool_]:
+    """Which poses are learnt from."""
+    return np.asarray(np.arange(len(poses.joints)) % HELD_OUT != HELD_OUT - 1)
+
+
+def _parameters(
+    robot: Robot, paths: Sequence[str], offsets: bool, extra: Sequence[str], prior: float
+) -> list[Parameter]:
+    """What is fitted, as it is before."""
     known = entries(robot)
     angle = prior / robot.size
     # A joint's value at home and its sensor's offset are one number.
@@ -182,31 +269,50 @@ def calibrate(
         Parameter(path, known[path][1], known[path][0], prior if known[path][1] == "m" else angle)
         for path in fitted
     ]
-    factors = robot.controller.factors
     if offsets:
         for joint, unit, factor, old in zip(
-            robot.joint_names, robot.joint_units, factors, robot.controller.offsets, strict=True
-        ):
+            robot.joint_names, robot.joint_units, robot.controller.factors,
+            robot.controller.offsets, strict=True,
+        ):  # fmt: skip
             size = (prior if unit == "m" else angle) * abs(factor)
-            parameters.append(Parameter(f"joint_map.{joint}.offset", unit, float(old), float(size)))
+            own = unit if abs(factor) == 1.0 else CONTROLLER
+            parameters.append(Parameter(f"joint_map.{joint}.offset", own, float(old), float(size)))
     # Where the instrument stands is not known at all.
     far = 100.0 * robot.engine.tree.size
-    extra = [*(FRAME if frame else ()), *(TARGET if target else ())]
-    parameters += [
+    return parameters + [
         Parameter(name, "rad" if name[-2] == "r" else "m", 0.0, 10.0 if name[-2] == "r" else far)
         for name in extra
     ]
-    held = np.arange(len(poses.joints)) % HELD_OUT == HELD_OUT - 1
-    learnt, judged = poses.part(~held), poses.part(held)
+
+
+def _looks_placed(
+    robot: Robot, state: State, poses: Poses, table: Array, told: Sequence[Parameter]
+) -> bool:
+    parts = state.parts(poses)
+    noise = weighed(parts, len(told))
+    six = _parameters(robot, (), False, FRAME, 1.0)
+    columns = _derivatives(robot, state, six)
+    halves = [columns[:, :3], columns[:, 3:]][: len(parts)]
+    asked = [(p.before - p.value) / p.prior for p in told]
+    return looks_placed(table, noise.over(halves), np.append(noise.over(parts), asked))
+
+
+def _calibrated(
+    robot: Robot, poses: Poses, parameters: Sequence[Parameter], frame: bool, prior: float,
+    progress: Callable[[int], None],
+) -> tuple[Calibration, State]:  # fmt: skip
+    """The fit with its faults, and the machine at the poses that are learnt from."""
+    rows = _learnt(poses)
+    learnt = poses.part(rows)
     # A pose that is measured again tells no more numbers.
     different = len(np.unique(np.round(learnt.joints / SAME), axis=0))
     equations = different * (3 if poses.rotation is None else 6)
-    if equations < len(parameters) + 6 or not held.any():
+    if equations < len(parameters) + 6 or rows.all():
         raise ParameterError(
             "poses", f"{different} different ones to learn from",
             f"enough for {len(parameters)} numbers to be fitted",
         )  # fmt: skip
-    instrument = [p for p in parameters if p.name in extra]
+    instrument = [p for p in parameters if p.name in (*FRAME, *TARGET)]
     start = start_of(robot, learnt)
     if frame:
         place_frame(start, learnt)
@@ -214,83 +320,93 @@ def calibrate(
     after, values, covariance, information, noise, steps = _fit(
         robot, before, learnt, parameters, progress
     )
-    most = max(prior, WRONG * robot.engine.tree.size)
-    if noise[0] > most:
-        raise ParameterError(
-            "poses", f"{noise[0]:.3g} m an axis left over", "poses of this machine, m and rad, its "
-            f"own joints beside them: at most {most:.3g} m",
-        )  # fmt: skip
-    steepest = max(prior / robot.engine.tree.size, TWISTED)
-    if noise[1] is not None and noise[1] > steepest:
-        raise ParameterError(
-            "poses", f"{noise[1]:.3g} rad an axis left over", "rotations of this machine from its "
-            f"home, rad, in the order and axes of the columns: at most {steepest:.3g} rad",
-        )  # fmt: skip
     built = type(robot).from_data(after.data, robot.name)
     deviations = np.sqrt(np.diag(covariance))
     told = [
         Parameter(p.name, p.unit, p.before, p.prior, float(v), float(d))
         for p, v, d in zip(parameters, values, deviations, strict=True)
     ]
+    outliers = outliers_of(after.instrument.parts(built, poses), noise.noise)
+    sound = np.ones(len(rows), bool)
+    sound[[one.index for one in outliers]] = False
+    shown = [
+        poses.part(which & sound if (which & sound).any() else which) for which in (rows, ~rows)
+    ]
+    fitted_errors, held_errors = (
+        (before.instrument.errors(robot, part), after.instrument.errors(built, part))
+        for part in shown
+    )
+    changes = [(p.name, p.unit, p.value - p.before, p.prior) for p in told]
+    faults = faults_of(noise, outliers, len(rows), changes, prior, robot.engine.tree.size)
     good = np.array([p.observed for p in told])
-    if not good.any():
+    if not good.any() and not faults:
         raise ParameterError(
             "poses", len(poses.joints), "poses apart from each other: these tell no number"
         )
     singular = np.linalg.svd(information[:, good], compute_uv=False)
-    fitted_errors, held_errors = (
-        (before.instrument.errors(robot, part), after.instrument.errors(built, part))
-        for part in (learnt, judged)
-    )
-    return Calibration(
-        built, tuple(told), covariance, float(singular[0] / singular[-1]), noise[0],
-        noise[1], fitted_errors, held_errors, steps,
+    condition = float(singular[0] / singular[-1]) if good.any() else np.inf
+    result = Calibration(
+        built, tuple(told), covariance, condition, noise.noise[0],
+        noise.noise[1] if len(noise.noise) > 1 else None, fitted_errors, held_errors, steps,
+        outliers, tuple(faults), cost_of(changes),
+        not frame and _looks_placed(robot, after, learnt, information, told),
     )  # fmt: skip
+    return result, after
 
 
 def _fit(
     robot: Robot, start: State, poses: Poses, parameters: Sequence[Parameter],
     progress: Callable[[int], None],
-) -> tuple[State, Array, Array, Array, Noise, int]:  # fmt: skip
-    """Least squares over all parameters, the noise found with them."""
+) -> tuple[State, Array, Array, Array, Weighed, int]:  # fmt: skip
+    """Robust least squares over all parameters, the noise found with them.
+
+    :raises ParameterError: it does not settle.
+    """
     state = start
     values = np.array([value_of(start, p.name, p.before) for p in parameters])
     centre = np.array([p.before for p in parameters])
     prior = np.array([p.prior for p in parameters])
 
-    def right(state: State, values: Array, noise: Noise) -> Array:
-        return np.concatenate([_over(state.residuals(poses), noise), (centre - values) / prior])
+    def right(state: State, values: Array, noise: Weighed) -> Array:
+        return np.concatenate([noise.over(state.parts(poses)), (centre - values) / prior])
 
-    damping = 0.0
+    damping, problem = 0.0, f"{STEPS} steps"
     for steps in range(1, STEPS + 1):
         progress(1)
-        noise = _noise(state, poses, len(parameters))
+        noise = weighed(state.parts(poses), len(parameters))
         columns = _derivatives(robot, state, parameters)
-        angular = None if poses.rotation is None else columns[:, 3:]
-        table = _over((columns[:, :3], angular), noise).reshape(-1, len(parameters))
+        halves = [columns[:, :3], columns[:, 3:]][: len(noise.noise)]
+        table = noise.over(halves)
         left, before = np.vstack([table, np.diag(1.0 / prior)]), right(state, values, noise)
         # In units of the prior no singular value is below one.
         _, sizes, axes = np.linalg.svd(left * prior, full_matrices=False)
         spread = prior[:, None] * axes.T / sizes
         covariance = spread @ spread.T
+        trial, gained = None, 0.0
         for _ in range(TRIALS):
             move = _move(left, before, np.sqrt(damping) / prior)
-            trial = _stepped(robot, state, poses, parameters, values, move)
-            settled = bool(np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))))
-            sums = [
-                float(row @ row)
-                for row in (before, before - left @ move, right(trial, values + move, noise))
-            ]
-            gained = (sums[0] - sums[2]) / max(sums[0] - sums[1], 1e-300)
-            if settled or gained > POOR:
-                break
+            small = bool(np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))))
+            sums = [float(row @ row) for row in (before, before - left @ move)]
+            settled = small or sums[0] - sums[1] < GAINED
+            try:
+                trial = _stepped(robot, state, poses, parameters, values, move)
+            except PkmTwinError as error:
+                # No machine has such numbers, or none of them is in these poses: a smaller step.
+                problem = str(error)
+            else:
+                row = right(trial, values + move, noise)
+                gained = (sums[0] - float(row @ row)) / max(sums[0] - sums[1], 1e-300)
+                if settled or gained > POOR:
+                    break
             damping = max(10.0 * damping, 1.0)
+        if trial is None:
+            break
         state, values = trial, values + move
         if settled:
             return state, values, covariance, table * prior, noise, steps
         if gained > GOOD:
             damping = 0.1 * damping if damping > 1.0 else 0.0
-    raise ParameterError("poses", f"{STEPS} steps", "poses to which a fit settles")
+    raise _UnsettledError("poses", problem, "poses to which a fit settles")
 
 
 def _move(left: Array, right: Array, damping: Array) -> Array:
@@ -315,28 +431,6 @@ def _stepped(
     turn = np.array([by.get(name, 0.0) for name in FRAME[3:]])
     new = dict(zip(names, (values + move).tolist(), strict=True))
     return moved(robot, state, poses, new, turn)
-
-
-def _noise(state: State, poses: Poses, parameters: int) -> Noise:
-    """Standard deviations of positions and rotations that the residuals tell."""
-    linear, angular = state.residuals(poses)
-    count = max(1, linear.size - parameters // (1 if angular is None else 2))
-    sizes = [
-        max(float(np.sqrt((part**2).sum() / count)), FINEST)
-        for part in (linear, angular)
-        if part is not None
-    ]
-    return sizes[0], sizes[1] if len(sizes) > 1 else None
-
-
-def _over(parts: tuple[Array, Array | None], noise: Noise) -> Array:
-    """Rows of positions, then of rotations, in units of their noise, the poses' axes flat."""
-    rows = [
-        part.reshape(part.shape[0] * 3, *part.shape[2:]) / size
-        for part, size in zip(parts, noise, strict=True)
-        if part is not None and size is not None
-    ]
-    return np.concatenate(rows)
 
 
 def _derivatives(robot: Robot, state: State, parameters: Sequence[Parameter]) -> Array:

@@ -93,10 +93,14 @@ class Instrument:
         apart = rotations().from_matrix(poses.rotation @ np.swapaxes(rotation, -1, -2))
         return poses.position - position, apart.as_rotvec()
 
+    def parts(self, robot: Robot, poses: Poses) -> list[Array]:
+        """Of a loaded robot: residuals of positions and, where measured, rotations, (k, 3) each."""
+        both = self.residuals(poses, *robot.platform(self.joints(robot, poses)))
+        return [part for part in both if part is not None]
+
     def errors(self, robot: Robot, poses: Poses) -> Errors:
         """Of a loaded robot."""
-        linear, angular = self.residuals(poses, *robot.platform(self.joints(robot, poses)))
-        sizes = [np.linalg.norm(part, axis=1) for part in (linear, angular) if part is not None]
+        sizes = [np.linalg.norm(part, axis=1) for part in self.parts(robot, poses)]
         pairs = [(float(np.sqrt(np.mean(size**2))), float(size.max())) for size in sizes]
         values = [value for pair in pairs for value in pair]
         return Errors(*values)
@@ -118,9 +122,10 @@ class State:
         name = self.graph.platform
         return self.placement.point(name, self.graph.origin), self.placement.rotation[name]
 
-    def residuals(self, poses: Poses) -> tuple[Array, Array | None]:
-        """As the instrument's, of the poses that are learnt from."""
-        return self.instrument.residuals(poses, *self.platform)
+    def parts(self, poses: Poses) -> list[Array]:
+        """The instrument's residuals of the poses that are learnt from, (k, 3) each."""
+        both = self.instrument.residuals(poses, *self.platform)
+        return [part for part in both if part is not None]
 
 
 def change_of(robot: Robot, data: dict[str, Any], path: str) -> GraphChange:

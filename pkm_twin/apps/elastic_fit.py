@@ -16,8 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics.estimation import Estimate, estimate
-from delta_dynamics.fit import HELD_OUT, SURE, Judged, Number, known
+from delta_dynamics.fit import SURE, Judged, Number, known
+from delta_dynamics.fit_solved import HELD_OUT
+from pkm_twin.apps.elastic_verdict import elastic_verdict, put_right
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.verdict import Verdict
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.shared import above_zero
 from stiffness_monitor.response import ElementResponse, element_response
@@ -42,8 +45,16 @@ SCALE: Final = 50.0
 """How many times softer or stiffer than the file says a machine may be as a whole."""
 LIKE: Final = 0.5
 """Correlation of deflections and loads from which the one speaks of the other's scale."""
+VARIES: Final = 4.0
+"""Variance over that of the noise from which on a direction says something of the elements."""
+HIDDEN: Final = 0.5
+"""The same of the variation that the robot's file makes of the loads."""
 UNEXPLAINED: Final = 0.9
-"""Part of the deflections' rms. A fit that a bound holds and that leaves more explains nothing."""
+"""Part of the deflections' variation: a fit that leaves more explains nothing."""
+UNLIKE: Final = 0.3
+"""Part of it from which a fault of the recording is looked for."""
+BETTER: Final = 0.85
+"""A recording has a fault if without it so much less is left."""
 SHOWN: Final = 0.1
 """Part of the greatest weight below which an element is no part of a combination."""
 
@@ -102,13 +113,12 @@ class ElasticFit:
     zeros: Array
     measured: NDArray[np.bool_]
     samples: int
-
-    @property
-    def told(self) -> int:
-        """How many combinations of factors are known."""
-        count = len(self.numbers)
-        own = self.estimate.covariance[:count, :count] / PRIOR**2
-        return int(np.sum(np.linalg.eigvalsh(own) < SURE**2))
+    told: int
+    """How many combinations of factors are known."""
+    verdict: Verdict
+    """Whether elastic elements explain the deflections."""
+    accepted: tuple[str, ...] = ()
+    """Why this machine cannot have made the recordings, where they were fitted all the same."""
 
     def of(self, status: str) -> tuple[Number, ...]:
         """The numbers of a status."""
@@ -141,13 +151,19 @@ class _Part:
 
 
 def fit_elements(
-    robot: Robot, recordings: Sequence[Deflected], update: Callable[[int], None] | None = None
+    robot: Robot,
+    recordings: Sequence[Deflected],
+    update: Callable[[int], None] | None = None,
+    *,
+    accept: bool = False,
 ) -> ElasticFit:
     """Fit a factor on the compliance of every elastic element.
 
     :param update: called with the number of recordings whose poses are solved.
+    :param accept: fit recordings that this machine cannot have made, too.
     :raises ParameterError: a robot without elastic members.
-    :raises PkmTwinError: recordings that are too short, or whose loads tell nothing.
+    :raises PkmTwinError: recordings that are too short, whose loads tell nothing, or that this
+        machine cannot have made.
     """
     parts = []
     for i, recording in enumerate(recordings):
@@ -159,31 +175,76 @@ def fit_elements(
         if update is not None:
             update(i + 1)
     _check_loads(recordings, robot)
-    _check_scale(parts)
+    faults = _scale_faults(parts)
+    refuse_faults(faults, accept)
     names = parts[0].response.names
-    found = _solve(parts, len(names))
+    try:
+        found, table = _solve(parts, len(names))
+    except PkmTwinError as error:
+        cause, _ = _best_put_right(robot, parts[0], len(names), np.inf)
+        raise PkmTwinError(f"{error}" + (f" ({cause}?)" if cause else "")) from None
     # What a bound holds at zero would be no compliance, and no file's.
     factors = np.maximum(found.values[: len(names)], STIFFEST)
-    before = np.array([robot.element_compliance.get(name, 1.0) for name in names])
-    deviations = np.sqrt(np.diag(found.covariance)[: len(names)])
-    numbers = tuple(
-        known(
-            ("element_compliance", name), "", float(b), float(b * f), float(b * d), float(PRIOR * b)
-        )
-        for name, b, f, d in zip(names, before, factors, deviations, strict=True)
-    )
+    zeros = found.values[len(names) :].reshape(len(parts), 6)
+    left = [
+        part.recording.deflection - part.response.deflection(part.recording.wrench, factors)[0] - z
+        for part, z in zip(parts, zeros, strict=True)
+    ]
+    verdict = elastic_verdict(
+        robot, AXES, [(part.response, part.recording.q, part.recording.wrench) for part in parts],
+        left, replace(found, values=np.concatenate([factors, zeros.ravel()])), table,
+        np.concatenate([np.ones(len(names)), np.zeros(zeros.size)]),
+    )  # fmt: skip
+    if not faults:
+        odd = verdict.answer == "does not explain"
+        faults = _unexplained(robot, parts, factors, zeros, odd)
+        refuse_faults(faults, accept)
+    numbers = _numbers(robot, names, factors, found, verdict)
     if all(number.status == "not excited" for number in numbers):
         raise PkmTwinError("no excitation: the loads tell nothing of any element's compliance")
-    zeros = found.values[len(names) :].reshape(len(parts), 6)
-    _check_explained(parts, factors, zeros, found.bound)
+    plain = found.covariance[: len(names), : len(names)]
+    found = replace(found, covariance=verdict.widened(found.covariance))
     own = found.covariance[: len(names), : len(names)]
     judged = tuple(
         _judged(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True)
     )
     return ElasticFit(
-        robot, found, numbers, groups_of(names, factors, found.covariance), judged, zeros,
+        robot, found, numbers, groups_of(names, factors, plain, own), judged, zeros,
         np.array([part.measured for part in parts]), sum(part.split for part in parts),
+        int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < SURE**2)), verdict,
+        tuple(faults),
     )  # fmt: skip
+
+
+def refuse_faults(faults: Sequence[str], accept: bool) -> None:
+    """Refuse recordings that a machine cannot have made.
+
+    :raises PkmTwinError: by the first fault, where they are not accepted all the same.
+    """
+    if faults and not accept:
+        raise PkmTwinError(f"{faults[0]}; --accept fits it all the same")
+
+
+def _numbers(
+    robot: Robot, names: Sequence[str], factors: Array, found: Estimate, verdict: Verdict
+) -> tuple[Number, ...]:
+    """Of the elements: known by the noise alone, their deviations by the verdict too."""
+    own, wide = (
+        np.sqrt(np.diag(one)[: len(names)])
+        for one in (found.covariance, verdict.widened(found.covariance))
+    )
+    numbers = []
+    for name, factor, plain, told in zip(names, factors, own, wide, strict=True):
+        before = float(robot.element_compliance.get(name, 1.0))
+        number = known(
+            ("element_compliance", name), "", before, float(before * factor),
+            float(before * plain), PRIOR * before,
+        )  # fmt: skip
+        if number.status != "not excited":
+            withheld = verdict.deviations == "withheld"
+            number = replace(number, deviation=np.nan if withheld else float(before * told))
+        numbers.append(number)
+    return tuple(numbers)
 
 
 def _check(recording: Deflected) -> None:
@@ -220,11 +281,12 @@ def _check_loads(recordings: Sequence[Deflected], robot: Robot) -> None:
         )
 
 
-def _check_scale(parts: Sequence[_Part]) -> None:
+def _scale_faults(parts: Sequence[_Part]) -> list[str]:
     """Deflections and the file's own, without the instrument's zero, over all directions at once.
 
-    :raises PkmTwinError: they are alike but for a factor that no machine is off by.
+    :returns: recordings in which they are alike but for a factor that no machine is off by.
     """
+    faults = []
     for part in parts:
         r = part.recording
         moved, _ = part.response.deflection(r.wrench, np.ones(len(part.response.names)))
@@ -238,39 +300,82 @@ def _check_scale(parts: Sequence[_Part]) -> None:
         if abs(like) < LIKE:
             continue
         if both < 0.0:
-            raise PkmTwinError(
+            faults.append(
                 f"{r.name}: the platform moves against its loads: signs, or the axes of either"
             )
-        if not 1.0 / SCALE <= both / own <= SCALE:
-            raise PkmTwinError(
+        elif not 1.0 / SCALE <= both / own <= SCALE:
+            faults.append(
                 f"{r.name}: deflections are {both / own:.3g} times what the robot's file makes of "
                 "the loads: units? m and rad, N and N m"
             )
+    return faults
 
 
-def _check_explained(parts: Sequence[_Part], factors: Array, zeros: Array, bound: bool) -> None:
-    """Refuse what is no fit: against all loads, and nothing left out of it.
+def _part_left(part: _Part, factors: Array, zero: Array) -> float:
+    """The part of the fitted deflections' variation that is left, beside noise between neighbours.
 
-    :raises PkmTwinError: the same would be left of deflections of another machine.
+    Over all measured directions that vary by more than their noise or would by the robot's file,
+    each by its own variation; zero where none does.
     """
-    if not bound:
-        return
-    explained = False
+    moved, _ = part.response.deflection(part.recording.wrench, factors)
+    told = (part.recording.deflection - zero)[: part.split, part.measured]
+    left = told - moved[: part.split, part.measured]
+    size = np.nanmean((told - np.nanmean(told, 0)) ** 2, 0)
+    noise = 0.5 * np.nanmean(np.diff(told, axis=0) ** 2, 0)
+    expected, _ = part.response.deflection(part.recording.wrench, np.ones(len(factors)))
+    due = np.nanvar(expected[: part.split, part.measured], 0)
+    good = (size > VARIES * noise) | (due > HIDDEN * noise)
+    if not good.any():
+        return 0.0
+    return float(np.sqrt(np.mean(np.nanmean(left**2, 0)[good] / size[good])))
+
+
+def _unexplained(
+    robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Array, odd: bool
+) -> list[str]:
+    """Recordings that no compliance of this robot explains, each with the likely fault.
+
+    A direction of noise alone is no fault where others are explained.
+
+    :param odd: the verdict is that the model does not explain them.
+    """
+    faults = []
     for part, zero in zip(parts, zeros, strict=True):
-        moved, _ = part.response.deflection(part.recording.wrench, factors)
-        told = (part.recording.deflection - zero)[: part.split, part.measured]
-        left = told - moved[: part.split, part.measured]
-        size = np.nanmean((told - np.nanmean(told, 0)) ** 2, 0)
-        explained |= bool((np.nanmean(left**2, 0) < UNEXPLAINED**2 * size).any())
-    if not explained:
-        raise PkmTwinError(
-            "no compliance of this robot explains the deflections: other loads, poses or axes than "
-            "the recording's?"
-        )
+        left = _part_left(part, factors, zero)
+        if left < UNLIKE and not odd:
+            continue
+        cause, best = _best_put_right(robot, part, len(factors), left)
+        if cause and best < BETTER * left:
+            faults.append(
+                f"{part.recording.name}: {cause}: put right, elastic elements leave "
+                f"{100 * best:.2g} % of the deflections' variation, as recorded {100 * left:.2g} %"
+            )
+        elif left > UNEXPLAINED:
+            faults.append(
+                f"{part.recording.name}: no compliance of this robot explains the deflections: "
+                "other loads, poses or axes than the recording's?"
+            )
+    return faults
 
 
-def _solve(parts: Sequence[_Part], count: int) -> Estimate:
-    """Of the factors and the zeros, by steps of linear least squares."""
+def _best_put_right(robot: Robot, part: _Part, count: int, most: float) -> tuple[str, float]:
+    """The fault without which the least is left of a recording, and how much; at most ``most``."""
+    r, best, cause = part.recording, most, ""
+    for text, wrench, deflection in put_right(robot, r.q, r.wrench, r.deflection):
+        other = replace(part, recording=replace(r, wrench=wrench, deflection=deflection))
+        try:
+            found, _ = _solve([other], count)
+        except (PkmTwinError, np.linalg.LinAlgError):
+            continue
+        factors = np.maximum(found.values[:count], STIFFEST)
+        left = _part_left(other, factors, found.values[count:])
+        if left < best:
+            best, cause = left, text
+    return cause, best
+
+
+def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
+    """Of the factors and the zeros, by steps of linear least squares; and the columns of both."""
     factors = np.ones(count)
     sizes = [np.nan_to_num(np.sqrt(np.nanmean(_measured(part) ** 2, 0))) for part in parts]
     scales = np.concatenate([np.full(count, PRIOR), *(np.maximum(s, 1e-12) for s in sizes)])
@@ -291,7 +396,7 @@ def _solve(parts: Sequence[_Part], count: int) -> Estimate:
         moved = np.abs(new - factors) / np.sqrt(np.diag(found.covariance)[:count])
         factors = new
         if moved.max() < CONVERGED:
-            return found
+            return found, table
     raise PkmTwinError(
         f"the compliances do not settle in {STEPS} steps: no compliance of this robot explains the "
         "deflections, or loads in more directions are needed"
@@ -333,13 +438,17 @@ def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judg
     return Judged(r.name, r.time[end], measured, before[end], after[end], spread[end])
 
 
-def groups_of(names: Sequence[str], factors: Array, covariance: Array) -> tuple[Group, ...]:
+def groups_of(
+    names: Sequence[str], factors: Array, covariance: Array, wide: Array | None = None
+) -> tuple[Group, ...]:
     """Elements that share a direction that is not known, and the directions that are.
 
-    :param factors: shape (elements,). ``covariance``: of them, and of more behind them.
+    :param factors: shape (elements,). ``covariance``: of them by the noise alone, and of more
+        behind them. ``wide``: with what the model does not explain; default the same.
     """
     count = len(names)
     own = covariance[:count, :count] / PRIOR**2
+    full = own if wide is None else wide[:count, :count] / PRIOR**2
     values, vectors = np.linalg.eigh(own)
     unknown = vectors[:, values > SURE**2]
     shared = np.abs(unknown @ unknown.T)
@@ -351,11 +460,14 @@ def groups_of(names: Sequence[str], factors: Array, covariance: Array) -> tuple[
             edge = {j for i in edge for j in left - group if shared[i, j] > SHOWN}
         left -= group
         if len(group) > 1:
-            groups.append(_group(sorted(group), names, factors, own))
+            groups.append(_group(sorted(group), names, factors, (own, full)))
     return tuple(groups)
 
 
-def _group(members: list[int], names: Sequence[str], factors: Array, own: Array) -> Group:
+def _group(
+    members: list[int], names: Sequence[str], factors: Array, covariances: tuple[Array, Array]
+) -> Group:
+    own, wide = covariances
     values, vectors = np.linalg.eigh(own[np.ix_(members, members)])
     told = []
     for value, vector in zip(values, vectors.T, strict=True):
@@ -364,7 +476,7 @@ def _group(members: list[int], names: Sequence[str], factors: Array, own: Array)
         weights = vector * np.sign(vector[np.argmax(np.abs(vector))])
         weights[np.abs(weights) < SHOWN * np.abs(weights).max()] = 0.0
         weights /= np.linalg.norm(weights)
-        deviation = float(np.sqrt(weights @ own[np.ix_(members, members)] @ weights)) * PRIOR
+        deviation = float(np.sqrt(weights @ wide[np.ix_(members, members)] @ weights)) * PRIOR
         told.append(
             Combination(
                 {names[k]: float(w) for k, w in zip(members, weights, strict=True) if w},

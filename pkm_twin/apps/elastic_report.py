@@ -21,6 +21,7 @@ from pkm_twin.apps.fit_report import (
     html_table,
     numbers_table,
     picture,
+    verdict_section,
 )
 from pkm_twin.atlas.plots import COLOURS, columns
 from pkm_twin.console import table_console
@@ -34,8 +35,11 @@ UNITS = ("m",) * 3 + ("rad",) * 3
 def as_json(result: ElasticFit) -> dict[str, Any]:
     """Plain data, units in the keys or beside the numbers; null for what was not measured."""
     e = result.estimate
+    names = tuple(str(n.key[-1]) for n in result.numbers)
     return {
         "robot": result.robot.name,
+        "verdict": result.verdict.as_json(_units(result), names),
+        "accepted": list(result.accepted),
         "condition": e.condition if np.isfinite(e.condition) else None,
         "combinations_determined": result.told,
         "held_by_a_physical_bound": e.bound,
@@ -44,7 +48,8 @@ def as_json(result: ElasticFit) -> dict[str, Any]:
             {
                 "key": number.name, "element": number.key[-1], "unit": "of the file's compliance",
                 "before": number.before, "value": number.after,
-                "standard_deviation": number.deviation, "status": number.status,
+                "standard_deviation": number.deviation if np.isfinite(number.deviation) else None,
+                "status": number.status,
             }
             for number in result.numbers
         ],
@@ -80,6 +85,19 @@ def as_json(result: ElasticFit) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _units(result: ElasticFit) -> tuple[str, ...]:
+    """Of the directions that were measured."""
+    return tuple(UNITS[AXES.index(one.name)] for one in result.verdict.channels)
+
+
+def verdict_lines(result: ElasticFit) -> list[str]:
+    """Whether elastic elements explain the deflections, in sentences."""
+    names = tuple(f"the factor of {n.key[-1]}" for n in result.numbers)
+    verdict = result.verdict
+    told = verdict.blind_lines(names, ("",) * len(names))
+    return [*verdict.lines(_units(result)), *told]
+
+
 def _listed(values: Array) -> list[float | None]:
     return [float(v) if np.isfinite(v) else None for v in values]
 
@@ -90,6 +108,7 @@ def yaml_head(result: ElasticFit, recordings: Sequence[str]) -> list[str]:
         f"Elastic elements fitted from {', '.join(recordings)}: {result.told} combinations, "
         f"condition number {result.estimate.condition:.3g}."
     ]
+    lines += [f"Verdict: {line}." for line in result.verdict.lines(_units(result))]
     lines += [f"{text}." for text in map(group_text, result.groups)]
     for judged in result.judged:
         before, after = (
@@ -123,9 +142,7 @@ def print_fit(result: ElasticFit) -> None:
     table.add_column("")
     for n in _shown(result):
         note = "only together with others" if n.status == "combination" else ""
-        table.add_row(
-            str(n.key[-1]), f"{n.before:.6g}", f"{n.after:.6g}", f"{n.deviation:.2g}", note
-        )
+        table.add_row(str(n.key[-1]), f"{n.before:.6g}", f"{n.after:.6g}", n.spread, note)
     table_console().print(table)
     idle = result.of("not excited")
     if idle:
@@ -137,6 +154,8 @@ def print_fit(result: ElasticFit) -> None:
     typer.echo(f"condition number {e.condition:.3g}, {result.told} combinations")
     if e.bound:
         typer.echo("held by a bound: the data alone want a negative compliance")
+    for line in verdict_lines(result):
+        typer.echo(line)
     for row in _residual_rows(result):
         name, axis, before, after, _, unit = row
         typer.echo(f"{name}, held out, {axis}: residual {before} before, {after} {unit} now")
@@ -165,6 +184,9 @@ def elastic_page(result: ElasticFit, recordings: Sequence[str], notes: Sequence[
     shown = _shown(result)
     parts = [HEAD_OF_PAGE.format(title=title)]
     parts += [f"<p>{html.escape(line)}</p>" for line in notes]
+    told = verdict_lines(result)[len(result.verdict.lines(_units(result))) :]
+    parts.append("<h2>Does the model explain the recordings?</h2>")
+    parts.append(verdict_section(result.verdict, _units(result), told))
     parts += ["<h2>Compliance of the elements</h2>", numbers_table(shown)]
     parts.append(
         "<p>Each number multiplies what the file says of an element's compliance. "

@@ -94,7 +94,7 @@ def excite(
     machine = load(robot)
     judge = Judge.of(machine, file_parameters(machine, kinds_of(what)))
     other = None if beside is None else _condition_of(beside, judge)
-    bounds = Bounds(share, acceleration, singularity)
+    bounds = Bounds(share, acceleration, singularity, rate)
     with progress("excite", trials) as update:
         best = design(judge, duration, harmonics, bounds, trials=trials, seed=seed, progress=update)
     time = np.arange(round(duration * rate) + 1) / rate

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
-from pkm_twin.apps.options import BagTopics, BeyondLimits, Json, LoadTimes, Payload, load_of
+from pkm_twin.apps.options import Accept, BagTopics, BeyondLimits, Json, LoadTimes, Payload, load_of
 from pkm_twin.console import file_name, print_json, progress, refuse_existing, table_console
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError, one_line
 from pkm_twin.files import replace_file
@@ -55,6 +55,7 @@ def fit(
     payload: Payload = None,
     load_times: LoadTimes = None,
     beyond_limits: BeyondLimits = False,
+    accept: Accept = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="replace the YAML and the report")
     ] = False,
@@ -68,8 +69,13 @@ def fit(
     held out and judged.
 
     The YAML is the robot's file with new numbers, each with its standard deviation in a comment.
-    What the motion does not show keeps the file's value and is named. --payload and --load-times
-    tell of a payload that is known, or, with `payload` among what is fitted, when it is held.
+    What the motion does not show keeps the file's value and is named. A recording that this machine
+    cannot have made is rejected with the reason; --accept fits it all the same and marks the files.
+    A verdict says whether the model explains the recordings, what does not fit and which error is
+    likely; where it does not, standard deviations are widened or withheld.
+
+    --payload and --load-times tell of a payload that is known, or, with `payload` among what is
+    fitted, when it is held.
 
     `--what compliance` fits a factor on the compliance of every elastic element (member or joint)
     to measured loads and deflections: in a bag the wrench and a TransformStamped; CSV columns
@@ -92,7 +98,7 @@ def fit(
             )
         _fit_compliance(
             robot, recordings, what, topic, out, page if report else None, json_output,
-            beyond_limits,
+            beyond_limits, accept,
         )  # fmt: skip
         return
     kinds = kinds_of(what)
@@ -100,17 +106,19 @@ def fit(
     carried = load_of(payload, load_times)
     with progress("fit", 2 * len(recordings)) as update:
         result, beyond = fit_recordings(
-            machine, recordings, kinds, topic, carried, update, limited=not beyond_limits
-        )
+            machine, recordings, kinds, topic, carried, update, limited=not beyond_limits,
+            accept=accept,
+        )  # fmt: skip
+    marks = [*(f"accepted all the same: {line}" for line in result.accepted), *beyond]
     names = [one_line(path.name, 100) for path in recordings]
     fitted = fitted_yaml(text, result, names)
     _check_loads(fitted, out)
     try:
-        write_edited(out, [*yaml_head(result, names), *beyond], fitted)
+        write_edited(out, [*marks, *yaml_head(result, names)], fitted)
         if report:
             from pkm_twin.apps.fit_report import fit_page
 
-            replace_file(page, fit_page(result, names, beyond).encode())
+            replace_file(page, fit_page(result, names, marks).encode())
     except OSError as error:
         raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
     if json_output:
@@ -118,7 +126,7 @@ def fit(
         print_json(as_json(result) | files | {"beyond_limits": beyond})
         return
     _print(result)
-    for line in beyond:
+    for line in marks:
         typer.echo(line)
     typer.echo(f"{out}" + (f", {page}" if report else ""))
 
@@ -161,7 +169,7 @@ def _beyond(machine: Any, recordings: Sequence[tuple[str, Array]], limited: bool
 
 def _fit_compliance(
     robot: str, recordings: Sequence[Path], what: str, topics: Sequence[str], out: Path,
-    page: Path | None, json_output: bool, beyond_limits: bool,
+    page: Path | None, json_output: bool, beyond_limits: bool, accept: bool,
 ) -> None:  # fmt: skip
     """The fit of elastic elements, its files and what it says."""
     from pkm_twin.apps import elastic_report
@@ -180,14 +188,15 @@ def _fit_compliance(
             read.append(read_deflected(path, machine, topics))
             update(len(read))
         beyond = _beyond(machine, [(r.name, r.q) for r in read], not beyond_limits)
-        result = fit_elements(machine, read, lambda k: update(len(recordings) + k))
+        result = fit_elements(machine, read, lambda k: update(len(recordings) + k), accept=accept)
+    marks = [*(f"accepted all the same: {line}" for line in result.accepted), *beyond]
     names = [one_line(path.name, 100) for path in recordings]
     fitted = fitted_yaml(text, result, names)
     _check_loads(fitted, out)
     try:
-        write_edited(out, [*elastic_report.yaml_head(result, names), *beyond], fitted)
+        write_edited(out, [*marks, *elastic_report.yaml_head(result, names)], fitted)
         if page is not None:
-            replace_file(page, elastic_report.elastic_page(result, names, beyond).encode())
+            replace_file(page, elastic_report.elastic_page(result, names, marks).encode())
     except OSError as error:
         raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
     if json_output:
@@ -198,7 +207,7 @@ def _fit_compliance(
         )
         return
     elastic_report.print_fit(result)
-    for line in beyond:
+    for line in marks:
         typer.echo(line)
     typer.echo(f"{out}" + (f", {page}" if page is not None else ""))
 
@@ -211,10 +220,12 @@ def fit_recordings(
     carried: Any = None,
     update: Callable[[int], None] | None = None,
     limited: bool = True,
+    accept: bool = False,
 ) -> tuple[Any, list[str]]:
     """The fit of recordings, read as ``pkm-twin fit`` reads them.
 
     :param limited: refuse what is beyond the robot's limits.
+    :param accept: fit recordings that the machine cannot have made, too.
     :returns: a :class:`delta_dynamics.fit.Fit`, and a line on each joint beyond its limits.
     :raises PkmTwinError: a recording without efforts, too short, or that shows nothing.
     """
@@ -244,7 +255,7 @@ def fit_recordings(
             recorded = _away_from_changes(recorded, load)
             held = load.held(recorded.time).astype(np.float64)
         made.append(dataclasses.replace(recorded, held=held, carried=known))
-    return fit_robot(base, made, kinds, progress=update), beyond
+    return fit_robot(base, made, kinds, accept=accept, progress=update), beyond
 
 
 def _away_from_changes(recorded: Any, load: Any) -> Any:
@@ -316,6 +327,8 @@ def as_json(result: Any) -> dict[str, Any]:
     units = result.robot.effort_units
     return {
         "robot": result.robot.name,
+        "verdict": result.verdict.as_json(units, result.parameters.names),
+        "accepted": list(result.accepted),
         "condition": e.condition if np.isfinite(e.condition) else None,
         "combinations_determined": e.directions,
         "held_by_a_physical_bound": e.bound,
@@ -325,7 +338,8 @@ def as_json(result: Any) -> dict[str, Any]:
         "parameters": [
             {
                 "key": number.name, "unit": number.unit, "before": number.before,
-                "value": number.after, "standard_deviation": number.deviation,
+                "value": number.after,
+                "standard_deviation": number.deviation if np.isfinite(number.deviation) else None,
                 "status": number.status,
             }
             for number in result.numbers
@@ -354,6 +368,15 @@ def as_json(result: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def verdict_lines(result: Any) -> list[str]:
+    """Whether the model explains the recordings, in sentences."""
+    names, units = result.parameters.names, result.parameters.units
+    verdict = result.verdict
+    told: list[str] = verdict.lines(result.robot.effort_units)
+    told += verdict.blind_lines(names, units)
+    return told
+
+
 def _print(result: Any) -> None:
     table = Table(box=None)
     for name, side in (("", "left"), ("before", "right"), ("now", "right"), ("+-", "right")):
@@ -364,9 +387,7 @@ def _print(result: Any) -> None:
         if n.status == "not excited":
             continue
         note = "only together with others" if n.status == "combination" else ""
-        table.add_row(
-            n.name, f"{n.before:.6g}", f"{n.after:.6g}", f"{n.deviation:.2g}", n.unit, note
-        )
+        table.add_row(n.name, f"{n.before:.6g}", f"{n.after:.6g}", n.spread, n.unit, note)
     console = table_console()
     console.print(table)
     idle = result.of("not excited")
@@ -379,6 +400,8 @@ def _print(result: Any) -> None:
     typer.echo(f"condition number {e.condition:.3g} over {e.directions} combinations")
     if e.bound:
         typer.echo("held by a bound: the data alone want negative friction or no possible body")
+    for line in verdict_lines(result):
+        typer.echo(line)
     for judged, delay in zip(result.judged, result.delays, strict=True):
         typer.echo(f"{judged.name}: efforts late by {1e3 * delay:.3g} ms")
         before, after = judged.rms(judged.before), judged.rms(judged.after)

@@ -62,6 +62,7 @@ def yaml_head(result: Fit, recordings: Sequence[str]) -> list[str]:
         f"Fitted from {', '.join(recordings)}: {e.directions} combinations, condition number "
         f"{e.condition:.3g}."
     ]
+    lines += [f"Verdict: {line}." for line in result.verdict.lines(result.robot.effort_units)]
     for judged in result.judged:
         before, after = (
             ", ".join(f"{v:.3g}" for v in judged.rms(which))
@@ -88,7 +89,7 @@ def fitted_yaml(text: str, result: Fitted, recordings: Sequence[str]) -> str:
             continue
         values[base] = _value(base, numbers)
         told = [n for n in numbers if n.status != "not excited"]
-        spread = ", ".join(f"{n.deviation:.2g}" for n in told)
+        spread = ", ".join(n.spread for n in told)
         alone = all(n.status == "fitted" for n in told)
         how = "" if alone else "; known only together with others"
         was = ", ".join(f"{n.before:.6g}" for n in told)

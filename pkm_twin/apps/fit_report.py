@@ -12,6 +12,7 @@ import numpy as np
 
 from delta_dynamics.fit import Fit, Number
 from pkm_twin.atlas.plots import COLOURS, columns, rendered
+from pkm_twin.identification.verdict import Verdict
 
 HEAD_OF_PAGE: Final = """<!DOCTYPE html>
 <html lang="en">
@@ -44,6 +45,12 @@ def fit_page(result: Fit, recordings: Sequence[str], notes: Sequence[str] = ()) 
     parts = [
         HEAD_OF_PAGE.format(title=title),
         *(f"<p>{html.escape(line)}</p>" for line in notes),
+        "<h2>Does the model explain the recordings?</h2>",
+        verdict_section(
+            result.verdict,
+            result.robot.effort_units,
+            result.verdict.blind_lines(result.parameters.names, result.parameters.units),
+        ),
         "<h2>What was fitted</h2>",
         numbers_table(_shown(result)),
     ]
@@ -72,6 +79,27 @@ def fit_page(result: Fit, recordings: Sequence[str], notes: Sequence[str] = ()) 
     return "\n".join([*parts, "</body>", "</html>", ""])
 
 
+def verdict_section(verdict: Verdict, units: tuple[str, ...], more: Sequence[str]) -> str:
+    """The verdict's sentences, and the residual by channel.
+
+    :param units: of the channels. ``more``: further sentences.
+    """
+    lines = [*verdict.lines(units), *more]
+    text = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+    rows = [
+        (
+            c.name, f"{c.residual:.3g}", f"{c.noise:.3g}", unit, f"{100 * c.left:.2g} %",
+            f"{c.held_out:.3g}",
+        )
+        for c, unit in zip(verdict.channels, units, strict=True)
+    ]  # fmt: skip
+    header = (
+        "", "residual in the band of the motion (rms)", "noise there (rms)", "unit",
+        "variation without a known cause", "held out over fitted",
+    )  # fmt: skip
+    return f"<ul>{text}</ul>{html_table(header, rows)}"
+
+
 def html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table of plain texts."""
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
@@ -86,7 +114,7 @@ def numbers_table(numbers: Sequence[Number]) -> str:
     return html_table(
         ("number", "before", "now", "+-", "unit", ""),
         [
-            (n.name, f"{n.before:.6g}", f"{n.after:.6g}", f"{n.deviation:.2g}", n.unit,
+            (n.name, f"{n.before:.6g}", f"{n.after:.6g}", n.spread, n.unit,
              WORDS[n.status])
             for n in numbers
         ],
@@ -131,9 +159,10 @@ def changes_figure(shown: Sequence[Number]) -> Any:
     figure.set_size_inches(9, 1 + 0.25 * len(shown))
     places = np.arange(len(shown))[::-1]
     for place, n in zip(places, shown, strict=True):
-        size = max(abs(n.before), abs(n.after), 3 * n.deviation, 1e-300)
+        deviation = n.deviation if np.isfinite(n.deviation) else 0.0
+        size = max(abs(n.before), abs(n.after), 3 * deviation, 1e-300)
         colour = COLOURS[0] if n.status == "fitted" else COLOURS[4]
-        ax.errorbar(n.after / size, place, xerr=3 * n.deviation / size, fmt="o", color=colour)
+        ax.errorbar(n.after / size, place, xerr=3 * deviation / size, fmt="o", color=colour)
         ax.plot(n.before / size, place, "x", color="0.4")
     ax.set_yticks(places, [n.name for n in shown], fontsize=8)
     ax.set_xlim(-2, 2)

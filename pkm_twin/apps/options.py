@@ -44,6 +44,10 @@ BeyondLimits = Annotated[
     bool,
     typer.Option("--beyond-limits", help="compute outside the joints' limits too, and mark it"),
 ]
+Accept = Annotated[
+    bool,
+    typer.Option("--accept", help="use data that this machine cannot have made too, and mark it"),
+]
 Platform = Annotated[
     Optional[str],  # noqa: UP045  typer reads it
     typer.Option(help="of a URDF, the link that carries the tool", show_default=False),

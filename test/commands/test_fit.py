@@ -2,6 +2,7 @@
 """`pkm-twin fit` and `pkm-twin excite` as a user runs them."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -200,9 +201,28 @@ def test_numbers_that_are_no_recording_of_this_machine(
     assert done.code == 1
     assert text in done.one_line_error()
     assert not list(tmp_path.glob("fitted*"))
+    if text.endswith("units?") and how(1.0) > 1.0:
+        done = command(
+            capsys, "fit", "five_bar", "m.csv", "--what", "friction", "--accept", "--json"
+        )
+        assert done.code == 0, done.err
+        data = json.loads(done.out)
+        (reason,) = data["accepted"]
+        for marked in (Path("fitted.yaml"), Path("fitted.html")):
+            assert "accepted all the same" in marked.read_text()
+        assert "units?" in reason and data["verdict"]["model"] != "explains"
+        assert {p["standard_deviation"] for p in data["parameters"]} == {None}
     if column == "position":
         done = command(
-            capsys, "fit", "five_bar", "m.csv", "--what", "friction", "--beyond-limits", "--json"
+            capsys,
+            "fit",
+            "five_bar",
+            "m.csv",
+            "--what",
+            "friction",
+            "--beyond-limits",
+            "--accept",
+            "--json",
         )
-        # Marked, or not reachable there at all.
+        # Marked, or not reachable there at all: what moves so is no machine of this file.
         assert "beyond limits" in done.out or "unreachable" in done.err

@@ -70,7 +70,7 @@ def test_an_instruments_zero_is_found_and_a_direction_may_be_missing():
     np.testing.assert_allclose(result.zeros[1, :3], zero[:3], atol=5e-8)
     assert within(result, TRUTH)
     # Nor is it so sure of nothing that all is within.
-    assert max(n.deviation for n in result.numbers if n.key[-1].endswith("B")) < 0.02
+    assert max(n.deviation for n in result.numbers if n.key[-1].endswith("B")) < 0.025
 
 
 def test_what_noise_hides_is_named_as_a_combination():

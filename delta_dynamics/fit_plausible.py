@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings as :mod:`pkm_twin.identification.plausible` asks for them, put right and as they are.
+
+May import: numpy, pkm_twin's core and identification, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.file_parameters import FileParameters
+from delta_dynamics.fit_rows import Recorded, Rows, rows_of
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.plausible import Problem, Retold, fault_of
+from pkm_twin.machine.inertia import ten_numbers
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+OFFSET: Final = 0.1
+"""Part of the efforts that a current sensor is off by."""
+HEAVIER: Final = 0.3
+"""Part of its value that a mass or a rotor of the file is off by."""
+REACH: Final = 1.5
+"""Machine sizes from the platform within which a payload is."""
+SOME: Final = 2000
+"""Samples by which other positions and times are judged."""
+TIMES: Final = {
+    "the time is in ms, not in s": 1e-3, "the time is in us, not in s": 1e-6,
+    "the time is in ns, not in s": 1e-9, "the time is in minutes, not in s": 60.0,
+    "the time is in s, and was taken for ms": 1e3, "the time runs at half its rate": 0.5,
+    "the time runs at twice its rate": 2.0,
+}  # fmt: skip
+ANGLES: Final = {
+    "positions are in degrees": np.pi / 180.0, "positions are in rad, and were taken for degrees":
+    180.0 / np.pi, "positions are in mm": 1e-3, "positions are in turns": 2.0 * np.pi,
+}  # fmt: skip
+
+
+def recording_fault(
+    robot: Robot, everything: FileParameters, recording: Recorded, rows: Rows
+) -> str | None:
+    """Why this machine cannot have made a recording; None where it can.
+
+    :param everything: all parameters of the file; ``rows``: the recording's, with all of them.
+    """
+    r = recording
+    period = float(np.median(np.diff(r.time)))
+
+    def put_right(**changes: Array) -> Callable[[], Problem | None]:
+        def make() -> Problem | None:
+            cut: dict[str, Any] = {"time": r.time, "q": r.q, "effort": r.effort} | changes
+            cut |= {"wrench": r.wrench, "held": r.held}
+            few: dict[str, Any] = {k: None if v is None else v[:SOME] for k, v in cut.items()}
+            try:
+                some = Recorded(r.name, **few, carried=r.carried)
+                made, _ = rows_of(robot, everything, some, None)
+            except (PkmTwinError, ValueError, np.linalg.LinAlgError):
+                return None
+            return problem_of(robot, everything, made)
+
+        return make
+
+    names, eye = robot.joint_names, np.eye(robot.joints_count)
+    retold: list[Retold] = [(text, put_right(time=r.time * scale)) for text, scale in TIMES.items()]
+    retold += [(text, put_right(q=r.q * scale)) for text, scale in ANGLES.items()]
+    if len(names) > 1:
+        retold.append(("positions of all joints have the wrong sign", put_right(q=-r.q)))
+    for name, e in zip(names, eye, strict=True):
+        turned = 1.0 - 2.0 * e
+        text = f"positions of {name} have the wrong sign"
+        retold.append((text, put_right(q=turned * r.q)))
+        text = f"positions and efforts of {name} have the wrong sign (joint_map?)"
+        retold.append((text, put_right(q=turned * r.q, effort=turned * r.effort)))
+    for i, k in combinations(range(len(names)), 2):
+        order = list(range(len(names)))
+        order[i], order[k] = k, i
+        text = f"positions of {names[i]} and {names[k]} are exchanged"
+        retold.append((text, put_right(q=r.q[:, order])))
+        text = f"{names[i]} and {names[k]} are exchanged"
+        retold.append((text, put_right(q=r.q[:, order], effort=r.effort[:, order])))
+    return fault_of(problem_of(robot, everything, rows), names, retold, period)
+
+
+def problem_of(robot: Robot, everything: FileParameters, rows: Rows) -> Problem:
+    """The machines that may have made a recording, around the robot's file."""
+    told = rows.rest + rows.table @ everything.values
+    size = np.sqrt(np.mean(told**2, 0))
+    total = sum(body.mass for body in robot.graph.bodies.values())
+    total += sum(rod.mass for rod in robot.graph.rods.values()) + robot.payload.mass
+    parts: list[Array] = []
+    bounds: list[tuple[float, float]] = []
+    prior: list[tuple[slice, float, float]] = []
+    friction: list[bool] = []
+    for where, group in zip(everything.slices, everything.groups, strict=True):
+        own, value = rows.table[..., where], float(group.values[0])
+        scale, first = float(everything.scales[where][0]), len(bounds)
+        rubs = group.kind == "friction" and not group.name.endswith("offset")
+        bound, known = (0.0, np.inf), (value, scale)
+        if group.kind == "inertia":
+            own, bound, known = (own @ group.values)[..., None], (0.3, 2.5), (1.0, HEAVIER)
+        elif group.kind == "payload":
+            own, bound, known = own @ _points(REACH * robot.size), (0.0, total), (value, scale)
+        elif group.kind == "rotor" and value > 0.0:
+            known = (value, HEAVIER * value)
+        elif group.name.endswith("offset"):
+            most = OFFSET * float(np.max(np.abs(own).max((0, 1)) * size))
+            bound, known = (-np.inf, np.inf), (value, most)
+        parts.append(own)
+        bounds += [bound] * own.shape[-1]
+        friction += [rubs] * own.shape[-1]
+        if not rubs and known[1] > 0.0:
+            prior.append((slice(first, len(bounds)), *known))
+    rows_of_prior = np.zeros((len(prior), len(bounds)))
+    for row, (columns, _, spread) in zip(rows_of_prior, prior, strict=True):
+        row[columns] = 1.0 / spread
+    low, high = np.array(bounds).T
+    return Problem(
+        rows.effort, rows.change, rows.rest, np.concatenate(parts, -1), low, high, rows_of_prior,
+        np.array([value / spread for _, value, spread in prior]), np.array(friction), rows.counts,
+        rows.signals.noise * np.sqrt(rows.signals.band), float(np.median(np.diff(rows.time))),
+    )  # fmt: skip
+
+
+def _points(reach: float) -> Array:
+    """Ten numbers of a kilogram at the platform's point and around it, shape (10, points)."""
+    corners = (
+        reach / np.sqrt(3.0) * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    )
+    places = [np.zeros(3), *(reach * np.eye(3)), *(-reach * np.eye(3)), *corners]
+    return np.stack([ten_numbers(1.0, place, np.zeros((3, 3))) for place in places], -1)

@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a fit's residual is held against: the noise above the motion's band, and common errors.
+
+May import: numpy, scipy, pkm_twin's core and identification, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
+from numpy.typing import NDArray
+
+from delta_dynamics.samples import DEGREE, Filtering, Track, low_pass
+from pkm_twin.identification.verdict import Suspect
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+Efforts = Callable[[Array, Array, Array], Array]
+"""Of positions, rates and accelerations (k, n) at the rows of a recording, shape (k, n)."""
+
+GAIN: Final = "gain of the efforts"
+LATE: Final = "efforts late"
+LOAD: Final = "friction that grows with the load"
+OFFSET: Final = "sensor offset"
+ELASTIC: Final = "elastic drive"
+GEOMETRY: Final = "geometry"
+STRIBECK: Final = (0.05, 0.1, 0.2)
+"""Speeds below which static friction shows, over the rms speed."""
+NOISE_BAND: Final = 0.898
+"""Width of the low-pass filter for white noise, over its cut-off: a Butterworth filter of fourth
+order, forwards and backwards."""
+UNFILTERED: Final = 0.25
+"""Part of the samples' rate above which there is noise alone, where nothing is filtered."""
+HIGHEST: Final = 0.48
+"""Part of the samples' rate up to which the noise is looked at."""
+STEP: Final = 1e-4
+"""Of difference quotients by an offset or a give, rad or machine sizes."""
+MOTION: Final = 0.25
+"""Part of the filter's cut-off in which nearly all of the motion is."""
+SEGMENT: Final = 256
+"""Samples of a spectrum."""
+STENCILS: Final = {
+    1: (-1 / 60, 3 / 20, -3 / 4, 0.0, 3 / 4, -3 / 20, 1 / 60),
+    2: (1 / 90, -3 / 20, 3 / 2, -49 / 18, 3 / 2, -3 / 20, 1 / 90),
+}
+"""Central differences of sixth order, by the order of the derivative."""
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Signals of a recording at its rows, filtered as they are; k rows, n joints.
+
+    ``motion``: q, qd and qdd, without noise beyond the motion's band, and ``missed``: what the
+    differentiation misses of qd and qdd; ``load``: of the efforts without friction, with its first
+    and second derivative, (k, n) each. ``effort``: what a first fit predicts, and its derivative.
+    ``own``: friction of other laws, a unit of each, (k, n, laws). ``wrench``: (k, 6); ``held``:
+    (k,). ``noise``: deviation of a row's noise as if rows were independent, (n,). ``band``: the
+    part of the rows' rate that the filter passes.
+    """
+
+    motion: tuple[Array, Array, Array]
+    missed: tuple[Array, Array]
+    load: tuple[Array, Array, Array]
+    effort: tuple[Array, Array]
+    own: Array
+    wrench: Array
+    held: Array
+    noise: Array
+    band: float
+
+
+def signals_of(
+    tracks: Sequence[Track], told: Sequence[Array], rub: Sequence[Array], how: Filtering,
+    noise: Array,
+) -> Signals:  # fmt: skip
+    """The signals of a recording's pieces.
+
+    :param told: efforts of a first fit, every sample, (samples, n) each. ``rub``: the part of them
+        that is friction of the drives.
+        ``noise``: of :func:`noise_of`.
+    """
+    speed = np.sqrt(np.mean(np.concatenate([t.qd for t in tracks]) ** 2, 0))
+    parts = []
+    for track, effort, friction in zip(tracks, told, rub, strict=True):
+        load, sign = effort - friction, np.sign(track.qd)
+        laws = [np.abs(load) * sign, track.qd * np.abs(track.qd)]
+        for share in STRIBECK:
+            laws.append(np.exp(-((track.qd / np.maximum(share * speed, 1e-300)) ** 2)) * sign)
+        change = np.gradient(effort, track.period, axis=0)
+        columns = [effort, change, *_calm(track, load, how), *laws, track.wrench]
+        whole = np.concatenate([*columns, track.held[:, None]], 1)
+        parts.append(low_pass(whole, track.period, how))
+    whole = np.concatenate(parts)
+    count = 10 + 2 + len(STRIBECK)
+    each = np.split(whole[:, : count * tracks[0].q.shape[1]], count, 1)
+    rate = 1.0 / (tracks[0].period * how.keep_every)
+    passed = 1.0 if how.cutoff is None else min(1.0, 2.0 * NOISE_BAND * how.cutoff / rate)
+    return Signals(
+        (each[2], each[3], each[4]), (each[5], each[6]), (each[7], each[8], each[9]),
+        (each[0], each[1]), np.stack(each[10:], -1), whole[:, -7:-1], whole[:, -1],
+        noise * np.sqrt(rate), passed,
+    )  # fmt: skip
+
+
+def _calm(track: Track, load: Array, how: Filtering) -> list[Array]:
+    """Motion and load in the motion's own band, where nearly no noise is, (samples, n) each.
+
+    Positions, rates and accelerations; what the local polynomials miss of the latter two; the load
+    and its derivatives. Noise in both of two columns would look like something in common.
+    """
+    cutoff = None if how.cutoff is None else MOTION * how.cutoff
+    calm = replace(how, cutoff=cutoff, keep_every=0)
+    q, force = (low_pass(v, track.period, calm) for v in (track.q, load))
+    motion, missed = [q], []
+    inner = slice(how.window // 2 + 3, len(q) - how.window // 2 - 3)
+    for order in (1, 2):
+        fine = _derivative(q, order, track.period)
+        rough = scipy.signal.savgol_filter(q, how.window, DEGREE, order, track.period, axis=0)
+        apart = np.zeros_like(q)
+        apart[inner] = (rough - fine)[inner]
+        motion.append(fine)
+        missed.append(apart)
+    return [*motion, *missed, force, *(_derivative(force, k, track.period) for k in (1, 2))]
+
+
+def _derivative(values: Array, order: int, period: float) -> Array:
+    """By central differences of sixth order, along the first axis."""
+    stencil = np.array(STENCILS[order])
+    return np.asarray(
+        scipy.ndimage.correlate1d(values, stencil, axis=0, mode="nearest") / period**order
+    )
+
+
+def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filtering) -> Array:
+    """Density of the efforts' noise in the band of the motion, N m or N per root hertz, (n,).
+
+    Above the band nothing but noise is left: the loudest octave there counts. The positions' noise
+    comes through the differentiation with another spectrum; what it does is taken off above the
+    band, and added in the band.
+
+    :param residual: measured less fitted, every sample, (samples, n) by piece.
+    :param shaken: what the positions' noise changes in the fitted efforts, (samples, n).
+    """
+    rate = 1.0 / period
+    begin = UNFILTERED * rate if how.cutoff is None else how.cutoff
+    loudest = np.zeros(shaken.shape[1])
+    spectra = [_spectrum(piece, rate) for piece in residual]
+    density = np.mean([own for _, own in spectra], 0)
+    frequency, passed = _spectrum(shaken, rate)
+    while begin < 0.9 * HIGHEST * rate:
+        inside = (frequency >= begin) & (frequency < min(2.0 * begin, HIGHEST * rate))
+        if np.count_nonzero(inside) > 2:
+            both = (np.mean(one[inside], 0) for one in (density, passed))
+            above, own = both
+            loudest = np.maximum(loudest, above - own)
+        begin *= 2.0
+    inside = frequency <= (HIGHEST * rate if how.cutoff is None else how.cutoff)
+    return np.asarray(np.sqrt(loudest + np.mean(passed[inside], 0)), np.float64)
+
+
+def _spectrum(values: Array, rate: float) -> tuple[Array, Array]:
+    """Frequencies, and two-sided spectral densities by channel (Welch), (frequencies, n)."""
+    size = min(SEGMENT, len(values))
+    frequency, density = scipy.signal.welch(values, rate, nperseg=size, axis=0, detrend="linear")
+    return np.asarray(frequency, np.float64), np.asarray(0.5 * density, np.float64)
+
+
+def suspects_of(robot: Robot) -> list[Suspect]:
+    """The errors whose columns :func:`columns_of` gives, in their order."""
+    names, units, efforts = robot.joint_names, robot.joint_units, robot.effort_units
+    lengths = lengths_of(robot)
+    found = [Suspect(GAIN, name, usual=0.05) for name in names]
+    found += [Suspect(LATE, name, "s", 2e-3) for name in names]
+    found += [Suspect(LOAD, name, usual=0.05) for name in names]
+    found += [
+        Suspect("friction that grows with the square of the speed", name, f"{e} s2/{u}2")
+        for name, u, e in zip(names, units, efforts, strict=True)
+    ]
+    for _ in STRIBECK:
+        found += [
+            Suspect("static friction above Coulomb friction", name, unit)
+            for name, unit in zip(names, efforts, strict=True)
+        ]
+    found += [
+        Suspect(OFFSET, name, unit, 0.01 * float(length))
+        for name, unit, length in zip(names, units, lengths, strict=True)
+    ]
+    found += [
+        Suspect(ELASTIC, name, f"{u}/({e})" if " " in e else f"{u}/{e}")
+        for name, u, e in zip(names, units, efforts, strict=True)
+    ]
+    found += [
+        Suspect(GAIN, "all joints", usual=0.05), Suspect(LATE, "all joints", "s"),
+        Suspect(LOAD, "all joints", usual=0.05),
+    ]  # fmt: skip
+    found += [
+        Suspect(GEOMETRY, f"limb of {n}", u)
+        for n, u in zip(names, units, strict=True)
+        for _ in names
+    ]
+    return found
+
+
+def lengths_of(robot: Robot) -> Array:
+    """A radian of the joints that turn, the machine's size of those that slide, (n,)."""
+    return np.array([robot.size if unit == "m" else 1.0 for unit in robot.joint_units])
+
+
+def columns_of(robot: Robot, signals: Signals, efforts: Efforts) -> tuple[Array, Array]:
+    """Derivatives of the measured efforts by the suspects' sizes, shape (k, n, suspects).
+
+    And what the differentiation misses, joint by joint, (k, n, n).
+    """
+    n = robot.joints_count
+    eye = np.eye(n)
+    unit = lengths_of(robot)
+    told, change = signals.effort
+
+    q, qd, qdd = signals.motion
+    here = efforts(q, qd, qdd)
+    missed = efforts(q, qd + signals.missed[0], qdd + signals.missed[1])
+
+    def each(values: Array) -> list[Array]:
+        return [values * e for e in eye]
+
+    laws = np.moveaxis(signals.own, -1, 0)
+    alone = each(told) + each(-change)
+    for law in laws:
+        alone += each(law)
+    offsets = []
+    for j in range(n):
+        h = STEP * unit[j] * eye[j]
+        apart = efforts(q - h, qd, qdd) - efforts(q + h, qd, qdd)
+        offsets.append(apart / (2.0 * STEP * unit[j]))
+    gives = []
+    for j in range(n):
+        # The load turns the drive's outer side back by so much.
+        size = STEP * unit[j] / max(float(np.abs(signals.load[0][:, j]).max()), 1e-300)
+        back = [size * one[:, [j]] * eye[j] for one in signals.load]
+        moved = efforts(*(a - b for a, b in zip(signals.motion, back, strict=True)))
+        gives.append((moved - here) / size)
+    place = q - q.mean(0)
+    place = place / np.maximum(np.abs(place).max(0), 1e-300)
+    bent = [offset * place[:, [i]] for offset in offsets for i in range(n)]
+    columns = [*alone, *offsets, *gives, told, -change, laws[0], *bent]
+    return np.stack(columns, -1), (missed - here)[..., None] * eye

@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict on a fit, from its residual.
+
+Noise is measured where the model cannot err: above the band of the motion. Inside the band the
+residual must not be larger. Each error that a machine commonly has (a gain, a delay, a sensor's
+offset, an elastic drive, another friction law, another geometry) adds its own signal to the
+residual; the derivatives of the measurements by these errors, the suspects, are regressed on it one
+by one, after what the fitted numbers and the differentiation can explain has been taken out. A
+suspect that explains more than noise does is a finding (forward selection by the score test of a
+restricted model: Rao, 1948). What a finding would have changed in the fitted numbers widens their
+standard deviations.
+
+May import: numpy, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.identification.verdict import Answer, Blind, Channel, Finding, Suspect, Verdict
+
+Array = NDArray[np.float64]
+
+SIGMAS: Final = 4.5
+"""Standard deviations from which a suspect is a finding."""
+HINT: Final = 3.0
+"""And from which it is not excluded."""
+NEAR: Final = 0.9
+"""A suspect that explains this part of the best one's significance is named with it."""
+CHOICES: Final = 3
+"""Most suspects that are named in the place of a finding."""
+FINDINGS: Final = 12
+"""Most findings that are looked for."""
+EXACT: Final = 1e-3
+"""Noise, as part of the measured rms, below which no recording is judged more strictly."""
+SEEN: Final = 1e-3
+"""Part of its norm that a suspect keeps beside the fitted numbers, or it cannot be seen."""
+RANK: Final = 1e-7
+"""Least singular value, of columns of norm one, that counts."""
+MISSED: Final = 0.5
+"""Part of what the differentiation misses that a finding has to exceed."""
+LOUD: Final = 1.5
+"""Residual over noise, in the band of the motion, from which more than noise is left."""
+MOST: Final = 0.2
+"""Part of a channel's measured variation that may stay unexplained."""
+ABSURD: Final = 10.0
+"""Times its usual size from which an error is another model's."""
+HARM: Final = 3.0
+"""Standard deviations of a fitted number by which an unseen error is worth a word."""
+UNSEEN: Final = 3
+"""Most unseen errors that are told."""
+VALUES: Final = 30000
+"""Values of the residual that are judged; of more, every so many rows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What one recording says, as rows of one rate: k rows, n channels.
+
+    ``residual``: measured less fitted, (k, n). ``explained``: columns of the fitted parameters,
+    (k, n, p). ``nuisance``: of what is no error of the model: delays that are fitted, what the
+    differentiation misses, (k, n, d); ``missed``: the rms of the latter, (n,). ``suspects``: by the
+    suspects' sizes, (k, n, s). ``noise``: deviation of a row's noise as if rows were independent,
+    (n,). ``band``: the part of the rows' rate that the filter passes. ``counts``: 1 for what is
+    judged, (k, n). ``fitted``: how many rows, the first ones, were fitted. ``size``: rms of the
+    measurements, ``variation``: about their mean, (n,).
+    """
+
+    residual: Array
+    explained: Array
+    nuisance: Array
+    missed: Array
+    suspects: Array
+    noise: Array
+    band: float
+    counts: Array
+    fitted: int
+    size: Array
+    variation: Array
+
+    @property
+    def floor(self) -> Array:
+        """The noise that the residual is held against, shape (n,)."""
+        return np.maximum(self.noise, EXACT * self.size)
+
+    @property
+    def weight(self) -> Array:
+        """One over the noise where something is judged, shape (k, n)."""
+        return self.counts / np.where(self.floor > 0.0, self.floor, np.inf)
+
+    def thinned(self, step: int) -> Evidence:
+        """Every so many rows: nearer to independent of each other."""
+        if step == 1:
+            return self
+        cut = {
+            name: getattr(self, name)[::step]
+            for name in ("residual", "explained", "nuisance", "suspects", "counts")
+        }
+        # A row's own noise stays; as independent rows fewer have less of it each.
+        band = min(1.0, step * self.band)
+        noise = self.noise * np.sqrt(self.band / band)
+        return replace(self, **cut, noise=noise, band=band, fitted=-(-self.fitted // step))
+
+
+def judge(
+    channels: Sequence[str],
+    suspects: Sequence[Suspect],
+    cases: Sequence[Evidence],
+    prior: tuple[Array, Array, Array],
+    response: Callable[[Sequence[Array]], Array],
+) -> Verdict:
+    """Judge a fit by all of its recordings.
+
+    :param prior: of the parameters of ``explained`` the change that the fit made, and how far each
+        may be from its value before, (p,) each; of all parameters that were fitted the standard
+        deviation, (f,).
+    :param response: from signals that are added to the measurements, by recording (k, n, m), to
+        what they change in the parameters that were fitted, shape (f, m).
+    """
+    step = -(-sum(case.residual.size for case in cases) // VALUES)
+    few = [case.thinned(step) for case in cases]
+    y, base, left = _rows(few, prior)
+    seen = np.linalg.norm(left, axis=0)
+    basis = _basis(base)
+    y, left = y - basis @ (basis.T @ y), left - basis @ (basis.T @ left)
+    chosen, after = _select(y, left, seen, _least(few))
+    sizes = _sizes(y, left, [one.index for one in chosen])
+    found = [_finding(suspects, one, pair) for one, pair in zip(chosen, sizes, strict=True)]
+    clear = [one for one in found if one.sigmas >= SIGMAS]
+    count = sum(case.residual.size for case in few)
+    told = tuple(
+        _channel(name, k, few, (y[:count], after[:count]), basis.shape[1] + len(chosen))
+        for k, name in enumerate(channels)
+    )
+    loud = [channel.left_ratio for channel in told if channel.left_ratio > LOUD]
+    answer: Answer = "explains"
+    absurd = [one for one in clear if abs(one.size) > ABSURD * (one.suspect.usual or np.inf)]
+    if absurd or max(channel.left for channel in told) > MOST:
+        answer = "does not explain"
+    elif clear or loud or any(channel.held_out > LOUD for channel in told):
+        answer = "explains partly"
+    shifts = [
+        response([case.suspects[..., k, None] * size for case in cases])[:, 0]
+        for one, (size, _) in zip(chosen, sizes, strict=True)
+        for k, size in ((one.index, size), *zip(one.near, one.sizes, strict=True))
+    ]
+    blind, unseen = _blind(
+        suspects, cases, (left, seen), prior[2], response, {o.index for o in chosen}
+    )
+    return Verdict(
+        answer, told, tuple(clear), tuple(one for one in found if one.sigmas < SIGMAS), blind,
+        np.reshape(shifts, (-1, len(prior[2]))), float(max([1.0, *loud]) ** 2), unseen,
+    )  # fmt: skip
+
+
+def _finding(suspects: Sequence[Suspect], one: _Chosen, size: tuple[float, float]) -> Finding:
+    own = suspects[one.index]
+    others = dict.fromkeys(suspects[k] for k in one.near)
+    others.pop(own, None)
+    return Finding(own, *size, one.sigmas, tuple(others))
+
+
+def _rows(
+    cases: Sequence[Evidence], prior: tuple[Array, Array, Array]
+) -> tuple[Array, Array, Array]:
+    """Residual, what may explain it, and suspects over the noise; the prior's rows at the end."""
+    values, tables, suspects = [], [], []
+    for i, case in enumerate(cases):
+        weight = case.weight[..., None]
+        own = [
+            case.nuisance if i == j else np.zeros((*case.residual.shape, other.nuisance.shape[-1]))
+            for j, other in enumerate(cases)
+        ]
+        values.append((case.residual * weight[..., 0]).ravel())
+        table = np.concatenate([case.explained, *own], -1) * weight
+        tables.append(table.reshape(-1, table.shape[-1]))
+        suspects.append((case.suspects * weight).reshape(-1, case.suspects.shape[-1]))
+    change, scales, _ = prior
+    rest = np.zeros((len(change), tables[0].shape[1] - len(change)))
+    tables.append(np.concatenate([np.diag(1.0 / scales), rest], 1))
+    values.append(-change / scales)
+    suspects.append(np.zeros((len(change), suspects[0].shape[1])))
+    return np.concatenate(values), np.concatenate(tables), np.concatenate(suspects)
+
+
+def _basis(table: Array) -> Array:
+    """An orthonormal basis of a table's columns."""
+    norms = np.linalg.norm(table, axis=0)
+    vectors, sizes, _ = np.linalg.svd(table[:, norms > 0.0] / norms[norms > 0.0], False)
+    return np.asarray(vectors[:, sizes > RANK * sizes.max(initial=0.0)], np.float64)
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """A suspect by its place, and those near it with the sizes that they would have alone."""
+
+    index: int
+    sigmas: float
+    near: tuple[int, ...]
+    sizes: tuple[float, ...]
+
+
+def _least(cases: Sequence[Evidence]) -> Array:
+    """Sizes below which a suspect may be what the differentiation misses, shape (s,)."""
+    missed, size = 0.0, 0.0
+    for case in cases:
+        weight = case.weight[..., None]
+        own = weight * (case.suspects != 0.0) * case.missed[:, None]
+        missed = missed + np.sum(own**2, (0, 1))
+        size = size + np.sum((weight * case.suspects) ** 2, (0, 1))
+    return np.asarray(MISSED * np.sqrt(missed / np.maximum(size, 1e-300)), np.float64)
+
+
+def _select(y: Array, table: Array, seen: Array, least: Array) -> tuple[list[_Chosen], Array]:
+    """Suspects that the residual shows, the last one perhaps not clearly, and what stays of it.
+
+    :param seen: norms of the suspects before the fitted numbers were taken out, (s,).
+    :param least: sizes from which they count, (s,).
+    """
+    chosen: list[_Chosen] = []
+    left, rest = table.copy(), y
+    while len(chosen) < FINDINGS and left.shape[1]:
+        norms = np.linalg.norm(left, axis=0)
+        good = norms > SEEN * np.maximum(seen, 1e-300)
+        norms = np.where(good, norms, 1.0)
+        scores = np.where(good, (rest @ left) / norms, 0.0)
+        scores = np.where(np.abs(scores) > least * norms, scores, 0.0)
+        best = int(np.argmax(np.abs(scores)))
+        sigmas = float(abs(scores[best]))
+        if sigmas < HINT:
+            break
+        order = np.argsort(-np.abs(scores))
+        near = [int(k) for k in order if k != best and abs(scores[k]) > NEAR * sigmas][:CHOICES]
+        own = tuple(float(scores[k] / norms[k]) for k in near)
+        chosen.append(_Chosen(best, sigmas, tuple(near), own))
+        if sigmas < SIGMAS:
+            break
+        unit = left[:, best] / norms[best]
+        rest = rest - unit * (unit @ rest)
+        left = left - np.outer(unit, unit @ left)
+    return chosen, rest
+
+
+def _sizes(y: Array, table: Array, chosen: Sequence[int]) -> list[tuple[float, float]]:
+    """Of all suspects that were chosen together, with standard deviations."""
+    inverse = np.linalg.pinv(table[:, list(chosen)])
+    sizes, deviations = inverse @ y, np.linalg.norm(inverse, axis=1)
+    return list(zip(sizes.tolist(), deviations.tolist(), strict=True))
+
+
+def _blind(
+    suspects: Sequence[Suspect], cases: Sequence[Evidence], tables: tuple[Array, Array],
+    deviations: Array, response: Callable[[Sequence[Array]], Array], chosen: set[int],
+) -> tuple[tuple[Blind, ...], Array]:  # fmt: skip
+    """Suspects of usual size that do not show, by what they would do, one of each kind.
+
+    And what each of them would change in the fitted parameters, (suspects, p).
+    """
+    left, seen = tables
+    norms = np.linalg.norm(left, axis=0)
+    hidden = [
+        k for k, one in enumerate(suspects)
+        if one.usual is not None and k not in chosen
+        and (norms[k] * one.usual < SIGMAS or norms[k] <= SEEN * seen[k])
+    ]  # fmt: skip
+    if not hidden:
+        return (), np.zeros((0, len(deviations)))
+    usual = np.array([suspects[k].usual for k in hidden])
+    moved = response([case.suspects[..., hidden] * usual for case in cases])
+    ratio = np.abs(moved) / np.maximum(deviations, 1e-300)[:, None]
+    found: dict[str, Blind] = {}
+    for place in np.argsort(-ratio.max(0)):
+        one, index = suspects[hidden[place]], int(np.argmax(ratio[:, place]))
+        if ratio[index, place] > HARM and one.kind not in found and len(found) < UNSEEN:
+            found[one.kind] = Blind(one, index, float(moved[index, place]))
+    return tuple(found.values()), moved.T
+
+
+def _channel(
+    name: str, k: int, cases: Sequence[Evidence], values: tuple[Array, Array], taken: int
+) -> Channel:
+    """A channel's figures over all recordings.
+
+    :param values: residual over noise, rows flat, before and after the findings.
+    :param taken: how many numbers were fitted.
+    """
+    starts = np.cumsum([0, *(case.residual.size for case in cases)])
+    free, sums, noise, variation, rows = 0.0, np.zeros(2), 0.0, 0.0, 0.0
+    parts = np.zeros((2, 2))
+    for case, a, b in zip(cases, starts[:-1], starts[1:], strict=True):
+        used = case.counts[:, k]
+        count, own = float(used.sum()), case.floor[k] ** 2
+        rows += count
+        free += count * case.band
+        noise += count * case.band * own
+        variation += count * case.variation[k] ** 2
+        for which in range(2):
+            one = values[which][a:b].reshape(-1, case.residual.shape[1])[:, k]
+            sums[which] += own * float(one @ one)
+        square = used * case.residual[:, k] ** 2
+        for half, part in enumerate((slice(0, case.fitted), slice(case.fitted, None))):
+            parts[half] += float(square[part].sum()), float(used[part].sum())
+    if not rows:
+        return Channel(name, 0.0, 0.0, 0.0, 0.0, 1.0)
+    share = min(taken / len(cases[0].noise), 0.5 * free) / max(free, 1.0)
+    before, after = np.sqrt(sums / (rows * (1.0 - share)))
+    level = np.sqrt(noise / rows)
+    beyond = np.sqrt(max(after**2 - level**2, 0.0) / max(variation / rows, 1e-300))
+    # By what stays of the noise in so many independent rows.
+    sure = 1.0 + 4.0 * np.sqrt(2.0 / max(free, 1.0))
+    fitted, held = (np.sqrt(p[0] / max(p[1], 1.0)) for p in parts)
+    return Channel(
+        name, float(before), float(level), float(beyond), float(after / (level * np.sqrt(sure))),
+        float(held / max(fitted, level)),
+    )  # fmt: skip

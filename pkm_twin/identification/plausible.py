@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Can this machine have made this recording? Asked before anything is fitted.
+
+The efforts are fitted by a machine as far from its file as one may be: friction, rotors, a payload,
+masses within a factor of two, current sensors off by a part of the load, all of them physically
+possible. What such a machine leaves unexplained is compared with what it leaves of the recording
+put right: signs turned, columns exchanged, another unit, another time. A recording that is
+explained much better by one of these has that fault.
+
+May import: numpy, scipy, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any, Final
+
+import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+GOOD: Final = 0.015
+"""Part of the efforts' variation that a sound model may leave."""
+INDEPENDENT: Final = 15.0
+"""As how many independent errors a model's error counts."""
+RARE: Final = 14.0
+"""What a fault costs, minus twice a logarithm of its probability: one in a thousand,"""
+UNIT: Final = 6.0
+"""and another unit, one in twenty."""
+POOR: Final = 0.3
+"""Part of the variation, beside noise, that no recording of the machine leaves."""
+NAMED: Final = 0.8
+"""A fault is named if without it no more than this part is left."""
+FAR: Final = 0.1
+"""What is left from which other positions and times are tried, which costs more."""
+RANGE: Final = 2.0
+"""How many times as heavy as its file a machine may be, and the inverse."""
+LATEST: Final = 0.05
+"""Efforts that are later or earlier are another recording's, s."""
+SEARCHED: Final = 1.5
+"""How far efforts are looked for in time, s."""
+SLOWEST: Final = 1.0
+"""Time between samples of a recording from which no motion can be differentiated, s."""
+UNITS: Final = {
+    "N mm or mN m": 1e3, "kgf cm": 100.0 / 9.80665, "kgf or kgf m": 1.0 / 9.80665,
+    "lbf": 1.0 / 4.4482216, "lbf in": 1.0 / 0.112984829, "ozf in": 1.0 / 0.00706155183,
+    "kN or kN m": 1e-3,
+}  # fmt: skip
+"""Units that efforts come in, by how many are a newton or a newton metre."""
+SCALES: Final = tuple(2.0 ** (k / 4.0) for k in range(-6, 7))
+"""Around the scale of least squares."""
+TURNS: Final = 4
+"""Most solutions for one recording, each with what the one before has left."""
+LIKE_A_UNIT: Final = 1.25
+"""A scale that is so near to a unit's is named by it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A recording's efforts and the machines that may have made them: k rows, n joints.
+
+    ``effort``: measured, (k, n); ``late``: its derivative in time. ``rest``: what is certain;
+    ``columns``: by what is not, (k, n, c), about ``usual``, as far off as ``spread`` (infinite:
+    nobody knows), between ``low`` and ``high``, (c,). ``friction``: which columns turn round with
+    time, (c,). ``counts``: 1 for what is judged. ``noise``: deviation of the rows, (n,).
+    ``period``: of the rows, s.
+    """
+
+    effort: Array
+    late: Array
+    rest: Array
+    columns: Array
+    low: Array
+    high: Array
+    prior: Array
+    usual: Array
+    friction: NDArray[np.bool_]
+    counts: Array
+    noise: Array
+    period: float
+
+    def backwards(self) -> Problem:
+        """The same with time reversed: friction helps the motion."""
+        return replace(self, columns=np.where(self.friction, -1.0, 1.0) * self.columns)
+
+    @property
+    def variation(self) -> Array:
+        """Standard deviation of the efforts, shape (n,)."""
+        return np.asarray(np.maximum(np.std(self.effort, 0), 1e-300), np.float64)
+
+    @property
+    def noisy(self) -> float:
+        """The part of the variation that is noise."""
+        return float(np.sqrt(np.mean((self.noise / self.variation) ** 2)))
+
+    def judged(self) -> Judged:
+        """How well, and how likely, the best of these machines explains the efforts."""
+        none = np.zeros((*self.effort.shape, 0))
+        return self._solved(none, self.effort, self.variation)[0]
+
+    def scales(self, free: Array) -> Array:
+        """Factors on the efforts with which a likely machine explains them, of any sign, (n,).
+
+        :param free: joints by the factors that are looked for, 1 or 0, shape (n, factors); a joint
+            of no factor keeps its efforts.
+        """
+        # Homogeneous in the efforts: what is certain of the machine is the measure.
+        size = np.std(self.rest + self.columns @ self.start, 0)
+        size = np.maximum(size, 1e-6 * max(float(size.max()), 1e-300))
+        stays = 1.0 - free.sum(1)
+        found = self._solved(-self.effort[..., None] * free, stays * self.effort, size)[1]
+        return np.asarray(free @ found[len(self.low) + 1 :] + stays, np.float64)
+
+    @property
+    def start(self) -> Array:
+        """What is not certain as it is usually, shape (c,)."""
+        return np.asarray(np.linalg.pinv(self.prior) @ self.usual, np.float64)
+
+    def _solved(self, free: Array, effort: Array, size: Array) -> tuple[Judged, Array]:
+        """By rows whose squares sum to the part of ``size``; and the numbers found."""
+        weight = self.counts / size / np.sqrt(max(float(self.counts.sum()), 1.0))
+        table = np.concatenate([self.columns, -self.late[..., None], free], -1) * weight[..., None]
+        width = table.shape[-1]
+        values = ((effort - self.rest) * weight).reshape(-1, 1)
+        rows = np.concatenate([table.reshape(-1, width), values], 1)
+        reduced = np.asarray(np.linalg.qr(rows, mode="r"), np.float64)
+        unbound = np.full(free.shape[-1], np.inf)
+        low = np.concatenate([self.low, [-LATEST], -unbound])
+        high = np.concatenate([self.high, [LATEST], unbound])
+        prior = np.pad(self.prior, ((0, 0), (0, width - len(self.low))))
+        norm = np.linalg.norm(reduced[:, :width], axis=0)
+        norm = np.where(norm > 0.0, norm, 1.0)
+        left, x = GOOD, np.zeros(width)
+        for _ in range(TURNS):
+            root = np.sqrt(INDEPENDENT / (left**2 + GOOD**2))
+            rows = np.concatenate([root * reduced[:, :width], prior]) / norm
+            aim = np.concatenate([root * reduced[:, width], self.usual])
+            found = scipy.optimize.lsq_linear(rows, aim, (low * norm, high * norm), method="bvls")
+            x = np.asarray(found.x / norm, np.float64)
+            before, left = left, float(np.linalg.norm(reduced[:, :width] @ x - reduced[:, width]))
+            if abs(left - before) < 0.01 * GOOD:
+                break
+        cost = INDEPENDENT * np.log(left**2 + GOOD**2) + np.sum((prior @ x - self.usual) ** 2)
+        return Judged(left, float(cost)), x
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The part of the efforts' variation that is left, and what the machine costs.
+
+    Minus twice a logarithm of its probability: of what is left, and of numbers far from the file's.
+    """
+
+    left: float
+    cost: float
+
+
+Retold = tuple[str, Callable[[], Problem | None]]
+"""A fault, and the recording without it; None where the machine cannot move so."""
+
+
+def fault_of(
+    problem: Problem, joints: Sequence[str], retold: Sequence[Retold], period: float
+) -> str | None:
+    """The fault for which no such machine can have made a recording, or None.
+
+    :param retold: the recording with other positions or times.
+    :param period: between samples, s.
+    """
+    if period > SLOWEST:
+        return f"samples {period:.3g} s apart show no motion (is the time in ms?)"
+    told = problem.judged()
+    if told.left < GOOD and told.cost < INDEPENDENT * np.log(2.0 * GOOD**2):
+        return None
+    best, cause = told, ""
+    backwards = ("time runs backwards", problem.backwards(), RARE)
+    for text, other, price in [*_efforts(problem, joints), backwards]:
+        found = other.judged()
+        if found.cost + price < best.cost:
+            best, cause = Judged(found.left, found.cost + price), text
+    if best.left > FAR:
+        for text, make in retold:
+            made = make()
+            found = best if made is None else made.judged()
+            if made is not None and found.cost + RARE < best.cost:
+                best, cause = Judged(found.left, found.cost + RARE), text
+    if cause and best.left < min(NAMED * told.left, 2.0 * POOR):
+        return (
+            f"{cause}: put right, a machine like the file's leaves {100 * best.left:.2g} % of the "
+            f"efforts' variation unexplained, as recorded {100 * told.left:.2g} %"
+        )
+    if cause and best.left < 2.0 * POOR:
+        return f"{cause}: as recorded, masses and payload would be far from the file's"
+    if cause or told.left**2 > POOR**2 + problem.noisy**2:
+        return (
+            f"no machine like the file's explains the efforts: {100 * told.left:.2g} % of their "
+            "variation is left (another machine, another motion, or noise?)"
+        )
+    return None
+
+
+def _efforts(problem: Problem, joints: Sequence[str]) -> Iterator[tuple[str, Problem, float]]:
+    """Faults of the efforts, with their prices: signs, scales, columns, delays."""
+    n = len(joints)
+
+    def scaled(factors: Array) -> Problem:
+        return replace(problem, effort=factors * problem.effort, late=factors * problem.late)
+
+    for signs in _signs(problem.scales(np.eye(n))):
+        negative = [joint for joint, sign in zip(joints, signs, strict=True) if sign < 0.0]
+        yield f"efforts of {_listed(negative, n)} have the wrong sign", scaled(signs), RARE
+    for which in [np.ones(n), *np.eye(n)] if n > 1 else [np.ones(1)]:
+        # The likeliest scale is looked for, as the one of least squares is near it alone.
+        near = problem.scales(which[:, None])[int(np.argmax(which))]
+        tried = [near * step for step in SCALES] + [1.0 / unit for unit in UNITS.values()]
+        factors = [np.where(which > 0.0, one, 1.0) for one in tried if one != 0.0]
+        likely = min(factors, key=lambda one: scaled(one).judged().cost)
+        factor = float(likely[int(np.argmax(which))])
+        if not 1.0 / RANGE <= factor <= RANGE:
+            names = _listed([j for j, one in zip(joints, which, strict=True) if one > 0.0], n)
+            price = UNIT if factor > 0.0 else RARE + UNIT
+            yield _scale_text(names, 1.0 / factor), scaled(likely), price
+    orders = [(f"efforts of {joints[i]} and {joints[k]} are exchanged", _swap(n, i, k))
+              for i, k in combinations(range(n), 2)]  # fmt: skip
+    if n > 2:
+        orders += [("columns of the efforts are in another order", np.roll(np.arange(n), s))
+                   for s in (1, n - 1)]  # fmt: skip
+        orders.append(("columns of the efforts are in another order", np.arange(n)[::-1]))
+    for text, order in orders:
+        other = replace(problem, effort=problem.effort[:, order], late=problem.late[:, order])
+        yield text, other, RARE
+    yield from ((text, other, RARE) for text, other in _delays(problem, joints))
+
+
+def _signs(scales: Array) -> list[Array]:
+    """All of them, each of them, and those that the best scales have."""
+    n, best = len(scales), np.sign(scales)
+    found = [-np.ones(n), *(1.0 - 2.0 * np.eye(n))] if n > 1 else [-np.ones(1)]
+    if (best < 0.0).any() and (best != 0.0).all():
+        found.append(best)
+    return found
+
+
+def _swap(n: int, i: int, k: int) -> NDArray[np.int64]:
+    order = np.arange(n)
+    order[[i, k]] = k, i
+    return order
+
+
+def _delays(problem: Problem, joints: Sequence[str]) -> Iterator[tuple[str, Problem]]:
+    """Efforts, of all joints or of one, that belong to another time."""
+    k, n = problem.effort.shape
+    most = min(int(SEARCHED / problem.period), k // 4)
+    least = int(np.ceil(LATEST / problem.period))
+    steps = [s for s in range(-most, most + 1) if abs(s) >= least]
+    if not steps:
+        return
+    inner = slice(most, k - most)
+    missed = np.empty((len(steps), n))
+    for j in range(n):
+        table = np.concatenate([problem.columns[inner, j], problem.late[inner, j, None]], 1)
+        table = table[:, np.abs(table).max(0) > 0.0]
+        basis = np.linalg.qr(table / np.linalg.norm(table, axis=0))[0]
+        rest = problem.rest[inner, j] / problem.variation[j]
+        own = problem.effort[:, j] / problem.variation[j]
+        shifted = np.stack([own[most + s : k - most + s] for s in steps]) - rest
+        missed[:, j] = np.sum(shifted**2, 1) - np.sum((shifted @ basis) ** 2, 1)
+    choices: list[tuple[Sequence[int], int]] = [(range(n), int(np.argmin(missed.sum(1))))]
+    choices += [((j,), int(np.argmin(missed[:, j]))) for j in range(n)] if n > 1 else []
+    for which, place in choices:
+        step = steps[place]
+        names = _listed([joints[j] for j in which], n)
+        late = step * problem.period
+        text = f"efforts of {names} are {abs(late):.2g} s {'late' if late > 0 else 'early'}"
+        cut = {name: getattr(problem, name)[inner] for name in ("rest", "columns", "counts")}
+        effort, change = problem.effort[inner].copy(), problem.late[inner].copy()
+        for j in which:
+            there = slice(most + step, k - most + step)
+            effort[:, j], change[:, j] = problem.effort[there, j], problem.late[there, j]
+        yield text, replace(problem, effort=effort, late=change, **cut)
+
+
+def _scale_text(names: str, scale: float) -> str:
+    sign = " and of the wrong sign" if scale < 0.0 else ""
+    near = sorted(UNITS, key=lambda unit: abs(np.log(abs(scale) / UNITS[unit])))[0]
+    unit = f" ({near}?)" if 1.0 / LIKE_A_UNIT < abs(scale) / UNITS[near] < LIKE_A_UNIT else ""
+    return (
+        f"efforts of {names} are {abs(scale):.3g} times what the robot's file makes of the motion"
+        f"{sign}: units? N m and N{unit}"
+    )
+
+
+def _listed(names: Sequence[Any], count: int) -> str:
+    return "all joints" if len(names) == count > 1 else " and ".join(names)

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What measured poses do not determine of a machine's geometry, in a few plain sentences.
+
+The directions that a fit leaves as they were span a space. Changes that mean something to whoever
+builds the machine (a limb moved as a whole, a joint moved along its own axis) are looked for in it,
+the particular ones before the general ones; what they leave is named by its greatest numbers.
+
+May import: numpy, pkm_twin's machine, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.machine.entries import keys_of
+from pkm_twin.machine.graph import Graph
+
+Array = NDArray[np.float64]
+
+LINES: Final = 10
+INSIDE: Final = 0.8
+"""Part of a change, squared, that lies in what is not determined."""
+NEW: Final = 0.1
+"""Part of it that no change before has named."""
+FEW: Final = 4
+"""Numbers of a combination that is named by all of them."""
+SHOWN: Final = 0.1
+"""Part of the greatest weight below which a number is not named."""
+NAMED: Final = 6
+"""Names in a list before the others are counted."""
+AXES: Final = "xyz"
+
+
+class Change(NamedTuple):
+    """A change of the numbers, (p,), what it is called, and what it happens to."""
+
+    kind: str
+    item: str
+    vector: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Numbers:
+    """Which numbers, by place, are whose."""
+
+    graph: Graph
+    names: Sequence[str]
+    scales: Array
+    points: dict[tuple[str, int], NDArray[np.int64]]
+    """Of a joint or rod (and its end): places of the point's three numbers, -1 where none."""
+    axes: dict[tuple[str, int], NDArray[np.int64]]
+    origin: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, graph: Graph, names: Sequence[str], scales: Array) -> _Numbers:
+        points: dict[tuple[str, int], NDArray[np.int64]] = {}
+        axes: dict[tuple[str, int], NDArray[np.int64]] = {}
+        origin = np.full(3, -1)
+        for place, name in enumerate(names):
+            keys = keys_of(name)
+            if not isinstance(keys[-1], int) or not 0 <= keys[-1] < 3:
+                continue
+            words, last = [str(k) for k in keys if isinstance(k, str)], keys[-1]
+            number = keys[-2] if isinstance(keys[-2], int) else 0
+            if words == ["origin"]:
+                origin[last] = place
+            elif len(words) != 3 or words[1] not in {**graph.joints, **graph.rods}:
+                continue
+            elif words[2] in ("at", "ends"):
+                points.setdefault((words[1], int(number)), np.full(3, -1))[last] = place
+            elif words[2] in ("axis", "axes"):
+                axes.setdefault((words[1], int(number)), np.full(3, -1))[last] = place
+        return cls(graph, names, scales, points, axes, origin)
+
+    def vector(self, moves: Sequence[tuple[NDArray[np.int64], Array]]) -> Array:
+        """Changes (3,) of numbers at places (3,), over their scales; zero where one is missing."""
+        found = np.zeros(len(self.names))
+        for places, change in moves:
+            for place, value in zip(places.tolist(), change.tolist(), strict=True):
+                if place >= 0:
+                    found[place] = value / self.scales[place]
+        return found
+
+    def bodies(self, point: tuple[str, int]) -> tuple[str, ...]:
+        """That a point belongs to: both of a joint's, one of a rod's end."""
+        name, end = point
+        if name in self.graph.joints:
+            joint = self.graph.joints[name]
+            return joint.inner, joint.outer
+        rod = self.graph.rods[name]
+        return (rod.inner, rod.outer)[end], name
+
+    def limbs(self) -> list[list[tuple[str, int]]]:
+        """Points by the limb they are on: what hangs together without base and platform."""
+        ends = {self.graph.platform, "base"}
+        group = {point: {b for b in self.bodies(point) if b not in ends} for point in self.points}
+        links = [{joint.inner, joint.outer} - ends for joint in self.graph.joints.values()]
+        links += [{rod.inner, rod.outer, rod.name} - ends for rod in self.graph.rods.values()]
+        merged: list[set[str]] = []
+        for link in links:
+            own = [one for one in merged if one & link]
+            merged = [one for one in merged if not one & link] + [set().union(link, *own)]
+        found = [[p for p, bodies in group.items() if bodies & one] for one in merged]
+        return [one for one in found if one]
+
+    def point(self, point: tuple[str, int]) -> Array:
+        """Where it is at home, (3,)."""
+        name, end = point
+        joints, rods = self.graph.joints, self.graph.rods
+        return joints[name].at if name in joints else np.asarray(rods[name].ends[end], np.float64)
+
+    def side(self, body: str) -> list[tuple[str, int]]:
+        """Points on a body."""
+        return [point for point in self.points if body in self.bodies(point)]
+
+
+def _changes(n: _Numbers) -> Iterator[Change]:
+    """All that are looked for, the particular ones first."""
+    eye = np.eye(len(n.names))
+    for k, name in enumerate(n.names):
+        yield Change("{items} alone", name, eye[k])
+    for (name, number), places in n.axes.items():
+        joint = n.graph.joints.get(name)
+        if joint is not None and number < len(joint.axes):
+            longer = n.vector([(places, joint.axes[number])])
+            yield Change("the length of the axes of {items}: only directions matter", name, longer)
+            point = n.points.get((name, 0))
+            if point is not None:
+                along = n.vector([(point, joint.axes[number])])
+                yield Change("{items} moved along their own axes", name, along)
+    for limb in n.limbs():
+        label = " with ".join(dict.fromkeys(name for name, _ in limb))
+        for k, axis in enumerate(AXES):
+            moved = n.vector([(n.points[point], np.eye(3)[k]) for point in limb])
+            yield Change(f"limbs moved as a whole along {axis}: {{items}}", label, moved)
+    base, platform = n.side("base"), n.side(n.graph.platform)
+    of_base, of_platform = "the base's joints", "the platform's joints"
+    reference = "the reference point"
+    groups = [
+        ([*platform], True, f"{of_platform} and {reference}"),
+        ([*platform], False, of_platform), ([*base], False, of_base),
+        ([*platform, *base], False, f"{of_platform} and {of_base}"),
+        ([*n.points], False, "all joints"), ([*n.points], True, f"all joints and {reference}"),
+    ]  # fmt: skip
+    for points, with_origin, label in groups:
+        own = [n.points[point] for point in dict.fromkeys(points)]
+        at = [n.point(point) for point in dict.fromkeys(points)]
+        if with_origin:
+            own, at = [*own, n.origin], [*at, n.graph.origin]
+        directions = [
+            (one, n.graph.joints[name].axes[number])
+            for (name, number), one in n.axes.items()
+            if (name, 0) in points and number < len(n.graph.joints[name].axes)
+        ]
+        for k, axis in enumerate(AXES):
+            moved = n.vector([(one, np.eye(3)[k]) for one in own])
+            yield Change("{items} moved together along " + axis, label, moved)
+        for k, axis in enumerate(AXES):
+            about = np.eye(3)[k]
+            turns = [(one, np.cross(about, p)) for one, p in zip(own, at, strict=True)]
+            turns += [(one, np.cross(about, d)) for one, d in directions]
+            yield Change("{items} turned together about " + axis, label, n.vector(turns))
+    lengths = [(n.points[point], n.point(point)) for point in n.points]
+    whole = n.vector([*lengths, (n.origin, n.graph.origin)])
+    yield Change("{items} in proportion", "all lengths", whole)
+
+
+def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: Array) -> list[str]:
+    """At most ten sentences.
+
+    :param names: of the numbers, as paths. ``scales``: their prior deviations, (p,).
+    :param directions: in units of these, orthonormal, (p, u).
+    """
+    n = _Numbers.of(graph, names, scales)
+    left = directions
+    found: dict[str, list[str]] = {}
+    for change in _changes(n):
+        size = float(np.linalg.norm(change.vector))
+        if not left.shape[1] or size == 0.0:
+            continue
+        unit = change.vector / size
+        if np.sum((directions.T @ unit) ** 2) < INSIDE:
+            continue
+        inner = left.T @ unit
+        if inner @ inner < NEW:
+            continue
+        found.setdefault(change.kind, []).append(change.item)
+        # What is orthogonal to it, in the space that is left.
+        left = left @ np.linalg.svd(inner[None])[2][1:].T
+    told = list(_joined(found))
+    rest = list(_combinations(names, left))
+    if len(told) + len(rest) > LINES:
+        shown = told[: LINES - 1]
+        more = left.shape[1] + sum(len(found[k]) for k in list(found)[LINES - 1 :] if k in found)
+        weights = np.sqrt(np.sum(left**2, 1))
+        return [
+            *shown,
+            f"{more} further combinations, mostly of {_listed(_greatest(names, weights))}",
+        ]
+    return [*told, *rest]
+
+
+def _joined(found: dict[str, list[str]]) -> Iterator[str]:
+    """A sentence for each kind; such as differ by the axis alone are one."""
+    merged: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for kind, items in found.items():
+        axis = next((a for a in AXES if f" {a}:" in kind or kind.endswith(f" {a}")), "")
+        plain = kind.replace(f" {axis}:", " {axes}:") if f" {axis}:" in kind else kind
+        if axis and kind.endswith(f" {axis}"):
+            plain = kind[: -len(axis)] + "{axes}"
+        merged.setdefault((plain, tuple(dict.fromkeys(items))), []).append(axis)
+    for (kind, names), axes in merged.items():
+        yield kind.format(items=_listed(names), axes=_and(sorted(set(axes))))
+
+
+def _combinations(names: Sequence[str], left: Array) -> Iterator[str]:
+    """What no change names."""
+    for vector in left.T:
+        shown = _greatest(names, np.abs(vector))
+        if len(shown) > FEW:
+            weights = np.sqrt(np.sum(left**2, 1))
+            many = "further combinations" if left.shape[1] > 1 else "further combination"
+            yield f"{left.shape[1]} {many}, mostly of {_listed(_greatest(names, weights))}"
+            return
+    for vector in left.T:
+        shown = sorted(_greatest(names, np.abs(vector)), key=names.index)
+        yield f"{_and(shown)} changed together"
+
+
+def _greatest(names: Sequence[str], weights: Array) -> list[str]:
+    order = np.argsort(-weights, kind="stable")
+    return [names[k] for k in order if weights[k] > SHOWN * weights.max()]
+
+
+def _listed(items: Sequence[str]) -> str:
+    """With commas, the first of many."""
+    if len(items) <= NAMED:
+        return ", ".join(items)
+    return f"{', '.join(items[:NAMED])} and {len(items) - NAMED} more"
+
+
+def _and(items: Sequence[str]) -> str:
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of drawn machines: sound ones, and such as no machine or another one makes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.fit_rows import Recorded
+from pkm_twin import Robot
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.entries import entries, with_entries
+from test.laws.recordings import smooth_motion
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A machine: the robot of its file, the robot that it is, and its motion."""
+
+    robot: Robot
+    truth: Robot
+    time: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    efforts: Array
+
+    @property
+    def size(self) -> Array:
+        """Rms of the efforts by joint, shape (n,)."""
+        return np.sqrt(np.mean(self.efforts**2, 0))
+
+    def recorded(self, q: Array | None = None, effort: Array | None = None) -> Recorded:
+        return Recorded(
+            "recording", self.time, self.q if q is None else q,
+            self.efforts if effort is None else effort,
+        )  # fmt: skip
+
+
+def machine(
+    robot: Robot, rng: np.random.Generator, duration: float = 12.0, rate: float = 100.0
+) -> Drawn:
+    """With friction and a payload that the file does not have."""
+    time, q, qd, qdd = smooth_motion(robot, rng, duration, rate)
+    size = np.sqrt(np.mean(inverse_dynamics(robot, q, qd, qdd) ** 2, 0))
+    n, radius = robot.joints_count, robot.size
+    mass = rng.uniform(0.3, 1.2) * robot.graph.bodies[robot.graph.platform].mass
+    moment = mass * (rng.uniform(0.2, 0.4) * radius) ** 2
+    truth = robot.changed(
+        friction={
+            "viscous": (rng.uniform(0.03, 0.15, n) * size / np.sqrt(np.mean(qd**2, 0))).tolist(),
+            "coulomb": (rng.uniform(0.02, 0.1, n) * size).tolist(),
+        },
+        payload={
+            "mass": mass, "com": (radius * rng.uniform(-0.3, 0.3, 3)).tolist(),
+            "inertia": [moment, 1.3 * moment, 1.6 * moment],
+        },
+    )  # fmt: skip
+    return Drawn(robot, truth, time, q, qd, qdd, inverse_dynamics(truth, q, qd, qdd))
+
+
+def noisy(
+    recorded: Recorded, rng: np.random.Generator, share: float = 0.01, steps: float = 1e5
+) -> Recorded:
+    """White noise of the efforts by their rms, an encoder of so many steps a span."""
+    shape = recorded.q.shape
+    size = np.sqrt(np.mean(recorded.effort**2, 0))
+    step = np.ptp(recorded.q, axis=0) / steps
+    q = np.round(recorded.q / step + rng.normal(size=shape)) * step
+    return replace(recorded, q=q, effort=recorded.effort + share * size * rng.normal(size=shape))
+
+
+def shifted(values: Array, time: Array, by: float) -> Array:
+    """Later by so many seconds."""
+    return np.stack([np.interp(time - by, time, column) for column in values.T], -1)
+
+
+# What is wrong with the model ------------------------------------------------------------------
+
+
+def gain(m: Drawn, rng: np.random.Generator) -> Recorded:
+    """One joint's efforts 5 % high."""
+    factor = np.ones(len(m.size))
+    factor[rng.integers(len(factor))] = 1.05
+    return m.recorded(effort=m.efforts * factor)
+
+
+def gains(m: Drawn, rng: np.random.Generator) -> Recorded:
+    """All efforts 5 % high."""
+    return m.recorded(effort=1.05 * m.efforts)
+
+
+def unit_of(robot: Robot) -> Array:
+    """A radian, or the machine's size."""
+    return np.array([robot.size if unit == "m" else 1.0 for unit in robot.joint_units])
+
+
+def sensor(m: Drawn, rng: np.random.Generator) -> Recorded:
+    """One joint's sensor off by 0.01 rad."""
+    off = np.zeros(len(m.size))
+    off[rng.integers(len(off))] = 0.01
+    return m.recorded(q=m.q + off * unit_of(m.robot))
+
+
+def sensors(m: Drawn, rng: np.random.Generator) -> Recorded:
+    """Every joint's sensor off by 0.01 rad."""
+    return m.recorded(q=m.q + 0.01 * rng.choice([-1.0, 1.0], len(m.size)) * unit_of(m.robot))
+
+
+def late(m: Drawn, rng: np.random.Generator) -> Recorded:
+    """One joint's efforts 2 ms late."""
+    j = rng.integers(len(m.size))
+    effort = m.efforts.copy()
+    effort[:, j] = shifted(effort, m.time, 2e-3)[:, j]
+    return m.recorded(effort=effort)
+
+
+def load_friction(m: Drawn, rng: np.random.Generator) -> Recorded:
+    """Friction of 5 % of the load."""
+    return m.recorded(effort=m.efforts + 0.05 * np.abs(m.efforts) * np.sign(m.qd))
+
+
+def stribeck(m: Drawn, rng: np.random.Generator) -> Recorded:
+    """Static friction of twice the Coulomb friction, below a tenth of the rms speed."""
+    slow = 0.1 * np.sqrt(np.mean(m.qd**2, 0))
+    peak = m.truth.friction.coulomb * np.exp(-((m.qd / slow) ** 2)) * np.sign(m.qd)
+    return m.recorded(effort=m.efforts + peak)
+
+
+def elastic(m: Drawn, rng: np.random.Generator) -> Recorded:
+    """Drives that give 5 mrad under their greatest effort, measured at the motor."""
+    give = 5e-3 * unit_of(m.robot) / np.abs(m.efforts).max(0)
+    return m.recorded(q=m.q + give * m.efforts)
+
+
+def lengths(m: Drawn, rng: np.random.Generator) -> Recorded:
+    """One length of the geometry off by 1 %, or a place by 1 % of the machine's size."""
+    robot = m.truth
+    found = {
+        path: value for path, (value, unit) in entries(robot).items()
+        if unit == "m" and not path.startswith(("limits", "payload", "joint_map", "uncertainty",
+                                                "members", "inertia", "bodies"))
+        and ".com" not in path and "compliance" not in path
+    }  # fmt: skip
+    named = [p for p in found if p.startswith("geometry.") and "arm" in p]
+    for _ in range(50):
+        path = str(rng.choice(named or list(found)))
+        step = 0.01 * (found[path] if abs(found[path]) > 0.1 * robot.size else robot.size)
+        try:
+            other = with_entries(robot, {path: found[path] + step})
+            effort = inverse_dynamics(other, m.q, m.qd, m.qdd)
+        except (PkmTwinError, ValueError):
+            continue
+        if np.abs(effort - m.efforts).max() > 1e-3 * np.abs(m.efforts).max():
+            return m.recorded(effort=effort)
+    raise AssertionError(f"no length of {robot.name} can change alone")
+
+
+WRONG: dict[str, Callable[[Drawn, np.random.Generator], Recorded]] = {
+    f.__name__: f
+    for f in (gain, gains, sensor, sensors, late, load_friction, stribeck, elastic, lengths)
+}
+"""Recordings that the model does not explain."""
+
+
+# What no machine of this file makes ------------------------------------------------------------
+
+
+def _but(rec: Recorded, rng: np.random.Generator, effort: bool) -> tuple[Array, int]:
+    values = (rec.effort if effort else rec.q).copy()
+    return values, int(rng.integers(values.shape[1]))
+
+
+def efforts_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=-r.effort)
+
+
+def one_effort_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+    effort, j = _but(r, rng, effort=True)
+    effort[:, j] *= -1.0
+    return replace(r, effort=effort)
+
+
+def positions_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, q=-r.q)
+
+
+def one_position_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+    q, j = _but(r, rng, effort=False)
+    q[:, j] = 2.0 * q[:, j].mean() - q[:, j]
+    return replace(r, q=q)
+
+
+def one_joint_negated(r: Recorded, rng: np.random.Generator) -> Recorded:
+    """Positions about their middle, so that the machine can take them."""
+    q, j = _but(r, rng, effort=False)
+    q[:, j] = 2.0 * q[:, j].mean() - q[:, j]
+    effort = r.effort.copy()
+    effort[:, j] *= -1.0
+    return replace(r, q=q, effort=effort)
+
+
+def time_reversed(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, q=r.q[::-1], effort=r.effort[::-1])
+
+
+def efforts_reversed(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=r.effort[::-1])
+
+
+def effort_columns_swapped(r: Recorded, rng: np.random.Generator) -> Recorded:
+    n = r.q.shape[1]
+    i, k = rng.permutation(n)[:2]
+    order = np.arange(n)
+    order[[i, k]] = k, i
+    return replace(r, effort=r.effort[:, order])
+
+
+def effort_columns_rolled(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=np.roll(r.effort, 1, 1))
+
+
+def position_columns_swapped(r: Recorded, rng: np.random.Generator) -> Recorded:
+    n = r.q.shape[1]
+    i, k = rng.permutation(n)[:2]
+    order = np.arange(n)
+    order[[i, k]] = k, i
+    return replace(r, q=r.q[:, order])
+
+
+def columns_taken_for_each_other(r: Recorded, rng: np.random.Generator) -> Recorded:
+    """Positions as efforts and efforts as positions."""
+    return replace(r, q=r.effort, effort=r.q)
+
+
+def milliseconds(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, time=1e3 * r.time)
+
+
+def seconds_for_milliseconds(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, time=1e-3 * r.time)
+
+
+def half_speed(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, time=2.0 * r.time)
+
+
+def kgf_cm(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=r.effort * 100.0 / 9.80665)
+
+
+def newton_millimetres(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=1e3 * r.effort)
+
+
+def kilogram_force(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=r.effort / 9.80665)
+
+
+def three_times(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=3.0 * r.effort)
+
+
+def a_third(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=r.effort / 3.0)
+
+
+def motor_side(r: Recorded, rng: np.random.Generator) -> Recorded:
+    """Of one joint the torque before its gear."""
+    effort, j = _but(r, rng, effort=True)
+    effort[:, j] /= 20.0
+    return replace(r, effort=effort)
+
+
+def degrees(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, q=np.degrees(r.q))
+
+
+def radians_for_degrees(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, q=np.radians(r.q))
+
+
+def millimetres(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, q=1e3 * r.q)
+
+
+def efforts_late(r: Recorded, rng: np.random.Generator) -> Recorded:
+    by = 0.3 * rng.choice([-1.0, 1.0])
+    return replace(r, effort=shifted(r.effort, r.time, by))
+
+
+def one_effort_late(r: Recorded, rng: np.random.Generator) -> Recorded:
+    effort, j = _but(r, rng, effort=True)
+    effort[:, j] = shifted(r.effort, r.time, 0.3)[:, j]
+    return replace(r, effort=effort)
+
+
+def efforts_shuffled(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=rng.permutation(r.effort))
+
+
+def noise_for_efforts(r: Recorded, rng: np.random.Generator) -> Recorded:
+    return replace(r, effort=r.effort.mean(0) + r.effort.std(0) * rng.normal(size=r.effort.shape))
+
+
+_ALL = (
+    efforts_negated, one_effort_negated, positions_negated, one_position_negated,
+    one_joint_negated, time_reversed, efforts_reversed, effort_columns_swapped,
+    effort_columns_rolled, position_columns_swapped, columns_taken_for_each_other, milliseconds,
+    seconds_for_milliseconds, half_speed, kgf_cm, newton_millimetres, kilogram_force, three_times,
+    a_third, motor_side, degrees, radians_for_degrees, millimetres, efforts_late, one_effort_late,
+    efforts_shuffled, noise_for_efforts,
+)  # fmt: skip
+IMPOSSIBLE: dict[str, Callable[[Recorded, np.random.Generator], Recorded]] = {
+    f.__name__: f for f in _ALL
+}
+"""Recordings that no machine of the file can have made."""

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings that a fit judges: sound ones, such as another machine makes, such as none makes."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from delta_dynamics.estimation import estimate
+from delta_dynamics.file_parameters import file_parameters
+from delta_dynamics.fit import Fit, fit
+from delta_dynamics.fit_plausible import recording_fault
+from delta_dynamics.fit_rows import Recorded, rows_of
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.machine.shared import above_zero
+from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy
+from test.laws.test_fit import truths
+from test.support.robots import load
+
+Array = NDArray[np.float64]
+
+KINDS: Any = ("friction", "payload")
+COMMON = (
+    "efforts_negated", "one_effort_negated", "one_joint_negated", "positions_negated",
+    "time_reversed", "effort_columns_swapped", "position_columns_swapped", "milliseconds",
+    "kgf_cm", "three_times", "efforts_late",
+)  # fmt: skip
+LIKELY = {
+    "gain": "gain of the efforts", "late": "efforts late", "sensor": "sensor offset",
+    "load_friction": "friction that grows with the load",
+    "stribeck": "static friction above Coulomb friction", "elastic": "elastic drive",
+    "lengths": "geometry",
+}  # fmt: skip
+
+
+@cache
+def drawn(name: str, seed: int) -> Drawn:
+    return machine(load(name), np.random.default_rng([seed, *name.encode()]))
+
+
+def recorded(what: str, name: str, seed: int) -> Recorded:
+    """Of a machine of the file, another one's, or nobody's."""
+    m, rng = drawn(name, seed), np.random.default_rng([seed, 17])
+    made = noisy(WRONG[what](m, rng) if what in WRONG else m.recorded(), rng)
+    return IMPOSSIBLE[what](made, rng) if what in IMPOSSIBLE else made
+
+
+def judged(what: str, name: str, seed: int) -> Fit:
+    return fit(drawn(name, seed).robot, [recorded(what, name, seed)], KINDS)
+
+
+def worst(result: Fit, m: Drawn) -> float:
+    """Greatest error of a fitted number over its standard deviation."""
+    true = truths(m.truth, KINDS)
+    return max(abs(n.after - true[n.name]) / n.deviation for n in result.numbers)
+
+
+def rejected(what: str, name: str, seed: int) -> bool:
+    robot, record = load(name), recorded(what, name, seed)
+    everything = file_parameters(robot)
+    try:
+        rows, _ = rows_of(robot, everything, record, None)
+        return recording_fault(robot, everything, record, rows) is not None
+    except PkmTwinError:
+        return True
+
+
+@pytest.mark.parametrize("name", ["linear_delta", "delta_cu"])
+def test_a_sound_recording_is_explained(name: str) -> None:
+    result = judged("sound", name, 3)
+    assert result.verdict.answer == "explains"
+    assert not result.verdict.findings and not result.accepted
+    assert worst(result, drawn(name, 3)) < 3.0
+
+
+@pytest.mark.parametrize("what", COMMON)
+def test_what_no_machine_of_the_file_makes_is_rejected(what: str) -> None:
+    assert rejected(what, "linear_delta", 4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["delta", "prru", "rps3", "upr_rpu", "linear_delta"])
+@pytest.mark.parametrize("what", IMPOSSIBLE)
+def test_others_are_rejected_too(what: str, name: str) -> None:
+    assert rejected(what, name, 5)
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_another_machine_of_the_file_s_kind_is_not_rejected(what: str) -> None:
+    assert not rejected(what, "linear_delta", 4)
+
+
+@pytest.mark.parametrize(
+    "what",
+    [pytest.param(w, marks=pytest.mark.long) if w in ("sensor", "elastic") else w for w in LIKELY],
+)
+def test_what_the_model_leaves_out_is_found(what: str) -> None:
+    result = judged(what, "delta_cu", 2)
+    assert result.verdict.answer != "explains"
+    named = [
+        one.kind for finding in result.verdict.findings
+        for one in (finding.suspect, *finding.others)
+    ]  # fmt: skip
+    assert LIKELY[what] in named
+    assert result.verdict.deviations in ("widened", "withheld")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["delta", "five_bar", "linear_delta", "prru", "upr_rpu"])
+@pytest.mark.parametrize("what", WRONG)
+def test_it_is_found_or_within_the_standard_deviations(what: str, name: str) -> None:
+    result = judged(what, name, 3)
+    assert result.verdict.answer != "explains" or worst(result, drawn(name, 3)) < 4.0
+
+
+def test_what_is_accepted_is_marked() -> None:
+    robot, record = load("linear_delta"), recorded("kgf_cm", "linear_delta", 4)
+    with pytest.raises(PkmTwinError, match=r"kgf cm.*--accept"):
+        fit(robot, [record], KINDS)
+    result = fit(robot, [record], KINDS, accept=True)
+    assert len(result.accepted) == 1
+    assert result.verdict.deviations == "withheld"
+    assert all(np.isnan(n.deviation) for n in result.numbers if n.status != "not excited")
+
+
+def test_a_bound_that_is_active_counts_in_the_standard_deviations() -> None:
+    """Of two columns with a common part the noise, which is slow, hides the one that is bounded.
+
+    The data know the other column well, but a fit that takes noise for white moves it with the
+    first one as far as the bound moves that.
+    """
+    rng, k = np.random.default_rng(8), np.arange(4000) / 4000.0
+    slow = np.sin(2.0 * np.pi * k)
+    errors, deviations = [], []
+    for _ in range(60):
+        table = np.stack([slow, slow + rng.normal(size=4000)], -1)[:, None]
+        drift = np.cumsum(rng.normal(size=4000))
+        target = table @ [0.0, 1.0] + 0.02 * (drift - drift.mean())[:, None]
+        cones = [(slice(0, 1), above_zero(0, 1))]
+        found = estimate(table, target, np.ones(2), np.ones(2), cones)
+        assert found.values[0] >= 0.0
+        if found.bound:
+            errors.append(found.values - [0.0, 1.0])
+            deviations.append(np.sqrt(np.diag(found.covariance)))
+    assert len(errors) > 20
+    assert np.mean(np.abs(errors) < 3.0 * np.array(deviations)) >= 0.95
