@@ -558,7 +558,9 @@ class Traced:
         """Unknowns along the tangent at home: nearer than home itself."""
         motion, jq, lu = self._at_home
         away = self.q - self.graph.home
-        return motion.retracted(self.tree.home, -lu.solve(jq @ away))
+        # Solved by joint: what is left to a sample are products with what is prepared.
+        columns = snapped_all([-lu.solve(jq[:, j]) for j in range(self.joints)])
+        return motion.retracted(self.tree.home, columns.T @ away)
 
     def _ordered(self, values: Mapping[str, Sequence[Any]]) -> list[Any]:
         """Unknowns of joints' values."""

@@ -128,6 +128,16 @@ def check_number(section: Any, keys: Sequence[Key], path: str) -> None:
         left.pop(0)
 
 
+def merged(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain data with other values at some keys, of mappings within likewise."""
+    result = dict(data)
+    for key, value in changes.items():
+        old = result.get(key)
+        both = isinstance(value, Mapping) and isinstance(old, Mapping)
+        result[key] = merged(dict(old or {}), value) if both else schema.plain(value)
+    return result
+
+
 def data_of(robot: Robot, values: Mapping[str, float] | None = None) -> dict[str, Any]:
     """What the robot's file gives, as plain data, with other numbers by dotted path.
 

@@ -34,7 +34,7 @@ from pkm_twin.kinematics.passive import (
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
-from pkm_twin.machine.entries import check_number, full_keys, number_in, placed
+from pkm_twin.machine.entries import check_number, full_keys, given, merged, number_in, placed
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Coefficients, Layout
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
@@ -769,16 +769,21 @@ class Robot:
         return np.array(rows)
 
     def changed(self: R, **sections: Mapping[str, object] | object) -> R:
-        """A copy with new values, e.g. ``payload={"mass": 0.2}, gravity=[0, 0, -9.81]``.
+        """A copy with new values, e.g. ``payload={"mass": 0.2}, geometry={"arm_length": 0.3}``.
 
-        All values are checked as in a file; one bad value refuses all.
+        All values are checked as in a file; one bad value rejects all. A section of geometry,
+        masses or members makes the machine of a new file: its home is chosen again.
 
-        :raises ParameterError: a value out of range, or a section that cannot change.
+        :raises ParameterError: a value out of range, or a machine that cannot be.
         """
+        if not set(sections) <= set(self.changeable):
+            known = self.parameter_sections()
+            for key in sections:
+                if key not in known:
+                    raise UnknownNameError(key, key, known)
+            return type(self).from_data(merged(given(known), sections), self.name)
         new: dict[str, Any] = {}
         for key, value in sections.items():
-            if key not in self.changeable:
-                raise UnknownNameError(key, key, self.changeable)
             if isinstance(value, Mapping) and not isinstance(getattr(self, key), Mapping):
                 new[key] = schema.replace(getattr(self, key), value, key)
             else:
