@@ -196,13 +196,15 @@ class Function:
             place.target,
         )
 
-    def load(self, place: Value) -> Value:
-        """What stands there."""
-        return self.new(place.target, f"load {place.target}, {place.kind} {place.name}")
+    def load(self, place: Value, align: int = 0) -> Value:
+        """What stands there; at a multiple of ``align`` bytes, by default of its own size."""
+        side = f", align {align}" if align else ""
+        return self.new(place.target, f"load {place.target}, {place.kind} {place.name}{side}")
 
-    def store(self, x: Value, place: Value) -> None:
-        """Write x there."""
-        self._put(f"store {x.kind} {x.name}, {place.kind} {place.name}")
+    def store(self, x: Value, place: Value, align: int = 0) -> None:
+        """Write x there, see :meth:`load`."""
+        side = f", align {align}" if align else ""
+        self._put(f"store {x.kind} {x.name}, {place.kind} {place.name}{side}")
 
     def extract_element(self, x: Value, lane: int) -> Value:
         """One entry of a vector."""

@@ -140,6 +140,13 @@ def _caller(inputs: int) -> Callable[..., Any]:
     return make
 
 
+def _aligned(rows: int, size: int) -> Array:
+    """An empty array at a multiple of 64 bytes: no vector lies across two lines of the cache."""
+    room = np.empty(rows * size + 8)
+    start = -room.ctypes.data % 64 // 8
+    return room[start : start + rows * size].reshape(rows, size)
+
+
 def _axes(array: Array) -> int:
     return array.ndim
 
@@ -170,13 +177,14 @@ class Code:
         with self._lock:
             if llvm is None:
                 plain = PlainCode(self.program)
-                return _header(self.program), plain.prepare, plain, None
+                return _header(self.program, 1), plain.prepare, plain, None
             name = cache.digest(self._key, _sources(), llvm.IDENTITY)
             stored = cache.read(name)
             if stored and _sound(stored[0]) and cache.is_object(stored[1], llvm.SYMBOL):
                 header, code = stored
             else:
-                header, code = _header(self.program), llvm.compile_object(llvm.emit(self.program))
+                header = _header(self.program, llvm.LANES)
+                code = llvm.compile_object(llvm.emit(self.program))
                 cache.write(name, header, code)
             prepare, address = llvm.load_object(code)
             prepare = llvm.LOCKED(prepare)
@@ -196,7 +204,7 @@ class Code:
         """What samples need of a machine's parameters.
 
         :param p: parameters, shape (k, parameters), contiguous, or of one machine (parameters,).
-        :returns: shape (k, prepared + 1), or (prepared + 1,): last by how much the parameters miss
+        :returns: shape (k, prepared), or (prepared,): last by how much the parameters miss
             what the program takes for constant, squared.
         """
         header, prepare, _, locked = self._loaded
@@ -205,7 +213,7 @@ class Code:
         rows = np.ascontiguousarray(np.atleast_2d(p), np.float64)
         if locked is None:
             return np.asarray(prepare(rows).reshape(*p.shape[:-1], -1), np.float64)
-        result = np.empty((len(rows), header["prepared"] + 1))
+        result = _aligned(len(rows), header["prepared"])
         words = np.array([len(rows), rows.ctypes.data, rows.shape[1], result.ctypes.data], np.int64)
         prepare(words.ctypes.data)
         return result.reshape(*p.shape[:-1], -1)
@@ -279,7 +287,7 @@ class Code:
     def run_each(self, prepared: Array, *inputs: Array) -> tuple[list[Array], Array | None]:
         """The same of many machines.
 
-        :param prepared: shape (k, prepared + 1).
+        :param prepared: shape (k, prepared).
         :param inputs: shape (k, samples, size), or (1, samples, size) for all machines alike, or
             (k or 1, 1, size) for all samples alike.
         :returns: outputs, shape (k, samples, size) each, and the status, None or (k, samples, 2).
@@ -498,12 +506,12 @@ class BoundCall:
         return int(status[..., 0].max()) if known else int(NOT_FINITE)
 
 
-def _header(program: Program) -> dict[str, Any]:
+def _header(program: Program, lanes: int) -> dict[str, Any]:
     return {
         "inputs": list(program.inputs.values()),
         "outputs": [len(row) for row in program.outputs.values()],
         "parameters": program.parameters + program.geometry,
-        "prepared": len(program.prepared),
+        "prepared": lanes * (len(program.prepared) + 1),
         "stepped": program.equations is not None,
     }
 

@@ -14,7 +14,7 @@ import ctypes
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import llvmlite
 import llvmlite.binding as binding
@@ -45,6 +45,8 @@ from pkm_twin.codegen.program import (
 )
 
 LANES: Final = 4
+ALIGN: Final = 8
+"""Bytes that rows of what is prepared are aligned to."""
 SYMBOL: Final = "kernel"
 PREPARE: Final = "prepare"
 STATUS: Final = " status"
@@ -110,14 +112,48 @@ IDENTITY: Final = f"{llvmlite.__version__} {CPU} {FEATURES} {LANES} {OPTIMISATIO
 """What machine code hangs on beside the program."""
 
 
+class _Known(dict[int, Value]):
+    """Values by expression; what is prepared is loaded where it is used.
+
+    A value that is held from one end of a program to the other would only be in the way of the
+    registers' allocation.
+    """
+
+    def __init__(self, known: Mapping[int, Value], b: Function, prepared: Prepared | None) -> None:
+        super().__init__(known)
+        self._b = b
+        self.places: Mapping[int, int] = {} if prepared is None else prepared.places
+        self._base = None if prepared is None else prepared.base
+
+    def __missing__(self, number: int) -> Value:
+        if self._base is None:
+            raise KeyError(number)
+        return self._b.load(self._b.gep(self._base, whole(self.places[number])), ALIGN)
+
+
+class Prepared(NamedTuple):
+    """Where the vectors of what is prepared stand, by expression's number."""
+
+    base: Value
+    places: Mapping[int, int]
+
+
 class _Emitter:
-    """Values of expressions at one place of the code, scalar or in lanes."""
+    """Values of expressions at one place of the code, scalar or in lanes.
+
+    :param prepared: where values that are known stand in memory.
+    """
 
     def __init__(
-        self, function: Function, used: Mapping[int, int], known: Mapping[int, Value], wide: bool
+        self,
+        function: Function,
+        used: Mapping[int, int],
+        known: Mapping[int, Value],
+        wide: bool,
+        prepared: Prepared | None = None,
     ) -> None:
         self.b, self.used, self.wide = function, used, wide
-        self.known = dict(known)
+        self.known = _Known(known, function, prepared)
         self.type = VECTOR if wide else DOUBLE
         self.integer = INTEGERS if wide else INT64
         self._turned: dict[int, tuple[Value, Value]] = {}
@@ -235,7 +271,7 @@ class _Emitter:
         self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]
     ) -> list[Value]:
         """Values of the results; every shared expression once."""
-        for e in ordered(results, self.known):
+        for e in ordered(results, [*self.known, *self.known.places]):
             self.known[e.number] = self.value(e, inputs)
         return [self.known[e.number] for e in results]
 
@@ -277,7 +313,7 @@ def _word(b: Function, k: int) -> Value:
 
 def _preparation(program: Program) -> Function:
     """What hangs on parameters alone, machine by machine; the words are machines, a pointer to
-    parameters and what they go on by, and a pointer to results.
+    parameters and what they go on by, and a pointer to results, each in all lanes.
     """
     b = _function(PREPARE)
     count, stride = _word(b, 0), _word(b, 2)
@@ -286,7 +322,7 @@ def _preparation(program: Program) -> Function:
     machines = _Counter(b, "machine", count)
     index = machines.begin()
     here = b.gep(source, b.mul(index, stride))
-    there = b.gep(target, b.mul(index, whole(len(results))))
+    there = b.gep(target, b.mul(index, whole(LANES * len(results))))
     # The geometry stands behind the program's own parameters.
     first = {PARAMETERS: 0, GEOMETRY: program.parameters}
     inputs: dict[str, dict[int, Value]] = {name: {} for name in first}
@@ -295,7 +331,8 @@ def _preparation(program: Program) -> Function:
             inputs[e.a][e.b] = b.load(b.gep(here, whole(first[e.a] + e.b)))
     out = _Emitter(b, uses(results), {}, wide=False)
     for k, value in enumerate(out.run(results, inputs)):  # type: ignore[arg-type]
-        b.store(value, b.gep(there, whole(k)))
+        for lane in range(LANES):
+            b.store(value, b.gep(there, whole(LANES * k + lane)))
     machines.close()
     b.ret(ZERO)
     return b
@@ -326,7 +363,9 @@ class _Writer:
         machines = _Counter(b, "machine", _word(b, 0))
         machines.begin()
         self.pointers = {name: b.inttoptr(b.load(at), DOUBLE) for name, at in places.items()}
-        self.constants = self._hoist(self.pointers[""])
+        self.constants = self._constants()
+        base = b.inttoptr(b.load(places[""]), VECTOR)
+        self.prepared = Prepared(base, {e.number: k for k, e in enumerate(program.prepared)})
         self._write()
         for name, (_, leap) in leaps.items():
             # Pointers are bytes, leaps are doubles.
@@ -334,19 +373,15 @@ class _Writer:
         machines.close()
         b.ret(b.load(self.flags))
 
-    def _hoist(self, parameters: Value) -> dict[int, Value]:
-        """Constants, and what is prepared, in all lanes."""
+    def _constants(self) -> dict[int, Value]:
+        """Constants, in all lanes."""
         wide = _Emitter(self.b, self.used, {}, wide=True)
-        for e in ordered(self.program.results, [e.number for e in self.program.prepared]):
-            if e.op == "const":
-                wide.known[e.number] = wide.number(e.a)
-        for k, e in enumerate(self.program.prepared):
-            value = self.b.load(self.b.gep(parameters, whole(k)))
-            wide.known[e.number] = self.b.splat(value, LANES)
-        return wide.known
+        known = [e.number for e in self.program.prepared]
+        constants = [e for e in ordered(self.program.results, known) if e.op == "const"]
+        return {e.number: wide.number(e.a) for e in constants}
 
     def emitter(self) -> _Emitter:
-        return _Emitter(self.b, self.used, self.constants, wide=True)
+        return _Emitter(self.b, self.used, self.constants, wide=True, prepared=self.prepared)
 
     def _not(self, mask: Value) -> Value:
         return self.b.xor(mask, TRUE)
