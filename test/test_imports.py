@@ -31,12 +31,15 @@ MAY = {
     "pkm_twin.state": STREAMS,
     "delta_dynamics": STREAMS,
     "stiffness_monitor": STREAMS,
+    "pkm_twin.paths": CORE | {"delta_dynamics"},
     "pkm_twin.ros": STREAMS | {"pkm_twin.bags"},
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
     "pkm_twin.atlas": NODE | TWINS | {"pkm_twin.console"},
-    "pkm_twin.apps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.atlas"},
+    "pkm_twin.apps": NODE
+    | TWINS
+    | {"pkm_twin.console", "pkm_twin.atlas", "pkm_twin.export", "pkm_twin.paths"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
 CIRCLES = {frozenset({"pkm_twin.machine", "pkm_twin.kinematics"})}
