@@ -66,7 +66,7 @@ class Motion:
 
 
 def motion_of_bag(
-    path: Path, robot: str | None, topics: Sequence[str] = (), carried: Load | None = None
+    path: Path, robot: str | Robot | None, topics: Sequence[str] = (), carried: Load | None = None
 ) -> Motion:
     """The motion that a bag recorded, accelerations by the node's differentiator.
 
@@ -101,19 +101,19 @@ def motion_of_bag(
     )
 
 
-def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion:
+def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -> Motion:
     """A motion from a CSV with a header row.
 
-    Columns, in any order: ``time``; for every joint NAME ``NAME.position``, and optionally
-    ``NAME.velocity`` and ``NAME.acceleration`` (of all joints or of none); optionally the wrench
-    ``fx fy fz mx my mz``. Absent rates are differentiated by second-order differences; below what
-    these can tell dry friction has no direction and is zero. Absent parts of the wrench are zero.
-    Other columns are left alone, but not those that begin with a joint's name and are none of these
-    or of :func:`table`'s: they are misspelt.
+    Columns, in any order: ``time``; for every joint NAME ``NAME.position``, or in their place all
+    coordinates of the pose (m, rad); optionally ``NAME.velocity`` and ``NAME.acceleration`` (of all
+    joints or of none), and the wrench ``fx fy fz mx my mz``. Absent rates are differentiated by
+    second-order differences; below what these can tell dry friction has no direction and is zero.
+    Absent parts of the wrench are zero. Other columns are left alone, but not those that begin with
+    a joint's name and are none of these or of :func:`table`'s: they are misspelt.
 
     :raises ParameterError: a column is missing or misspelt, or a value is no finite number.
     """
-    machine = load(robot)
+    machine = robot if isinstance(robot, Robot) else load(robot)
     columns = read_columns(path)
     known = [f"{joint}.{what}" for joint in machine.joint_names for what in INPUTS]
     for name in columns:
@@ -133,9 +133,15 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
         return np.stack([columns[name] for name in names], -1)
 
     q = stack("position")
+    posed = q is None and all(name in columns for name in machine.pose_names)
+    if posed:
+        q = machine.inverse(np.stack([columns[name] for name in machine.pose_names], -1))
     if q is None or "time" not in columns:
         needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
-        raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
+        or_pose = ", ".join(machine.pose_names)
+        raise ParameterError(
+            str(path), ", ".join(columns), f"columns time, and {needed} or {or_pose}"
+        )
     time = columns["time"]
     times_of(path, time)
     qd, qdd = stack("velocity"), stack("acceleration")
@@ -146,6 +152,8 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
     wrench = [columns.get(name, np.zeros(len(time))) for name in WRENCH_AXES]
     still = None if qd is not None else np.abs(rates) <= rate_doubt(time, q, gradient_gain(time))
     notes = [] if carried is None else [f"payload: {carried}"]
+    if posed:
+        notes.append(f"joint positions by the pose, {', '.join(machine.pose_names)}")
     return Motion(
         machine,
         time,

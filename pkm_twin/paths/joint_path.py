@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.machine.robot import Robot
-from pkm_twin.paths.geometry import Path, Stretch, scales_of
+from pkm_twin.paths.geometry import Path, Stretch
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -69,12 +69,35 @@ class JointPath:
         return q, first / h, second / h**2
 
 
-def joint_path(robot: Robot, path: Path, stretch: Stretch, points: int) -> JointPath:
+def _joints(robot: Robot, places: Array, way: Array) -> Array:
+    """Joint positions of poses (k, m).
+
+    :raises ParameterError: by the first pose out of reach, its way along the path (k,).
+    """
+    q, good = robot.try_inverse(places)
+    if good.all():
+        return q
+    row = int(np.argmin(good))
+    where = Place(float(way[row]), tuple(places[row].tolist()), robot.pose_names)
+    try:
+        robot.inverse(places[row])
+    except (UnreachableError, SingularityError) as error:
+        raise ParameterError(
+            f"path {where}", str(error), "a pose that the machine reaches"
+        ) from None
+    return robot.inverse(places)
+
+
+def joint_path(
+    robot: Robot, path: Path, stretch: Stretch, points: int, begin: float = 0.0
+) -> JointPath:
     """A stretch of a path as joint positions.
 
+    :param begin: way up to the stretch, m.
     :param points: about how many; half by the pieces' lengths, half alike for all pieces.
-    :raises UnreachableError: a pose that the machine does not reach.
-    :raises SingularityError: a pose beyond a singularity.
+    :raises ParameterError: by the place, a pose that the machine does not reach.
+    :raises UnreachableError: joint positions without an assembly.
+    :raises SingularityError: joint positions beyond a singularity.
     """
     pieces = stretch.pieces
     counts = [
@@ -96,7 +119,7 @@ def joint_path(robot: Robot, path: Path, stretch: Stretch, points: int) -> Joint
         q, first, second = place, slope, bend
         robot.forward(q)
     else:
-        q = robot.inverse(place)
+        q = _joints(robot, place, begin + s)
         jacobian = robot.jacobian(q)
         first = np.linalg.solve(jacobian, slope[..., None])[..., 0]
         own = robot.pose_acceleration(q, first, np.zeros_like(q))
@@ -188,13 +211,10 @@ def joint_paths(robot: Robot, path: Path, points: int, singularity: float) -> li
     for stretch in path.stretches:
         share = max(2 * LEAST_POINTS, round(points * stretch.length / path.length))
         try:
-            part = joint_path(robot, path, stretch, share)
+            part = joint_path(robot, path, stretch, share, begin)
         except (UnreachableError, SingularityError) as error:
-            raise ParameterError("path", str(error), "poses that the machine reaches") from None
+            raise ParameterError("path", str(error), "joints that can be assembled") from None
         check_positions(robot, part, begin, singularity)
         begin += stretch.length
         result.append(part)
     return result
-
-
-__all__ = ["JointPath", "Place", "check_positions", "joint_path", "joint_paths", "scales_of"]

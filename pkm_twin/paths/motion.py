@@ -206,11 +206,7 @@ class TimedPath:
     @cached_property
     def bounds(self) -> list[Bound]:
         """Which limit binds when, in order."""
-        names = names_of(self.robot)
-        worst = self.used.argmax(1)
-        used = self.used.max(1)
-        labels = [names[i] if u >= BINDS else "" for i, u in zip(worst, used, strict=True)]
-        return merged(self.fine.time, labels, used)
+        return merged(self.fine.time, binding(self.used), names_of(self.robot), self.used)
 
     @property
     def worst(self) -> dict[str, float]:
@@ -249,25 +245,47 @@ def has_masses(robot: Robot) -> bool:
     return True
 
 
-def merged(time: Array, labels: list[str], used: Array) -> list[Bound]:
-    """Runs of equal labels; those shorter than :data:`BRIEF` of the whole join the one before."""
+def binding(used: Array) -> list[int]:
+    """The column of each row of used parts (k, l) that binds, -1 for none.
+
+    As few changes as can be: of several that bind, the one that binds longest from there.
+    """
+    active = used >= BINDS
+    lasts = np.zeros(used.shape, np.int64)
+    count = np.zeros(used.shape[1], np.int64)
+    for row in range(len(used) - 1, -1, -1):
+        count = np.where(active[row], count + 1, 0)
+        lasts[row] = count
+    result: list[int] = []
+    for row in range(len(used)):
+        now = result[-1] if result else -1
+        if now < 0 or not active[row, now]:
+            now = int(lasts[row].argmax()) if active[row].any() else -1
+        result.append(now)
+    return result
+
+
+def merged(time: Array, columns: list[int], names: list[str], used: Array) -> list[Bound]:
+    """Parts of one binding limit; one shorter than :data:`BRIEF` of all joins its neighbour."""
     if len(time) < 2:
         return []
     brief = BRIEF * float(time[-1] - time[0])
-    edges = [0, *(i for i in range(1, len(labels)) if labels[i] != labels[i - 1]), len(labels)]
-    spans: list[tuple[int, int, str]] = []
-    for begin, end in pairwise(edges):
-        last = float(time[min(end, len(time) - 1)])
-        short = last - float(time[begin]) < brief
-        if spans and (short or spans[-1][2] == labels[begin]):
-            spans[-1] = (spans[-1][0], end, spans[-1][2])
+    changes = (i for i in range(1, len(columns)) if columns[i] != columns[i - 1])
+    edges = [0, *changes, len(columns) - 1]
+    spans = [(b, e, columns[b]) for b, e in pairwise(edges) if e > b]
+    result: list[tuple[int, int, int]] = []
+    for b, e, column in spans:
+        short = float(time[e] - time[b]) < brief
+        if result and (short or result[-1][2] == column):
+            result[-1] = (result[-1][0], e, result[-1][2])
         else:
-            spans.append((begin, end, labels[begin]))
+            result.append((b, e, column))
     return [
         Bound(
-            float(time[b]), float(time[min(e, len(time) - 1)]), what, float(used[b:e].max())
+            float(time[b]), float(time[e]), "" if column < 0 else names[column],
+            float(used[b : e + 1].max()),
         )
-        for b, e, what in spans
+        for b, e, column in result
     ]  # fmt: skip
 
 
