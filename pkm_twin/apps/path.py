@@ -240,7 +240,7 @@ def path_command(
     )  # fmt: skip
     try:
         if out is not None:
-            write(motion, motion.uniform(rate), out, overwrite)
+            write(motion, motion.uniform(rate), carried, out, overwrite)
         if drawing is not None:
             draw_limits(motion, drawing)
     except OSError as error:

@@ -32,7 +32,9 @@ def columns_of(motion: TimedPath, samples: Samples) -> dict[str, Array]:
     return columns
 
 
-def write(motion: TimedPath, samples: Samples, out: Path, overwrite: bool) -> None:
+def write(
+    motion: TimedPath, samples: Samples, carried: Load | None, out: Path, overwrite: bool
+) -> None:
     """The motion as a CSV or as a bag with one JointTrajectory."""
     if out.suffix == ".csv":
         from pkm_twin.apps.torques import write_table
@@ -41,7 +43,14 @@ def write(motion: TimedPath, samples: Samples, out: Path, overwrite: bool) -> No
         return
     from pkm_twin.apps.trajectories import write_trajectory
 
-    facts = {"robot": motion.robot.name, "source": "pkm-twin path", "law": motion.law}
+    facts: dict[str, Any] = {
+        "robot": motion.robot.name, "source": "pkm-twin path", "law": motion.law,
+    }  # fmt: skip
+    if carried is not None and carried.com is None:
+        facts |= {
+            "payload_mass_kg": carried.mass, "payload_picked_s": 0.0,
+            "payload_released_s": motion.duration,
+        }  # fmt: skip
     own = (samples.q, samples.qd, samples.qdd)
     write_trajectory(out, motion.robot, samples.time, own, samples.effort, facts, overwrite)
 

@@ -39,6 +39,10 @@ def size(
             show_default=False,
         ),
     ] = None,
+    singularity: Annotated[
+        float,
+        typer.Option(help="least singularity index for --over-workspace, 0 to 1", min=0.0, max=1.0),
+    ] = 0.05,
     efforts: Annotated[
         str, typer.Option(help="file: those of the file where it has them; or model")
     ] = "file",
@@ -86,7 +90,7 @@ def size(
             raise ParameterError("over-workspace", over_workspace, "two numbers, 0 or more")
         if carried is not None:
             machine = carried.on(machine)
-        data, text = sizes.worst_report(machine, speed, change)
+        data, text = sizes.worst_report(machine, speed, change, singularity)
     else:
         assert motion is not None  # noqa: S101  one of the two is given
         taken = sizes.read_motion(motion, machine, topic, carried, efforts)

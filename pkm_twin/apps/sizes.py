@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.apps.columns import read_columns
-from pkm_twin.apps.loads import Load, by_load
+from pkm_twin.apps.loads import Load, by_load, told_load
 from pkm_twin.apps.topics import JOINT_STATE
 from pkm_twin.apps.torques import Motion, motion_of_bag, motion_of_csv
 from pkm_twin.apps.trajectories import read_trajectory
@@ -68,6 +68,7 @@ def read_motion(
             given = motion.measured
         else:
             time, q, qd, qdd, given = planned
+            carried = carried or told_load(bag)
             motion = Motion(robot, time, q, qd, qdd, np.zeros((len(time), 6)), load=carried)
     else:
         motion = motion_of_csv(path, robot, carried)
@@ -76,10 +77,6 @@ def read_motion(
         if all(name in columns for name in names):
             given = np.stack([columns[name] for name in names], -1)
     if given is not None and efforts == "file":
-        if carried is not None:
-            raise ParameterError(
-                "payload", str(carried), "--efforts model: the file's efforts are those of its load"
-            )
         return Taken(motion, given, "the file's")
     effort = np.empty_like(motion.q)
     for machine, part in by_load(motion.robot, motion.load, motion.time, 4096):
@@ -209,9 +206,11 @@ def _words(duty: Any, force: str, rate: str) -> str:
     )
 
 
-def worst_report(robot: Robot, speed: float, change: float) -> tuple[dict[str, Any], str]:
+def worst_report(
+    robot: Robot, speed: float, change: float, singularity: float
+) -> tuple[dict[str, Any], str]:
     """The worst efforts and speeds over the workspace, as plain data and as text."""
-    worst = worst_over_workspace(robot, speed, change)
+    worst = worst_over_workspace(robot, speed, change, singularity=singularity)
     names = robot.pose_names
     data: dict[str, Any] = {
         "robot": robot.name, "speed_m_s": speed, "acceleration_m_s2": change,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -74,16 +75,16 @@ class SmoothRun:
         return j, part, np.maximum(v + t * (u + t * jerk / 2), 0.0), u + t * jerk
 
 
-def _third(part: JointPath) -> tuple[Array, Array, Array]:
-    """q', q'' and q''' at the points between two intervals, shape (i - 1, n) each."""
+def _sides(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
+    """The first two derivatives at the points between two intervals, and the third on both sides.
+
+    Shape (i - 1, n) each; where two pieces meet the third jumps.
+    """
     left = part.left
-    step = part.steps[:, None]
-    inside = (part.second[left + 1] - part.second[left]) / step
-    weight = step[:-1] / (step[:-1] + step[1:])
-    third = (1.0 - weight) * inside[:-1] + weight * inside[1:]
+    third = (part.second[left + 1] - part.second[left]) / part.steps[:, None]
     at = left[1:]
     second = 0.5 * (part.second[at] + part.second[left[:-1] + 1])
-    return part.first[at], second, third
+    return part.first[at], second, (third[:-1], third[1:])
 
 
 def smooth_profile(part: JointPath, rows: Rows, limits: Limits, start: Array) -> Array:
@@ -186,7 +187,8 @@ def _drag_rows(rows: Rows, part: JointPath, x: Array) -> tuple[csr_matrix, Array
 def _jerk_rows(part: JointPath, limits: Limits, h: Array, x: Array) -> tuple[csr_matrix, Array]:
     """Jerks at the points between two intervals, their bound's tangent at a profile."""
     used = np.isfinite(limits.jerk)
-    first, second, third = (value[:, used] for value in _third(part))
+    first, second, sides = _sides(part)
+    first, second = first[:, used], second[:, used]
     most = limits.jerk[used]
     count, width = first.shape
     before, behind = h[:-1][:, None], h[1:][:, None]
@@ -197,7 +199,7 @@ def _jerk_rows(part: JointPath, limits: Limits, h: Array, x: Array) -> tuple[csr
     slope = first / middle
     mean = 1.5 * second
     front = back[0] * (-slope + mean)
-    here = back[1] * (-slope + mean) + on[0] * (slope + mean) + third
+    here = back[1] * (-slope + mean) + on[0] * (slope + mean)
     after = on[1] * (slope + mean)
     about = np.maximum(x[1:-1], 1e-9 * x.max())[:, None]
     tangent = 0.5 * most / about**1.5
@@ -205,14 +207,14 @@ def _jerk_rows(part: JointPath, limits: Limits, h: Array, x: Array) -> tuple[csr
     point = np.repeat(np.arange(count), width)
     made: list[tuple[Any, Any, Any]] = []
     at = 0
-    for sign in (1.0, -1.0):
+    for sign, third in product((1.0, -1.0), sides):
         number = at + np.arange(count * width)
         made.append((sign * front, number, point))
-        made.append((sign * here + tangent, number, point + 1))
+        made.append((sign * (here + third[:, used]) + tangent, number, point + 1))
         made.append((sign * after, number, point + 2))
         at += count * width
     bound = np.ravel(np.broadcast_to(top, (count, width)))
-    return _triplets(made, (at, len(x))), np.concatenate([bound, bound])
+    return _triplets(made, (at, len(x))), np.tile(bound, 4)
 
 
 def smooth_run(part: JointPath, x: Array) -> SmoothRun:

@@ -17,6 +17,7 @@ PLACES = {
     "state.node": (6.6, 4.2),
     "atlas": (2.0, 4.2),
     "export": (-1.0, 4.2),
+    "paths": (-1.0, 3.4),
     "ros": (5.6, 3.3),
     "delta_dynamics": (0.6, 3.0),
     "stiffness_monitor": (3.4, 3.0),
