@@ -19,7 +19,7 @@ from pkm_twin.apps.check import at_rest, motion
 from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.apps.loads import Load, by_load
-from pkm_twin.apps.recorded import read_recording
+from pkm_twin.apps.recorded import WRENCH_AXES, read_recording
 from pkm_twin.errors import (
     BagError,
     ParameterError,
@@ -36,7 +36,6 @@ Array = NDArray[np.float64]
 BLOCK = 4096
 """Samples computed at a time, so that memory stays flat."""
 ENDINGS = (".csv", ".parquet")
-WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
 MAPPED = "tables have the model's numbers of the joints; joint_map is for messages and bags"
@@ -140,7 +139,7 @@ def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -
         needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
         or_pose = ", ".join(machine.pose_names)
         raise ParameterError(
-            str(path), ", ".join(columns), f"columns time, and {needed} or {or_pose}"
+            str(path), ", ".join(columns), f"columns time, {needed}; or time, {or_pose}"
         )
     time = columns["time"]
     times_of(path, time)

@@ -90,7 +90,7 @@ class Limits:
         )  # fmt: skip
 
     def check(self) -> None:
-        """Refuse limits that leave the speed open.
+        """Reject limits that leave the speed open.
 
         :raises ParameterError: there is none.
         """
@@ -222,7 +222,7 @@ def shares(
 
 
 def check_rest(robot: Robot, part: JointPath, rows: Rows, limits: Limits, begin: float) -> None:
-    """Refuse a path on which the drives cannot hold the machine or creep.
+    """Reject a path on which the drives cannot hold the machine or creep.
 
     :raises ParameterError: by the place and joint.
     """

@@ -69,8 +69,9 @@ def fastest(
     :param singularity: least singularity index on the path, 0 to 1.
     :param wrench: what the surroundings apply to the platform all the time, (6,), base axes.
     :param points: of the path, about; with a limit of jerk at most :data:`JERK_POINTS`.
-    :returns: the motion; ``.uniform(rate)`` or ``.sample(times)`` give times, q, qd, qdd, effort
-        and pose, ``.bounds`` which limit binds when, ``.duration`` the time.
+    :returns: the motion: ``.times``, ``.q``, ``.qd``, ``.qdd``, ``.effort`` and ``.pose`` at its
+        points, the same of ``.uniform(rate)`` and ``.sample(times)``; ``.bounds``, which limit
+        binds when; ``.duration``, s.
     :raises ParameterError: by the place: a pose out of reach, beyond a joint's limit, close to a
         singularity, or where a drive cannot hold the machine; or no limit bounds the speed.
     """
@@ -167,7 +168,7 @@ def _run(
 
 
 def _check_moves(run: Run, begin: float) -> None:
-    """Refuse a profile that stands still on its way."""
+    """Reject a profile that stands still on its way."""
     slow = (run.x[:-1] + run.x[1:]) <= 0.0
     if slow.any():
         way = begin + float(run.part.s[run.part.left[int(slow.argmax())]])

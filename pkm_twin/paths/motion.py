@@ -6,6 +6,7 @@ May import: numpy, pkm_twin's core, the standard library, this package; never rc
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -185,9 +186,46 @@ class TimedPath:
         return Samples(t, q, qd, qdd, effort, self.robot.forward(q), travel)
 
     def uniform(self, rate: float) -> Samples:
-        """The motion at ``rate`` samples a second, the last at its end."""
-        count = max(1, int(np.ceil(self.duration * rate - 1e-9)))
+        """The motion at ``rate`` samples a second; the last is its end, half to three halves of a
+        period after the one before.
+        """
+        count = max(1, round(self.duration * rate))
         return self.sample(np.append(np.arange(count) / rate, self.duration))
+
+    def __iter__(self) -> Iterator[Any]:
+        """Times, q, qd, qdd, effort (as in ``fine``) and ``bounds``, to unpack."""
+        s = self.fine
+        return iter((s.time, s.q, s.qd, s.qdd, s.effort, self.bounds))
+
+    @property
+    def times(self) -> Array:
+        """Times of ``fine``, shape (k,), s."""
+        return self.fine.time
+
+    @property
+    def q(self) -> Array:
+        """Joint positions of ``fine``, shape (k, n), rad or m."""
+        return self.fine.q
+
+    @property
+    def qd(self) -> Array:
+        """Joint rates of ``fine``, shape (k, n)."""
+        return self.fine.qd
+
+    @property
+    def qdd(self) -> Array:
+        """Joint accelerations of ``fine``, shape (k, n)."""
+        return self.fine.qdd
+
+    @property
+    def effort(self) -> Array | None:
+        """Efforts of ``fine``, shape (k, n), N m or N; None for a robot without masses."""
+        return self.fine.effort
+
+    @property
+    def pose(self) -> Array:
+        """Poses of ``fine``, shape (k, m)."""
+        return self.fine.pose
 
     @cached_property
     def fine(self) -> Samples:
@@ -290,8 +328,14 @@ def merged(time: Array, columns: list[int], names: list[str], used: Array) -> li
 
 
 def needs_forces(robot: Robot, limits: Limits) -> bool:
-    """Whether efforts bound the motion."""
-    return bool(np.isfinite(limits.effort).any()) and has_masses(robot)
+    """Whether efforts bound the motion.
+
+    :raises ParameterError: they do, and the robot's file gives no masses.
+    """
+    if not np.isfinite(limits.effort).any():
+        return False
+    robot.massive()
+    return True
 
 
 def forces_at(robot: Robot, part: JointPath, wrench: Array | None) -> Forces:

@@ -68,6 +68,16 @@ def test_a_cycle_as_a_table_that_torques_reads(twin, tmp_path):
     np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd), effort, atol=1e-9)
 
 
+def test_a_planned_table_is_checked_and_one_with_other_efforts_is_bad(twin, tmp_path):
+    out = tmp_path / "cycle.csv"
+    good(twin(*CYCLE, "--out", out, "--no-picture"))
+    good(twin("check", out, "--robot", "delta"))
+    assert twin("check", out, "--robot", "delta", "--payload", "1.0").code == 1
+    result = twin("check", out)
+    assert result.code == 1
+    result.one_line_error()
+
+
 def test_torques_takes_the_pose_in_place_of_the_joints(twin, tmp_path):
     robot = load("delta")
     time = np.linspace(0.0, 1.0, 400)

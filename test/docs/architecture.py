@@ -16,7 +16,7 @@ PLACES = {
     "stiffness_monitor.node": (4.0, 4.2),
     "state.node": (6.6, 4.2),
     "atlas": (2.0, 4.2),
-    "export": (-1.0, 4.2),
+    "export": (-1.2, 4.9),
     "paths": (-1.0, 3.4),
     "ros": (5.6, 3.3),
     "delta_dynamics": (0.6, 3.0),

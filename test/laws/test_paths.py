@@ -7,7 +7,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
-from pkm_twin.paths.geometry import Arc, Corner, arc_through
+from pkm_twin.paths.pieces import Arc, Corner, arc_through
 from test.support.robots import FREE, load, partly_long
 
 SOME = partly_long(

@@ -5,7 +5,6 @@ The convex program shares the inverse dynamics and the geometry alone: derivativ
 the path are those of a spline, limits hold in the middle of intervals, the time is minimised.
 """
 
-import cvxpy as cp
 import numpy as np
 import pytest
 import yaml
@@ -15,6 +14,8 @@ from scipy.optimize import brentq
 from delta_dynamics import inverse_dynamics
 from pkm_twin.paths import cycle, fastest, lines, through
 from test.support.robots import load, often
+
+cp = pytest.importorskip("cvxpy")
 
 FORCE, MASS, WAY = 12.0, 3.0, 0.5
 
