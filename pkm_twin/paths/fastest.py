@@ -34,6 +34,8 @@ KEPT: Final = 1e-4
 """Part of each limit that the points of a path leave to what is between them."""
 LOOKED: Final = np.array([1e-6, 0.25, 0.5, 0.75, 1.0 - 1e-6])
 """Parts of each interval of time at which limits are checked."""
+SMALL: Final = 3e-4
+"""Part of a limit passed between the points that slowing the whole down makes good."""
 ROUNDS: Final = 4
 """How often limits are tightened where they are passed between the points."""
 
@@ -160,7 +162,7 @@ def _run(
         run = Run(part, x)
         _check_moves(run, begin)
         over = passed(robot, run, limits, wrench)
-        bad = over > 1.0 + KEPT
+        bad = over > 1.0 + SMALL
         if not bad.any():
             break
         share[bad] /= over[bad]
@@ -207,18 +209,24 @@ def passed(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) -> Ar
 
 
 def kept(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) -> Timed:
-    """A run, slower by as much as its limits need, to the last 0.01 %.
+    """A run, slower by as much as its limits need.
 
     :raises ParameterError: no speed keeps them.
     """
-    if passed(robot, run, limits, wrench).max() <= 1.0:
-        return run
-    low, high = 1.0, 1.0 + KEPT
+    over = float(passed(robot, run, limits, wrench).max())
+    slower = run
+    for _ in range(ROUNDS):
+        if over <= 1.0:
+            return slower
+        # What moves goes by the speed or its square; what rests does not.
+        slower = slower.slower(over)
+        over = float(passed(robot, slower, limits, wrench).max())
+    low, high = 1.0, 1.0 + 10.0 * KEPT
     while passed(robot, run.slower(high), limits, wrench).max() > 1.0:
         low, high = high, 1.0 + 2.0 * (high - 1.0)
         if high > 1e3:
             raise ParameterError("path", "any speed", "limits that a slow motion keeps")
-    while high - low > 0.1 * KEPT:
+    while high - low > KEPT:
         middle = 0.5 * (low + high)
         good = passed(robot, run.slower(middle), limits, wrench).max() <= 1.0
         low, high = (low, middle) if good else (middle, high)

@@ -29,7 +29,7 @@ STEPS: Final = 50
 """Most steps to an interval's greatest x; two or three are usual."""
 SMALL: Final = 1e-12
 """Of a row's greatest coefficient, what counts as none."""
-SETTLED: Final = 1e-4
+SETTLED: Final = 3e-4
 """Relative change of the speeds at which viscous friction is settled."""
 ROUNDS: Final = 8
 """Most solutions for viscous friction."""
