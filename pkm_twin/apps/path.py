@@ -177,7 +177,7 @@ def path_command(
     ] = 1.0,
     singularity: Annotated[
         float, typer.Option(help="least singularity index on the path, 0 to 1", min=0.0, max=1.0)
-    ] = 0.02,
+    ] = 0.01,
     payload: Payload = None,
     platform: Platform = None,
     rate: Annotated[

@@ -147,27 +147,30 @@ class Forces:
 class Rows:
     """Limits at points of a path as parts of them, and the greatest x there.
 
-    -1 <= alpha u + beta x + drag v + fixed <= 1, shape (p, r), and x <= most, shape (p,).
+    -1 <= alpha u + beta x + drag v + fixed + dry <= 1, shape (p, r), and x <= most, shape (p,).
+    ``dry``: dry friction, which jumps where a joint turns round.
     """
 
     alpha: Array
     beta: Array
     drag: Array
     fixed: Array
+    dry: Array
     most: Array
 
     @classmethod
     def of(cls, part: JointPath, forces: Forces | None, limits: Limits) -> Rows:
         """Of the points of a stretch."""
         p = len(part.s)
-        alpha, beta, drag, fixed = ([np.zeros((p, 0))] for _ in range(4))
+        alpha, beta, drag, fixed, dry = ([np.zeros((p, 0))] for _ in range(5))
         used = np.isfinite(limits.effort)
         if forces is not None and used.any():
             scale = 1.0 / limits.effort[used]
             alpha.append(forces.a[:, used] * scale)
             beta.append(forces.b[:, used] * scale)
             drag.append(forces.w[:, used] * scale)
-            fixed.append((forces.g + forces.k)[:, used] * scale)
+            fixed.append(forces.g[:, used] * scale)
+            dry.append(forces.k[:, used] * scale)
         used = np.isfinite(limits.acceleration)
         if used.any():
             scale = 1.0 / limits.acceleration[used]
@@ -175,9 +178,10 @@ class Rows:
             beta.append(part.second[:, used] * scale)
             drag.append(np.zeros((p, int(used.sum()))))
             fixed.append(drag[-1])
-        a, b, w, k = (np.concatenate(columns, 1) for columns in (alpha, beta, drag, fixed))
+            dry.append(drag[-1])
+        a, b, w, g, k = (np.concatenate(rows, 1) for rows in (alpha, beta, drag, fixed, dry))
         most = _most(part, limits)
-        return cls(a, b, w, k, np.minimum(most, _fast(part, a, most)))
+        return cls(a, b, w, g, k, np.minimum(most, _fast(part, a, most)))
 
 
 def _fast(part: JointPath, alpha: Array, most: Array) -> float:
@@ -226,7 +230,7 @@ def check_rest(robot: Robot, part: JointPath, rows: Rows, limits: Limits, begin:
 
     :raises ParameterError: by the place and joint.
     """
-    size = np.abs(rows.fixed)
+    size = np.abs(rows.fixed + rows.dry)
     if not size.size or (size < 1.0).all():
         return
     row, column = np.unravel_index(int(size.argmax()), size.shape)

@@ -28,8 +28,8 @@ POINTS: Final = 1000
 """Points of a path."""
 JERK_POINTS: Final = 400
 """The same where jerks are limited: each is a variable of linear programs."""
-SINGULARITY: Final = 0.02
-"""Least singularity index of a path."""
+SINGULARITY: Final = 0.01
+"""Least singularity index of a path, by default the nodes' ``singularity_stop``."""
 KEPT: Final = 1e-4
 """Part of each limit that the points of a path leave to what is between them."""
 LOOKED: Final = np.array([1e-6, 0.25, 0.5, 0.75, 1.0 - 1e-6])

@@ -156,7 +156,7 @@ def _rows(part: JointPath, rows: Rows, h: Array) -> tuple[csr_matrix, Array]:
     column = np.repeat(np.arange(count), width)
     for k, own in ((part.left, 0), (part.left + 1, 1)):
         lever = rows.alpha[k] / (2.0 * h[:, None])
-        beta, fixed = rows.beta[k], rows.fixed[k]
+        beta, fixed = rows.beta[k], rows.fixed[k] + rows.dry[k]
         for sign in (1.0, -1.0):
             number = at + np.arange(count * width)
             made.append((sign * (-lever + (beta if own == 0 else 0.0)), number, column))

@@ -122,6 +122,9 @@ def programs_of(rows: Rows, left: Index, steps: Array, x: Array | None, part: Ar
     double = (2.0 * steps)[:, None]
     right = left + 1
     bound = part[:, None]
+    # A joint that turns round in an interval has dry friction of both signs there.
+    dry = rows.dry[left], rows.dry[right]
+    least, greatest = np.minimum(*dry), np.maximum(*dry)
     alphas, betas, lows, highs = [], [], [], []
     for k, end in ((left, slice(None, -1)), (right, slice(1, None))):
         beta, fixed = rows.beta[k], rows.fixed[k]
@@ -133,8 +136,8 @@ def programs_of(rows: Rows, left: Index, steps: Array, x: Array | None, part: Ar
         alphas.append(rows.alpha[k] / double)
         betas.append(beta)
         # At rest, limits that are made smaller hold all the same.
-        lows.append(np.minimum(-bound - fixed, 0.0))
-        highs.append(np.maximum(bound - fixed, 0.0))
+        lows.append(np.minimum(-bound - fixed - least, 0.0))
+        highs.append(np.maximum(bound - fixed - greatest, 0.0))
     most = np.append(rows.most[left], rows.most[right[-1]])
     # Where two pieces meet the stricter one counts.
     most[1:] = np.minimum(most[1:], rows.most[right])

@@ -128,6 +128,18 @@ def test_all_limits_hold_at_every_moment(name):
     assert begins[0] == 0.0
 
 
+@pytest.mark.parametrize("name", ["delta", "five_bar", "rps3"])
+def test_limits_hold_between_few_points_too(name):
+    robot = load(name)
+    for points in (48, 70):
+        motion = fastest(robot, points_of(robot), points=points)
+        s = motion.sample(np.linspace(0.0, motion.duration, 5000))
+        assert (np.abs(s.effort) / robot.limits.effort).max() <= 1.0 + 5e-4
+        assert (np.abs(s.qd) / robot.limits.velocity).max() <= 1.0 + 5e-4
+        fine = fastest(robot, points_of(robot)).duration
+        assert motion.duration == pytest.approx(fine, rel=0.03)
+
+
 @pytest.mark.parametrize("name", SOME)
 def test_rates_are_those_of_the_positions_and_efforts_those_of_the_model(name):
     robot = load(name)
