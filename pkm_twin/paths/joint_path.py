@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.geometry import Path, Stretch
+from pkm_twin.paths.pieces import Piece, Smooth
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 LEAST_POINTS: Final = 16
 """Intervals of the shortest piece."""
+PER_KNOT: Final = 3
+"""Intervals between two way-points of a smooth curve."""
 GRADE: Final = 1.5
 """Power of the distance from a stop by which points are set: speeds go by its root."""
 ROUNDING: Final = 1e-9
@@ -101,7 +104,7 @@ def joint_path(
     """
     pieces = stretch.pieces
     counts = [
-        max(LEAST_POINTS, round(0.5 * points * (p.length / stretch.length + 1.0 / len(pieces))))
+        max(_least(p), round(0.5 * points * (p.length / stretch.length + 1.0 / len(pieces))))
         for p in pieces
     ]
     last = len(pieces) - 1
@@ -127,6 +130,12 @@ def joint_path(
     twist = np.einsum("kij,kj->ki", robot.platform_jacobian(q)[:, :3], first)
     travel = np.linalg.norm(twist, axis=1)
     return JointPath(s, q, first, second, travel, left)
+
+
+def _least(piece: Piece) -> int:
+    """Intervals that a piece needs for its own bends."""
+    bends = PER_KNOT * (len(piece.spline.x) - 1) if isinstance(piece, Smooth) else 0
+    return max(LEAST_POINTS, bends)
 
 
 def _graded(count: int, *, begins: bool, ends: bool) -> Array:
