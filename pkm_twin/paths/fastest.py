@@ -6,6 +6,7 @@ May import: numpy, delta_dynamics, pkm_twin's core, the standard library; never 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +19,7 @@ from pkm_twin.paths.constraints import Limits, Rows, check_rest, shares
 from pkm_twin.paths.geometry import Path, through
 from pkm_twin.paths.jerk import smooth_profile, smooth_run
 from pkm_twin.paths.joint_path import JointPath, joint_paths
-from pkm_twin.paths.laws import LAWS, quintic, shortest
+from pkm_twin.paths.laws import LAWS, Law, quintic, shortest
 from pkm_twin.paths.motion import Run, Timed, TimedPath, forces_at, needs_forces
 from pkm_twin.paths.profile import fastest_profile
 
@@ -126,10 +127,7 @@ def timed(
             limits.check()
         load = None if wrench is None else np.asarray(wrench, float)
         parts = joint_paths(robot, made, points, singularity)
-        runs = tuple(
-            kept(robot, shortest(robot, part, LAWS[law], limits, load), limits, load)
-            for part in parts
-        )
+        runs = tuple(_lawful(robot, part, LAWS[law], limits, load) for part in parts)
         rests = (made.wait, *(stretch.dwell for stretch in made.stretches))
         result = TimedPath(robot, made, limits, runs, rests, law, load)
     if duration is None:
@@ -167,6 +165,14 @@ def _run(
             break
         share[bad] /= over[bad]
     return kept(robot, run, limits, wrench)
+
+
+def _lawful(
+    robot: Robot, part: JointPath, laws: Sequence[Law], limits: Limits, wrench: Array | None
+) -> Timed:
+    """One stretch by the fastest of some laws."""
+    runs = (shortest(robot, part, law, limits, wrench) for law in laws)
+    return kept(robot, min(runs, key=lambda run: run.duration), limits, wrench)
 
 
 def _check_moves(run: Run, begin: float) -> None:

@@ -6,7 +6,7 @@ May import: numpy, pkm_twin's core, the standard library, this package; never rc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -31,35 +31,44 @@ def quintic(t: Array) -> tuple[Array, Array, Array]:
     return way, 30.0 * t**2 * (1.0 - t) ** 2, 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t)
 
 
-_EDGES: Final = np.array([0.0, 1.0, 2.0, 3.0, 5.0, 6.0, 7.0, 8.0]) / 8.0
-_JERKS: Final = 51.2 * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])
-"""Seven parts, the middle one at even speed; 51.2 makes the way 1."""
+def s_curve(cruise: float, smooth: float) -> Law:
+    """The same of seven parts of constant jerk.
 
-
-def _s_curve_starts() -> Array:
-    rows = [np.zeros(3)]
-    for jerk, h in zip(_JERKS, np.diff(_EDGES), strict=True):
-        s, v, a = rows[-1]
-        rows.append(
-            np.array([s + v * h + a * h**2 / 2 + jerk * h**3 / 6, v + a * h + jerk * h**2 / 2,
-                      a + jerk * h])
+    :param cruise: part of the duration at even speed, 0 to below 1.
+    :param smooth: part of each ramp in which its acceleration changes, above 0 to 1.
+    """
+    ramp = 0.5 * (1.0 - cruise)
+    change, even = 0.5 * smooth * ramp, (1.0 - smooth) * ramp
+    top = 1.0 / (ramp + cruise)
+    jerk = top / (ramp - change) / change * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])
+    steps = np.array([change, even, change, cruise, change, even, change])
+    edges = np.concatenate([[0.0], np.cumsum(steps)])
+    starts = np.zeros((8, 3))
+    for k, h in enumerate(steps):
+        s, v, a = starts[k]
+        starts[k + 1] = (
+            s + v * h + a * h**2 / 2 + jerk[k] * h**3 / 6, v + a * h + jerk[k] * h**2 / 2,
+            a + jerk[k] * h,
         )  # fmt: skip
-    return np.array(rows)
+
+    def law(t: Array) -> tuple[Array, Array, Array]:
+        k = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, 6)
+        h, (s, v, a) = t - edges[k], starts[k].T
+        way = s + v * h + a * h**2 / 2 + jerk[k] * h**3 / 6
+        return way, v + a * h + jerk[k] * h**2 / 2, a + jerk[k] * h
+
+    return law
 
 
-_STARTS: Final = _s_curve_starts()
-
-
-def s_curve(t: Array) -> tuple[Array, Array, Array]:
-    """The same of seven parts of constant jerk, an eighth of the duration each, the middle two."""
-    k = np.clip(np.searchsorted(_EDGES, t, side="right") - 1, 0, 6)
-    h, jerk = t - _EDGES[k], _JERKS[k]
-    s, v, a = _STARTS[k].T
-    way = s + v * h + a * h**2 / 2 + jerk * h**3 / 6
-    return way, v + a * h + jerk * h**2 / 2, a + jerk * h
-
-
-LAWS: Final[Mapping[str, Law]] = {"quintic": quintic, "s-curve": s_curve}
+LAWS: Final[Mapping[str, Sequence[Law]]] = {
+    "quintic": (quintic,),
+    "s-curve": tuple(
+        s_curve(cruise, smooth)
+        for cruise in (0.0, 0.15, 0.3, 0.45, 0.6, 0.75)
+        for smooth in (0.3, 0.5, 0.75, 1.0)
+    ),
+}
+"""Laws by name: of several the one that is fastest within the limits."""
 
 
 @dataclass(frozen=True)

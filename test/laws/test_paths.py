@@ -7,6 +7,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
+from pkm_twin.paths.laws import LAWS
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
 from test.support.robots import FREE, load, partly_long
 
@@ -200,6 +201,17 @@ def test_jerks_are_kept_and_cost_time(name):
     jerk = np.diff(s.qdd, axis=0) / np.diff(s.time)[:, None]
     assert np.abs(jerk).max() < 1.1 * 2e5
     assert motion.used.max() < 1.05
+
+
+@pytest.mark.parametrize("law", [law for laws in LAWS.values() for law in laws])
+def test_laws_go_from_rest_to_rest(law):
+    t = np.linspace(0.0, 1.0, 20001)
+    way, rate, change = law(t)
+    for values, ends in ((way, (0.0, 1.0)), (rate, (0.0, 0.0)), (change, (0.0, 0.0))):
+        np.testing.assert_allclose(values[[0, -1]], ends, atol=1e-9)
+    np.testing.assert_allclose(np.gradient(way, t)[1:-1], rate[1:-1], atol=1e-6)
+    np.testing.assert_allclose(np.gradient(rate, t)[1:-1], change[1:-1], atol=2e-2)
+    assert rate.min() > -1e-12
 
 
 @pytest.mark.parametrize("law", ["quintic", "s-curve"])
