@@ -49,7 +49,7 @@ def write(
     if carried is not None and carried.com is None:
         facts |= {
             "payload_mass_kg": carried.mass, "payload_picked_s": 0.0,
-            "payload_released_s": motion.duration,
+            "payload_released_s": motion.duration + 1.0,
         }  # fmt: skip
     own = (samples.q, samples.qd, samples.qdd)
     write_trajectory(out, motion.robot, samples.time, own, samples.effort, facts, overwrite)

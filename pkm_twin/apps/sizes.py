@@ -17,11 +17,8 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.apps.columns import read_columns
-from pkm_twin.apps.loads import Load, by_load, told_load
-from pkm_twin.apps.topics import JOINT_STATE
+from pkm_twin.apps.loads import Load, by_load
 from pkm_twin.apps.torques import Motion, motion_of_bag, motion_of_csv
-from pkm_twin.apps.trajectories import read_trajectory
-from pkm_twin.bags.reader import open_bag
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
@@ -60,16 +57,8 @@ def read_motion(
     """
     given: Array | None = None
     if is_bag(path):
-        bag = open_bag(path)
-        states = any(topic.type == JOINT_STATE for topic in bag.report.topics.values())
-        planned = None if states else read_trajectory(bag, robot)
-        if planned is None:
-            motion = motion_of_bag(path, robot, topics, carried)
-            given = motion.measured
-        else:
-            time, q, qd, qdd, given = planned
-            carried = carried or told_load(bag)
-            motion = Motion(robot, time, q, qd, qdd, np.zeros((len(time), 6)), load=carried)
+        motion = motion_of_bag(path, robot, topics, carried)
+        given = motion.measured if motion.planned is None else motion.planned
     else:
         motion = motion_of_csv(path, robot, carried)
         columns = read_columns(path)

@@ -18,8 +18,11 @@ from pkm_twin import load
 from pkm_twin.apps.check import at_rest, motion
 from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
-from pkm_twin.apps.loads import Load, by_load
-from pkm_twin.apps.recorded import WRENCH_AXES, read_recording
+from pkm_twin.apps.loads import Load, by_load, told_load
+from pkm_twin.apps.recorded import WRENCH_AXES, read_recording, robot_of
+from pkm_twin.apps.topics import JOINT_STATE
+from pkm_twin.apps.trajectories import read_trajectory
+from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import (
     BagError,
     ParameterError,
@@ -62,6 +65,8 @@ class Motion:
     load: Load | None = None
     notes: tuple[str, ...] = ()
     still: NDArray[np.bool_] | None = None
+    planned: Array | None = None
+    """Efforts of a planned motion, shape (samples, n)."""
 
 
 def motion_of_bag(
@@ -69,11 +74,21 @@ def motion_of_bag(
 ) -> Motion:
     """The motion that a bag recorded, accelerations by the node's differentiator.
 
+    Of a bag without joint states, the motion of its JointTrajectory as it is.
+
     Messages that a node refuses are left out, but not those beyond the robot's limits: see
     :func:`pkm_twin.apps.limits.beyond_limits`.
 
     :raises BagError: the bag is damaged, or has too few joint states in a row.
     """
+    bag = open_bag(path)
+    if not any(topic.type == JOINT_STATE for topic in bag.report.topics.values()):
+        machine = robot_of(bag, robot)
+        plan = read_trajectory(bag, machine)
+        if plan is not None:
+            time, q, qd, qdd, planned = plan
+            still, held = np.zeros((len(time), 6)), carried or told_load(bag)
+            return Motion(machine, time, q, qd, qdd, still, load=held, planned=planned)
     r = read_recording(path, robot, topics=topics, carried=carried, limited=False)
     qd, qdd, used = motion(r)
     if not used.any():

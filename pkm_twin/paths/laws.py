@@ -60,6 +60,8 @@ def s_curve(cruise: float, smooth: float) -> Law:
     return law
 
 
+SHORTEST: Final = 1e-6
+"""Duration of a stretch that nothing limits, s."""
 LAWS: Final[Mapping[str, Sequence[Law]]] = {
     "quintic": (quintic,),
     "s-curve": tuple(
@@ -142,4 +144,4 @@ def shortest(
             hits = (sign * linear) ** 2 + 4.0 * sign * square * rest >= 0.0
             slowest = np.where(hits, (sign * linear + root) / (2.0 * rest), 0.0)
             duration = max(duration, float(slowest.max()))
-    return run.slower(duration)
+    return run.slower(max(duration, SHORTEST))

@@ -112,6 +112,10 @@ def test_a_cycle_as_a_trajectory_that_size_reads(twin, tmp_path):
     np.testing.assert_allclose(message.points[-1].effort, held)
     result = json.loads(good(twin("size", "delta", out, "--json")).out)
     assert result["efforts"] == "the file's"
+    assert result["payload"]["mass_kg"] == 0.4
+    again = tmp_path / "torques.csv"
+    good(twin("torques", "delta", out, "--out", again, "--no-picture"))
+    np.testing.assert_allclose(of_joints(table(again), robot, "effort"), motion.effort, atol=1e-6)
     peak = result["drives"]["arm_1"]["joint"]["peak_effort_N_m"]
     assert peak == pytest.approx(np.abs(motion.effort[:, 0]).max())
 

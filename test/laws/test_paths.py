@@ -248,6 +248,14 @@ def test_what_cannot_be_is_rejected_by_its_place():
     assert fastest(load("upr_rpu"), points_of(load("upr_rpu")), velocity=0.3).duration > 0.0
 
 
+def test_a_given_duration_needs_no_limits():
+    robot = load("upr_rpu")
+    motion = timed(robot, points_of(robot), "quintic", duration=0.8)
+    assert motion.duration == pytest.approx(0.8)
+    assert motion.sample([0.4]).qd.any()
+    assert not motion.worst
+
+
 def test_a_path_of_joints_is_followed_in_joints():
     robot = load("delta")
     q = robot.inverse(points_of(robot, 3))
