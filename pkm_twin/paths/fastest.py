@@ -37,6 +37,7 @@ LOOKED: Final = np.array([1e-6, 0.25, 0.5, 0.75, 1.0 - 1e-6])
 """Parts of each interval of time at which limits are checked."""
 SMALL: Final = 3e-4
 """Part of a limit passed between the points that slowing the whole down makes good."""
+ROUNDING: Final = 1e-12
 ROUNDS: Final = 4
 """How often limits are tightened where they are passed between the points."""
 
@@ -164,7 +165,7 @@ def _run(
         if not bad.any():
             break
         share[bad] /= over[bad]
-    return kept(robot, run, limits, wrench)
+    return kept(robot, run, limits, wrench, float(over.max()))
 
 
 def _lawful(
@@ -214,18 +215,22 @@ def passed(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) -> Ar
     return np.asarray(used.max(1).reshape(count, len(LOOKED)).max(1), np.float64)
 
 
-def kept(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) -> Timed:
+def kept(
+    robot: Robot, run: Timed, limits: Limits, wrench: Array | None, over: float = 0.0
+) -> Timed:
     """A run, slower by as much as its limits need.
+
+    :param over: greatest used part of a limit, where it is known.
 
     :raises ParameterError: no speed keeps them.
     """
-    over = float(passed(robot, run, limits, wrench).max())
+    over = over or float(passed(robot, run, limits, wrench).max())
     slower = run
     for _ in range(ROUNDS):
         if over <= 1.0:
             return slower
         # What moves goes by the speed or its square; what rests does not.
-        slower = slower.slower(over)
+        slower = slower.slower(over * (1.0 + ROUNDING))
         over = float(passed(robot, slower, limits, wrench).max())
     low, high = 1.0, 1.0 + 10.0 * KEPT
     while passed(robot, run.slower(high), limits, wrench).max() > 1.0:

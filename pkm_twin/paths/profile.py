@@ -141,6 +141,8 @@ def programs_of(rows: Rows, left: Index, steps: Array, x: Array | None, part: Ar
     most = np.append(rows.most[left], rows.most[right[-1]])
     # Where two pieces meet the stricter one counts.
     most[1:] = np.minimum(most[1:], rows.most[right])
+    most[:-1] *= part**2
+    most[1:] *= part**2
     (a, a2), (b, b2) = alphas, betas
     return Programs.of(
         np.concatenate([b - a, -a2], 1), np.concatenate([a, b2 + a2], 1),
@@ -156,14 +158,14 @@ def fastest_profile(
     :param part: of each interval's limits that is used, shape (i,).
     :param about: a profile close to the result, about which viscous friction is linear first.
     """
-    drags = bool(rows.drag.any())
-    x = programs_of(rows, left, steps, about if drags else None, part).passes()
-    if not drags:
-        return x
+    x = about if rows.drag.any() else None
     for _ in range(ROUNDS):
         new = programs_of(rows, left, steps, x, part).passes()
-        change = np.abs(np.sqrt(new) - np.sqrt(x)).max()
-        x = new
-        if change <= SETTLED * np.sqrt(x.max()):
-            break
-    return x
+        if not rows.drag.any():
+            return new
+        before, x = x, new
+        if before is not None:
+            change = np.abs(np.sqrt(x) - np.sqrt(before)).max()
+            if change <= SETTLED * np.sqrt(x.max()):
+                break
+    return new
