@@ -33,6 +33,7 @@ MAY = {
     "pkm_twin.state": STREAMS,
     "delta_dynamics": STREAMS | {"pkm_twin.identification"},
     "stiffness_monitor": STREAMS,
+    "pkm_twin.paths": CORE | {"delta_dynamics"},
     "pkm_twin.ros": STREAMS | {"pkm_twin.bags"},
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
@@ -40,7 +41,8 @@ MAY = {
     "pkm_twin.atlas": NODE | TWINS | {"pkm_twin.console"},
     "pkm_twin.apps": NODE
     | TWINS
-    | {"pkm_twin.console", "pkm_twin.atlas", "pkm_twin.export", "pkm_twin.identification"},
+    | {"pkm_twin.console", "pkm_twin.atlas", "pkm_twin.export", "pkm_twin.identification"}
+    | {"pkm_twin.paths"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
 CIRCLES = {frozenset({"pkm_twin.machine", "pkm_twin.kinematics"})}

@@ -71,7 +71,7 @@ def modules():
 
 
 def robots():
-    return {name.stem for name in tracked() if name.parts[0] == "config" and name.suffix == ".yaml"}
+    return {name.stem for name in tracked() if name.match("config/*.yaml")}
 
 
 def check_installation(site, folder):

@@ -31,6 +31,8 @@ from pkm_twin.apps.options import (
     RobotName,
     load_of,
 )
+from pkm_twin.apps.path import path_command
+from pkm_twin.apps.size import size
 from pkm_twin.apps.view.command import view
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
@@ -539,6 +541,8 @@ def certify(
 app.add_typer(atlases.app, name="atlas")
 app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
+app.command("path")(path_command)
+app.command()(size)
 app.command()(guard_check)
 app.command()(view)
 app.command()(fit)

@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 
 from pkm_twin.apps.columns import read_columns, times_of
 from pkm_twin.apps.elastic_fit import AXES, Deflected
-from pkm_twin.apps.recorded import BASE_FRAME, Recording, read_recording, recorded_wrench
+from pkm_twin.apps.recorded import (
+    BASE_FRAME,
+    WRENCH_AXES,
+    Recording,
+    read_recording,
+    recorded_wrench,
+)
 from pkm_twin.apps.topics import TRANSFORM, require_definition
-from pkm_twin.apps.torques import WRENCH_AXES
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import BagError, MessageError, ParameterError, UnknownNameError, one_line

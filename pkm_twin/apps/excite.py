@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, Optional
+from typing import Annotated, Any, Optional
 
 import numpy as np
 import typer
@@ -16,30 +15,6 @@ from pkm_twin.console import file_name, print_json, progress, refuse_existing
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError
 
 Array = NDArray[np.float64]
-
-TOPIC: Final = "/delta_dynamics/joint_trajectory"
-TYPE: Final = "trajectory_msgs/msg/JointTrajectory"
-DEFINITION: Final = """\
-std_msgs/Header header
-string[] joint_names
-JointTrajectoryPoint[] points
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: trajectory_msgs/JointTrajectoryPoint
-float64[] positions
-float64[] velocities
-float64[] accelerations
-float64[] effort
-builtin_interfaces/Duration time_from_start
-================================================================================
-MSG: builtin_interfaces/Duration
-int32 sec
-uint32 nanosec
-"""
-SECOND: Final = 1_000_000_000
 
 
 def excite(
@@ -85,6 +60,7 @@ def excite(
     from pkm_twin import load
     from pkm_twin.apps.fit import kinds_of
     from pkm_twin.apps.torques import write_table
+    from pkm_twin.apps.trajectories import write_trajectory
 
     if out.suffix != ".mcap":
         raise ParameterError("out", str(out), "a name that ends in .mcap")
@@ -100,11 +76,8 @@ def excite(
     time = np.arange(round(duration * rate) + 1) / rate
     time = time[time <= duration]
     motion = best.at(time)
-    own = machine.controller
-    place, rates, changes = (m * own.factors for m in motion)
-    commanded = (place + own.offsets, rates, changes)
     facts = {"robot": machine.name, "source": "pkm-twin excite", "condition": best.condition}
-    _write_bag(out, own.names, time, commanded, facts, overwrite)
+    write_trajectory(out, machine, time, motion, None, facts, overwrite)
     columns = {"time": time}
     for i, joint in enumerate(machine.joint_names):
         for word, values in zip(("position", "velocity", "acceleration"), motion, strict=True):
@@ -146,34 +119,3 @@ def _condition_of(path: Path, judge: Any) -> float:
     step = max(1, len(parts[0]) // 2000)
     result: float = judge.condition(*(part[::step] for part in parts))
     return result
-
-
-def _write_bag(
-    path: Path,
-    names: tuple[str, ...],
-    time: Array,
-    motion: tuple[Array, Array, Array],
-    facts: Mapping[str, Any],
-    overwrite: bool,
-) -> None:
-    """One message, whose zero stamp means a start on receipt."""
-    from pkm_twin.bags.reader import BagWriter
-
-    points = []
-    for t, q, qd, qdd in zip(time.tolist(), *(m.tolist() for m in motion), strict=True):
-        whole = round(t * SECOND)
-        points.append(
-            {
-                "positions": q, "velocities": qd, "accelerations": qdd, "effort": [],
-                "time_from_start": {"sec": whole // SECOND, "nanosec": whole % SECOND},
-            }
-        )  # fmt: skip
-    message = {
-        "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
-        "joint_names": list(names),
-        "points": points,
-    }
-    metadata = {"pkm_twin": {key: str(value) for key, value in facts.items()}}
-    with BagWriter(path, overwrite=overwrite, metadata=metadata, flush_period=None) as bag:
-        bag.add_topic(TOPIC, TYPE, definition=DEFINITION)
-        bag.write(TOPIC, message, 0)

@@ -297,7 +297,7 @@ def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tu
 def _of_csv(path: Path, machine: Any) -> Any:
     from delta_dynamics.fit_rows import Recorded
     from pkm_twin.apps.columns import read_columns, times_of
-    from pkm_twin.apps.torques import WRENCH_AXES
+    from pkm_twin.apps.recorded import WRENCH_AXES
 
     columns = read_columns(path)
     for what in ("position", "effort"):

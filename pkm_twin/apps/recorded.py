@@ -13,15 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin import load, robot_names
+from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
 from pkm_twin.apps.loads import Load, metadata_error, told_load
 from pkm_twin.apps.topics import JOINT_STATE, Topics, choose_topics
 from pkm_twin.bags.reader import Bag, open_bag
-from pkm_twin.errors import BagError, MessageError, one_line
+from pkm_twin.bags.storage import is_bag
+from pkm_twin.errors import BagError, MessageError, ParameterError, one_line
 from pkm_twin.machine.robot import Robot
 from pkm_twin.ros.messages import JointReader, JointSample, StampRules, read_wrench, stamp_of
 
 Array = NDArray[np.float64]
 
+WRENCH_AXES: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 BASE_FRAME: Final = "base_link"
 PLATFORM_FRAME: Final = "platform"
 
@@ -33,10 +36,11 @@ class Recording:
     stamps (samples,) in ns; time (samples,) in s since the first stamp; q, qd, effort (samples, n),
     None where the bag has none; wrench (samples, 6) in fixed axes at the platform's origin, the one
     nearest in time, None without a wrench topic. ``rejected`` counts refused messages by reason.
+    ``bag`` is None of a table.
     """
 
     robot: Robot
-    bag: Bag
+    bag: Bag | None
     topics: Topics
     load: Load | None
     stamps: NDArray[np.int64]
@@ -47,10 +51,14 @@ class Recording:
     wrench: Array | None
     rejected: Counter[str]
     first_reject: str
+    qdd: Array | None = None
+    """Accelerations of a table that has them, shape (samples, n)."""
 
     @property
     def message_count(self) -> int:
         """How many messages the chosen topics have."""
+        if self.bag is None:
+            return len(self.time)
         names = (self.topics.joint_states, self.topics.wrench)
         return sum(self.bag.report.topics[name].count for name in names if name is not None)
 
@@ -86,12 +94,17 @@ def read_recording(
 ) -> Recording:
     """Read a bag's joint states and wrenches, every message checked as the nodes check it.
 
+    Or a table, a CSV: see :func:`recorded_table`.
+
     :param progress: called with the number of messages read so far.
     :param topics: what to read, where names and joints do not tell.
     :param carried: the payload; by default the one that the bag tells of.
     :param limited: refuse what is beyond the robot's limits, as a node does.
     :raises BagError: the bag is damaged, names no robot, or has no usable joint state.
+    :raises ParameterError: a table that is no recording.
     """
+    if not is_bag(Path(path)):
+        return recorded_table(Path(path), robot, carried)
     bag = open_bag(path)
     machine = robot_of(bag, robot)
     chosen = choose_topics(bag, machine, topics)
@@ -137,6 +150,43 @@ def read_recording(
         rejected=rejected,
         first_reject=first,
     )
+
+
+def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) -> Recording:
+    """A recording as a CSV with columns ``time`` and ``JOINT.position``.
+
+    Optionally ``JOINT.velocity`` and ``.acceleration``, ``JOINT.measured`` or else
+    ``JOINT.effort``, and the wrench ``fx fy fz mx my mz``; other columns are left alone.
+
+    :raises ParameterError: no robot is given, a column is missing, or a value is no finite number.
+    """
+    if robot is None:
+        raise ParameterError("robot", None, "--robot: a table names none")
+    machine = robot if isinstance(robot, Robot) else load(robot)
+    columns = read_columns(path)
+
+    def stack(what: str) -> Array | None:
+        names = [f"{joint}.{what}" for joint in machine.joint_names]
+        missing = [name for name in names if name not in columns]
+        if missing and len(missing) < len(names):
+            raise ParameterError(str(path), ", ".join(columns), f"a column {missing[0]}")
+        return None if missing else np.stack([columns[name] for name in names], -1)
+
+    q = stack("position")
+    if q is None or "time" not in columns:
+        needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
+        raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
+    time, qd, measured = times_of(path, columns["time"]), stack("velocity"), stack("measured")
+    check_motion_times(path, time, q, qd)
+    wrench = None
+    if any(axis in columns for axis in WRENCH_AXES):
+        wrench = np.stack([columns.get(axis, np.zeros(len(time))) for axis in WRENCH_AXES], -1)
+    return Recording(
+        robot=machine, bag=None, topics=Topics("columns of the table"), load=carried,
+        stamps=np.round(time * 1e9).astype(np.int64), time=time, q=q, qd=qd,
+        effort=stack("effort") if measured is None else measured, wrench=wrench,
+        rejected=Counter(), first_reject="", qdd=stack("acceleration"),
+    )  # fmt: skip
 
 
 def recorded_wrench(message: Any, now: int, rules: StampRules) -> tuple[int, str, Array]:

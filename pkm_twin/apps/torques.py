@@ -18,8 +18,11 @@ from pkm_twin import load
 from pkm_twin.apps.check import at_rest, motion
 from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
-from pkm_twin.apps.loads import Load, by_load
-from pkm_twin.apps.recorded import read_recording
+from pkm_twin.apps.loads import Load, by_load, told_load
+from pkm_twin.apps.recorded import WRENCH_AXES, read_recording, robot_of
+from pkm_twin.apps.topics import JOINT_STATE
+from pkm_twin.apps.trajectories import read_trajectory
+from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import (
     BagError,
     ParameterError,
@@ -36,7 +39,6 @@ Array = NDArray[np.float64]
 BLOCK = 4096
 """Samples computed at a time, so that memory stays flat."""
 ENDINGS = (".csv", ".parquet")
-WRENCH_AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
 MAPPED = "tables have the model's numbers of the joints; joint_map is for messages and bags"
@@ -63,18 +65,30 @@ class Motion:
     load: Load | None = None
     notes: tuple[str, ...] = ()
     still: NDArray[np.bool_] | None = None
+    planned: Array | None = None
+    """Efforts of a planned motion, shape (samples, n)."""
 
 
 def motion_of_bag(
-    path: Path, robot: str | None, topics: Sequence[str] = (), carried: Load | None = None
+    path: Path, robot: str | Robot | None, topics: Sequence[str] = (), carried: Load | None = None
 ) -> Motion:
     """The motion that a bag recorded, accelerations by the node's differentiator.
+
+    Of a bag without joint states, the motion of its JointTrajectory as it is.
 
     Messages that a node refuses are left out, but not those beyond the robot's limits: see
     :func:`pkm_twin.apps.limits.beyond_limits`.
 
     :raises BagError: the bag is damaged, or has too few joint states in a row.
     """
+    bag = open_bag(path)
+    if not any(topic.type == JOINT_STATE for topic in bag.report.topics.values()):
+        machine = robot_of(bag, robot)
+        plan = read_trajectory(bag, machine)
+        if plan is not None:
+            time, q, qd, qdd, planned = plan
+            still, held = np.zeros((len(time), 6)), carried or told_load(bag)
+            return Motion(machine, time, q, qd, qdd, still, load=held, planned=planned)
     r = read_recording(path, robot, topics=topics, carried=carried, limited=False)
     qd, qdd, used = motion(r)
     if not used.any():
@@ -101,19 +115,19 @@ def motion_of_bag(
     )
 
 
-def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion:
+def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -> Motion:
     """A motion from a CSV with a header row.
 
-    Columns, in any order: ``time``; for every joint NAME ``NAME.position``, and optionally
-    ``NAME.velocity`` and ``NAME.acceleration`` (of all joints or of none); optionally the wrench
-    ``fx fy fz mx my mz``. Absent rates are differentiated by second-order differences; below what
-    these can tell dry friction has no direction and is zero. Absent parts of the wrench are zero.
-    Other columns are left alone, but not those that begin with a joint's name and are none of these
-    or of :func:`table`'s: they are misspelt.
+    Columns, in any order: ``time``; for every joint NAME ``NAME.position``, or in their place all
+    coordinates of the pose (m, rad); optionally ``NAME.velocity`` and ``NAME.acceleration`` (of all
+    joints or of none), and the wrench ``fx fy fz mx my mz``. Absent rates are differentiated by
+    second-order differences; below what these can tell dry friction has no direction and is zero.
+    Absent parts of the wrench are zero. Other columns are left alone, but not those that begin with
+    a joint's name and are none of these or of :func:`table`'s: they are misspelt.
 
     :raises ParameterError: a column is missing or misspelt, or a value is no finite number.
     """
-    machine = load(robot)
+    machine = robot if isinstance(robot, Robot) else load(robot)
     columns = read_columns(path)
     known = [f"{joint}.{what}" for joint in machine.joint_names for what in INPUTS]
     for name in columns:
@@ -133,9 +147,15 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
         return np.stack([columns[name] for name in names], -1)
 
     q = stack("position")
+    posed = q is None and all(name in columns for name in machine.pose_names)
+    if posed:
+        q = machine.inverse(np.stack([columns[name] for name in machine.pose_names], -1))
     if q is None or "time" not in columns:
         needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
-        raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
+        or_pose = ", ".join(machine.pose_names)
+        raise ParameterError(
+            str(path), ", ".join(columns), f"columns time, {needed}; or time, {or_pose}"
+        )
     time = columns["time"]
     times_of(path, time)
     qd, qdd = stack("velocity"), stack("acceleration")
@@ -146,6 +166,8 @@ def motion_of_csv(path: Path, robot: str, carried: Load | None = None) -> Motion
     wrench = [columns.get(name, np.zeros(len(time))) for name in WRENCH_AXES]
     still = None if qd is not None else np.abs(rates) <= rate_doubt(time, q, gradient_gain(time))
     notes = [] if carried is None else [f"payload: {carried}"]
+    if posed:
+        notes.append(f"joint positions by the pose, {', '.join(machine.pose_names)}")
     return Motion(
         machine,
         time,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
@@ -29,7 +28,7 @@ from pkm_twin.machine.graph import (
 )
 from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
-from pkm_twin.machine.sections import check_angles, length, mass
+from pkm_twin.machine.sections import DriveSpec, check_angles, length, mass
 from pkm_twin.machine.shared import Key
 
 Array = NDArray[np.float64]
@@ -97,33 +96,6 @@ class LimitSpec:
     position: Array | None = schema.interval(unit="{joint}", default=None)
     velocity: float | None = schema.number(above=0.0, unit="{joint}/s", default=None)
     effort: float | None = schema.number(above=0.0, unit="{effort}", default=None)
-
-
-@dataclass(frozen=True, eq=False)
-class DriveSpec:
-    """A drive: inertia of the rotor (kg m2) behind a gear of ``ratio`` turns a turn, or of a screw
-    or belt of ``lead`` metres a turn; reflected to the joint it is ``rotor_inertia``.
-    """
-
-    inertia: float = schema.number(at_least=0.0, unit="kg m2")
-    ratio: float | None = schema.number(
-        at_least=1e-6, at_most=1e6, unit="turns a turn", default=None
-    )
-    lead: float | None = schema.number(at_least=1e-6, at_most=1e6, unit="m a turn", default=None)
-
-    def verify(self, path: str) -> None:
-        """One of the two."""
-        if (self.ratio is None) == (self.lead is None):
-            raise ParameterError(path, None, "one of ratio (turns a turn) and lead (m a turn)")
-
-    def reflected(self, slides: bool, path: str) -> float:
-        """Kg m2 of a joint that turns, kg of one that slides."""
-        if slides != (self.lead is not None):
-            what = "lead, m a turn" if slides else "ratio, turns a turn"
-            raise ParameterError(path, None, f"{what}, for this type of joint")
-        factor: Any = self.ratio if self.lead is None else 2 * math.pi / self.lead
-        reflected: float = self.inertia * (factor * factor)
-        return reflected
 
 
 @dataclass(frozen=True, eq=False)

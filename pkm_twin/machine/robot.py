@@ -41,8 +41,14 @@ from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import position_box
-from pkm_twin.machine.sections import JointLimits, Payload, friction_of, limits_of
-from pkm_twin.machine.shared import Shared, drive_units, shared_number, shared_payload
+from pkm_twin.machine.sections import DriveSpec, JointLimits, Payload, friction_of, limits_of
+from pkm_twin.machine.shared import (
+    Shared,
+    behind_gear,
+    drive_units,
+    shared_number,
+    shared_payload,
+)
 from pkm_twin.machine.uncertainty import (
     Factor,
     UncertaintyEntry,
@@ -104,6 +110,8 @@ class Robot:
     friction: Coefficients = schema.section(friction_of(3), default={})
     gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])
     limits: JointLimits = schema.section(limits_of(3), default={})
+    drive: DriveSpec | None = schema.section(DriveSpec, default=None)
+    """Rotor and gear of every actuated joint, in place of ``inertia.rotor_inertia``."""
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
     element_compliance: Mapping[str, float] = schema.numbers(at_least=1e-6, at_most=1e6, default={})
@@ -252,14 +260,31 @@ class Robot:
                     )
                 )  # fmt: skip
         first, rotors = graph.actuated[0], [f"{j}.rotor_inertia" for j in graph.actuated]
-        result.append(
-            shared_number(
-                "rotor", "rotor_inertia", drive_units(graph, first)["rotor_inertia"],
-                graph.joints[first].rotor_inertia, math.nan, ("inertia", "rotor_inertia"),
-                others=rotors,
-            )
+        drive = self.drive
+        rotor = shared_number(
+            "rotor", "rotor_inertia", drive_units(graph, first)["rotor_inertia"],
+            graph.joints[first].rotor_inertia, math.nan,
+            ("inertia", "rotor_inertia") if drive is None else ("drive", "inertia"), others=rotors,
         )  # fmt: skip
-        return tuple(result)
+        if drive is not None:
+            rotor = dataclasses.replace(rotor, keys=behind_gear(rotor, drive.turns))
+        return (*result, rotor)
+
+    @property
+    def drives(self) -> tuple[DriveSpec | None, ...]:
+        """Rotor and gear of each actuated joint, None where the file does not give them."""
+        return (self.drive,) * self.joints_count
+
+    def reflected_rotor(self, given: float, slides: bool) -> float:
+        """Rotor inertia at the joints, kg m2 or kg: of the file's ``drive``, else as given.
+
+        :raises ParameterError: both are given, or a gear for another type of joint.
+        """
+        if self.drive is None:
+            return given
+        if given:
+            raise ParameterError("inertia.rotor_inertia", given, "0 beside a section drive")
+        return self.drive.reflected(slides, "drive")
 
     def shared_parameters(self) -> tuple[Shared, ...]:
         """All that a fit of the robot's file may change: drives, payload, bodies and rods.

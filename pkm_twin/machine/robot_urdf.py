@@ -69,6 +69,11 @@ def robot_description(robot: Robot) -> dict[str, Any]:
         data["payload"] = {
             "mass": load.mass, "com": load.com.tolist(), "inertia": load.inertia.tolist()
         }  # fmt: skip
+    for name, gear in zip(robot.joint_names, robot.drives, strict=True):
+        if gear is not None:
+            own = {key: value for key, value in schema.plain(gear).items() if value is not None}
+            data["joints"][name].pop("rotor_inertia", None)
+            data["joints"][name]["drive"] = own
     for name, drive in _drives(robot).items():
         joint = data["joints"][name]
         limits: dict[str, Any] = {}

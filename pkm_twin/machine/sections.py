@@ -74,6 +74,40 @@ def check_angles(angle: float, path: str) -> None:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class DriveSpec:
+    """A drive: inertia of the rotor (kg m2) behind a gear of ``ratio`` turns a turn, or of a screw
+    or belt of ``lead`` metres a turn; reflected to the joint it is ``rotor_inertia``.
+
+    ``efficiency``: of the gear or screw, for the sizing of motors; the dynamics read none of it.
+    """
+
+    inertia: float = schema.number(at_least=0.0, unit="kg m2")
+    ratio: float | None = schema.number(
+        at_least=1e-6, at_most=1e6, unit="turns a turn", default=None
+    )
+    lead: float | None = schema.number(at_least=1e-6, at_most=1e6, unit="m a turn", default=None)
+    efficiency: float = schema.number(above=0.0, at_most=1.0, default=1.0)
+
+    def verify(self, path: str) -> None:
+        """One of the two."""
+        if (self.ratio is None) == (self.lead is None):
+            raise ParameterError(path, None, "one of ratio (turns a turn) and lead (m a turn)")
+
+    @property
+    def turns(self) -> float:
+        """Motor angle per joint motion, rad/rad or rad/m."""
+        turns: Any = self.ratio if self.lead is None else 2 * math.pi / self.lead
+        return turns  # type: ignore[no-any-return]
+
+    def reflected(self, slides: bool, path: str) -> float:
+        """Kg m2 of a joint that turns, kg of one that slides."""
+        if slides != (self.lead is not None):
+            what = "lead, m a turn" if slides else "ratio, turns a turn"
+            raise ParameterError(path, None, f"{what}, for this type of joint")
+        return self.inertia * self.turns**2
+
+
 @remembered
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign.

@@ -196,3 +196,11 @@ def bar(pivot: Array, along: Array) -> Array:
         ]
     )
     return np.asarray(transport(np.eye(3), pivot) @ local.T, np.float64)
+
+
+def behind_gear(reflected: Shared, turns: float) -> Callable[[Array], Mapping[Key, float]]:
+    """The rotor's own inertia for the one that is reflected to the joint.
+
+    :param turns: motor angle per joint motion.
+    """
+    return lambda new: {key: v / turns**2 for key, v in reflected.keys(new).items()}

@@ -346,6 +346,7 @@ class Delta(Robot):
         """Arms on the base, forearms as parallelograms or on an rcu's joints, a platform."""
         g, m = self.geometry, self.inertia
         q, platform = self._home
+        rotor = self.reflected_rotor(m.rotor_inertia, slides=False)
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
         rods: dict[str, Rod] = {}
@@ -364,7 +365,7 @@ class Delta(Robot):
             )
             joints[self.joints[i]] = Joint(
                 self.joints[i], "revolute", BASE, arm, pivot, array([along]), actuated=True,
-                home=q[i], rotor_inertia=m.rotor_inertia, directions=fixed,
+                home=q[i], rotor_inertia=rotor, directions=fixed,
                 label=f"base joint {limb}",
             )  # fmt: skip
             corner = array(platform + g.platform_radius * out)

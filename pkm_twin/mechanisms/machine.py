@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -46,8 +46,15 @@ from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.robot_urdf import robot_description
-from pkm_twin.machine.sections import Payload, friction_of, limits_of
-from pkm_twin.machine.shared import Key, Shared, drive_units, shared_body, shared_number
+from pkm_twin.machine.sections import DriveSpec, Payload, friction_of, limits_of
+from pkm_twin.machine.shared import (
+    Key,
+    Shared,
+    behind_gear,
+    drive_units,
+    shared_body,
+    shared_number,
+)
 from pkm_twin.machine.uncertainty import UncertaintyEntry, check_uncertainty
 
 Array = NDArray[np.float64]
@@ -233,6 +240,11 @@ class Machine(Robot):
         """Joints of which the file does not say where they count from."""
         return frozenset(n for n, joint in self.specs["joints"].items() if joint.home is None)
 
+    @property
+    def drives(self) -> tuple[DriveSpec | None, ...]:
+        """Rotor and gear of each actuated joint, None where the file does not give them."""
+        return tuple(self.specs["joints"][name].drive for name in self.joint_names)
+
     def make_graph(self) -> Graph:
         """The graph of the file."""
         return self.described
@@ -286,8 +298,8 @@ class Machine(Robot):
                 drive_units(graph, names[0])["rotor_inertia"], first.rotor_inertia, math.nan,
                 (*path, *tail), others=[f"{name}.rotor_inertia" for name in names],
             )  # fmt: skip
-            if drive is not None and drive.inertia > 0.0:
-                one = dataclasses.replace(one, keys=_behind_gear(one, drive.inertia))
+            if drive is not None:
+                one = dataclasses.replace(one, keys=behind_gear(one, drive.turns))
             result.append(one)
         return tuple(result)
 
@@ -449,12 +461,6 @@ def _drives(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
             effort=_together([v.effort for v in limits], math.inf),
         ),
     }
-
-
-def _behind_gear(reflected: Shared, rotor: float) -> Callable[[Array], Mapping[Key, float]]:
-    """The rotor's own inertia for the one that is reflected to the joint."""
-    factor = rotor / float(reflected.values[0])
-    return lambda new: {key: factor * v for key, v in reflected.keys(new).items()}
 
 
 def _root(inertia: Array) -> Array:

@@ -314,6 +314,7 @@ class Prru(Robot):
         thin = np.array([l**2 / 12, 0.0])
         lower = m.lower_link_mass * thin if m.lower_link_inertia is None else m.lower_link_inertia
         upper = m.upper_link_mass * thin if m.upper_link_inertia is None else m.upper_link_inertia
+        rotor = self.reflected_rotor(m.rotor_inertia, slides=True)
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
         origin = array([0.0, 0.0, height + self._rise])
@@ -332,7 +333,7 @@ class Prru(Robot):
             name = self.joints[i]
             joints[name] = Joint(
                 name, "prismatic", BASE, slider, foot, array([UP]), actuated=True, home=height,
-                rotor_inertia=m.rotor_inertia, directions=fixed, label=f"guide {limb}",
+                rotor_inertia=rotor, directions=fixed, label=f"guide {limb}",
             )  # fmt: skip
             for label, kind, pair, at, axes in (
                 ("slider joint", "revolute", (slider, low), foot, [t]),

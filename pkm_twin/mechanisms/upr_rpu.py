@@ -417,6 +417,8 @@ class UprRpu(Robot):
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
         inertia = self.inertia
+        given = 0.0 if inertia is None else inertia.rotor_inertia
+        rotor = self.reflected_rotor(given, slides=True)
         for i, limb in enumerate("123"):
             foot, head = array(b * _PATTERN[i]), array(origin + a * _PATTERN[i])
             reach = norm(head - foot)
@@ -431,7 +433,7 @@ class UprRpu(Robot):
             universal = _named((BASE if i < 2 else high, _X), (low if i < 2 else PLATFORM, _Y))
             drive = Joint(
                 self.joints[i], "prismatic", low, high, foot, array([d]), actuated=True, home=reach,
-                rotor_inertia=0.0 if inertia is None else inertia.rotor_inertia,
+                rotor_inertia=rotor,
                 label=f"P joint {limb}",
             )  # fmt: skip
             if i < 2:

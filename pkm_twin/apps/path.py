@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin path``: a motion along way-points, a cycle or a circle, as a trajectory or table."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Final, Optional
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from pkm_twin.apps.options import Json, Payload, Platform, RobotName, load_of
+from pkm_twin.console import file_name, numbers, parse_numbers, print_json, refuse_existing
+from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.paths.geometry import Path as Way
+from pkm_twin.paths.geometry import Space
+
+Array = NDArray[np.float64]
+
+ENDINGS: Final = (".mcap", ".csv")
+OPTIONS: Final = ("blend", "dwell", "arc")
+"""Columns of way-points beside their coordinates."""
+MILLIMETRES: Final = 1e-3
+LEAST_CYCLE: Final = 1.0
+"""Millimetres below which a cycle's numbers look like metres."""
+
+
+def read_waypoints(file: Path, robot: Robot, blend: float | None) -> Way:
+    """The path of a CSV of way-points, see :func:`path_command`.
+
+    :raises ParameterError: a column is missing, unknown, or a number is out of range.
+    """
+    from pkm_twin.apps.columns import read_columns
+    from pkm_twin.paths import lines, through
+
+    columns = read_columns(file)
+    joints = [f"{name}.position" for name in robot.joint_names]
+    others = {f"{j}.{w}" for j in robot.joint_names for w in ("velocity", "acceleration", "effort")}
+    by_joints = any(name in columns for name in joints)
+    by_pose = any(name in columns for name in robot.pose_names)
+    space: Space = "pose" if by_pose else "joint"
+    needed = list(robot.pose_names) if by_pose else joints
+    if not (by_pose or by_joints):
+        known = f"{', '.join(robot.pose_names)} or {', '.join(joints)}"
+        raise ParameterError(f"{file}: columns", ", ".join(columns), known)
+    for name in needed:
+        if name not in columns:
+            raise ParameterError(f"{file}: columns", ", ".join(columns), f"a column {name}")
+    known_names = {*robot.pose_names, *joints, *others, *OPTIONS, "time"}
+    for name in columns:
+        if name not in known_names:
+            raise UnknownNameError(f"{file}: column", name, known_names)
+    points = np.stack([columns[name] for name in needed], -1)
+    if blend is None and not any(name in columns for name in OPTIONS):
+        return through(robot, points, space=space)
+    given = {name: columns[name] for name in OPTIONS if name in columns}
+    if "arc" in given and not np.isin(given["arc"], (0.0, 1.0)).all():
+        raise ParameterError(f"{file}: arc", given["arc"].tolist(), "0 or 1")
+    arc = given.get("arc", np.zeros(len(points))) == 1.0
+    rounded = given.get("blend", np.full(len(points), blend or 0.0))
+    if "blend" not in given:
+        # An arc's ends and middle are no corners.
+        near = arc | np.roll(arc, 1) | np.roll(arc, -1)
+        rounded = np.where(near, 0.0, rounded)
+    try:
+        return lines(
+            robot, points, blend=rounded, dwell=given.get("dwell", 0.0), arc=arc, space=space
+        )
+    except ParameterError as error:
+        raise ParameterError(f"{file}: {error.field}", error.value, error.bound) from None
+
+
+def _chosen(
+    machine: Robot, waypoints: Path | None, cycle: str | None, circle: float | None,
+    at: str | None, direction: float, blend: float | None, dwell: float,
+) -> Way:  # fmt: skip
+    """The path that a command line asks for."""
+    from pkm_twin import paths
+
+    asked = [name for name, value in (("WAYPOINTS", waypoints), ("--cycle", cycle),
+                                      ("--circle", circle)) if value is not None]  # fmt: skip
+    if len(asked) != 1:
+        raise typer.BadParameter("give one of WAYPOINTS.csv, --cycle and --circle")
+    if waypoints is not None:
+        if at is not None or dwell or direction:
+            raise typer.BadParameter("--at, --direction and --dwell are for --cycle and --circle")
+        return read_waypoints(waypoints, machine, blend)
+    names = ", ".join(machine.pose_names)
+    centre = None if at is None else numbers(at, len(machine.pose_names), f"a pose: {names}")
+    if circle is not None:
+        home = machine.home() if centre is None else np.array(centre)
+        return paths.circle(machine, home, circle)
+    lengths = parse_numbers(cycle or "")
+    if len(lengths) not in (2, 3) or min(lengths) < LEAST_CYCLE:
+        raise typer.BadParameter(
+            f"--cycle {cycle}: HEIGHT,WIDTH[,LIFT] in millimetres, for example 25,305,25"
+        )
+    metres = [MILLIMETRES * value for value in lengths]
+    return paths.cycle(
+        machine, *metres, at=centre, direction=math.radians(direction), blend=blend, dwell=dwell
+    )
+
+
+_PerJoint = Optional[str]  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+
+
+def path_command(
+    robot: RobotName,
+    waypoints: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Argument(help="CSV of way-points; or give --cycle or --circle", show_default=False),
+    ] = None,
+    cycle: Annotated[
+        _PerJoint,
+        typer.Option(
+            help="pick-and-place cycle there and back, HEIGHT,WIDTH[,LIFT] in mm: 25,305,25",
+            show_default=False,
+        ),
+    ] = None,
+    circle: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="circle of this radius, m", show_default=False),
+    ] = None,
+    at: Annotated[
+        _PerJoint,
+        typer.Option(
+            help="pose in the middle of --cycle (between the two places) or --circle, numbers "
+            "with commas; default: home",
+            show_default=False,
+        ),
+    ] = None,
+    direction: Annotated[
+        float, typer.Option(help="of the cycle's way across, degrees from x towards y")
+    ] = 0.0,
+    blend: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(
+            help="distance from a corner at which the path leaves the line, m; 0 stops in every "
+            "way-point; default: a smooth curve through way-points, 0.8 of a cycle's rise",
+            min=0.0,
+            show_default=False,
+        ),
+    ] = None,
+    dwell: Annotated[float, typer.Option(help="rest at both places of a cycle, s", min=0.0)] = 0.0,
+    fastest: Annotated[
+        bool, typer.Option("--fastest", help="the shortest motion within all limits")
+    ] = False,
+    law: Annotated[
+        str, typer.Option(help="without --fastest: quintic or s-curve, from stop to stop")
+    ] = "quintic",
+    duration: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="of the whole, s; default: the shortest", show_default=False),
+    ] = None,
+    effort: Annotated[
+        _PerJoint,
+        typer.Option(help="limit, one number or one a joint, N m or N; default: the file's"),
+    ] = None,
+    velocity: Annotated[
+        _PerJoint, typer.Option(help="limit of the joints, rad/s or m/s; default: the file's")
+    ] = None,
+    acceleration: Annotated[
+        _PerJoint, typer.Option(help="limit of the joints, rad/s2 or m/s2; default: none")
+    ] = None,
+    jerk: Annotated[
+        _PerJoint, typer.Option(help="limit of the joints, rad/s3 or m/s3; default: none")
+    ] = None,
+    speed: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="limit of the tool point, m/s; default: none", show_default=False),
+    ] = None,
+    share: Annotated[
+        float, typer.Option(help="part of the file's efforts and velocities that is used")
+    ] = 1.0,
+    singularity: Annotated[
+        float, typer.Option(help="least singularity index on the path, 0 to 1", min=0.0, max=1.0)
+    ] = 0.01,
+    payload: Payload = None,
+    platform: Platform = None,
+    rate: Annotated[
+        float, typer.Option(help="samples a second in the file", min=1.0, max=1e5)
+    ] = 1000.0,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            help="FILE.mcap (a JointTrajectory with efforts) or FILE.csv",
+            callback=file_name,
+            show_default=False,
+        ),
+    ] = None,
+    picture: Annotated[
+        bool, typer.Option(help="draw which limit binds where as a PNG beside the file")
+    ] = True,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace both files")] = False,
+    as_json: Json = False,
+) -> None:
+    """Plan a motion along a path, the fastest too.
+
+    WAYPOINTS.csv has a header row and the pose's coordinates (m, rad) or JOINT.position of every
+    joint; the platform goes through the points on a smooth curve without a stop. With a column
+    blend (m), dwell (s) or arc (1: the middle of an arc), or with --blend, it follows straight
+    lines and arcs, and stops where blend is 0. An arc and a tangent line meet without a stop.
+
+    --fastest is the shortest time within effort, velocity, acceleration, jerk and speed limits by
+    the exact inverse dynamics, with payload and friction. Printed are the duration, which limit
+    binds when, and the greatest part of each limit that is used.
+
+    The CSV has columns time, JOINT.position, JOINT.velocity, JOINT.acceleration, JOINT.effort, and
+    the pose's coordinates, as `pkm-twin torques` and `pkm-twin size` read them.
+    """
+    from pkm_twin import load
+    from pkm_twin.apps.path_report import draw_limits, report, write
+    from pkm_twin.paths import timed
+
+    drawing = None if out is None or not picture else out.with_suffix(".png")
+    if out is not None:
+        if out.suffix not in ENDINGS:
+            raise ParameterError("out", str(out), f"a name that ends in {' or '.join(ENDINGS)}")
+        for target in (out, drawing):
+            if target is not None:
+                refuse_existing(target, overwrite, waypoints)
+    machine = load(robot, platform=platform) if platform else load(robot)
+    carried = load_of(payload, None)
+    if carried is not None:
+        machine = carried.on(machine)
+    made = _chosen(machine, waypoints, cycle, circle, at, direction, blend, dwell)
+    bounds: dict[str, Any] = {
+        name: None if text is None else _limit(name, text, machine)
+        for name, text in (
+            ("effort", effort), ("velocity", velocity), ("acceleration", acceleration),
+            ("jerk", jerk),
+        )
+    }  # fmt: skip
+    motion = timed(
+        machine, made, "fastest" if fastest else law, duration=duration, speed=speed, share=share,
+        singularity=singularity, **bounds,
+    )  # fmt: skip
+    try:
+        if out is not None:
+            write(motion, motion.uniform(rate), carried, out, overwrite)
+        if drawing is not None:
+            draw_limits(motion, drawing)
+    except OSError as error:
+        raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
+    data, text = report(motion, carried, out, drawing)
+    if as_json:
+        print_json(data)
+    else:
+        typer.echo(text)
+
+
+def _limit(name: str, text: str, machine: Robot) -> list[float]:
+    values = parse_numbers(text)
+    n = machine.joints_count
+    if len(values) not in (1, n) or min(values) <= 0.0:
+        raise typer.BadParameter(f"--{name} {text}: one number above 0, or {n} with commas between")
+    return values

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin size``: what drives must give for a recorded or planned motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from pkm_twin.apps.options import BagTopics, Json, LoadTimes, Payload, Platform, RobotName, load_of
+from pkm_twin.console import file_name, numbers, print_json, refuse_existing
+from pkm_twin.errors import ParameterError, PkmTwinError
+
+
+def size(
+    robot: RobotName,
+    motion: Annotated[
+        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        typer.Argument(
+            help="a recording or a path: MCAP, rosbag2 folder or CSV", show_default=False
+        ),
+    ] = None,
+    drives: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            help="YAML of motors to compare with, or `shipped` for those of config/drives",
+            show_default=False,
+        ),
+    ] = None,
+    motor: Annotated[
+        list[str], typer.Option(help="compare with these of the drives file only")
+    ] = [],  # noqa: B006  typer copies it
+    over_workspace: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="instead of a motion: SPEED,ACCELERATION of the tool point (m/s, m/s2), in the "
+            "worst direction at the worst pose",
+            show_default=False,
+        ),
+    ] = None,
+    singularity: Annotated[
+        float,
+        typer.Option(help="least singularity index for --over-workspace, 0 to 1", min=0.0, max=1.0),
+    ] = 0.05,
+    efforts: Annotated[
+        str, typer.Option(help="file: those of the file where it has them; or model")
+    ] = "file",
+    payload: Payload = None,
+    load_times: LoadTimes = None,
+    platform: Platform = None,
+    topic: BagTopics = [],  # noqa: B006
+    picture: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            help="PNG of torque against speed of each drive",
+            callback=file_name,
+            show_default=False,
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the picture")] = False,
+    as_json: Json = False,
+) -> None:
+    """Size the drives for a motion.
+
+    For each drive: peak and RMS effort (which heats the motor), speed, power, energy given and
+    regenerated, and the machine's inertia at the joint. Where the robot's file has a section drive
+    (inertia, ratio or lead, efficiency), the same at the motor, and the ratio of the inertias.
+
+    With --drives each motor of the file is compared with each drive: its torque curve, its
+    continuous torque against the RMS torque, its speed; its rotor takes the place of the file's.
+
+    The motion is a CSV of `pkm-twin path` or `pkm-twin torques`, a bag of joint states, or a bag
+    with a JointTrajectory.
+    """
+    from pkm_twin.apps import sizes
+
+    if efforts not in ("file", "model"):
+        raise typer.BadParameter(f"--efforts {efforts}: file or model")
+    if picture is not None:
+        refuse_existing(picture, overwrite, motion)
+    if (motion is None) == (over_workspace is None):
+        raise typer.BadParameter("give a recording or path, or --over-workspace")
+    carried = load_of(payload, load_times)
+    machine = sizes.loaded(robot, platform)
+    motors = [] if drives is None else sizes.read_motors(drives, motor)
+    if over_workspace is not None:
+        speed, change = numbers(over_workspace, 2, "SPEED,ACCELERATION")
+        if speed < 0.0 or change < 0.0:
+            raise ParameterError("over-workspace", over_workspace, "two numbers, 0 or more")
+        if carried is not None:
+            machine = carried.on(machine)
+        data, text = sizes.worst_report(machine, speed, change, singularity)
+    else:
+        assert motion is not None  # noqa: S101  one of the two is given
+        taken = sizes.read_motion(motion, machine, topic, carried, efforts)
+        result = sizes.duties(taken, motors)
+        data, text = sizes.report(taken, result)
+        if picture is not None:
+            try:
+                sizes.draw(taken, result, picture)
+            except OSError as error:
+                what = f"cannot write {error.filename or picture}: {error.strerror}"
+                raise PkmTwinError(what) from None
+            text += f"\n{picture}"
+    if as_json:
+        print_json(data)
+    else:
+        typer.echo(text)

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``pkm-twin size`` reads, prints and draws."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import load
+from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.loads import Load, by_load
+from pkm_twin.apps.torques import Motion, motion_of_bag, motion_of_csv
+from pkm_twin.bags.storage import is_bag
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine import schema
+from pkm_twin.machine.catalogue import config_folder
+from pkm_twin.machine.robot import Robot
+from pkm_twin.paths.sizing import DriveDuty, Motor, size_drives
+from pkm_twin.paths.worst import worst_over_workspace
+
+Array = NDArray[np.float64]
+
+SHIPPED: Final = "shipped"
+RPM: Final = 2 * math.pi / 60
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A motion with the efforts that are sized, shape (k, n), and where these are from."""
+
+    motion: Motion
+    effort: Array
+    source: str
+
+
+def loaded(name: str, platform: str | None) -> Robot:
+    """The robot of a command line."""
+    return load(name, platform=platform) if platform else load(name)
+
+
+def read_motion(
+    path: Path, robot: Robot, topics: Sequence[str], carried: Load | None, efforts: str
+) -> Taken:
+    """A recording or a path, with the file's efforts where it has them and they are asked for.
+
+    :raises ParameterError: a table that is no motion.
+    :raises BagError: a bag without joint states or a trajectory.
+    """
+    given: Array | None = None
+    if is_bag(path):
+        motion = motion_of_bag(path, robot, topics, carried)
+        given = motion.measured if motion.planned is None else motion.planned
+    else:
+        motion = motion_of_csv(path, robot, carried)
+        columns = read_columns(path)
+        names = [f"{joint}.effort" for joint in robot.joint_names]
+        if all(name in columns for name in names):
+            given = np.stack([columns[name] for name in names], -1)
+    if given is not None and efforts == "file":
+        return Taken(motion, given, "the file's")
+    effort = np.empty_like(motion.q)
+    for machine, part in by_load(motion.robot, motion.load, motion.time, 4096):
+        effort[part] = inverse_dynamics(
+            machine, motion.q[part], motion.qd[part], motion.qdd[part], motion.wrench[part]
+        )
+    return Taken(motion, effort, "the model's")
+
+
+def duties(taken: Taken, motors: Sequence[Motor]) -> list[DriveDuty]:
+    """What each drive gives."""
+    m = taken.motion
+    robot = m.robot if m.load is None else m.load.on(m.robot)
+    return size_drives(robot, m.time, m.q, m.qd, m.qdd, taken.effort, motors)
+
+
+@dataclass(frozen=True, eq=False)
+class MotorSpec:
+    """A motor as its data sheet has it: torques in N m, speeds in 1/min, inertia in kg m2.
+
+    ``curve``: rows of speed and greatest torque; without it the peak torque up to the rated speed,
+    then a straight line to the continuous torque at the greatest speed.
+    """
+
+    inertia: float = schema.number(above=0.0, unit="kg m2")
+    continuous_torque: float = schema.number(above=0.0, unit="N m")
+    peak_torque: float = schema.number(above=0.0, unit="N m")
+    rated_speed: float = schema.number(above=0.0, unit="1/min")
+    max_speed: float = schema.number(above=0.0, unit="1/min")
+    source: str = schema.text(default="")
+    curve: Any = dataclasses.field(
+        default=None, metadata={"check": lambda field, value: _curve(field, value), "key": None}
+    )
+
+    def motor(self, name: str) -> Motor:
+        """In SI units."""
+        rows = self.curve
+        if rows is None:
+            rows = np.array(
+                [[0.0, self.peak_torque], [self.rated_speed, self.peak_torque],
+                 [self.max_speed, self.continuous_torque]]
+            )  # fmt: skip
+        return Motor(
+            name, self.inertia, self.continuous_torque, rows * np.array([RPM, 1.0]), self.source
+        )
+
+
+def _curve(field: str, value: Any) -> Array:
+    rows = np.array(value, float) if isinstance(value, list) else np.zeros(0)
+    rising = rows.ndim == 2 and rows.shape[1:] == (2,) and len(rows) > 1
+    if not (rising and (np.diff(rows[:, 0]) > 0.0).all() and (rows >= 0.0).all()):
+        raise ParameterError(field, value, "rows of speed (1/min, rising from 0) and torque (N m)")
+    return rows
+
+
+def read_motors(path: Path, names: Sequence[str] = ()) -> list[Motor]:
+    """Motors of a YAML with a mapping ``drives`` of names to data.
+
+    :raises ParameterError: by the field.
+    """
+    if str(path) == SHIPPED:
+        path = config_folder() / "drives" / "servos.yaml"
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        what = error.strerror if isinstance(error, OSError) else str(error)
+        raise ParameterError(str(path), what, "a readable YAML file of drives") from None
+    entries = data.get("drives") if isinstance(data, dict) else None
+    if not isinstance(entries, dict) or not entries:
+        raise ParameterError(str(path), None, "a mapping drives of names to data")
+    for name in names:
+        if name not in entries:
+            raise UnknownNameError(f"{path}: motor", name, [str(n) for n in entries])
+    return [
+        schema.build(MotorSpec, entry, f"{path}: drives.{name}").motor(str(name))
+        for name, entry in entries.items()
+        if not names or name in names
+    ]
+
+
+def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], str]:
+    """The result as plain data and as text."""
+    m = taken.motion
+    duration = float(m.time[-1] - m.time[0])
+    total = [d.at_joint.energy for d in result]
+    data = {
+        "robot": m.robot.name, "duration_s": duration, "samples": len(m.time),
+        "efforts": taken.source,
+        "payload": None if m.load is None else m.load.as_json(),
+        "drives": {d.joint: d.as_json() for d in result},
+        "energy_J": sum(total), "mean_power_W": sum(total) / duration,
+        "regenerated_J": sum(d.at_joint.returned for d in result),
+    }  # fmt: skip
+    lines = [
+        f"{m.robot.name}: {len(m.time)} samples, {duration:.4g} s; efforts: {taken.source}; "
+        f"payload: {m.load or 'the robot file alone'}"
+    ]
+    for d in result:
+        force, rate, inertia = ("N", "m/s", "kg") if d.slides else ("N m", "rad/s", "kg m2")
+        lines.append(f"{d.joint}:")
+        lines.append("  joint: " + _words(d.at_joint, force, rate))
+        low, high = d.load_inertia
+        lines.append(f"  load inertia at the joint {low:.4g} to {high:.4g} {inertia}")
+        if d.at_motor is not None:
+            lines.append("  motor: " + _words(d.at_motor, "N m", "rad/s"))
+            if d.inertia_ratio is not None:
+                lines.append(f"  inertia ratio, load to rotor: {d.inertia_ratio:.4g}")
+        for fit in sorted(d.fits, key=lambda f: (not f.good, f.motor.continuous)):
+            lines.append(
+                f"  {'fits' if fit.good else 'too small'}: {fit.motor.name}: torque "
+                f"{100 * fit.torque:.4g} %, continuous torque {100 * fit.thermal:.4g} %, speed "
+                f"{100 * fit.speed:.4g} %, inertia ratio {fit.inertia_ratio:.3g}"
+            )
+    lines.append(
+        f"all drives: energy {sum(total):.4g} J, of it regenerated "
+        f"{data['regenerated_J']:.4g} J, mean power {data['mean_power_W']:.4g} W"
+    )
+    lines += list(m.notes)
+    return data, "\n".join(lines)
+
+
+def _words(duty: Any, force: str, rate: str) -> str:
+    return (
+        f"effort peak {duty.peak:.4g}, RMS {duty.rms:.4g} {force}; speed peak {duty.speed:.4g}, "
+        f"mean {duty.mean_speed:.4g} {rate}; power peak {duty.power:.4g}, regenerated peak "
+        f"{duty.braking:.4g} W; energy {duty.energy:.4g} J ({duty.returned:.4g} J regenerated)"
+    )
+
+
+def worst_report(
+    robot: Robot, speed: float, change: float, singularity: float
+) -> tuple[dict[str, Any], str]:
+    """The worst efforts and speeds over the workspace, as plain data and as text."""
+    worst = worst_over_workspace(robot, speed, change, singularity=singularity)
+    names = robot.pose_names
+    data: dict[str, Any] = {
+        "robot": robot.name, "speed_m_s": speed, "acceleration_m_s2": change,
+        "poses": worst.poses, "drives": {},
+    }  # fmt: skip
+    lines = [
+        f"{robot.name}: tool point at {speed:g} m/s and {change:g} m/s2 in the worst directions, "
+        f"{worst.poses} poses of the workspace"
+    ]
+    for i, joint in enumerate(robot.joint_names):
+        force = "N" if robot.joint_units[i] == "m" else "N_m"
+        rate = "m_s" if robot.joint_units[i] == "m" else "rad_s"
+        entry: dict[str, Any] = {}
+        for what, value, pose in (
+            (f"effort_{force}", worst.effort[i], worst.effort_pose[i]),
+            (f"holding_effort_{force}", worst.holding[i], worst.holding_pose[i]),
+            (f"speed_{rate}", worst.speed[i], worst.speed_pose[i]),
+        ):
+            entry[what] = float(value)
+            entry[f"{what.split('_')[0]}_pose"] = dict(zip(names, pose.tolist(), strict=True))
+            where = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, pose, strict=True))
+            words = what.replace("_N_m", " (N m)").replace("_N", " (N)")
+            words = words.replace("_rad_s", " (rad/s)").replace("_m_s", " (m/s)").replace("_", " ")
+            lines.append(f"{joint}: {words} {value:.4g} at {where}")
+        data["drives"][joint] = entry
+    return data, "\n".join(lines)
+
+
+def draw(taken: Taken, result: Sequence[DriveDuty], path: Path) -> None:
+    """Torque against speed, an axes for each drive, with the curves of motors."""
+    from pkm_twin.atlas import plots
+
+    shown = list(result)[:4]
+    figure, axes = plots.columns(1, len(shown))
+    m = taken.motion
+    for k, (ax, d) in enumerate(zip(axes[0], shown, strict=True)):
+        if d.torques is not None and d.speeds is not None:
+            side, speeds, torques = "motor", d.speeds / RPM, d.torques
+            labels = "speed of the motor (1/min)", "torque (N m)"
+        else:
+            side, speeds, torques = "joint", m.qd[:, k], taken.effort[:, k]
+            unit = m.robot.joint_units[k]
+            labels = f"speed of the joint ({unit}/s)", f"effort ({m.robot.effort_units[k]})"
+        ax.plot(speeds, torques, color="black", lw=1, label="motion")
+        for colour, fit in zip(plots.COLOURS, d.fits[:6], strict=False):
+            speed, torque = fit.motor.curve.T
+            for sign in (1.0, -1.0):
+                for way in (1.0, -1.0):
+                    label = fit.motor.name if sign == way == 1.0 else None
+                    ax.plot(way * speed / RPM, sign * torque, color=colour, lw=1, label=label)
+        ax.set_title(f"{m.robot.name}: is the drive of {d.joint} strong enough? ({side})")
+        ax.set_xlabel(labels[0])
+        ax.set_ylabel(labels[1])
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+        ax.grid(alpha=0.3)
+    plots.save(figure, path)

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A JointTrajectory in a bag of its own: written for a controller, read back as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.bags.reader import Bag, BagWriter
+from pkm_twin.errors import BagError
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+TOPIC: Final = "/delta_dynamics/joint_trajectory"
+TYPE: Final = "trajectory_msgs/msg/JointTrajectory"
+DEFINITION: Final = """\
+std_msgs/Header header
+string[] joint_names
+JointTrajectoryPoint[] points
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: trajectory_msgs/JointTrajectoryPoint
+float64[] positions
+float64[] velocities
+float64[] accelerations
+float64[] effort
+builtin_interfaces/Duration time_from_start
+================================================================================
+MSG: builtin_interfaces/Duration
+int32 sec
+uint32 nanosec
+"""
+SECOND: Final = 1_000_000_000
+
+
+def write_trajectory(
+    path: Path,
+    robot: Robot,
+    time: Array,
+    motion: tuple[Array, Array, Array],
+    effort: Array | None,
+    facts: Mapping[str, Any],
+    overwrite: bool,
+) -> None:
+    """One message in the controller's numbers, whose zero stamp means a start on receipt.
+
+    :param time: shape (k,), s from the start.
+    :param motion: the model's q, qd and qdd, shape (k, n).
+    :param effort: the model's, shape (k, n), None for none.
+    :raises BagError: the file exists or cannot be written.
+    """
+    own = robot.controller
+    q, qd, qdd = motion
+    empty: list[list[float]] = [[]] * len(time)
+    efforts = empty if effort is None else own.controller_efforts(effort).tolist()
+    rows = zip(
+        time.tolist(), own.controller_positions(q).tolist(), own.controller_rates(qd).tolist(),
+        own.controller_rates(qdd).tolist(), efforts, strict=True,
+    )  # fmt: skip
+    points = []
+    for t, position, rate, change, force in rows:
+        whole = round(t * SECOND)
+        points.append(
+            {
+                "positions": position, "velocities": rate, "accelerations": change, "effort": force,
+                "time_from_start": {"sec": whole // SECOND, "nanosec": whole % SECOND},
+            }
+        )  # fmt: skip
+    message = {
+        "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
+        "joint_names": list(own.names),
+        "points": points,
+    }
+    metadata = {"pkm_twin": {key: str(value) for key, value in facts.items()}}
+    with BagWriter(path, overwrite=overwrite, metadata=metadata, flush_period=None) as bag:
+        bag.add_topic(TOPIC, TYPE, definition=DEFINITION)
+        bag.write(TOPIC, message, 0)
+
+
+def read_trajectory(
+    bag: Bag, robot: Robot
+) -> tuple[Array, Array, Array, Array, Array | None] | None:
+    """Time (k,), q, qd, qdd and efforts (k, n) of a bag's only JointTrajectory.
+
+    In the model's numbers. None where the bag has no trajectory with velocities and accelerations,
+    and for efforts that it does not have.
+
+    :raises BagError: joints of another robot, or several trajectories.
+    """
+    names = [name for name, topic in bag.report.topics.items() if topic.type == TYPE]
+    messages = list(bag.messages(names)) if names else []
+    if not messages:
+        return None
+    if len(messages) > 1:
+        text = f"{len(messages)} trajectories; expected one"
+        raise BagError(text, path=bag.report.path, reason="trajectories")
+    message = messages[0].message
+    own = robot.controller
+    if sorted(message.joint_names) != sorted(own.names):
+        text = f"joints {', '.join(message.joint_names)}; expected {', '.join(own.names)}"
+        raise BagError(text, path=bag.report.path, reason="joints")
+    order = [list(message.joint_names).index(name) for name in own.names]
+    points = message.points
+    if len(points) < 2 or any(not len(p.velocities) or not len(p.accelerations) for p in points):
+        return None
+    time = np.array(
+        [p.time_from_start.sec + p.time_from_start.nanosec / SECOND for p in points], float
+    )
+    q, qd, qdd = (
+        np.array([getattr(p, what) for p in points], float)[:, order]
+        for what in ("positions", "velocities", "accelerations")
+    )
+    effort = None
+    if all(len(p.effort) for p in points):
+        effort = own.efforts(np.array([p.effort for p in points], float)[:, order])
+    return time, own.positions(q), own.rates(qd), own.rates(qdd), effort

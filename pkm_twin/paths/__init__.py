@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Paths, their time laws, the fastest motion along them, and the sizing of drives."""
+
+from pkm_twin.paths.constraints import Limits
+from pkm_twin.paths.fastest import fastest, timed
+from pkm_twin.paths.geometry import Path, circle, cycle, lines, through
+from pkm_twin.paths.motion import Bound, Samples, TimedPath
+from pkm_twin.paths.sizing import Motor, size_drives
+from pkm_twin.paths.worst import worst_over_workspace
+
+__all__ = [
+    "Bound", "Limits", "Motor", "Path", "Samples", "TimedPath", "circle", "cycle", "fastest",
+    "lines", "size_drives", "through", "timed", "worst_over_workspace",
+]  # fmt: skip

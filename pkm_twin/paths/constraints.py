@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of a motion along a path as rows in the path's acceleration and speed.
+
+With v = ds/dt, x = v^2 and u = d2s/dt2 the efforts are exactly
+
+    tau = a u + b x + w v + k + g,
+
+a by the masses, b by the velocity terms, w by viscous and k by dry friction in the direction of the
+path, g by gravity, offsets and the wrench. The five come from five calls of the inverse dynamics.
+
+May import: numpy, delta_dynamics, pkm_twin's core, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.paths.joint_path import JointPath, place_at
+
+Array = NDArray[np.float64]
+
+NOTHING: Final = 1e-12
+"""Part of the greatest rate below which a joint does not move."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a motion must keep; infinite where there is no limit.
+
+    ``effort``, ``velocity``, ``acceleration``, ``jerk``: of the actuated joints, shape (n,).
+    ``speed``: of the platform's reference point, m/s.
+    """
+
+    effort: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    speed: float = np.inf
+
+    @classmethod
+    def of(
+        cls,
+        robot: Robot,
+        *,
+        effort: ArrayLike | None = None,
+        velocity: ArrayLike | None = None,
+        acceleration: ArrayLike | None = None,
+        jerk: ArrayLike | None = None,
+        speed: float | None = None,
+        share: float = 1.0,
+    ) -> Limits:
+        """The limits of a robot's file, or those given here; one number stands for all joints.
+
+        :param share: part of the file's efforts and velocities that a motion may use.
+        :raises ParameterError: a limit that is not above 0, or too many numbers.
+        """
+        n = robot.joints_count
+        own = robot.limits
+        if not 0.0 < share <= 1.0:
+            raise ParameterError("share", share, "above 0, at most 1")
+
+        def of(name: str, given: ArrayLike | None, file: Array | None) -> Array:
+            if given is None:
+                return np.full(n, np.inf) if file is None else share * np.asarray(file, float)
+            values = np.asarray(given, float)
+            if values.shape not in ((), (1,), (n,)) or not (values > 0.0).all():
+                raise ParameterError(name, values.tolist(), f"one number above 0, or {n}")
+            return np.broadcast_to(values, (n,)).astype(float)
+
+        most = np.inf if speed is None else float(speed)
+        if not most > 0.0:
+            raise ParameterError("speed", speed, "above 0, m/s")
+        return cls(
+            of("effort", effort, own.effort), of("velocity", velocity, own.velocity),
+            of("acceleration", acceleration, None), of("jerk", jerk, None), most,
+        )  # fmt: skip
+
+    def part(self, share: float) -> Limits:
+        """The same, each times ``share``."""
+        return Limits(
+            share * self.effort, share * self.velocity, share * self.acceleration,
+            share * self.jerk, share * self.speed,
+        )  # fmt: skip
+
+    def check(self) -> None:
+        """Reject limits that leave the speed open.
+
+        :raises ParameterError: there is none.
+        """
+        bounds = (self.effort, self.velocity, self.acceleration, self.jerk)
+        if not (np.isfinite(self.speed) or any(np.isfinite(b).any() for b in bounds)):
+            raise ParameterError(
+                "limits", "none",
+                "a limit of effort, velocity, acceleration or speed, in the robot's file or given",
+            )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Forces:
+    """a, b, w, k and g of the efforts at points of a path, shape (p, n) each."""
+
+    a: Array
+    b: Array
+    w: Array
+    k: Array
+    g: Array
+
+    @classmethod
+    def of(
+        cls, robot: Robot, q: Array, first: Array, second: Array, wrench: Array | None = None
+    ) -> Forces:
+        """From the inverse dynamics at joint positions with derivatives by s, (p, n) each."""
+        zero = np.zeros_like(q)
+        rates = (zero, zero, first, -first, 2.0 * first)
+        changes = (zero, first, second, second, 4.0 * second)
+        load = None if wrench is None else np.tile(wrench, (5, 1))
+        efforts = inverse_dynamics(
+            robot, np.tile(q, (5, 1)), np.concatenate(rates), np.concatenate(changes), load
+        )
+        g, a, ahead, back, twice = efforts.reshape(5, *q.shape)
+        b = 0.5 * (ahead + back) - g
+        odd = 0.5 * (ahead - back)
+        w = twice - g - 4.0 * b - odd
+        # What is left of rounding is no friction.
+        size = 1e-12 * np.abs(efforts).max(initial=0.0)
+        w = np.where(np.abs(w) > size, w, 0.0)
+        k = odd - w
+        return cls(a - g, b, w, np.where(np.abs(k) > size, k, 0.0), g)
+
+    def efforts(self, v: Array, u: Array) -> Array:
+        """Efforts at speeds v and accelerations u along the path, (p,) each: shape (p, n)."""
+        moving = (v > 0.0)[:, None]
+        v, u = v[:, None], u[:, None]
+        # A machine that starts has its dry friction already.
+        moving |= u != 0.0
+        return self.a * u + self.b * v**2 + self.w * v + self.g + np.where(moving, self.k, 0.0)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Limits at points of a path as parts of them, and the greatest x there.
+
+    -1 <= alpha u + beta x + drag v + fixed + dry <= 1, shape (p, r), and x <= most, shape (p,).
+    ``dry``: dry friction, which jumps where a joint turns round.
+    """
+
+    alpha: Array
+    beta: Array
+    drag: Array
+    fixed: Array
+    dry: Array
+    most: Array
+
+    @classmethod
+    def of(cls, part: JointPath, forces: Forces | None, limits: Limits) -> Rows:
+        """Of the points of a stretch."""
+        p = len(part.s)
+        alpha, beta, drag, fixed, dry = ([np.zeros((p, 0))] for _ in range(5))
+        used = np.isfinite(limits.effort)
+        if forces is not None and used.any():
+            scale = 1.0 / limits.effort[used]
+            alpha.append(forces.a[:, used] * scale)
+            beta.append(forces.b[:, used] * scale)
+            drag.append(forces.w[:, used] * scale)
+            fixed.append(forces.g[:, used] * scale)
+            dry.append(forces.k[:, used] * scale)
+        used = np.isfinite(limits.acceleration)
+        if used.any():
+            scale = 1.0 / limits.acceleration[used]
+            alpha.append(part.first[:, used] * scale)
+            beta.append(part.second[:, used] * scale)
+            drag.append(np.zeros((p, int(used.sum()))))
+            fixed.append(drag[-1])
+            dry.append(drag[-1])
+        a, b, w, g, k = (np.concatenate(rows, 1) for rows in (alpha, beta, drag, fixed, dry))
+        most = _most(part, limits)
+        return cls(a, b, w, g, k, np.minimum(most, _fast(part, a, most)))
+
+
+def _fast(part: JointPath, alpha: Array, most: Array) -> float:
+    """An x that no motion reaches: ten times what the hardest acceleration all the way gives."""
+    size = np.abs(alpha).max(1, initial=0.0)
+    pushed = size > NOTHING * size.max()
+    if not pushed.any():
+        return float(most[np.isfinite(most)].max())
+    return float(10.0 * 2.0 * part.s[-1] * (2.0 / size[pushed]).max())
+
+
+def _most(part: JointPath, limits: Limits) -> Array:
+    """Greatest x by joint velocities and the tool's speed, shape (p,)."""
+    rates = np.abs(part.first)
+    least = NOTHING * max(float(rates.max()), 1e-300)
+    with np.errstate(divide="ignore"):
+        fastest = np.where(rates > least, limits.velocity / np.maximum(rates, least), np.inf)
+        tool = limits.speed / np.maximum(part.travel, 1e-300)
+    return np.asarray(np.minimum(fastest.min(1), tool) ** 2, np.float64)
+
+
+def names_of(robot: Robot) -> list[str]:
+    """What may bind, in the order of :func:`shares`."""
+    joints = robot.joint_names
+    words = ("effort", "velocity", "acceleration", "jerk")
+    return [f"{word} {joint}" for word in words for joint in joints] + ["speed"]
+
+
+def shares(
+    limits: Limits, effort: Array | None, qd: Array, qdd: Array, qddd: Array, speed: Array
+) -> Array:
+    """Each limit's used part, shape (k, 4 n + 1), 1 at the limit; 0 where there is none."""
+    zero = np.zeros_like(qd)
+    parts = [
+        np.abs(values) / bound
+        for values, bound in (
+            (zero if effort is None else effort, limits.effort), (qd, limits.velocity),
+            (qdd, limits.acceleration), (qddd, limits.jerk),
+        )
+    ]  # fmt: skip
+    return np.concatenate([*parts, (np.asarray(speed) / limits.speed)[:, None]], 1)
+
+
+def check_rest(robot: Robot, part: JointPath, rows: Rows, limits: Limits, begin: float) -> None:
+    """Reject a path on which the drives cannot hold the machine or creep.
+
+    :raises ParameterError: by the place and joint.
+    """
+    size = np.abs(rows.fixed + rows.dry)
+    if not size.size or (size < 1.0).all():
+        return
+    row, column = np.unravel_index(int(size.argmax()), size.shape)
+    where = place_at(robot, part.q[row], begin + float(part.s[row]))
+    bounded = np.flatnonzero(np.isfinite(limits.effort))
+    name = robot.joint_names[bounded[column]]
+    raise ParameterError(
+        f"path: effort of {name} at rest {where}",
+        f"{100 * float(size[row, column]):.4g} % of its limit",
+        "less than 100 %: the drive cannot hold the machine there",
+    )  # fmt: skip

@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Paths in pose or joint coordinates: lines, rounded corners, arcs and smooth curves.
+
+A path is a chain of stretches, each from rest to rest; a stretch is a chain of pieces that meet
+with the same direction. The coordinate s of a piece is a length: angles count by the platform's
+radius, see :func:`scales_of`.
+
+May import: numpy, scipy, pkm_twin's core, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.paths.pieces import Arc, Corner, Line, Piece, Smooth, arc_through
+
+Array = NDArray[np.float64]
+Space = Literal["pose", "joint"]
+
+SHORTEST: Final = 1e-9
+"""Distance below which two way-points are one, m."""
+SHARPEST: Final = -0.985
+"""Cosine of the turn from which on a corner is a reversal (170 degrees) and cannot be rounded."""
+TANGENT: Final = 1e-6
+"""Difference of two unit directions below which a path passes from one to the other at speed."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Pieces that are passed without a stop, and how long the machine then rests, s."""
+
+    pieces: tuple[Piece, ...]
+    dwell: float = 0.0
+
+    @property
+    def length(self) -> float:
+        """Range of s."""
+        return sum(piece.length for piece in self.pieces)
+
+
+@dataclass(frozen=True)
+class Path:
+    """Stretches in pose or joint coordinates; ``wait`` is the rest before the first, s."""
+
+    space: Space
+    stretches: tuple[Stretch, ...]
+    wait: float = 0.0
+    kind: str = "path"
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def length(self) -> float:
+        """Length of the whole path, m."""
+        return sum(stretch.length for stretch in self.stretches)
+
+
+def scales_of(robot: Robot, space: Space) -> Array:
+    """What makes lengths of the coordinates: 1 of a length, the platform's radius of an angle."""
+    if space == "pose":
+        return robot.pose_scales
+    return np.array([1.0 if unit == "m" else robot.size for unit in robot.joint_units])
+
+
+def _points(robot: Robot, points: ArrayLike, space: Space) -> tuple[Array, Array]:
+    """Way-points (k, m), and which of them differ from the one before.
+
+    :raises ParameterError: a wrong shape, no number, or no way at all.
+    """
+    values = np.asarray(points, np.float64)
+    names = robot.pose_names if space == "pose" else robot.joint_names
+    if values.ndim != 2 or values.shape[1] != len(names) or len(values) < 2:
+        raise ParameterError(
+            "way-points", f"shape {values.shape}", f"2 or more rows of {', '.join(names)}"
+        )
+    if not np.isfinite(values).all():
+        row = int(np.argwhere(~np.isfinite(values))[0, 0])
+        raise ParameterError(f"way-point {row}", values[row].tolist(), "finite numbers")
+    steps = np.linalg.norm(np.diff(values, axis=0) * scales_of(robot, space), axis=1)
+    if not (steps > SHORTEST).any():
+        raise ParameterError("way-points", "all the same", "different way-points")
+    return values, np.concatenate([[True], steps > SHORTEST])
+
+
+def through(robot: Robot, points: ArrayLike, *, space: Space = "pose") -> Path:
+    """A smooth curve through way-points without a stop: a cubic spline over the chords' lengths.
+
+    :param points: shape (k, m), coordinates of the pose, or joint positions (k, n).
+    :raises ParameterError: fewer than two different way-points, or no numbers.
+    """
+    values, new = _points(robot, points, space)
+    values = values[new]
+    steps = np.linalg.norm(np.diff(values, axis=0) * scales_of(robot, space), axis=1)
+    knots = np.concatenate([[0.0], np.cumsum(steps)])
+    if len(values) == 2:
+        piece: Piece = Line(values[0], (values[1] - values[0]) / knots[1], float(knots[1]))
+    else:
+        piece = Smooth(CubicSpline(knots, values))
+    return Path(space, (Stretch((piece,)),), kind="smooth curve")
+
+
+def lines(
+    robot: Robot,
+    points: ArrayLike,
+    *,
+    blend: ArrayLike = 0.0,
+    dwell: ArrayLike = 0.0,
+    arc: ArrayLike = False,
+    space: Space = "pose",
+) -> Path:
+    """Straight lines and arcs between way-points, corners rounded or passed with a stop.
+
+    :param points: shape (k, m), coordinates of the pose, or joint positions (k, n).
+    :param blend: by way-point (k,) or one for all: distance from the corner at which the path
+        leaves the line, m (angles by the platform's radius); at most half of the shorter
+        neighbouring line. 0 is a stop. It must be 0 where an arc begins or ends.
+    :param dwell: rest in each way-point, s, shape (k,) or one for all; above 0 it is a stop.
+    :param arc: which way-points (k,) are points in the middle of an arc, from the way-point before
+        to the one behind. An arc and a tangent line meet without a stop.
+    :raises ParameterError: by the way-point.
+    """
+    values, new = _points(robot, points, space)
+    count = len(values)
+    blends, dwells = (np.broadcast_to(np.asarray(v, float), count).copy() for v in (blend, dwell))
+    arcs = np.broadcast_to(np.asarray(arc, bool), count).copy()
+    for name, numbers in (("blend", blends), ("dwell", dwells)):
+        bad = ~(np.isfinite(numbers) & (numbers >= 0.0))
+        if bad.any():
+            row = int(bad.argmax())
+            raise ParameterError(f"way-point {row}: {name}", numbers[row], "0 or more")
+    # A way-point that is repeated only adds its rest.
+    for k in np.flatnonzero(np.logical_not(new)):
+        dwells[k] += dwells[k - 1]
+        keep = int(np.flatnonzero(new[:k])[-1])
+        dwells[keep], arcs[keep] = dwells[k], arcs[keep] and arcs[k]
+    values, blends, dwells, arcs = (v[new] for v in (values, blends, dwells, arcs))
+    builder = _Lines(robot, space, values, blends, dwells, arcs)
+    return builder.path()
+
+
+class _Lines:
+    """Lines and arcs between way-points that differ."""
+
+    def __init__(
+        self, robot: Robot, space: Space, points: Array, blends: Array, dwells: Array,
+        arcs: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        self.robot, self.space = robot, space
+        self.points, self.blends, self.dwells, self.arcs = points, blends, dwells, arcs
+        self.scales = scales_of(robot, space)
+
+    def path(self) -> Path:
+        moves = list(self._moves())
+        pieces: list[Piece] = []
+        stretches: list[Stretch] = []
+        last = len(moves) - 1
+        cut = 0.0
+        for k, (piece, end) in enumerate(moves):
+            if k == last:
+                pieces += _shortened(piece, cut, 0.0)
+                stretches.append(Stretch(tuple(pieces), float(self.dwells[end])))
+                break
+            following = moves[k + 1][0]
+            out, into = _end(piece), following.at(np.zeros(1))[1][0]
+            radius = self._radius(end, piece, following)
+            if radius > 0.0:
+                pieces += _shortened(piece, cut, radius)
+                pieces.append(Corner(self.points[end], out, into, radius))
+                cut = radius
+                continue
+            pieces += _shortened(piece, cut, 0.0)
+            cut = 0.0
+            apart = float(np.linalg.norm((out - into) * self.scales))
+            if apart > TANGENT or self.dwells[end] > 0.0:
+                stretches.append(Stretch(tuple(pieces), float(self.dwells[end])))
+                pieces = []
+        return Path(self.space, tuple(stretches), float(self.dwells[0]), "lines")
+
+    def _moves(self) -> Sequence[tuple[Piece, int]]:
+        """Each line or arc, and the way-point that it ends in."""
+        result: list[tuple[Piece, int]] = []
+        k, last = 0, len(self.points) - 1
+        if self.arcs[0] or self.arcs[last]:
+            raise ParameterError(
+                "way-points: arc", "the first or last", "way-points between two others"
+            )
+        while k < last:
+            if self.arcs[k + 1]:
+                if self.arcs[k + 2]:
+                    raise ParameterError(
+                        f"way-point {k + 2}: arc", 1, "an arc's end: one point in its middle only"
+                    )
+                result.append((self._arc(k), k + 2))
+                k += 2
+                continue
+            way = self.points[k + 1] - self.points[k]
+            length = float(np.linalg.norm(way * self.scales))
+            result.append((Line(self.points[k], way / length, length), k + 1))
+            k += 1
+        return result
+
+    def _radius(self, k: int, piece: Piece, following: Piece) -> float:
+        """Where a corner is left, m; 0 where it is passed with a stop or is none."""
+        wanted = float(self.blends[k])
+        if wanted == 0.0 or self.dwells[k] > 0.0:
+            return 0.0
+        if not (isinstance(piece, Line) and isinstance(following, Line)):
+            raise ParameterError(
+                f"way-point {k}: blend", wanted, "0 where an arc begins or ends (make it tangent)"
+            )
+        turn = float(np.sum(piece.slope * following.slope * self.scales**2))
+        if turn <= SHARPEST or turn >= 1.0 - TANGENT**2:
+            return 0.0
+        return min(wanted, 0.5 * piece.length, 0.5 * following.length)
+
+    def _arc(self, k: int) -> Arc:
+        """The arc from way-point k through the next one to the one behind."""
+        names = self.robot.pose_names if self.space == "pose" else ()
+        places = [i for i, name in enumerate(names) if name in ("x", "y", "z")]
+        if len(places) < 2:
+            raise ParameterError(
+                f"way-point {k + 1}: arc", 1, "poses with two or more of x, y, z among them"
+            )
+        return arc_through(*self.points[k : k + 3], places=places, where=f"way-point {k + 1}")
+
+
+def _end(piece: Piece) -> Array:
+    return np.asarray(piece.at(np.array([piece.length]))[1][0], np.float64)
+
+
+def _shortened(piece: Piece, begin: float, end: float) -> list[Piece]:
+    """A line without its first and last parts; nothing where nothing is left."""
+    length = piece.length - begin - end
+    if not length > SHORTEST:
+        return []
+    if begin == end == 0.0 or not isinstance(piece, Line):
+        return [piece]
+    return [Line(piece.begin + begin * piece.slope, piece.slope, length)]
+
+
+def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0) -> Path:
+    """A circle of the platform's reference point about a pose, in the first two of x, y, z.
+
+    :param centre: the pose in the middle, shape (m,).
+    :param radius: m.
+    :param turns: how often; negative turns the other way.
+    :raises ParameterError: a pose without two of x, y, z, or a radius that is none.
+    """
+    middle = np.asarray(centre, float)
+    places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")][:2]
+    if len(places) < 2:
+        raise ParameterError("circle", robot.name, "a robot whose pose has two of x, y, z")
+    if not (radius > 0.0 and turns):
+        raise ParameterError("circle", radius, "a radius above 0, m, and turns other than 0")
+    across, along = np.zeros(len(middle)), np.zeros(len(middle))
+    across[places[0]], along[places[1]] = 1.0, float(np.sign(turns))
+    angle = 2 * np.pi * abs(turns)
+    piece = Arc(middle, across, along, np.zeros(len(middle)), float(radius), angle)
+    return Path("pose", (Stretch((piece,)),), kind="circle")
+
+
+def cycle(
+    robot: Robot,
+    height: float,
+    width: float,
+    lift: float | None = None,
+    *,
+    at: ArrayLike | None = None,
+    direction: float = 0.0,
+    blend: float | None = None,
+    dwell: float = 0.0,
+    back: bool = True,
+) -> Path:
+    """A pick-and-place cycle: up, across, down, a stop, and the same way back.
+
+    :param height: rise at the first place, m.
+    :param width: between the two places, m.
+    :param lift: fall at the second place, m; default ``height``.
+    :param at: pose in the middle between the two places, shape (m,); default home.
+    :param direction: of the way across in the x-y plane, rad; of a planar robot it is along x.
+    :param blend: rounding of the upper corners, m; default 0.8 of the smaller rise.
+    :param dwell: rest in both places, s.
+    :param back: whether the path goes back to the first place.
+    :raises ParameterError: a robot that cannot move up and across, or no way.
+    """
+    fall = height if lift is None else lift
+    for name, value in (("height", height), ("width", width), ("lift", fall)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise ParameterError(f"cycle: {name}", value, "above 0, m")
+    names = robot.pose_names
+    if "z" not in names or not {"x", "y"} & set(names):
+        raise ParameterError("cycle", f"pose {', '.join(names)}", "a pose with z and one of x, y")
+    middle = robot.home() if at is None else np.asarray(at, float)
+    if middle.shape != (len(names),):
+        raise ParameterError("at", middle.tolist(), f"a pose: {', '.join(names)}")
+    across, up = np.zeros(len(names)), np.zeros(len(names))
+    up[names.index("z")] = 1.0
+    if {"x", "y"} <= set(names):
+        across[names.index("x")], across[names.index("y")] = np.cos(direction), np.sin(direction)
+    else:
+        across[names.index("x" if "x" in names else "y")] = 1.0
+    first = middle - 0.5 * width * across
+    second = middle + 0.5 * width * across + (height - fall) * up
+    there = [first, first + height * up, second + fall * up, second]
+    points = there + there[-2::-1] if back else there
+    corner = 0.8 * min(height, fall) if blend is None else blend
+    rounded = [0.0, corner, corner, 0.0] + ([corner, corner, 0.0] if back else [])
+    rests = [0.0, 0.0, 0.0, dwell] + ([0.0, 0.0, dwell] if back else [])
+    made = lines(robot, points, blend=rounded, dwell=rests)
+    return Path(made.space, made.stretches, made.wait, "pick-and-place cycle")

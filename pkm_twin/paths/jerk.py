@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fastest speed along a path with limits on the joints' jerk, as a sequence of linear programs.
+
+A joint's jerk is v (q' du/ds + 3 q'' u + q''' x) with x = v^2, so a limit J on it is a bound
+J / sqrt(x) on what is linear in x. That bound is convex: its tangent at a profile that keeps the
+limit is stricter, so every program's result keeps it too, and each is at least as fast as the one
+before. It starts from a quintic.
+
+May import: numpy, scipy, pkm_twin's core, the standard library, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog  # type: ignore[import-untyped]
+from scipy.sparse import coo_matrix, csr_matrix, vstack  # type: ignore[import-untyped]
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.paths.constraints import Limits, Rows
+from pkm_twin.paths.joint_path import JointPath
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+PROGRAMS: Final = 20
+"""Most linear programs."""
+SETTLED: Final = 1e-4
+"""Relative change of the duration that ends them."""
+
+
+@dataclass(frozen=True)
+class SmoothRun:
+    """One stretch of a path in time, its acceleration linear between times.
+
+    ``times`` (k,), s; way, speed and acceleration along the path there, shape (k,).
+    """
+
+    part: JointPath
+    times: Array
+    way: Array
+    v: Array
+    u: Array
+
+    @property
+    def duration(self) -> float:
+        """From rest to rest, s."""
+        return float(self.times[-1])
+
+    def slower(self, factor: float) -> SmoothRun:
+        """The same with ``factor`` times the duration."""
+        return SmoothRun(
+            self.part, factor * self.times, self.way, self.v / factor, self.u / factor**2
+        )
+
+    @cached_property
+    def _ends(self) -> Array:
+        return np.append(self.part.s[self.part.left], self.part.s[-1])
+
+    def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
+        """Interval, part of it, v and u at times (k,)."""
+        k = np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2)
+        t = np.clip(time - self.times[k], 0.0, self.times[k + 1] - self.times[k])
+        u, v = self.u[k], self.v[k]
+        jerk = (self.u[k + 1] - u) / (self.times[k + 1] - self.times[k])
+        way = self.way[k] + t * (v + t * (u / 2 + t * jerk / 6))
+        s = self._ends
+        j = np.clip(np.searchsorted(s, way, side="right") - 1, 0, len(s) - 2)
+        part = np.clip((way - s[j]) / (s[j + 1] - s[j]), 0.0, 1.0)
+        return j, part, np.maximum(v + t * (u + t * jerk / 2), 0.0), u + t * jerk
+
+
+def _sides(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
+    """The first two derivatives at the points between two intervals, and the third on both sides.
+
+    Shape (i - 1, n) each; where two pieces meet the third jumps.
+    """
+    left = part.left
+    third = (part.second[left + 1] - part.second[left]) / part.steps[:, None]
+    at = left[1:]
+    second = 0.5 * (part.second[at] + part.second[left[:-1] + 1])
+    return part.first[at], second, (third[:-1], third[1:])
+
+
+def smooth_profile(part: JointPath, rows: Rows, limits: Limits, start: Array) -> Array:
+    """The greatest x at the intervals' ends, (i + 1,), with the joints' jerks within limits.
+
+    :param start: a profile that keeps the limits, shape (i + 1,).
+    :raises ParameterError: the first program has no solution.
+    """
+    h = part.steps
+    fixed, bound = _rows(part, rows, h)
+    best, x = np.inf, start
+    for count in range(PROGRAMS):
+        more, top = _jerk_rows(part, limits, h, x)
+        drag, rest = _drag_rows(rows, part, x)
+        v = np.sqrt(np.maximum(x, 1e-12 * x.max()))
+        weight = np.zeros(len(x))
+        share = h / (v[:-1] + v[1:]) ** 2
+        weight[:-1] += share / v[:-1]
+        weight[1:] += share / v[1:]
+        most = _most(part, rows, limits)
+        answer = linprog(
+            -weight / weight[1:-1].max(),
+            A_ub=vstack([fixed + drag, more]).tocsr(), b_ub=np.concatenate([bound - rest, top]),
+            bounds=np.stack([np.zeros(len(x)), most], 1), method="highs",
+        )  # fmt: skip
+        if answer.status != 0:
+            if count == 0:
+                raise ParameterError("jerk", "no profile", f"a solution: {answer.message}")
+            break
+        new = np.maximum(answer.x, 0.0)
+        v = np.sqrt(new)
+        duration = float(np.sum(2.0 * h / np.maximum(v[:-1] + v[1:], 1e-300)))
+        if duration < best:
+            settled = duration > best * (1.0 - SETTLED)
+            best, x = duration, new
+            if settled:
+                break
+        else:
+            break
+    return x
+
+
+def _most(part: JointPath, rows: Rows, limits: Limits) -> Array:
+    """Greatest x at the intervals' ends: by speeds, and at the first by the jerk from rest."""
+    left = part.left
+    most = np.append(rows.most[left], rows.most[left[-1] + 1])
+    most[1:] = np.minimum(most[1:], rows.most[left + 1])
+    most[0] = most[-1] = 0.0
+    for k, step, at in ((1, part.steps[0], 0), (-2, part.steps[-1], -1)):
+        rates = np.abs(part.first[at])
+        jerk = float((limits.jerk / np.maximum(rates, 1e-300)).min())
+        if np.isfinite(jerk):
+            # From rest s = jerk t^3 / 6 and v = jerk t^2 / 2.
+            most[k] = min(most[k], 0.25 * jerk**2 * (6.0 * step / jerk) ** (4 / 3))
+    return most
+
+
+def _triplets(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> csr_matrix:
+    values, row, column = (np.concatenate([np.ravel(r[k]) for r in rows]) for k in range(3))
+    return coo_matrix((values, (row, column)), shape=shape).tocsr()
+
+
+def _rows(part: JointPath, rows: Rows, h: Array) -> tuple[csr_matrix, Array]:
+    """Efforts and accelerations at both ends of all intervals, without viscous friction."""
+    count, width = len(h), rows.alpha.shape[1]
+    made: list[tuple[Any, Any, Any]] = []
+    bounds = []
+    at = 0
+    column = np.repeat(np.arange(count), width)
+    for k, own in ((part.left, 0), (part.left + 1, 1)):
+        lever = rows.alpha[k] / (2.0 * h[:, None])
+        beta, fixed = rows.beta[k], rows.fixed[k] + rows.dry[k]
+        for sign in (1.0, -1.0):
+            number = at + np.arange(count * width)
+            made.append((sign * (-lever + (beta if own == 0 else 0.0)), number, column))
+            made.append((sign * (lever + (beta if own == 1 else 0.0)), number, column + 1))
+            bounds.append(np.ravel(np.maximum(1.0 - sign * fixed, 0.0)))
+            at += count * width
+    return _triplets(made, (at, count + 1)), np.concatenate(bounds)
+
+
+def _drag_rows(rows: Rows, part: JointPath, x: Array) -> tuple[csr_matrix, Array]:
+    """Viscous friction about a profile, in the order of :func:`_rows`."""
+    count, width = len(part.left), rows.drag.shape[1]
+    v = np.maximum(np.sqrt(x), 0.01 * np.sqrt(x.max()))
+    made: list[tuple[Any, Any, Any]] = []
+    rests = []
+    at = 0
+    for k, own in ((part.left, 0), (part.left + 1, 1)):
+        about = v[own : own + count][:, None]
+        column = np.repeat(np.arange(count) + own, width)
+        for sign in (1.0, -1.0):
+            number = at + np.arange(count * width)
+            made.append((sign * rows.drag[k] / (2.0 * about), number, column))
+            rests.append(np.ravel(sign * 0.5 * rows.drag[k] * about))
+            at += count * width
+    return _triplets(made, (at, count + 1)), np.concatenate(rests)
+
+
+def _jerk_rows(part: JointPath, limits: Limits, h: Array, x: Array) -> tuple[csr_matrix, Array]:
+    """Jerks at the points between two intervals, their bound's tangent at a profile."""
+    used = np.isfinite(limits.jerk)
+    first, second, sides = _sides(part)
+    first, second = first[:, used], second[:, used]
+    most = limits.jerk[used]
+    count, width = first.shape
+    before, behind = h[:-1][:, None], h[1:][:, None]
+    middle = 0.5 * (before + behind)
+    # u before and behind the point, from x in front, at and after it.
+    back = (-0.5 / before, 0.5 / before)
+    on = (-0.5 / behind, 0.5 / behind)
+    slope = first / middle
+    mean = 1.5 * second
+    front = back[0] * (-slope + mean)
+    here = back[1] * (-slope + mean) + on[0] * (slope + mean)
+    after = on[1] * (slope + mean)
+    about = np.maximum(x[1:-1], 1e-9 * x.max())[:, None]
+    tangent = 0.5 * most / about**1.5
+    top = 1.5 * most / np.sqrt(about)
+    point = np.repeat(np.arange(count), width)
+    made: list[tuple[Any, Any, Any]] = []
+    at = 0
+    for sign, third in product((1.0, -1.0), sides):
+        number = at + np.arange(count * width)
+        made.append((sign * front, number, point))
+        made.append((sign * (here + third[:, used]) + tangent, number, point + 1))
+        made.append((sign * after, number, point + 2))
+        at += count * width
+    bound = np.ravel(np.broadcast_to(top, (count, width)))
+    return _triplets(made, (at, len(x))), np.tile(bound, 4)
+
+
+def smooth_run(part: JointPath, x: Array) -> SmoothRun:
+    """A profile in time: its mean accelerations, joined by lines in time.
+
+    Between points y = x^(3/4) is linear in s, as it is from rest with even jerk. What the lines
+    miss of the way's end and of rest there, a smooth change over the whole makes good.
+    """
+    h = part.steps
+    v, y = np.sqrt(x), x**0.75
+    even = np.abs(np.diff(y)) < 1e-6 * np.maximum(y[:-1], y[1:])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curved = 3.0 * np.diff(np.cbrt(y)) * h / np.diff(y)
+    span = np.where(even, 2.0 * h / np.maximum(v[:-1] + v[1:], 1e-300), curved)
+    ends = np.concatenate([[0.0], np.cumsum(span)])
+    times = np.concatenate([[0.0], 0.5 * (ends[1:] + ends[:-1]), ends[-1:]])
+    u = np.concatenate([[0.0], np.diff(v) / span, [0.0]])
+    t = times / times[-1]
+    step = np.diff(times)
+
+    def speeds(u: Array) -> Array:
+        return np.concatenate([[0.0], np.cumsum(0.5 * step * (u[1:] + u[:-1]))])
+
+    bump = 6.0 * t * (1.0 - t)
+    u = u - bump * speeds(u)[-1] / speeds(bump)[-1]
+    v = speeds(u)
+    jerk = np.diff(u) / step
+    way = np.cumsum(step * (v[:-1] + step * (u[:-1] / 2 + step * jerk / 6)))
+    scale = float(part.s[-1]) / way[-1]
+    return SmoothRun(part, times, scale * np.append(0.0, way), scale * v, scale * u)

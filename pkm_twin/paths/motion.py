@@ -1,0 +1,344 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A motion along a path in time, and which limit binds where.
+
+May import: numpy, pkm_twin's core, the standard library, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.paths.constraints import Forces, Limits, names_of, shares
+from pkm_twin.paths.geometry import Path
+from pkm_twin.paths.joint_path import JointPath
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+BINDS: Final = 0.98
+"""Used part of a limit from which on it binds."""
+CREEP: Final = 1e-9
+"""Least speed along the path of a machine that moves, m/s."""
+BRIEF: Final = 0.01
+"""Part of the duration: a stretch shorter than it joins the one before it."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A part of the motion in which one limit binds: times (s), its name and its used part.
+
+    ``what`` is empty where the machine rests or no limit binds.
+    """
+
+    begin: float
+    end: float
+    what: str
+    used: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data, units in the keys."""
+        return {
+            "from_s": self.begin, "to_s": self.end, "limit": self.what or None, "used": self.used,
+        }  # fmt: skip
+
+
+class Timed(Protocol):
+    """One stretch of a path in time."""
+
+    @property
+    def part(self) -> JointPath:
+        """The stretch."""
+
+    @property
+    def times(self) -> Array:
+        """Times of the motion's points, from 0 to its duration, s."""
+
+    @property
+    def duration(self) -> float:
+        """From rest to rest, s."""
+
+    def slower(self, factor: float) -> Timed:
+        """The same with ``factor`` times the duration."""
+
+    def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
+        """Interval, part of it, v and u at times (k,)."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One stretch of a path in time: x = v^2 at its intervals' ends, linear between, (i + 1,)."""
+
+    part: JointPath
+    x: Array
+
+    @cached_property
+    def steps(self) -> Array:
+        """Times that the intervals take, shape (i,), s."""
+        v = np.sqrt(self.x)
+        return np.asarray(2.0 * self.part.steps / (v[:-1] + v[1:]), np.float64)
+
+    @cached_property
+    def changes(self) -> Array:
+        """Accelerations along the path in the intervals, shape (i,), m/s2."""
+        return np.asarray(np.diff(self.x) / (2.0 * self.part.steps), np.float64)
+
+    @cached_property
+    def times(self) -> Array:
+        """Times of the intervals' ends, shape (i + 1,), s."""
+        return np.concatenate([[0.0], np.cumsum(self.steps)])
+
+    @property
+    def duration(self) -> float:
+        """From rest to rest, s."""
+        return float(self.times[-1])
+
+    def slower(self, factor: float) -> Run:
+        """The same with ``factor`` times the duration."""
+        return Run(self.part, self.x / factor**2)
+
+    def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
+        """Interval, part of it, v and u at times (k,)."""
+        last = len(self.steps) - 1
+        k = np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, last)
+        passed = np.clip(time - self.times[k], 0.0, self.steps[k])
+        begin, u, h = np.sqrt(self.x[k]), self.changes[k], self.part.steps[k]
+        part = np.clip((begin * passed + 0.5 * u * passed**2) / h, 0.0, 1.0)
+        v = np.sqrt(np.maximum(self.x[k] + 2.0 * u * part * h, 0.0))
+        return k, part, v, u
+
+
+@dataclass(frozen=True)
+class TimedPath:
+    """A motion along a path: runs from rest to rest, with the rests before and between (s).
+
+    ``limits``: what it was to keep. ``singularity``: least singularity index on the path.
+    ``limited`` (stretches): how the limits bind. ``law``: how its speed was chosen.
+    """
+
+    robot: Robot
+    path: Path
+    limits: Limits
+    runs: tuple[Timed, ...]
+    rests: tuple[float, ...]
+    law: str
+    wrench: Array | None = None
+
+    @property
+    def duration(self) -> float:
+        """From the first to the last moment, s."""
+        return sum(run.duration for run in self.runs) + sum(self.rests)
+
+    @cached_property
+    def begins(self) -> list[float]:
+        """Time at which each run begins, s."""
+        result, clock = [], 0.0
+        for rest, run in zip(self.rests, self.runs, strict=False):
+            clock += rest
+            result.append(clock)
+            clock += run.duration
+        return result
+
+    @cached_property
+    def _points(self) -> Array:
+        """Times of all intervals' ends, middles of intervals between, s."""
+        times = []
+        for begin, run in zip(self.begins, self.runs, strict=True):
+            ends = begin + run.times
+            times += [ends, 0.5 * (ends[1:] + ends[:-1])]
+        return np.unique(np.concatenate(times))
+
+    def sample(self, times: ArrayLike) -> Samples:
+        """The motion at times (k,), s from its beginning; it rests before and behind it."""
+        t = np.asarray(times, np.float64)
+        n = self.robot.joints_count
+        q, qd, qdd = (np.zeros((len(t), n)) for _ in range(3))
+        travel = np.zeros(len(t))
+        run_of = np.clip(np.searchsorted(self.begins, t, side="right") - 1, 0, None)
+        for k, (begin, run) in enumerate(zip(self.begins, self.runs, strict=True)):
+            mine = np.flatnonzero(run_of == k)
+            if not len(mine):
+                continue
+            interval, part, v, u = run.at(t[mine] - begin)
+            place, first, second = run.part.between(interval, part)
+            # At its end the machine rests; at its beginning it has its friction already.
+            passed = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
+            v, u = np.where(passed, np.maximum(v, CREEP), 0.0), np.where(passed, u, 0.0)
+            q[mine] = place
+            qd[mine] = first * v[:, None]
+            qdd[mine] = first * u[:, None] + second * (v**2)[:, None]
+            left = run.part.left[interval]
+            slopes = run.part.travel
+            travel[mine] = v * ((1.0 - part) * slopes[left] + part * slopes[left + 1])
+        effort = None
+        if has_masses(self.robot):
+            load = None if self.wrench is None else np.broadcast_to(self.wrench, (len(t), 6))
+            effort = inverse_dynamics(self.robot, q, qd, qdd, load)
+        return Samples(t, q, qd, qdd, effort, self.robot.forward(q), travel)
+
+    def uniform(self, rate: float) -> Samples:
+        """The motion at ``rate`` samples a second; the last is its end, half to three halves of a
+        period after the one before.
+        """
+        count = max(1, round(self.duration * rate))
+        return self.sample(np.append(np.arange(count) / rate, self.duration))
+
+    def __iter__(self) -> Iterator[Any]:
+        """Times, q, qd, qdd, effort (as in ``fine``) and ``bounds``, to unpack."""
+        s = self.fine
+        return iter((s.time, s.q, s.qd, s.qdd, s.effort, self.bounds))
+
+    @property
+    def times(self) -> Array:
+        """Times of ``fine``, shape (k,), s."""
+        return self.fine.time
+
+    @property
+    def q(self) -> Array:
+        """Joint positions of ``fine``, shape (k, n), rad or m."""
+        return self.fine.q
+
+    @property
+    def qd(self) -> Array:
+        """Joint rates of ``fine``, shape (k, n)."""
+        return self.fine.qd
+
+    @property
+    def qdd(self) -> Array:
+        """Joint accelerations of ``fine``, shape (k, n)."""
+        return self.fine.qdd
+
+    @property
+    def effort(self) -> Array | None:
+        """Efforts of ``fine``, shape (k, n), N m or N; None for a robot without masses."""
+        return self.fine.effort
+
+    @property
+    def pose(self) -> Array:
+        """Poses of ``fine``, shape (k, m)."""
+        return self.fine.pose
+
+    @cached_property
+    def fine(self) -> Samples:
+        """The motion at all points of the path and in the middle between them."""
+        return self.sample(self._points)
+
+    @cached_property
+    def used(self) -> Array:
+        """Used part of every limit at the points of ``fine``, shape (k, 4 n + 1)."""
+        s = self.fine
+        jerk = np.zeros_like(s.q)
+        if np.isfinite(self.limits.jerk).any() and len(s.time) > 2:
+            jerk = np.gradient(s.qdd, s.time, axis=0)
+        return shares(self.limits, s.effort, s.qd, s.qdd, jerk, s.speed)
+
+    @cached_property
+    def bounds(self) -> list[Bound]:
+        """Which limit binds when, in order."""
+        return merged(self.fine.time, binding(self.used), names_of(self.robot), self.used)
+
+    @property
+    def worst(self) -> dict[str, float]:
+        """Greatest used part of each limit that there is, 1 is the limit."""
+        finite = self.used.max(0)
+        return {
+            name: float(value)
+            for name, value in zip(names_of(self.robot), finite, strict=True)
+            if value > 0.0
+        }
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A motion at times (k,), s: joint positions, rates, accelerations and efforts, shape (k, n),
+    rad or m, per s and s2, N m or N; the pose (k, m); speed of the reference point (k,), m/s.
+
+    ``effort`` is None for a robot without masses.
+    """
+
+    time: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    effort: Array | None
+    pose: Array
+    speed: Array
+
+
+def has_masses(robot: Robot) -> bool:
+    """Whether a robot's file gives masses."""
+    try:
+        robot.massive()
+    except ParameterError:
+        return False
+    return True
+
+
+def binding(used: Array) -> list[int]:
+    """The column of each row of used parts (k, l) that binds, -1 for none.
+
+    As few changes as can be: of several that bind, the one that binds longest from there.
+    """
+    active = used >= BINDS
+    lasts = np.zeros(used.shape, np.int64)
+    count = np.zeros(used.shape[1], np.int64)
+    for row in range(len(used) - 1, -1, -1):
+        count = np.where(active[row], count + 1, 0)
+        lasts[row] = count
+    result: list[int] = []
+    for row in range(len(used)):
+        now = result[-1] if result else -1
+        if now < 0 or not active[row, now]:
+            now = int(lasts[row].argmax()) if active[row].any() else -1
+        result.append(now)
+    return result
+
+
+def merged(time: Array, columns: list[int], names: list[str], used: Array) -> list[Bound]:
+    """Parts of one binding limit; one shorter than :data:`BRIEF` of all joins its neighbour."""
+    if len(time) < 2:
+        return []
+    brief = BRIEF * float(time[-1] - time[0])
+    changes = (i for i in range(1, len(columns)) if columns[i] != columns[i - 1])
+    edges = [0, *changes, len(columns) - 1]
+    spans = [(b, e, columns[b]) for b, e in pairwise(edges) if e > b]
+    result: list[tuple[int, int, int]] = []
+    for b, e, column in spans:
+        short = float(time[e] - time[b]) < brief
+        if result and (short or result[-1][2] == column):
+            result[-1] = (result[-1][0], e, result[-1][2])
+        else:
+            result.append((b, e, column))
+    return [
+        Bound(
+            float(time[b]), float(time[e]), "" if column < 0 else names[column],
+            float(used[b : e + 1].max()),
+        )
+        for b, e, column in result
+    ]  # fmt: skip
+
+
+def needs_forces(robot: Robot, limits: Limits) -> bool:
+    """Whether efforts bound the motion.
+
+    :raises ParameterError: they do, and the robot's file gives no masses.
+    """
+    if not np.isfinite(limits.effort).any():
+        return False
+    robot.massive()
+    return True
+
+
+def forces_at(robot: Robot, part: JointPath, wrench: Array | None) -> Forces:
+    """Of a stretch's points."""
+    load = None if wrench is None else np.broadcast_to(wrench, (len(part.s), 6))
+    return Forces.of(robot, part.q, part.first, part.second, load)

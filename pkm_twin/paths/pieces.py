@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pieces of paths: curves p(s) with their first two derivatives.
+
+May import: numpy, scipy, errors, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
+
+from pkm_twin.errors import ParameterError
+
+Array = NDArray[np.float64]
+
+
+class Piece(Protocol):
+    """A curve over s in [0, length]."""
+
+    @property
+    def length(self) -> float:
+        """Range of s."""
+
+    def at(self, s: Array) -> tuple[Array, Array, Array]:
+        """Coordinates and their first two derivatives by s, shape (k, m) each."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A straight line from ``begin`` with a constant ``slope`` by s, shape (m,)."""
+
+    begin: Array
+    slope: Array
+    length: float
+
+    def at(self, s: Array) -> tuple[Array, Array, Array]:
+        """See :class:`Piece`."""
+        first = np.broadcast_to(self.slope, (len(s), len(self.slope)))
+        return self.begin + s[:, None] * self.slope, first, np.zeros(first.shape)
+
+
+@dataclass(frozen=True)
+class Corner:
+    """A rounded corner: it leaves one line ``radius`` before the corner and meets the next one
+    ``radius`` behind it, with continuous second derivatives.
+
+    With t = s / radius - 1 and f(t) = 3/16 + t/2 + 3/8 t^2 - t^4/16:
+    p = corner + radius (before (t - f) + behind f).
+    """
+
+    corner: Array
+    before: Array
+    behind: Array
+    radius: float
+
+    @property
+    def length(self) -> float:
+        """Range of s."""
+        return 2.0 * self.radius
+
+    def at(self, s: Array) -> tuple[Array, Array, Array]:
+        """See :class:`Piece`."""
+        t = (s / self.radius - 1.0)[:, None]
+        f = 3 / 16 + t / 2 + 3 / 8 * t**2 - t**4 / 16
+        slope = 1 / 2 + 3 / 4 * t - t**3 / 4
+        bend = 3 / 4 * (1 - t**2) / self.radius
+        turn = self.behind - self.before
+        place = self.corner + self.radius * (self.before * t + turn * f)
+        return place, self.before + turn * slope, turn * bend
+
+
+@dataclass(frozen=True)
+class Arc:
+    """A circular arc of the position; the other coordinates change evenly along it.
+
+    ``across``, ``along``: unit vectors (m,) from the centre to the beginning, and of the motion
+    there; ``rest``: change of the other coordinates by s.
+    """
+
+    centre: Array
+    across: Array
+    along: Array
+    rest: Array
+    radius: float
+    angle: float
+
+    @property
+    def length(self) -> float:
+        """Range of s."""
+        return self.radius * self.angle
+
+    def at(self, s: Array) -> tuple[Array, Array, Array]:
+        """See :class:`Piece`."""
+        angle = (s / self.radius)[:, None]
+        c, si = np.cos(angle), np.sin(angle)
+        place = self.centre + self.radius * (c * self.across + si * self.along)
+        first = c * self.along - si * self.across
+        second = -(c * self.across + si * self.along) / self.radius
+        return place + s[:, None] * self.rest, first + self.rest, second
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A cubic spline over its length."""
+
+    spline: CubicSpline
+
+    @property
+    def length(self) -> float:
+        """Range of s."""
+        return float(self.spline.x[-1])
+
+    def at(self, s: Array) -> tuple[Array, Array, Array]:
+        """See :class:`Piece`."""
+        return self.spline(s), self.spline(s, 1), self.spline(s, 2)
+
+
+def arc_through(
+    begin: Array, middle: Array, end: Array, *, places: Sequence[int], where: str = "arc"
+) -> Arc:
+    """The arc through three points, by the coordinates ``places`` that are lengths.
+
+    :raises ParameterError: three points on a line.
+    """
+    a, b, c = (np.asarray(p, float)[list(places)] for p in (begin, middle, end))
+    u, v = b - a, c - a
+    gram = np.array([[u @ u, u @ v], [u @ v, v @ v]])
+    if not np.linalg.det(gram) > 1e-16 * float(gram.max()) ** 2:
+        raise ParameterError(where, "three points on a line", "points of an arc, not on a line")
+    parts = np.linalg.solve(gram, 0.5 * np.diag(gram))
+    offset = parts[0] * u + parts[1] * v
+    radius = float(np.linalg.norm(offset))
+    across = -offset / radius
+    normal = u - (u @ across) * across
+    along = normal / np.linalg.norm(normal)
+
+    def angle(p: Array) -> float:
+        d = p - a - offset
+        return float(np.arctan2(d @ along, d @ across) % (2 * np.pi))
+
+    if angle(c) < angle(b):
+        along = -along
+    whole = angle(c)
+    size = len(np.asarray(begin))
+    full = [np.zeros(size) for _ in range(3)]
+    for row, part in zip(full, (a + offset, across, along), strict=True):
+        row[list(places)] = part
+    others = [i for i in range(size) if i not in places]
+    rest = np.zeros(size)
+    full[0][others] = np.asarray(begin, float)[others]
+    rest[others] = (np.asarray(end, float) - np.asarray(begin, float))[others] / (radius * whole)
+    return Arc(full[0], full[1], full[2], rest, radius, whole)

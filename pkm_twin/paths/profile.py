@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fastest speed along a path within limits: reachability over a grid.
+
+Between two points of the path the acceleration u is constant, so x = v^2 is linear:
+x' = x + 2 h u. Limits hold at both ends of every interval. A pass from the end finds the greatest x
+from which the end is still reached, a pass from the beginning then accelerates as hard as is
+allowed.
+
+Source: Pham, Pham: A new approach to time-optimal path parameterization based on reachability
+analysis, IEEE Transactions on Robotics 34 (2018), with the first-order interpolation scheme.
+
+May import: numpy, the standard library, this package; never rclpy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.paths.constraints import Rows
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+STEPS: Final = 50
+"""Most steps to an interval's greatest x; two or three are usual."""
+SMALL: Final = 1e-12
+"""Of a row's greatest coefficient, what counts as none."""
+SETTLED: Final = 3e-4
+"""Relative change of the speeds at which viscous friction is settled."""
+ROUNDS: Final = 8
+"""Most solutions for viscous friction."""
+SLOW: Final = 0.01
+"""Part of the greatest speed below which viscous friction is taken as at this speed."""
+
+
+Numbers = list[float]
+
+
+@dataclass(frozen=True)
+class Programs:
+    """The intervals' linear programs in x and x', a list of rows for each interval.
+
+    x <= ``most``, and low + slope x <= x' <= high + slope x.
+    """
+
+    low: list[Numbers]
+    high: list[Numbers]
+    slope: list[Numbers]
+    most: Numbers
+
+    @classmethod
+    def of(cls, p: Array, q: Array, least: Array, greatest: Array, most: Array) -> Programs:
+        """Of rows least <= p x + q x' <= greatest, (i, r); ``most`` at the ends, (i + 1,)."""
+        level = np.abs(q) <= SMALL * np.abs(p)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, other, slope = least / q, greatest / q, -p / q
+            cap = np.where(level & (p != 0.0), np.maximum(least / p, greatest / p), np.inf)
+        low = np.where(level, -np.inf, np.minimum(one, other))
+        high = np.where(level, np.inf, np.maximum(one, other))
+        slope = np.where(level, 0.0, slope)
+        most = most.copy()
+        most[:-1] = np.minimum(most[:-1], cap.min(1, initial=np.inf))
+        return cls(low.tolist(), high.tolist(), slope.tolist(), most.tolist())
+
+    def passes(self) -> Array:
+        """The greatest x at the intervals' ends, shape (i + 1,), from rest to rest."""
+        count = len(self.low)
+        reachable = [0.0] * (count + 1)
+        value = 0.0
+        for i in range(count - 1, -1, -1):
+            value = reachable[i] = _before(
+                self.low[i], self.high[i], self.slope[i], self.most[i], value
+            )
+        result = [0.0] * (count + 1)
+        value = 0.0
+        for i in range(count):
+            most = reachable[i + 1]
+            for c, d in zip(self.high[i], self.slope[i], strict=True):
+                after = c + d * value
+                if after < most:
+                    most = after
+            value = result[i + 1] = max(most, 0.0)
+        return np.array(result)
+
+
+def _before(low: Numbers, high: Numbers, slopes: Numbers, x: float, after: float) -> float:
+    """Greatest x of an interval from which some x' up to ``after`` is reached.
+
+    Where the gap between the greatest lower and the least upper line on x' closes: the gap is
+    convex in x and open at 0, so Newton's steps from the right end there, on a line each.
+    """
+    for _ in range(STEPS):
+        least, rise, most, fall = 0.0, 0.0, after, 0.0
+        for c, e, d in zip(low, high, slopes, strict=True):
+            way = d * x
+            if c + way > least:
+                least, rise = c + way, d
+            if e + way < most:
+                most, fall = e + way, d
+        gap, closing = least - most, rise - fall
+        if gap <= 0.0 or closing <= 0.0:
+            return x
+        new = x - gap / closing
+        if new >= x:
+            return x
+        if new <= 0.0:
+            return 0.0
+        x = new
+    return x
+
+
+def programs_of(rows: Rows, left: Index, steps: Array, x: Array | None, part: Array) -> Programs:
+    """Rows of the intervals; viscous friction linear in x about a profile.
+
+    :param x: at the intervals' ends, shape (i + 1,); None leaves viscous friction out.
+    :param part: of each interval's limits that is used, shape (i,).
+    """
+    double = (2.0 * steps)[:, None]
+    right = left + 1
+    bound = part[:, None]
+    # A joint that turns round in an interval has dry friction of both signs there.
+    dry = rows.dry[left], rows.dry[right]
+    least, greatest = np.minimum(*dry), np.maximum(*dry)
+    alphas, betas, lows, highs = [], [], [], []
+    for k, end in ((left, slice(None, -1)), (right, slice(1, None))):
+        beta, fixed = rows.beta[k], rows.fixed[k]
+        if x is not None:
+            v = np.sqrt(x)
+            about = np.maximum(v[end], SLOW * v.max())[:, None]
+            beta = beta + rows.drag[k] / (2.0 * about)
+            fixed = fixed + 0.5 * rows.drag[k] * about
+        alphas.append(rows.alpha[k] / double)
+        betas.append(beta)
+        # At rest, limits that are made smaller hold all the same.
+        lows.append(np.minimum(-bound - fixed - least, 0.0))
+        highs.append(np.maximum(bound - fixed - greatest, 0.0))
+    most = np.append(rows.most[left], rows.most[right[-1]])
+    # Where two pieces meet the stricter one counts.
+    most[1:] = np.minimum(most[1:], rows.most[right])
+    most[:-1] *= part**2
+    most[1:] *= part**2
+    (a, a2), (b, b2) = alphas, betas
+    return Programs.of(
+        np.concatenate([b - a, -a2], 1), np.concatenate([a, b2 + a2], 1),
+        np.concatenate(lows, 1), np.concatenate(highs, 1), most,
+    )  # fmt: skip
+
+
+def fastest_profile(
+    rows: Rows, left: Index, steps: Array, part: Array, about: Array | None = None
+) -> Array:
+    """The greatest x = v^2 at the intervals' ends, shape (i + 1,), at rest at both ends.
+
+    :param part: of each interval's limits that is used, shape (i,).
+    :param about: a profile close to the result, about which viscous friction is linear first.
+    """
+    x = about if rows.drag.any() else None
+    for _ in range(ROUNDS):
+        new = programs_of(rows, left, steps, x, part).passes()
+        if not rows.drag.any():
+            return new
+        before, x = x, new
+        if before is not None:
+            change = np.abs(np.sqrt(x) - np.sqrt(before)).max()
+            if change <= SETTLED * np.sqrt(x.max()):
+                break
+    return new

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What drives must give for a motion: efforts, speeds, power and energy, at joint and motor.
+
+At the joint power is effort times rate. With a drive of ``turns`` N (motor angle per joint motion),
+rotor inertia J and efficiency e of the gear, the motor gives
+
+    torque = J N qdd + load / (N e)     where the load takes power,
+    torque = J N qdd + load e / N       where it gives power back,
+
+with load = effort - J N^2 qdd, what goes through the gear.
+
+May import: numpy, delta_dynamics, pkm_twin's core, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics import mass_matrix
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.sections import DriveSpec
+
+Array = NDArray[np.float64]
+
+LEAST: Final = 2
+"""Samples of a motion."""
+
+
+@dataclass(frozen=True)
+class Duty:
+    """One side of a drive over a motion; torques in N m (or N), speeds in rad/s (or m/s).
+
+    ``peak``: greatest amount of the effort; ``rms``: its root mean square, which heats the motor;
+    ``speed``, ``mean_speed``: greatest and mean amount; ``power``: greatest, W; ``braking``:
+    greatest power that comes back, W; ``work``, ``returned``: energy given and come back, J.
+    """
+
+    peak: float
+    rms: float
+    speed: float
+    mean_speed: float
+    power: float
+    braking: float
+    work: float
+    returned: float
+
+    @property
+    def energy(self) -> float:
+        """Given less come back, J."""
+        return self.work - self.returned
+
+    @classmethod
+    def of(cls, time: Array, effort: Array, rate: Array) -> Duty:
+        """Of a motion's samples (k,), by trapezoids."""
+        power = effort * rate
+        whole = float(time[-1] - time[0])
+        return cls(
+            float(np.abs(effort).max()), math.sqrt(integral(time, effort**2) / whole),
+            float(np.abs(rate).max()), integral(time, np.abs(rate)) / whole,
+            max(0.0, float(power.max())), max(0.0, -float(power.min())),
+            integral(time, np.maximum(power, 0.0)), integral(time, np.maximum(-power, 0.0)),
+        )  # fmt: skip
+
+    def as_json(self, slides: bool) -> dict[str, float]:
+        """Plain data, units in the keys."""
+        force, rate = ("N", "m_s") if slides else ("N_m", "rad_s")
+        return {
+            f"peak_effort_{force}": self.peak, f"rms_effort_{force}": self.rms,
+            f"peak_speed_{rate}": self.speed, f"mean_speed_{rate}": self.mean_speed,
+            "peak_power_W": self.power, "peak_regenerated_power_W": self.braking,
+            "work_J": self.work, "regenerated_J": self.returned, "energy_J": self.energy,
+        }  # fmt: skip
+
+
+def integral(time: Array, values: Array) -> float:
+    """Trapezoids under values (k,) at times (k,)."""
+    return float(np.sum(0.5 * np.diff(time) * (values[:-1] + values[1:])))
+
+
+@dataclass(frozen=True)
+class Motor:
+    """A motor of a drives file: torques in N m, speeds in rad/s, inertia in kg m2.
+
+    ``curve``: its greatest torque by speed, shape (k, 2) of speed and torque, rising speeds;
+    ``continuous``: torque that it may give all the time.
+    """
+
+    name: str
+    inertia: float
+    continuous: float
+    curve: Array
+    source: str = ""
+
+    def most(self, speed: Array) -> Array:
+        """Greatest torque at speeds (k,), rad/s; 0 beyond the curve."""
+        amount = np.abs(speed)
+        inside = np.interp(amount, self.curve[:, 0], self.curve[:, 1])
+        return np.where(amount > self.curve[-1, 0], 0.0, inside)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a motor suits a drive, its rotor in place of the file's.
+
+    Greatest used parts of its torque curve, of its continuous torque and of its greatest speed, 1
+    at the bound.
+    """
+
+    motor: Motor
+    torque: float
+    thermal: float
+    speed: float
+    inertia_ratio: float
+
+    @property
+    def good(self) -> bool:
+        """Whether all three are kept."""
+        return max(self.torque, self.thermal, self.speed) <= 1.0
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data; parts are 1 at the bound."""
+        return {
+            "motor": self.motor.name, "good": self.good, "used_torque": _finite(self.torque),
+            "used_continuous_torque": self.thermal, "used_speed": self.speed,
+            "inertia_ratio": _finite(self.inertia_ratio), "source": self.motor.source,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DriveDuty:
+    """What one drive gives: at its joint, and at its motor where the file has a ``drive``.
+
+    ``load_inertia``: least and greatest inertia of the machine at the joint without the rotor,
+    kg m2 or kg; ``inertia_ratio``: the greatest, seen by the motor, against the rotor's inertia.
+    ``torques``, ``speeds``: the motor's, shape (k,), N m and rad/s.
+    """
+
+    joint: str
+    slides: bool
+    at_joint: Duty
+    load_inertia: tuple[float, float]
+    drive: DriveSpec | None = None
+    at_motor: Duty | None = None
+    inertia_ratio: float | None = None
+    torques: Array | None = None
+    speeds: Array | None = None
+    fits: tuple[Fit, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data, units in the keys."""
+        unit = "kg" if self.slides else "kg_m2"
+        data: dict[str, Any] = {
+            "joint": self.at_joint.as_json(self.slides),
+            f"load_inertia_{unit}": list(self.load_inertia),
+            "motor": None if self.at_motor is None else self.at_motor.as_json(False),
+            "inertia_ratio": self.inertia_ratio,
+        }
+        if self.fits:
+            data["drives"] = [fit.as_json() for fit in self.fits]
+        return data
+
+
+def size_drives(
+    robot: Robot,
+    time: Array,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    effort: Array,
+    motors: Sequence[Motor] = (),
+) -> list[DriveDuty]:
+    """What each drive gives over a motion.
+
+    :param time: rising times (k,), s; q, qd, qdd and effort, shape (k, n).
+    :param motors: that may be taken; each replaces the rotor of the robot's file.
+    :raises ParameterError: fewer than two samples; or motors for a joint without a ``drive``.
+    """
+    if len(time) < LEAST:
+        raise ParameterError("motion", f"{len(time)} samples", f"{LEAST} or more")
+    masses = np.diagonal(mass_matrix(robot, q), axis1=-2, axis2=-1)
+    graph = robot.graph
+    result = []
+    for i, (joint, drive) in enumerate(zip(robot.joint_names, robot.drives, strict=True)):
+        slides = robot.joint_units[i] == "m"
+        rotor = graph.joints[joint].rotor_inertia
+        load = masses[:, i] - rotor
+        span = (float(load.min()), float(load.max()))
+        at_joint = Duty.of(time, effort[:, i], qd[:, i])
+        if drive is None:
+            if motors:
+                raise ParameterError(
+                    f"{robot.name}: drive of {joint}", None,
+                    "a section drive with ratio or lead, to compare it with motors",
+                )  # fmt: skip
+            result.append(DriveDuty(joint, slides, at_joint, span))
+            continue
+        through = effort[:, i] - rotor * qdd[:, i]
+        turns, share = drive.turns, drive.efficiency
+        speeds = turns * qd[:, i]
+        torques = motor_torque(through, qd[:, i], qdd[:, i], drive.inertia, turns, share)
+        fits = []
+        for motor in motors:
+            own = motor_torque(through, qd[:, i], qdd[:, i], motor.inertia, turns, share)
+            fits.append(_fit(motor, time, own, speeds, span[1] / turns**2))
+        ratio = span[1] / turns**2 / drive.inertia if drive.inertia > 0.0 else None
+        result.append(
+            DriveDuty(
+                joint, slides, at_joint, span, drive, Duty.of(time, torques, speeds), ratio,
+                torques, speeds, tuple(fits),
+            )
+        )  # fmt: skip
+    return result
+
+
+def motor_torque(
+    through: Array, qd: Array, qdd: Array, inertia: float, turns: float, efficiency: float
+) -> Array:
+    """Torque of the motor, shape (k,), N m, see the module.
+
+    :param through: effort at the joint that goes through the gear, shape (k,), N m or N.
+    :param inertia: of the rotor, kg m2.
+    """
+    losses = np.where(through * qd < 0.0, efficiency, 1.0 / efficiency)
+    return inertia * turns * qdd + through * losses / turns
+
+
+def _fit(motor: Motor, time: Array, torques: Array, speeds: Array, load: float) -> Fit:
+    most = motor.most(speeds)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        parts = np.where(most > 0.0, np.abs(torques) / most, np.where(torques == 0.0, 0.0, np.inf))
+    rms = math.sqrt(integral(time, torques**2) / float(time[-1] - time[0]))
+    ratio = load / motor.inertia if motor.inertia > 0.0 else math.inf
+    fastest = float(np.abs(speeds).max()) / float(motor.curve[-1, 0])
+    return Fit(motor, float(parts.max()), rms / motor.continuous, fastest, ratio)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

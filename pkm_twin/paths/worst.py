@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The greatest efforts and speeds of drives over the whole workspace.
+
+May import: numpy, delta_dynamics, pkm_twin's core, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.directions import sphere_directions
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+RAYS: Final = 1000
+"""Rays from home on which poses of the workspace are taken."""
+PARTS: Final = (1.0, 0.8, 0.5)
+"""Of a ray's length at which poses are taken."""
+HALVINGS: Final = 14
+"""Of the search for a ray's end."""
+DIRECTIONS: Final = 32
+"""Of the tool point's speed, at all poses."""
+MORE_DIRECTIONS: Final = 2000
+"""The same at each drive's worst poses."""
+WORST: Final = 8
+"""Worst poses of each drive that are looked at closely."""
+SINGULARITY: Final = 0.05
+"""Least singularity index of a pose that counts."""
+
+
+@dataclass(frozen=True)
+class Worst:
+    """By actuated joint the greatest effort, effort at rest and speed, shape (n,), N m or N and
+    rad/s or m/s, and the pose of each, shape (n, m); ``poses``: how many were looked at.
+    """
+
+    effort: Array
+    effort_pose: Array
+    holding: Array
+    holding_pose: Array
+    speed: Array
+    speed_pose: Array
+    poses: int
+
+
+def workspace_poses(robot: Robot, rays: int = RAYS, singularity: float = SINGULARITY) -> Array:
+    """Poses of the workspace, shape (k, m): in reach, within limits, clear of singularities.
+
+    On rays from home through the pose coordinates, up to where the workspace ends on them.
+
+    :raises ParameterError: a workspace without bounds, or a home outside of it.
+    """
+    home, box = robot.home(), robot.search_box()
+    rng = np.random.default_rng(0)
+    ways = rng.normal(size=(rays, len(home)))
+    ways /= np.abs(ways).max(1, keepdims=True)
+    ways = np.concatenate([np.eye(len(home)), -np.eye(len(home)), ways])
+    # From home to the side of the box that the ray leaves it by.
+    span = np.where(ways > 0.0, box[:, 1] - home, home - box[:, 0]) * ways
+    if not _inside(robot, home[None], singularity)[0]:
+        raise ParameterError(
+            "workspace", dict(zip(robot.pose_names, home.tolist(), strict=True)),
+            "a home within the limits, clear of singularities",
+        )  # fmt: skip
+    low, high = np.zeros(len(span)), np.ones(len(span))
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        good = _inside(robot, home + middle[:, None] * span, singularity)
+        low, high = np.where(good, middle, low), np.where(good, high, middle)
+    rows = [home + (part * low)[:, None] * span for part in PARTS]
+    found = np.concatenate([home[None], *rows])
+    return np.asarray(found[_inside(robot, found, singularity)], np.float64)
+
+
+def _inside(robot: Robot, poses: Array, singularity: float) -> NDArray[np.bool_]:
+    """Which poses (k, m) are of the workspace."""
+    q, good = robot.try_inverse(poses)
+    limits = robot.limits.position
+    if limits is not None:
+        with np.errstate(invalid="ignore"):
+            good = good & ((q >= limits[:, 0]) & (q <= limits[:, 1])).all(1)
+    result = good.copy()
+    if good.any():
+        result[good] = robot.singularity(q[good]) >= singularity
+    return result
+
+
+def worst_over_workspace(
+    robot: Robot,
+    speed: float,
+    acceleration: float,
+    *,
+    singularity: float = SINGULARITY,
+    rays: int = RAYS,
+) -> Worst:
+    """The greatest efforts and speeds of the drives, tool point in the worst directions.
+
+    Speed and acceleration are those of the position in the pose; its angles stand still. The
+    worst acceleration is exact; of the speed :data:`DIRECTIONS` are tried at all poses, and
+    :data:`MORE_DIRECTIONS` at the worst.
+
+    :param speed: of the tool point, m/s; ``acceleration``: m/s2.
+    :param singularity: least singularity index of a pose that counts, 0 to 1.
+    :raises ParameterError: a pose without a position, or a workspace without bounds.
+    """
+    places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")]
+    if not places:
+        raise ParameterError("over-workspace", robot.name, "a robot whose pose has x, y or z")
+    poses = workspace_poses(robot, rays, singularity)
+    q = robot.inverse(poses)
+    back = np.asarray(np.linalg.inv(robot.jacobian(q))[..., places], np.float64)
+    k, n = q.shape
+    zero = np.zeros_like(q)
+    holding = np.abs(inverse_dynamics(robot, q, zero, zero))
+    greatest = _efforts(robot, q, back, speed, acceleration, DIRECTIONS).max(1)
+    for joint in range(n):
+        close = np.argsort(-greatest[:, joint])[:WORST]
+        finer = _efforts(robot, q[close], back[close], speed, acceleration, MORE_DIRECTIONS).max(1)
+        greatest[close] = np.maximum(greatest[close], finer)
+    rates = speed * np.linalg.norm(back, axis=-1)
+
+    def pick(values: Array) -> tuple[Array, Array]:
+        best = values.argmax(0)
+        return values[best, np.arange(n)], poses[best]
+
+    return Worst(*pick(greatest), *pick(holding), *pick(rates), poses=k)
+
+
+def _efforts(
+    robot: Robot, q: Array, back: Array, speed: float, acceleration: float, count: int
+) -> Array:
+    """Greatest efforts by direction of the speed, shape (k, count + 1, n); the last is rest.
+
+    :param back: joint rates by the position's, shape (k, n, size).
+    """
+    k, n, size = back.shape
+    ways = _directions(size, count)
+    ways = np.concatenate([speed * ways, np.zeros((1, size))])
+    wide = (k, len(ways), n)
+    qd = np.einsum("knj,dj->kdn", back, ways).reshape(-1, n)
+    qs = np.broadcast_to(q[:, None], wide).reshape(-1, n)
+    zero = np.zeros_like(qs)
+    own = robot.pose_acceleration(qs, qd, zero)
+    qdd = -np.linalg.solve(robot.jacobian(qs), own[..., None])[..., 0]
+    base = inverse_dynamics(robot, qs, qd, qdd).reshape(wide)
+    still = np.zeros_like(q)
+    held = inverse_dynamics(robot, q, still, still)
+    # Efforts by an acceleration along each axis of the position.
+    rows = [inverse_dynamics(robot, q, still, back[..., i]) - held for i in range(size)]
+    swing = acceleration * np.linalg.norm(np.stack(rows, -1), axis=-1)
+    return np.asarray(np.abs(base) + swing[:, None], np.float64)
+
+
+def _directions(size: int, count: int) -> Array:
+    """Unit vectors of a position of ``size`` coordinates, shape (count, size)."""
+    if size == 1:
+        return np.array([[1.0], [-1.0]])
+    if size == 2:
+        angle = 2 * np.pi * np.arange(count) / count
+        return np.stack([np.cos(angle), np.sin(angle)], -1)
+    return np.asarray(sphere_directions(count), np.float64)

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`pkm-twin path` and `pkm-twin size` as a user runs them."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import yaml
+from scipy.integrate import trapezoid
+
+from delta_dynamics import inverse_dynamics, mass_matrix
+from pkm_twin.bags.reader import read_messages
+from pkm_twin.paths import cycle, fastest
+from test.support.robots import load, parameters_of
+
+CYCLE = ("path", "delta", "--cycle", "25,305,25", "--fastest")
+GEAR = {"inertia": 1.73e-5, "ratio": 10.0, "efficiency": 0.9}
+
+
+def table(path):
+    with path.open(newline="") as file:
+        head, *rows = csv.reader(file)
+    values = np.array([[float(cell or "nan") for cell in row] for row in rows])
+    return dict(zip(head, values.T, strict=True))
+
+
+def of_joints(columns, robot, what):
+    return np.stack([columns[f"{joint}.{what}"] for joint in robot.joint_names], -1)
+
+
+def good(result):
+    assert result.code == 0, result.err
+    return result
+
+
+@pytest.fixture
+def geared(tmp_path):
+    data = parameters_of("delta")
+    data["inertia"].pop("rotor_inertia")
+    path = tmp_path / "geared.yaml"
+    path.write_text(yaml.safe_dump({**data, "drive": GEAR}))
+    return path
+
+
+def test_a_cycle_as_a_table_that_torques_reads(twin, tmp_path):
+    out = tmp_path / "cycle.csv"
+    data = json.loads(good(twin(*CYCLE, "--out", out, "--json")).out)
+    assert out.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
+    robot = load("delta")
+    assert data["duration_s"] == pytest.approx(
+        fastest(robot, cycle(robot, 0.025, 0.305, 0.025)).duration
+    )
+    ends = [limit["to_s"] for limit in data["limits"]]
+    assert ends == sorted(ends)
+    assert {"effort arm_1", "velocity arm_1"} <= {limit["limit"] for limit in data["limits"]}
+    assert max(data["used"].values()) == pytest.approx(1.0, abs=1e-3)
+    columns = table(out)
+    words = ("position", "velocity", "acceleration", "effort")
+    joints = [f"{joint}.{word}" for joint in robot.joint_names for word in words]
+    assert list(columns) == ["time", *joints, "x", "y", "z"]
+    q, qd, qdd, effort = (of_joints(columns, robot, word) for word in words)
+    assert (np.abs(effort) <= robot.limits.effort).all()
+    np.testing.assert_allclose(robot.inverse(np.stack([columns[n] for n in "xyz"], -1)), q)
+    again = tmp_path / "torques.csv"
+    good(twin("torques", "delta", out, "--out", again, "--no-picture"))
+    np.testing.assert_allclose(of_joints(table(again), robot, "effort"), effort, atol=1e-9)
+    np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd), effort, atol=1e-9)
+
+
+def test_a_planned_table_is_checked_and_one_with_other_efforts_is_bad(twin, tmp_path):
+    out = tmp_path / "cycle.csv"
+    good(twin(*CYCLE, "--out", out, "--no-picture"))
+    good(twin("check", out, "--robot", "delta"))
+    assert twin("check", out, "--robot", "delta", "--payload", "1.0").code == 1
+    result = twin("check", out)
+    assert result.code == 1
+    result.one_line_error()
+
+
+def test_torques_takes_the_pose_in_place_of_the_joints(twin, tmp_path):
+    robot = load("delta")
+    time = np.linspace(0.0, 1.0, 400)
+    pose = robot.home() + 0.03 * np.stack([np.sin(3 * time), np.cos(2 * time), 0 * time], -1)
+    given, out = tmp_path / "poses.csv", tmp_path / "torques.csv"
+    rows = np.column_stack([time, pose])
+    given.write_text("time,x,y,z\n" + "\n".join(",".join(map(repr, r)) for r in rows.tolist()))
+    good(twin("torques", "delta", given, "--out", out, "--no-picture"))
+    columns = table(out)
+    np.testing.assert_allclose(of_joints(columns, robot, "position"), robot.inverse(pose))
+    given.write_text("time,x,y\n0,0,0\n1,0,0\n2,0,0\n")
+    result = twin("torques", "delta", given, "--out", tmp_path / "none.csv")
+    assert result.code == 1
+    result.one_line_error()
+
+
+def test_a_cycle_as_a_trajectory_that_size_reads(twin, tmp_path):
+    out = tmp_path / "cycle.mcap"
+    good(twin(*CYCLE, "--out", out, "--no-picture", "--payload", "0.4"))
+    (message,) = (m.message for m in read_messages(out))
+    robot = load("delta").changed(payload={"mass": 0.4})
+    assert list(message.joint_names) == list(robot.joint_names)
+    motion = fastest(robot, cycle(robot, 0.025, 0.305, 0.025)).uniform(1000)
+    assert len(message.points) == len(motion.time)
+    for k in (0, 17, -1):
+        point = message.points[k]
+        np.testing.assert_allclose(point.effort, motion.effort[k])
+        np.testing.assert_allclose(point.positions, motion.q[k])
+    # At the end the machine rests and is held.
+    assert not any(message.points[-1].velocities)
+    held = inverse_dynamics(robot, motion.q[-1], np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(message.points[-1].effort, held)
+    result = json.loads(good(twin("size", "delta", out, "--json")).out)
+    assert result["efforts"] == "the file's"
+    assert result["payload"]["mass_kg"] == 0.4
+    again = tmp_path / "torques.csv"
+    good(twin("torques", "delta", out, "--out", again, "--no-picture"))
+    np.testing.assert_allclose(of_joints(table(again), robot, "effort"), motion.effort, atol=1e-6)
+    peak = result["drives"]["arm_1"]["joint"]["peak_effort_N_m"]
+    assert peak == pytest.approx(np.abs(motion.effort[:, 0]).max())
+
+
+def test_sizes_are_a_readers_own_sums(twin, tmp_path, geared):
+    out = tmp_path / "cycle.csv"
+    good(twin("path", geared, *CYCLE[2:], "--out", out, "--no-picture"))
+    picture = tmp_path / "speeds.png"
+    given = ("size", geared, out, "--drives", "shipped", "--picture", picture, "--json")
+    result = json.loads(good(twin(*given)).out)
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    robot, columns = load(geared), table(out)
+    t = columns["time"]
+    q, qd, qdd, tau = (
+        of_joints(columns, robot, word)
+        for word in ("position", "velocity", "acceleration", "effort")
+    )
+    whole = t[-1] - t[0]
+    for i, joint in enumerate(robot.joint_names):
+        side = result["drives"][joint]["joint"]
+        power = tau[:, i] * qd[:, i]
+        assert side["rms_effort_N_m"] == pytest.approx(
+            np.sqrt(trapezoid(tau[:, i] ** 2, t) / whole)
+        )
+        assert side["peak_speed_rad_s"] == pytest.approx(np.abs(qd[:, i]).max())
+        assert side["peak_power_W"] == pytest.approx(power.max())
+        assert side["peak_regenerated_power_W"] == pytest.approx(-power.min())
+        assert side["energy_J"] == pytest.approx(trapezoid(power, t))
+        assert side["regenerated_J"] == pytest.approx(-trapezoid(np.minimum(power, 0), t))
+        n, rotor, share = GEAR["ratio"], GEAR["inertia"], GEAR["efficiency"]
+        load_torque = tau[:, i] - rotor * n**2 * qdd[:, i]
+        driven = load_torque * qd[:, i] >= 0
+        at_shaft = np.where(driven, load_torque / (n * share), load_torque * share / n)
+        motor = rotor * n * qdd[:, i] + at_shaft
+        side = result["drives"][joint]["motor"]
+        assert side["peak_effort_N_m"] == pytest.approx(np.abs(motor).max())
+        assert side["rms_effort_N_m"] == pytest.approx(np.sqrt(trapezoid(motor**2, t) / whole))
+        assert side["peak_speed_rad_s"] == pytest.approx(n * np.abs(qd[:, i]).max())
+        seen = mass_matrix(robot, q)[:, i, i] - rotor * n**2
+        assert result["drives"][joint]["inertia_ratio"] == pytest.approx(seen.max() / n**2 / rotor)
+        own = next(d for d in result["drives"][joint]["drives"] if d["motor"] == "SGMAH-04A")
+        assert own["used_continuous_torque"] == pytest.approx(side["rms_effort_N_m"] / 1.27)
+        assert own["used_torque"] == pytest.approx(side["peak_effort_N_m"] / 3.82)
+        assert own["good"]
+        small = next(d for d in result["drives"][joint]["drives"] if d["motor"] == "SGMAH-A5A")
+        assert not small["good"]
+
+
+def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
+    out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
+    good(twin("path", geared, "--cycle", "25,200", "--out", out, "--no-picture"))
+    motor = {"inertia": 1.73e-5, "continuous_torque": 9.0, "peak_torque": 9.0,
+             "rated_speed": 3000.0, "max_speed": 5000.0}  # fmt: skip
+    drives.write_text(yaml.safe_dump({"drives": {"flat": motor, "slow": {
+        **motor, "curve": [[0.0, 9.0], [200.0, 9.0]]}}}))  # fmt: skip
+    result = json.loads(good(twin("size", geared, out, "--drives", drives, "--json")).out)
+    flat, slow = result["drives"]["arm_1"]["drives"]
+    assert flat["good"]
+    assert not slow["good"]
+    assert slow["used_speed"] > 1.0
+    drives.write_text("drives: {one: {inertia: 1.0}}")
+    assert twin("size", geared, out, "--drives", drives).code == 1
+    assert twin("size", "delta", out, "--drives", "shipped").code == 1
+    assert twin("size", geared, out, "--drives", "shipped", "--motor", "none").code == 1
+
+
+def test_a_recording_is_sized_by_its_measured_efforts(twin):
+    bag = "bags/delta_cu_pick_and_place.mcap"
+    measured, model = (
+        json.loads(good(twin("size", "delta_cu", bag, "--efforts", what, "--json")).out)
+        for what in ("file", "model")
+    )
+    for joint in measured["drives"]:
+        one, other = (r["drives"][joint]["joint"]["rms_effort_N_m"] for r in (measured, model))
+        assert one == pytest.approx(other, rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["delta", "five_bar", "linear_delta"])
+def test_the_worst_of_the_workspace_is_that_of_many_tries(twin, name):
+    speed, change = 0.8, 9.0
+    given = ("size", name, "--over-workspace", f"{speed},{change}", "--json")
+    result = json.loads(good(twin(*given)).out)
+    robot = load(name)
+    rng = np.random.default_rng(5)
+    places = [i for i, n in enumerate(robot.pose_names) if n in "xyz"]
+    for joint, entry in result["drives"].items():
+        i = robot.joint_names.index(joint)
+        key = next(k for k in entry if k.startswith("effort_N"))
+        q = robot.inverse(list(entry["effort_pose"].values()))
+        count = 3000
+        directions = rng.normal(size=(2, count, len(places)))
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        v, a = np.zeros((count, len(robot.pose_names))), np.zeros((count, len(robot.pose_names)))
+        v[:, places], a[:, places] = speed * directions[0], change * directions[1]
+        qs = np.tile(q, (count, 1))
+        j = robot.jacobian(qs)
+        qd = np.linalg.solve(j, v[..., None])[..., 0]
+        own = robot.pose_acceleration(qs, qd, 0 * qd)
+        qdd = np.linalg.solve(j, (a - own)[..., None])[..., 0]
+        tried = np.abs(inverse_dynamics(robot, qs, qd, qdd)[:, i]).max()
+        assert tried <= entry[key] * (1.0 + 0.01)
+        assert tried >= entry[key] * 0.93
+
+
+WAYPOINTS = "x,y,z,blend,dwell\n-0.05,0,-0.38,0,0\n-0.05,0,-0.35,0.02,0\n0.05,0,-0.35,0,0.1\n"
+
+
+def test_way_points_are_lines_or_a_smooth_curve(twin, tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text(WAYPOINTS)
+    data = json.loads(good(twin("path", "delta", path, "--fastest", "--json")).out)
+    assert data["path"] == "lines"
+    assert [s["dwell_s"] for s in data["stretches"]] == [0.1]
+    path.write_text("x,y,z\n-0.05,0,-0.38\n-0.05,0,-0.35\n0.05,0,-0.35\n")
+    data = json.loads(good(twin("path", "delta", path, "--fastest", "--json")).out)
+    assert data["path"] == "smooth curve"
+    stops = json.loads(good(twin("path", "delta", path, "--blend", "0", "--json")).out)
+    assert len(stops["stretches"]) == 2
+    joints = ",".join(f"{joint}.position" for joint in load("delta").joint_names)
+    path.write_text(f"{joints}\n0.1,0.1,0.1\n0.2,0.3,0.1\n")
+    data = json.loads(good(twin("path", "delta", path, "--law", "s-curve", "--json")).out)
+    assert data["law"] == "s-curve"
+
+
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [
+        ("x,y\n0,0\n0,1\n", ()),
+        ("x,y,z,blnd\n0,0,-0.3,0\n0,0,-0.4,0\n", ()),
+        ("x,y,z\n0,0,-0.3\n0,0,-9\n", ()),
+        ("x,y,z,arc\n0,0,-0.3,1\n0,0,-0.4,0\n", ()),
+        ("x,y,z\n0,0,-0.35\n0,0,-0.4\n", ("--duration", "0.001")),
+        ("x,y,z\n0,0,-0.35\n0,0,-0.4\n", ("--law", "cubic")),
+        ("x,y,z\n0,0,-0.35\n0,0,-0.4\n", ("--out", "a.txt")),
+    ],
+)
+def test_what_is_no_path_is_one_line(twin, tmp_path, text, options):
+    path = tmp_path / "points.csv"
+    path.write_text(text)
+    result = twin("path", "delta", path, *options)
+    assert result.code == 1
+    result.one_line_error()
+
+
+def test_a_command_line_needs_one_path(twin, tmp_path):
+    assert twin("path", "delta").code == 2
+    assert twin("path", "delta", "--cycle", "0.025,0.305").code == 2
+    assert twin("path", "delta", "--cycle", "25,305", "--circle", "0.1").code == 2
+    assert twin("path", "delta", "--cycle", "25,305", "--effort", "1,2").code == 2
+    assert twin("size", "delta").code == 2

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Paths and motions along them: what they go through, and laws of the fastest motion."""
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.errors import ParameterError
+from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
+from pkm_twin.paths.laws import LAWS
+from pkm_twin.paths.pieces import Arc, Corner, arc_through
+from test.support.robots import FREE, load, partly_long
+
+SOME = partly_long(
+    ["delta", "prru", "five_bar", "stewart", "linear_delta", "rps3"], "delta", "five_bar", "stewart"
+)
+
+
+def points_of(robot, count=4, seed=3):
+    rng = np.random.default_rng(seed)
+    span = np.array([0.03 if unit == "m" else 0.06 for unit in robot.pose_units])
+    return robot.home() + span * rng.uniform(-1.0, 1.0, (count, len(robot.pose_names)))
+
+
+def walked(path, count=400):
+    """Places along a path, and the pieces' derivatives against differences."""
+    places = []
+    for stretch in path.stretches:
+        for piece in stretch.pieces:
+            s = np.linspace(0.0, piece.length, count)
+            p, first, second = piece.at(s)
+            tol = 1e-4 * np.abs(second).max() + 1e-9
+            np.testing.assert_allclose(np.gradient(p, s, axis=0)[1:-1], first[1:-1], atol=tol)
+            np.testing.assert_allclose(
+                np.gradient(first, s, axis=0)[1:-1], second[1:-1],
+                atol=2e-2 * np.abs(second).max() + 1e-9,
+            )  # fmt: skip
+            places.append(p)
+    return np.concatenate(places)
+
+
+@pytest.mark.parametrize("name", ["delta", "stewart", "five_bar"])
+def test_a_smooth_curve_goes_through_its_way_points(name):
+    robot = load(name)
+    points = points_of(robot, 6)
+    path = through(robot, points)
+    assert len(path.stretches) == 1
+    p = path.stretches[0].pieces[0]
+    np.testing.assert_allclose(p.at(p.spline.x)[0], points, atol=1e-12)
+    walked(path)
+
+
+def test_lines_are_rounded_where_they_are_asked_to_and_stop_elsewhere():
+    robot = load("delta")
+    points = points_of(robot, 5)
+    blend = [0.0, 0.004, 0.0, 0.9, 0.0]
+    path = lines(robot, points, blend=blend, dwell=[0.1, 0.0, 0.2, 0.0, 0.3])
+    assert [stretch.dwell for stretch in path.stretches] == [0.2, 0.3]
+    assert path.wait == 0.1
+    places = walked(path)
+    distance = np.linalg.norm(places[:, None] - points, axis=-1).min(0)
+    assert distance[[0, 2, 4]].max() < 1e-12
+    assert 0.0 < distance[1] < 0.004
+    corners = [p for s in path.stretches for p in s.pieces if isinstance(p, Corner)]
+    sides = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    assert [corner.radius for corner in corners] == pytest.approx([0.004, sides[2:].min() / 2])
+    for stretch in path.stretches:
+        for one, other in zip(stretch.pieces, stretch.pieces[1:], strict=False):
+            before, behind = one.at(np.array([one.length])), other.at(np.zeros(1))
+            for k in range(3):
+                np.testing.assert_allclose(before[k], behind[k], atol=1e-9)
+
+
+def test_way_points_that_repeat_rest_longer_and_a_reversal_is_a_stop():
+    robot = load("delta")
+    a, b = points_of(robot, 2)
+    path = lines(robot, [a, a, b, a], blend=0.01, dwell=[0.5, 0.25, 0.0, 0.0])
+    assert path.wait == 0.75
+    assert len(path.stretches) == 2
+
+
+def test_arcs_are_circles_and_join_tangent_lines_at_speed():
+    robot = load("delta")
+    x, y, z = robot.home()
+    r = 0.03
+    points = [[x - 0.05, y, z], [x, y, z], [x + r, y + r, z], [x, y + 2 * r, z],
+              [x - 0.05, y + 2 * r, z]]  # fmt: skip
+    path = lines(robot, points, arc=[0, 0, 1, 0, 0])
+    (stretch,) = path.stretches
+    (arc,) = (piece for piece in stretch.pieces if isinstance(piece, Arc))
+    assert arc.length == pytest.approx(np.pi * r)
+    places = walked(path)
+    assert np.linalg.norm(places - np.array(points[2]), axis=1).min() < 1e-3
+    round_ = arc.at(np.linspace(0, arc.length, 50))[0]
+    np.testing.assert_allclose(np.linalg.norm(round_ - [x, y + r, z], axis=1), r, atol=1e-12)
+    with pytest.raises(ParameterError):
+        arc_through(*np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), places=[0, 1, 2])
+    assert circle(robot, robot.home(), r).length == pytest.approx(2 * np.pi * r)
+
+
+def test_a_cycle_has_its_height_width_and_two_stops():
+    robot = load("delta")
+    path = cycle(robot, 0.025, 0.305, 0.02, dwell=0.05)
+    places = walked(path)
+    assert np.ptp(places[:, 0]) == pytest.approx(0.305)
+    assert np.ptp(places[:, 2]) == pytest.approx(0.025)
+    assert [stretch.dwell for stretch in path.stretches] == [0.05, 0.05]
+    second = path.stretches[0].pieces[-1].at(np.array([path.stretches[0].pieces[-1].length]))[0][0]
+    assert places[:, 2].max() - second[2] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_all_limits_hold_at_every_moment(name):
+    robot = load(name)
+    acceleration = {"rad": 400.0, "m": 20.0}[robot.joint_units[0]]
+    motion = fastest(robot, points_of(robot), acceleration=acceleration, speed=1.5)
+    times = np.random.default_rng(1).uniform(0.0, motion.duration, 4000)
+    s = motion.sample(times)
+    assert (np.abs(s.effort) / robot.limits.effort).max() <= 1.0 + 1e-5
+    assert (np.abs(s.qd) / robot.limits.velocity).max() <= 1.0 + 1e-9
+    assert np.abs(s.qdd).max() <= acceleration * (1.0 + 1e-5)
+    assert s.speed.max() <= 1.5 * (1.0 + 1e-5)
+    # Something binds nearly always.
+    assert np.quantile(motion.used.max(1), 0.1) > 0.98
+    named = " ".join(bound.what for bound in motion.bounds)
+    assert any(word in named for word in ("effort", "velocity", "acceleration", "speed"))
+    begins = [bound.begin for bound in motion.bounds] + [motion.duration]
+    assert begins == sorted(begins)
+    assert begins[0] == 0.0
+
+
+@pytest.mark.parametrize("name", ["delta", "five_bar", "rps3"])
+def test_limits_hold_between_few_points_too(name):
+    robot = load(name)
+    for points in (48, 70):
+        motion = fastest(robot, points_of(robot), points=points)
+        s = motion.sample(np.linspace(0.0, motion.duration, 5000))
+        assert (np.abs(s.effort) / robot.limits.effort).max() <= 1.0 + 5e-4
+        assert (np.abs(s.qd) / robot.limits.velocity).max() <= 1.0 + 5e-4
+        fine = fastest(robot, points_of(robot)).duration
+        assert motion.duration == pytest.approx(fine, rel=0.03)
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_rates_are_those_of_the_positions_and_efforts_those_of_the_model(name):
+    robot = load(name)
+    motion = fastest(robot, points_of(robot))
+    s = motion.sample(np.linspace(0.1, 0.9, 9) * motion.duration)
+    step = 1e-6
+    on, back = (motion.sample(s.time + sign * step) for sign in (1.0, -1.0))
+    scale = np.abs(motion.fine.qdd).max()
+    np.testing.assert_allclose((on.q - back.q) / (2 * step), s.qd, atol=2 * scale * step)
+    expected = inverse_dynamics(robot, s.q, s.qd, s.qdd)
+    np.testing.assert_allclose(s.effort, expected, rtol=1e-12)
+    np.testing.assert_allclose(robot.inverse(s.pose), s.q, atol=1e-7)
+    end = motion.sample([motion.duration, motion.duration + 1.0])
+    assert not end.qd.any()
+    assert not end.qdd.any()
+
+
+def test_the_way_back_takes_as_long_without_friction():
+    robot = load("stewart")
+    robot = robot.changed(friction=FREE)
+    points = points_of(robot)
+    there, back = fastest(robot, points), fastest(robot, points[::-1])
+    assert there.duration == pytest.approx(back.duration, rel=3e-4)
+
+
+def test_time_is_scaled_with_limits_and_gravity():
+    """Of all efforts k^2 times and rates k times as great a motion takes 1 / k of the time."""
+    robot, k = load("delta"), 1.7
+    stronger = robot.changed(
+        gravity=(k**2 * robot.gravity).tolist(),
+        limits={"effort": (k**2 * robot.limits.effort).tolist(),
+                "velocity": (k * robot.limits.velocity).tolist()},
+    )  # fmt: skip
+    points = points_of(robot)
+    assert fastest(stronger, points).duration * k == pytest.approx(
+        fastest(robot, points).duration, rel=1e-6
+    )
+
+
+def test_more_to_carry_takes_longer_and_more_force_shorter():
+    robot = load("delta")
+    path = cycle(robot, 0.025, 0.2)
+    times = [fastest(robot.changed(payload={"mass": m}), path).duration for m in (0.0, 0.3, 1.0)]
+    assert times == sorted(times)
+    assert times[0] < times[2]
+    assert fastest(robot, path, effort=30.0).duration < times[0]
+
+
+@pytest.mark.parametrize("name", ["delta", "five_bar"])
+def test_jerks_are_kept_and_cost_time(name):
+    robot = load(name)
+    points = points_of(robot)
+    free = fastest(robot, points).duration
+    slower = timed(robot, points, "quintic", jerk=2e5).duration
+    motion = fastest(robot, points, jerk=2e5, points=300)
+    assert free < motion.duration < slower
+    s = motion.sample(np.linspace(0.0, motion.duration, 1500)[:-1])
+    jerk = np.diff(s.qdd, axis=0) / np.diff(s.time)[:, None]
+    assert np.abs(jerk).max() < 1.1 * 2e5
+    assert motion.used.max() < 1.05
+
+
+@pytest.mark.parametrize("law", [law for laws in LAWS.values() for law in laws])
+def test_laws_go_from_rest_to_rest(law):
+    t = np.linspace(0.0, 1.0, 20001)
+    way, rate, change = law(t)
+    for values, ends in ((way, (0.0, 1.0)), (rate, (0.0, 0.0)), (change, (0.0, 0.0))):
+        np.testing.assert_allclose(values[[0, -1]], ends, atol=1e-9)
+    np.testing.assert_allclose(np.gradient(way, t)[1:-1], rate[1:-1], atol=1e-6)
+    np.testing.assert_allclose(np.gradient(rate, t)[1:-1], change[1:-1], atol=2e-2)
+    assert rate.min() > -1e-12
+
+
+@pytest.mark.parametrize("law", ["quintic", "s-curve"])
+@pytest.mark.parametrize("name", ["delta", "five_bar"])
+def test_laws_are_as_short_as_limits_let_them_be(name, law):
+    robot = load(name)
+    path = lines(robot, points_of(robot), blend=0.004)
+    motion = timed(robot, path, law)
+    assert 0.99 < motion.used.max() <= 1.0
+    longer = timed(robot, path, law, duration=2.0 * motion.duration)
+    assert longer.duration == pytest.approx(2.0 * motion.duration)
+    assert longer.used.max() < 1.0
+    with pytest.raises(ParameterError) as error:
+        timed(robot, path, law, duration=0.9 * motion.duration)
+    assert error.value.field == "duration"
+    assert motion.duration > fastest(robot, path).duration
+
+
+def test_what_cannot_be_is_rejected_by_its_place():
+    robot = load("delta")
+    home = robot.home()
+    up, deep = (home + np.array([0.0, 0.0, z]) for z in (0.02, -2.0))
+    for bad in ([home, deep], [home], [home, home], [[0.0, np.nan, 0.0], home]):
+        with pytest.raises(ParameterError):
+            fastest(robot, bad)
+    with pytest.raises(ParameterError) as error:
+        fastest(robot, [home, up], effort=0.4)
+    assert "at rest" in error.value.field
+    with pytest.raises(ParameterError) as error:
+        fastest(robot, [home, up], singularity=0.99)
+    assert "singularity" in error.value.field
+    with pytest.raises(ParameterError):
+        fastest(load("upr_rpu"), points_of(load("upr_rpu")))
+    assert fastest(load("upr_rpu"), points_of(load("upr_rpu")), velocity=0.3).duration > 0.0
+
+
+def test_a_given_duration_needs_no_limits():
+    robot = load("upr_rpu")
+    motion = timed(robot, points_of(robot), "quintic", duration=0.8)
+    assert motion.duration == pytest.approx(0.8)
+    assert motion.sample([0.4]).qd.any()
+    assert not motion.worst
+
+
+def test_a_path_of_joints_is_followed_in_joints():
+    robot = load("delta")
+    q = robot.inverse(points_of(robot, 3))
+    motion = fastest(robot, through(robot, q, space="joint"))
+    ends = motion.sample([0.0, motion.duration])
+    np.testing.assert_allclose(ends.q, q[[0, -1]], atol=1e-12)
