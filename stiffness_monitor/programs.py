@@ -194,8 +194,8 @@ class Solved:
             known = Motion(t.tree, *self.elastic.robot.engine._samples[chosen.sample])
             # The state is one of this geometry alone.
             assumed += [(e, e.value) for e in t.tape.inputs(GEOMETRY, len(t.tape.reference))]
-        follow, inverse, _ = _followed(self.frame, chosen)
-        _, there, left = _followed(self._frame(known), chosen)
+        follow, inverse, _ = followed(self.frame, chosen)
+        _, there, left = followed(self._frame(known), chosen)
         # On other numbers a closure may hold more than what was chosen.
         assumed += [(e * _LEFT, 0.0) for e in t.lift(left)]
         # Where they stop to determine what was chosen near home, nothing is known of the frame.
@@ -254,7 +254,7 @@ class Solved:
         return Program(sizes, 0, rows, t.equations())
 
 
-def _followed(frame: Frame, chosen: Followers) -> tuple[dict[int, Row], Any, list[Any]]:
+def followed(frame: Frame, chosen: Followers) -> tuple[dict[int, Row], Any, list[Any]]:
     """Of chosen coordinates, their rows of the others; the reciprocal determinant of what
     determines them; and what other closures hold beside, which is zero.
     """

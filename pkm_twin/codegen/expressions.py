@@ -299,6 +299,11 @@ def reference(value: Any) -> float:
     return value.value if isinstance(value, Expression) else float(value)
 
 
+def number(value: Any) -> Any:
+    """A number as Python's own, an expression as it is."""
+    return value if isinstance(value, Expression) else float(value)
+
+
 def references(values: Any) -> NDArray[np.float64]:
     """The same of every entry of an array."""
     array = np.asarray(values)
