@@ -18,7 +18,7 @@ from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
-from pkm_twin.kinematics.numbers import FileNumbers
+from pkm_twin.kinematics.numbers import FileNumbers, geometry_and_masses
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -87,13 +87,12 @@ def _derivatives(
         robot.refuse_joints(status, inputs[0], inputs)
     found: dict[str, Array] = {}
     if by:
-        numbers = FileNumbers(robot, tuple(by))
         kernel = engine.kernel("torque gradient by numbers", _by_numbers, free=True)
         (of_geometry, of_masses), status = kernel(robot.inertial, *inputs)
         if status is not None:
             robot.refuse_joints(status, inputs[0], inputs)
-        geometry, inertial = numbers.slopes
-        table = of_geometry @ geometry + of_masses @ inertial
+        slopes = FileNumbers(robot, tuple(by), geometry_and_masses).slopes
+        table = np.concatenate([of_geometry, of_masses], -1) @ slopes
         found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
     by_q, by_qd, by_qdd = outputs
     return TorqueDerivatives(by_q, by_qd, by_qdd, found)

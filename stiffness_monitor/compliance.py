@@ -21,7 +21,7 @@ from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
 from pkm_twin.errors import SingularityError
 from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
-from stiffness_monitor.programs import PARTS, elastic_of
+from stiffness_monitor.programs import NONE, PARTS, elastic_of
 
 Array = NDArray[np.float64]
 
@@ -97,11 +97,11 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
 def _row(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     """What the program answers, shape (..., size), rejected by sample."""
     elastic = elastic_of(robot)
-    one = robot.call_one("response", lambda: elastic.response, elastic.parameters, q, wrench)
+    one = robot.call_one("response", lambda: elastic.response, NONE, q, wrench)
     if one is not None and one[-1] > SINGULARITY_BOUND:
         return one
     q, wrench = doubles(q, "joint positions"), vectors(wrench, 6, "the wrench")
-    (rows,), status = elastic.response(elastic.parameters, q, wrench)
+    (rows,), status = elastic.response(NONE, q, wrench)
     check(robot, q, wrench, rows[..., -1], status)
     return rows
 
@@ -171,7 +171,7 @@ def member_deflections(
         base axes.
     """
     elastic = elastic_of(robot)
-    (rows, measure), status = elastic.deflections(elastic.parameters, q, wrench)
+    (rows, measure), status = elastic.deflections(NONE, q, wrench)
     check(robot, q, wrench, measure[..., 0], status)
     names = [member.name for member in elastic.plan.members]
     table = rows.reshape(*rows.shape[:-1], len(names), 2, PARTS + 1, 3)

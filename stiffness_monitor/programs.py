@@ -5,17 +5,16 @@ K = sum of d b b' over the frame's columns is factorised once, the platform's si
 last: what is left there is the platform's stiffness, C its inverse, and the displacements x under a
 wrench follow without another solution. An element has the energy sum of d (b . x)^2 / 2.
 
-Moduli, diameters and compliances are run-time parameters; only whether a compliance is zero, finite
-or free is part of a program.
+Points, lengths, moduli, diameters and compliances are run-time inputs; only whether a compliance is
+zero, finite or free is part of a program, and what a machine's structure is made of.
 
 May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
 from typing import Any, Final
 
@@ -23,70 +22,97 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.cholesky import SparseCholesky
-from pkm_twin.codegen.expressions import PARAMETERS, absolute, maximum, minimum, sqrt
+from pkm_twin.codegen.expressions import GEOMETRY, absolute, maximum, minimum, sqrt
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.codegen.lu import SparseLU, independent_rows, pivot_order
+from pkm_twin.codegen.lu import Order, SparseLU, independent_rows, pivot_order
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.frame import PLATFORM, Column, Frame, Row, bent, combined
-from stiffness_monitor.structure import StructuralModel, plan_of, posed
+from stiffness_monitor.numbers import numbers_of, pattern_of, structure_on
+from stiffness_monitor.structure import FREE, plan_of, posed
 
 Array = NDArray[np.float64]
 
 PARTS: Final = 4
 """Parts that a member is divided into where its deflection is drawn."""
+NONE: Final = np.zeros(0)
+"""The programs' parameters: all numbers are the kernels' own."""
 _TINY: Final = 1e-200
+_LEFT: Final = 1e-3
+"""What a closure may hold beside, over the bound of other numbers: a billionth."""
+
+
+@dataclass(frozen=True)
+class Followers:
+    """Which coordinates of a frame follow from its closures: ``chosen``, by ``rows``.
+
+    ``sample``: the engine's state in which closures hold the most; 0, home, wherever that is one.
+    """
+
+    rows: tuple[int, ...]
+    chosen: tuple[int, ...]
+    pivots: Order
+    sample: int
 
 
 class Elastic:
-    """A robot's elastic frame: its plan, run-time numbers and programs.
+    """A robot's elastic frame: its plan, its numbers and its programs.
 
-    ``names``: of the elements, as energies have them. ``parameters``: of each member EA, GJ, EI
-    and 12 E I over the shear rigidity, then each joint's finite compliances.
+    Machines of one structure share the programs: all numbers are run-time inputs. ``names``: of the
+    elements, as energies have them.
     """
 
     def __init__(self, robot: Robot) -> None:
-        self.robot, structure = robot, robot.elastic
-        self.plan = plan_of(robot.graph, structure)
-        self.soft = list(
-            dict.fromkeys(
-                v for s in self.plan.supports for v in s.compliance if v.__class__ is tuple
-            )
-        )
-        elastic = [member.body for member in self.plan.members] + [name for name, _ in self.soft]
-        self.names = structure.order or tuple(dict.fromkeys(elastic))
-        rows = [structure.sections[member.section].rigidities for member in self.plan.members]
-        values = [structure.compliances[name][k] for name, k in self.soft]
-        self.parameters = np.array([*np.ravel(rows), *values], np.float64)
-        self._key = hashlib.sha256(
-            repr((robot.graph.key, _text(self.plan), self.names)).encode()
-        ).hexdigest()
+        self.robot, self.structure = robot, robot.elastic
+        self.plan = plan_of(robot.graph, self.structure)
+        soft = [v[0] for s in self.plan.supports for v in s.compliance if v.__class__ is tuple]
+        bodies = [member.body for member in self.plan.members]
+        self.names = self.structure.order or tuple(dict.fromkeys([*bodies, *soft]))
 
-    def posed(self, motion: Motion, p: Any) -> StructuralModel:
-        """The plan in a motion, with the parameters ``p``."""
-        of = {member.section: 4 * k for k, member in enumerate(self.plan.members)}
-        at = {entry: 4 * len(of) + k for k, entry in enumerate(self.soft)}
-        return posed(
-            self.plan, motion.point, motion.direction, lambda name: p[of[name] : of[name] + 4],
-            lambda joint, k: p[at[joint, k]],
-        )  # fmt: skip
+    @cached_property
+    def followers(self) -> Followers | None:
+        """Chosen by what closures hold at home and near it; None without closures.
 
-    def near_home(self) -> Array:
-        """What closures hold where they hold most, home first, shape (k, rows, size)."""
-        engine, ones = self.robot.engine, np.ones(len(self.parameters))
-        frames = (
-            Frame(self.posed(Motion(engine.tree, x, q), ones), static=True)
-            for x, q in engine._samples
-        )
+        :raises ValueError: they hold the platform itself.
+        """
+        if not self.plan.closures:
+            return None
+        engine = self.robot.engine
+        frames = [self._frame(Motion(engine.tree, x, q)) for x, q in engine._samples]
         tables = np.array([frame.table() for frame in frames], np.float64)
         # Home can be a singularity of the frame.
         ranks = np.array([len(independent_rows(table[None, :, PLATFORM:])) for table in tables])
-        return np.asarray(tables[ranks == ranks.max()], np.float64)
+        most = ranks == ranks.max()
+        rows, chosen = frames[0].dependents(tables[most])
+        pivots = pivot_order(tables[most][:, rows][:, :, chosen])
+        return Followers(tuple(rows), tuple(chosen), pivots, int(most.argmax()))
+
+    def _frame(self, motion: Motion) -> Frame:
+        """The frame in a state on numbers, every rigidity and compliance one."""
+        model = posed(
+            self.plan, motion.point, motion.direction, lambda _: [1.0] * 4, lambda *_: 1.0
+        )
+        return Frame(model, static=True)
+
+    @cached_property
+    def _key(self) -> str:
+        tree, followers = self.robot.engine.tree, self.followers
+        pattern = pattern_of(self.structure, tree)
+        own = self.robot.graph.key if followers is not None and followers.sample else ""
+        return repr((_text(self.plan), pattern, self.names, followers, own))
 
     def _kernel(self, name: str, write: Callable[[Solved], Program]) -> Kernel:
-        return self.robot.engine.kernel(f"{name} {self._key}", lambda t: write(Solved(t, self)))
+        numbers = np.array(numbers_of(self.structure), np.float64)
+        return self.robot.engine.kernel_with(
+            numbers, name, lambda t: write(Solved(t, self)), self._key
+        )
+
+    @cached_property
+    def compliance(self) -> Kernel:
+        """Q to C (36) of the platform, and the measure of :attr:`response`."""
+        return self._kernel("platform compliance", _compliance)
 
     @cached_property
     def response(self) -> Kernel:
@@ -120,9 +146,11 @@ def elastic_of(robot: Robot) -> Elastic:
 
 
 def _text(value: Any) -> Any:
-    """A plan as plain data."""
+    """A plan as plain data, without what is a number of the machine."""
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        return None
+    if isinstance(value, float):
+        return value if value in (0.0, FREE) else None
     if is_dataclass(value):
         return [_text(getattr(value, field.name)) for field in fields(value)]
     return [_text(one) for one in value] if isinstance(value, tuple) else value
@@ -142,31 +170,41 @@ class Solved:
     def __init__(self, t: Traced, elastic: Elastic) -> None:
         t.solve()
         self.t, self.elastic = t, elastic
-        p = t.tape.inputs(PARAMETERS, len(elastic.parameters))
-        self.frame = frame = Frame(elastic.posed(t.motion, p), static=True)
+        self.structure, self.rigidities = structure_on(elastic.structure, t.graph, t.more)
+        self.plan = plan_of(t.graph, self.structure)
+        self.frame = frame = self._frame(t.motion)
         self.measure: Any = 1.0
-        self.follow = self._followers() if frame.held else {}
+        self.follow = {} if elastic.followers is None else self._followers(elastic.followers)
         left = (k for k in range(frame.size) if k not in self.follow)
         self.place = {k: i for i, k in enumerate(left)}
         columns = [column for bar in frame.bars for column in frame.columns(bar)]
         self.columns = [self._free(column) for column in (*columns, *frame.springs)]
 
-    def _followers(self) -> dict[int, Row]:
-        tables = self.elastic.near_home()
-        rows, chosen = self.frame.dependents(tables)
-        table, samples = self.frame.table()[rows], tables[:, rows][:, :, chosen]
-        lu = SparseLU(table[:, chosen], pivot_order(samples))
+    def _frame(self, motion: Motion) -> Frame:
+        compliances = self.structure.compliances
+        model = posed(
+            self.plan, motion.point, motion.direction, self.rigidities.__getitem__,
+            lambda joint, k: compliances[joint][k],
+        )  # fmt: skip
+        return Frame(model, static=True)
+
+    def _followers(self, chosen: Followers) -> dict[int, Row]:
+        t, assumed, known = self.t, self.t.tape.assumed, self.t.home
+        if chosen.sample:
+            known = Motion(t.tree, *self.elastic.robot.engine._samples[chosen.sample])
+            # The state is one of this geometry alone.
+            assumed += [(e, e.value) for e in t.tape.inputs(GEOMETRY, len(t.tape.reference))]
+        follow, inverse, _ = followed(self.frame, chosen)
+        _, there, left = followed(self._frame(known), chosen)
+        # On other numbers a closure may hold more than what was chosen.
+        assumed += [(e * _LEFT, 0.0) for e in t.lift(left)]
         # Where they stop to determine what was chosen near home, nothing is known of the frame.
-        size = float(abs(np.linalg.det(samples[0])))
-        self.measure = 1.0 / maximum(absolute(size * lu.inverse_determinant), _TINY)
-        rest = sorted({k for r in rows for k in self.frame.held[r]} - set(chosen))
-        solved = [lu.solve(-table[:, k]) for k in rest]
-        return {c: combined((rest, [one[i] for one in solved])) for i, c in enumerate(chosen)}
+        self.measure = 1.0 / maximum(absolute(inverse / there), _TINY)
+        return follow
 
     def _free(self, column: Column) -> Column:
         """A column on the coordinates that closures leave."""
-        terms = [(self.follow.get(k, {k: 1.0}), value) for k, value in column.row.items()]
-        row = combined(*((own, [value * f for f in own.values()]) for own, value in terms))
+        row = _reduced(column.row, self.follow)
         return column._replace(row={self.place[k]: value for k, value in row.items()})
 
     def factorise(self) -> None:
@@ -213,7 +251,32 @@ class Solved:
         t = self.t
         rows = {name: t.lift(row) for name, row in outputs.items()}
         sizes = {"q": t.joints} | inputs
-        return Program(sizes, len(self.elastic.parameters), rows, t.equations())
+        return Program(sizes, 0, rows, t.equations())
+
+
+def followed(frame: Frame, chosen: Followers) -> tuple[dict[int, Row], Any, list[Any]]:
+    """Of chosen coordinates, their rows of the others; the reciprocal determinant of what
+    determines them; and what other closures hold beside, which is zero.
+    """
+    table = frame.table()[list(chosen.rows)]
+    lu = SparseLU(table[:, list(chosen.chosen)], chosen.pivots)
+    rest = sorted({k for r in chosen.rows for k in frame.held[r]} - set(chosen.chosen))
+    solved = [lu.solve(-table[:, k]) for k in rest]
+    follow = {c: combined((rest, [one[i] for one in solved])) for i, c in enumerate(chosen.chosen)}
+    others = (row for r, row in enumerate(frame.held) if r not in chosen.rows)
+    left = [value for row in others for value in _reduced(row, follow).values()]
+    return follow, lu.inverse_determinant, left
+
+
+def _reduced(row: Row, follow: dict[int, Row]) -> Row:
+    """A linear form without the coordinates that follow from others."""
+    terms = [(follow.get(k, {k: 1.0}), value) for k, value in row.items()]
+    return combined(*((own, [value * f for f in own.values()]) for own, value in terms))
+
+
+def _compliance(s: Solved) -> Program:
+    s.factorise()
+    return s.program({}, {"compliance": s.compliance.ravel(), "measure": [s.measure]})
 
 
 def _response(s: Solved) -> Program:

@@ -25,7 +25,7 @@ from pkm_twin.codegen.arrays import one_vector, vectors
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.compliance import platform_response
 from stiffness_monitor.frame import PLATFORM
-from stiffness_monitor.programs import elastic_of
+from stiffness_monitor.programs import NONE, elastic_of
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -106,7 +106,7 @@ def element_response(robot: Robot, pose: ArrayLike) -> ElementResponse:
     elastic = elastic_of(robot)
     q = robot.inverse(pose)
     whole = platform_response(robot, q, np.zeros(6)).compliance
-    (entries, *places), _ = elastic.columns(elastic.parameters, q)
+    (entries, *places), _ = elastic.columns(NONE, q)
     rows, columns, owner = (np.atleast_2d(p)[0].astype(int) for p in places)
     size = rows.max() + 1
     both = np.zeros((*q.shape[:-1], size, PLATFORM + len(owner)))

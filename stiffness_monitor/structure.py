@@ -7,7 +7,8 @@ displacements, and what closes a loop between bodies that hang already is a clos
 
 What hangs on what is decided once, at home: that is the plan. In it a point or direction is a pair
 of its body and its vector at home, a section is its beam's name, and a compliance is 0, infinite or
-the joint's name and the entry. :func:`posed` puts numbers, or expressions, in their place.
+the joint's name and the entry. :func:`posed` puts numbers, or expressions, in their place. A plan
+of a geometry on expressions is that of its known case.
 
 May import: numpy, pkm_twin's core, the standard library; never rclpy.
 """
@@ -23,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.expressions import maximum, sign, sqrt
+from pkm_twin.codegen.expressions import maximum, reference, references, sign, sqrt
 from pkm_twin.kinematics.motion import reaction_directions
 from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.members import Beam, Structure
@@ -103,7 +104,7 @@ class Member:
     inner: Support
     outer: Support | None
     strut: bool = False
-    constant: float | None = None
+    constant: Any = None
 
     @cached_property
     def length(self) -> Any:
@@ -301,7 +302,8 @@ class _Planner:
         part = self._part(body)
         if part not in self.points:
             raise ValueError(f"{part} hangs nowhere")
-        return part, int(np.argmin([size(point - at) for point in self.points[part]]))
+        apart = [reference(size(point - at)) for point in self.points[part]]
+        return part, int(np.argmin(apart))
 
     def _support(self, joint: Joint, body: str, at: Array) -> Support:
         part, end = self._stand(body, at)
@@ -313,12 +315,13 @@ class _Planner:
         if joint.type.count == 2:
             axes = (joint.inner, joint.axes[0]), (joint.outer, joint.axes[1])
             # Which given direction each is nearly along.
-            order = np.abs(vectors @ _axes(axes, lambda _, vector: vector)).argmax(0).tolist()
+            along = references(vectors @ _axes(axes, lambda _, vector: vector))
+            order = np.abs(along).argmax(0).tolist()
             values = [values[k] for k in order] + [values[3 + k] for k in order]
             values[3] = values[4] = FREE
         elif not joint.actuated:
             for freedom in joint.freedoms:
-                k = int(np.abs(vectors @ freedom.axis).argmax())
+                k = int(np.abs(references(vectors @ freedom.axis)).argmax())
                 if freedom.turns and freedom.slide:
                     screws.append((k, freedom.slide))
                 else:
@@ -328,7 +331,7 @@ class _Planner:
     def _compliance(self, name: str) -> list[Any]:
         """Of a joint in a plan; infinite in a file says what its freedoms say."""
         values = enumerate(self.structure.compliances.get(name, RIGID))
-        return [(name, k) if 0.0 < value < FREE else 0.0 for k, value in values]
+        return [(name, k) if 0.0 < reference(value) < FREE else 0.0 for k, value in values]
 
     def _hang(self, joint: Joint, left: list[Joint]) -> None:
         known, new = joint.inner, joint.outer
@@ -340,7 +343,7 @@ class _Planner:
             self.points[new] = [joint.at]
             return
         ends = [beam.inner, beam.outer]
-        if size(ends[1][1] - joint.at) < size(ends[0][1] - joint.at):
+        if _nearer(joint.at, ends[1][1], ends[0][1]):
             ends.reverse()
         support = self._support(joint, known, ends[0][1])
         for part in [j for j in left if self._inside(j)]:
@@ -350,7 +353,7 @@ class _Planner:
         for other in left:
             for body, there in ((other.inner, other.outer), (other.outer, other.inner)):
                 if body in beam.parts and self._hangs(there) and there not in beam.parts:
-                    near = size(other.at - ends[1][1]) < size(other.at - ends[0][1])
+                    near = _nearer(other.at, ends[1][1], ends[0][1])
                     if closing is None and near:
                         closing = other, there
         outer = None
@@ -361,8 +364,8 @@ class _Planner:
 
     def _member(self, beam: Beam, ends: list[Any], inner: Support, outer: Support | None) -> None:
         strut = beam.parts[0] in self.graph.rods
-        length = float(size(ends[1][1] - ends[0][1]))
-        if not length > 0.0:
+        length = size(ends[1][1] - ends[0][1])
+        if not reference(length) > 0.0:
             raise ValueError(f"{beam.name} has no length")
         self.points[beam.name] = [point for _, point in ends]
         known = strut or ends[0][0] == ends[1][0]
@@ -384,6 +387,11 @@ class _Planner:
             part, end = self._stand(body, at)
             supports.append(Support(name, part, None, values, end))
         self._member(beam, [beam.inner, beam.outer], *supports)
+
+
+def _nearer(at: Array, first: Array, second: Array) -> bool:
+    """Whether a place is nearer to the first of two points."""
+    return reference(size(at - first)) < reference(size(at - second))
 
 
 def _masses(robot: Robot, place: Callable[[str, Array], Array], turn: Turn) -> list[RigidBody]:

@@ -300,6 +300,19 @@ def reference(value: Any) -> float:
     return value.value if isinstance(value, Expression) else float(value)
 
 
+def number(value: Any) -> Any:
+    """A number as Python's own, an expression as it is."""
+    return value if isinstance(value, Expression) else float(value)
+
+
+def references(values: Any) -> NDArray[np.float64]:
+    """The same of every entry of an array."""
+    array = np.asarray(values)
+    if array.dtype != object:
+        return np.asarray(array, np.float64)
+    return np.asarray(np.frompyfunc(reference, 1, 1)(array), np.float64)
+
+
 def plain(values: Any) -> NDArray[Any]:
     """An array of floats where all are numbers, else of objects."""
     objects = np.asarray(values, dtype=object)

@@ -23,11 +23,13 @@ from delta_dynamics.virtual_work import masses_kernel, torques
 from pkm_twin.codegen.arrays import doubles
 from pkm_twin.codegen.kernels import MISSED, Code, Kernel
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.kinematics.numbers import FileNumbers, ProgramNumbers
+from pkm_twin.kinematics.numbers import FileNumbers, geometry_and_masses
 from pkm_twin.machine.entries import with_entries
 from pkm_twin.machine.geometry import pattern_of
-from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
 from pkm_twin.machine.tree import Tree
+from stiffness_monitor.numbers import numbers_of
+from stiffness_monitor.programs import elastic_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -61,7 +63,7 @@ class Variants:
             raise ParameterError("numbers", sizes, "as many of each, one a machine") from None
         self.values: Array = np.stack([np.atleast_1d(row) for row in rows], -1)
         """Of the paths, shape (k, paths)."""
-        self._function = FileNumbers(robot, self.paths)
+        self._function = FileNumbers(robot, self.paths, geometry_and_masses)
         self._own: dict[int, Robot | PkmTwinError] = {}
         self._patterns: dict[int, str] = {}
         self._prepared: dict[int, tuple[Code, Array]] = {}
@@ -148,18 +150,34 @@ class Variants:
         """Shape (k, ...), see :meth:`Robot.singularity`."""
         return np.asarray(self._run(_singularity, q)[0][0][..., 0], np.float64)
 
+    def compliance(self, pose: ArrayLike) -> Array:
+        """Shape (k, ..., 6, 6), see :func:`stiffness_monitor.compliance`.
+
+        :raises ParameterError: the robot's file lacks a section that elasticity needs.
+        """
+        _ = elastic_of(self.robot)
+        (flat, measure), good = self._run(_compliance, self.inverse(pose))
+        found = np.where(good & (measure > SINGULARITY_BOUND), flat, np.nan)
+        return np.asarray(found.reshape(*flat.shape[:-1], 6, 6), np.float64)
+
     @cached_property
-    def _numbers(self) -> ProgramNumbers:
-        """Inputs of programs; NaN of a machine whose file's numbers are out of range."""
+    def _numbers(self) -> tuple[Array, Array]:
+        """Geometry and masses; NaN of a machine whose file's numbers are out of range."""
         found = self._function(self.values)
-        out = self._out_of_range
-        found.geometry[out] = np.nan
-        return found
+        found[self._out_of_range] = np.nan
+        geometry, masses = np.split(found, [len(self.robot.engine.geometry)], 1)
+        return geometry, masses
+
+    @cached_property
+    def _elastic(self) -> Array:
+        """Numbers of the elasticity."""
+        function = FileNumbers(self.robot, self.paths, lambda made: numbers_of(made.elastic))
+        return function(self.values)
 
     @cached_property
     def _out_of_range(self) -> Mask:
         """Machines with numbers that no file may have."""
-        out = np.asarray(~np.isfinite(self.values).all(1))
+        out = np.asarray(np.isnan(self.values).any(1))
         sections: dict[str, list[int]] = {}
         for column, path in enumerate(self.paths):
             sections.setdefault(path.rpartition(".")[0], []).append(column)
@@ -191,14 +209,11 @@ class Variants:
 
     def _prepare(self, ask: _Ask, robot: Robot) -> tuple[Code, Array]:
         """A robot's program, and what hangs on each machine's numbers, shape (k, prepared + 1)."""
-        code = ask(robot)[0].code
+        kernel, numbers = ask(robot)
+        code = kernel.code
         found = self._prepared.get(id(code))
         if found is None:
-            numbers = self._numbers
-            own = code.parameters - numbers.geometry.shape[1]
-            p = numbers.inertial if own else np.zeros((len(self), 0))
-            found = code, code.prepare(np.concatenate([p, numbers.geometry], 1))
-            self._prepared[id(code)] = found
+            found = self._prepared[id(code)] = code, code.prepare(numbers(self))
         return found
 
     def _run(self, ask: _Ask, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
@@ -250,7 +265,12 @@ class Variants:
         left = ~self._out_of_range
         robots = itertools.chain([self.robot], self._built(left))
         for robot in robots:
-            code, prepared = self._prepare(ask, robot)
+            try:
+                code, prepared = self._prepare(ask, robot)
+            except (PkmTwinError, ValueError):
+                if robot is self.robot:
+                    raise
+                continue
             fits = left & (prepared[:, -1] <= MISSED)
             yield code, prepared, np.flatnonzero(fits)
             left &= ~fits
@@ -281,8 +301,21 @@ class Variants:
         return self._patterns[k]
 
 
-_Ask = Callable[[Robot], tuple[Kernel, Array]]
-_NONE: Final = np.zeros(0)
+_Program = tuple[Kernel, Callable[[Variants], Array]]
+"""A program, and what it takes of the machines, shape (k, size)."""
+_Ask = Callable[[Robot], _Program]
+
+
+def _geometry(many: Variants) -> Array:
+    return many._numbers[0]
+
+
+def _massive(many: Variants) -> Array:
+    return np.concatenate(many._numbers[::-1], 1)
+
+
+def _elastic(many: Variants) -> Array:
+    return np.concatenate([many._numbers[0], many._elastic], 1)
 
 
 def _layout(robot: Robot) -> list[tuple[str, str]]:
@@ -290,24 +323,28 @@ def _layout(robot: Robot) -> list[tuple[str, str]]:
     return [(link.body, str(link.joint)) for link in robot.engine.tree.links.values()]
 
 
-def _forward(robot: Robot) -> tuple[Kernel, Array]:
-    return robot.engine.forward, _NONE
+def _forward(robot: Robot) -> _Program:
+    return robot.engine.forward, _geometry
 
 
-def _inverse(robot: Robot) -> tuple[Kernel, Array]:
-    return robot.inverse_kernel, _NONE
+def _inverse(robot: Robot) -> _Program:
+    return robot.inverse_kernel, _geometry
 
 
-def _singularity(robot: Robot) -> tuple[Kernel, Array]:
-    return robot.singularity_kernel(), _NONE
+def _singularity(robot: Robot) -> _Program:
+    return robot.singularity_kernel(), _geometry
 
 
-def _torques(robot: Robot) -> tuple[Kernel, Array]:
-    return torques(robot), robot.inertial
+def _torques(robot: Robot) -> _Program:
+    return torques(robot), _massive
 
 
-def _masses(robot: Robot) -> tuple[Kernel, Array]:
-    return masses_kernel(robot), robot.inertial
+def _masses(robot: Robot) -> _Program:
+    return masses_kernel(robot), _massive
+
+
+def _compliance(robot: Robot) -> _Program:
+    return elastic_of(robot).compliance, _elastic
 
 
 def variants(robot: Robot, numbers: Mapping[str, ArrayLike]) -> Variants:

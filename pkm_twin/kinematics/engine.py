@@ -424,13 +424,30 @@ class Engine:
         """
         known = self._kernels.get(name)
         if known is None:
-            key = f"{name} {extra} {self.structure}"
-            known = self._kernels[name] = Kernel(_code(key, self, write, free), self.geometry)
-            if not known.holds:
-                # It takes for constant what is none here: a program of this geometry's own.
-                exact = f"{key} {self.graph.key}"
-                known = self._kernels[name] = Kernel(_code(exact, self, write), self.geometry)
+            known = self.kernel_with(_NO_PARAMETERS, name, write, extra, free=free)
+            self._kernels[name] = known
         return known
+
+    def kernel_with(
+        self,
+        more: Array,
+        name: str,
+        write: Callable[[Traced], Program],
+        extra: str = "",
+        *,
+        free: bool = False,
+    ) -> Kernel:
+        """A program with numbers beside the geometry's, which are :attr:`Traced.more` there.
+
+        :param extra: as of :meth:`kernel`, and ``free``.
+        """
+        key, numbers = f"{name} {extra} {self.structure}", np.concatenate([self.geometry, more])
+        made = Kernel(_code(key, self, write, more, free=free), numbers)
+        if not made.holds:
+            # It takes for constant what is none here: a program of these numbers' own.
+            exact = f"{key} {self.graph.key} {more.tolist()}"
+            made = Kernel(_code(exact, self, write, more), numbers)
+        return made
 
     @property
     def forward(self) -> Kernel:
@@ -499,15 +516,18 @@ def _reciprocal(matrix: Array) -> float:
 class Traced:
     """A machine's motion on expressions of its geometry: what programs are written with."""
 
-    def __init__(self, engine: Engine, *, free: bool = False) -> None:
+    def __init__(self, engine: Engine, more: Array = _NO_PARAMETERS, *, free: bool = False) -> None:
         self.engine = engine
-        self.tape = Tape(engine.geometry.tolist(), free=free)
-        given = self.tape.inputs(GEOMETRY, len(engine.geometry))
-        own = len(given) - len(engine.closed.numbers)
-        self.geometry = given
+        self.tape = Tape([*engine.geometry.tolist(), *more.tolist()], free=free)
+        given = self.tape.inputs(GEOMETRY, len(self.tape.reference))
+        end = len(engine.geometry)
+        own = end - len(engine.closed.numbers)
+        self.geometry = given[:end]
         self.graph = graph_on(engine.graph, given[:own])
-        self.closed = given[own:]
+        self.closed = given[own:end]
         """Numbers of the mechanism's closed forms."""
+        self.more = given[end:]
+        """Numbers beside the geometry's, see :meth:`Engine.kernel_with`."""
         self.tree, self.joints = Tree(self.graph), engine.joints
         self.x = self.tape.inputs(UNKNOWNS, len(self.tree.home))
         self.q = self.tape.inputs("q", self.joints)
@@ -548,9 +568,14 @@ class Traced:
         )  # fmt: skip
 
     @cached_property
+    def home(self) -> Motion:
+        """The motion at home."""
+        return Motion(self.tree, self.tree.home, self.graph.home)
+
+    @cached_property
     def _at_home(self) -> tuple[Motion, Objects, SparseLU]:
         """At home: the motion, derivatives of the kept closures by qd, factors of those by u."""
-        motion = Motion(self.tree, self.tree.home, self.graph.home)
+        motion = self.home
         ju, jq = (snapped_all(m[self.engine.kept]) for m in matrices(self.tree, motion.closures()))
         return motion, jq, SparseLU(ju, self.engine.pivots)
 
@@ -818,11 +843,13 @@ def engine_of(
     return engine
 
 
-def _code(key: str, engine: Engine, write: Callable[[Traced], Program], free: bool = False) -> Code:
+def _code(
+    key: str, engine: Engine, write: Callable[[Traced], Program], more: Array, *, free: bool = False
+) -> Code:
     """The program of a key, written on an engine if nobody has it."""
     code = _codes.get(key)
     if code is None:
-        code = _codes.setdefault(key, Code(lambda: write(Traced(engine, free=free)), key))
+        code = _codes.setdefault(key, Code(lambda: write(Traced(engine, more, free=free)), key))
     return code
 
 

@@ -9,9 +9,9 @@ May import: numpy, pkm_twin's core, the standard library.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,51 +27,43 @@ from pkm_twin.machine.tree import Tree
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class ProgramNumbers:
-    """Inputs of programs, of k machines: shape (k, geometry), (k, inertial)."""
-
-    geometry: Array
-    inertial: Array
-
-
 class FileNumbers:
-    """The numbers of programs as expressions of numbers of a robot's file.
+    """What is computed of a robot, as expressions of numbers of its file.
 
     :param paths: dotted, as of :meth:`Robot.numbered`.
+    :param of: of a robot a row of numbers, or of expressions.
     :raises ParameterError: a path that there is not.
     """
 
-    def __init__(self, robot: Robot, paths: Sequence[str]) -> None:
-        self.base = np.array([robot.number(path) for path in paths])
-        tape = Tape(self.base.tolist())
+    def __init__(
+        self, robot: Robot, paths: Sequence[str], of: Callable[[Robot], Sequence[Any]]
+    ) -> None:
+        tape = Tape([robot.number(path) for path in paths])
         given = tape.inputs(GEOMETRY, len(paths))
         made = robot.numbered(dict(zip(paths, given, strict=True)))
-        graph, load = made.make_graph(), made.payload
-        layout = Layout(Tree(graph))
-        inertial = layout.pack(graph, made.gravity, made.friction)
-        inertial = inertial + layout.payload(load.mass, load.com, load.inertia)
-        geometry = [*geometry_of(graph), *made.closed_numbers]
         self._given = list(given)
-        self._sizes = len(geometry), len(inertial)
-        self._results: list[Expression] = [tape.lift(v) for v in (*geometry, *inertial)]
+        self._results: list[Expression] = [tape.lift(value) for value in of(made)]
         _, self._run = functions(self._results, {GEOMETRY: len(paths)})
 
     @cached_property
-    def slopes(self) -> tuple[Array, Array]:
-        """Derivatives of geometry and inertial inputs by the file's numbers, at its own values.
+    def slopes(self) -> Array:
+        """Derivatives of the row by the numbers, at the file's own values, shape (row, paths)."""
+        return tangents(self._results, self._given)
 
-        Shapes (geometry, paths) and (inertial, paths).
-        """
-        table = tangents(self._results, self._given)
-        return table[: self._sizes[0]], table[self._sizes[0] :]
-
-    def __call__(self, values: Array) -> ProgramNumbers:
-        """Of values, shape (k, paths); NaN where a machine's numbers lead to none."""
+    def __call__(self, values: Array) -> Array:
+        """Of values, shape (k, paths): (k, row); NaN where a machine's numbers lead to none."""
         with np.errstate(all="ignore"):
             rows = self._run(**{GEOMETRY: list(values.T)})
         table = np.empty((len(values), len(rows)))
         for column, row in zip(table.T, rows, strict=True):
             column[:] = row
-        split = self._sizes[0]
-        return ProgramNumbers(table[:, :split], table[:, split:])
+        return table
+
+
+def geometry_and_masses(robot: Robot) -> list[Any]:
+    """The geometry as ``Engine.geometry`` has it, then the masses as ``Robot.inertial``."""
+    graph, load = robot.make_graph(), robot.payload
+    layout = Layout(Tree(graph))
+    inertial = layout.pack(graph, robot.gravity, robot.friction)
+    inertial = inertial + layout.payload(load.mass, load.com, load.inertia)
+    return [*geometry_of(graph), *robot.closed_numbers, *inertial]

@@ -98,17 +98,17 @@ def pattern_of(tree: Tree) -> str:
     Two graphs of one topology and one pattern have the same programs, on their own numbers.
     """
     graph = tree.graph
-    parts: list[Any] = [_marks([*_walk(graph), *graph.origin])]
+    parts: list[Any] = [marks([*_walk(graph), *graph.origin])]
     for body, link in tree.links.items():
         # The signs and zeros of a frame in base axes tell which way its axes were chosen.
-        parts += [link.parent, _marks(link.arm), _marks(link.axes)]
-        parts += [(_marks(s.before), _marks(s.local), _marks([s.offset])) for s in link.steps]
+        parts += [link.parent, marks(link.arm), marks(link.axes)]
+        parts += [(marks(s.before), marks(s.local), marks([s.offset])) for s in link.steps]
         for vector in _vectors(graph, body):
-            parts.append(_marks(link.axes.T @ vector))
-        parts += [_marks(link.axes.T @ (point - link.at)) for point in _points(graph, body)]
+            parts.append(marks(link.axes.T @ vector))
+        parts += [marks(link.axes.T @ (point - link.at)) for point in _points(graph, body)]
     for joint in graph.joints.values():
         for held in joint.constraints:
-            parts.append(_marks([held.inner @ held.outer]))
+            parts.append(marks([held.inner @ held.outer]))
     return repr(parts)
 
 
@@ -129,7 +129,7 @@ def _vectors(graph: Graph, body: str) -> Iterator[Array]:
             yield rod.pair
 
 
-def _marks(values: Any) -> str:
+def marks(values: Any) -> str:
     """A character a number: what it is taken for."""
-    marks = {0.0: "0", 1.0: "1", -1.0: "-"}
-    return "".join(marks.get(float(snapped(v)), ".") for v in np.ravel(values))
+    known = {0.0: "0", 1.0: "1", -1.0: "-"}
+    return "".join(known.get(float(snapped(v)), ".") for v in np.ravel(values))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Elastic members of a machine: round bars between points of its bodies, and their sections.
 
-May import: numpy, this package, the standard library.
+May import: numpy, pkm_twin's codegen, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.expressions import maximum, number, reference, sign, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
 
@@ -111,27 +112,30 @@ class Tube:
     def section(self, mass_per_length: float, path: str) -> Section:
         """The section of a tube with this mass per length, kg/m.
 
+        Of expressions one that cannot be is NaN where its numbers are.
+
         :raises ParameterError: at that density the mass is more than the whole circle's, or none.
         """
         outer = self.outer_diameter
         inner = self.inner_diameter
-        if not mass_per_length > 0.0:
+        if not reference(mass_per_length) > 0.0:
             raise ParameterError(path, mass_per_length, "a member with mass, kg/m above zero")
         if inner is None:
             square = outer * outer - 4 * mass_per_length / (math.pi * self.density)  # type: ignore[operator]
             # A mass that was worked out from a solid bar may miss it by rounding.
-            if square < -1e-9 * outer * outer:
+            spare = square + 1e-9 * outer * outer
+            if reference(spare) < 0.0:
                 raise ParameterError(
                     f"{path}.density",
                     self.density,
                     f"at least {4 * mass_per_length / (math.pi * outer * outer):.6g} kg/m3: the "
                     f"mass in a solid bar of that diameter",
                 )
-            inner = math.sqrt(max(0.0, square))
+            inner = number(sqrt(maximum(0.0, square)) * sqrt(sign(spare)))
         factor = cowper(inner / outer) if self.shear_factor is None else self.shear_factor
-        return Section(
-            self.youngs_modulus, self.shear_modulus, outer, inner, mass_per_length, factor
-        )
+        # One, or NaN without mass.
+        young = number(self.youngs_modulus * sqrt(2.0 * sign(mass_per_length) - 1.0))
+        return Section(young, self.shear_modulus, outer, inner, mass_per_length, factor)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.expressions import norm, plain
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.kinematics.engine import choose_coordinates
 from pkm_twin.kinematics.motion import matrices, numbers
@@ -417,13 +418,13 @@ class Machine(Robot):
         for name, body in self.specs["bodies"].items():
             m = body.member
             if m is not None and m.section is not None:
-                span = float(np.linalg.norm(m.end - m.start))
+                span = norm(plain(m.end - m.start))
                 sections[name] = m.section.section(
                     body.mass / span, f"bodies.{name}.member.section"
                 )
         for name, rod in self.specs["rods"].items():
             if rod.section is not None:
-                span = float(np.linalg.norm(rod.ends[1] - rod.ends[0]))
+                span = norm(plain(rod.ends[1] - rod.ends[0]))
                 sections[name] = rod.section.section(rod.mass / span, f"rods.{name}.section")
         compliances = {
             name: joint.compliance.tolist()

@@ -506,7 +506,7 @@ class UprRpu(Robot):
         for i, limb in enumerate("123"):
             low, high = f"lower tube {limb}", f"upper tube {limb}"
             ends = (low, b * _PATTERN[i]), (high, self.graph.origin + a * _PATTERN[i])
-            radius = float(self.members.diameter[i]) / 2
+            radius = self.members.diameter[i] / 2
             beams.append(Beam(f"{limb}B", f"{limb}B", i, *ends, (low, high), radius))
         return tuple(beams)
 
@@ -520,10 +520,10 @@ class UprRpu(Robot):
         density = 0.0 if self.inertia is None else self.inertia.density
         sections = {
             beam.name: Section(
-                m.youngs_modulus, m.shear_modulus, float(d), 0.0,
-                density * math.pi / 4 * float(d) ** 2, m.shear_factor,
+                m.youngs_modulus, m.shear_modulus, d, 0.0,
+                density * math.pi / 4 * d**2, m.shear_factor,
             )
-            for beam, d in zip(self.beams, m.diameter, strict=True)
+            for beam, d in zip(self.beams, m.diameter.tolist(), strict=True)
         }  # fmt: skip
         compliances = {"3U": j.rpu_universal.tolist(), "3R": j.rpu_revolute.tolist()}
         for limb in "12":

@@ -266,7 +266,7 @@ def test_a_stored_program_that_must_not_run_is_rebuilt(tmp_path, monkeypatch, ha
     made = [program(lambda x, k=k: [k * x[0]], 1) for k in (2.0, 3.0)]
 
     def outputs():
-        return [Kernel(lambda m=m: m, f"times {id(m)}")(NONE, [1.0])[0][0][0] for m in made]
+        return [Kernel(Code(lambda m=m: m, f"times {id(m)}"))(NONE, [1.0])[0][0][0] for m in made]
 
     assert outputs() == [2.0, 3.0]
     paths = sorted(tmp_path.iterdir())

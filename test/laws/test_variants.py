@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,16 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin import Robot, variants
+from pkm_twin.apps.certificate.description import expand
+from pkm_twin.codegen.lu import pivot_order
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.kinematics.motion import Motion
+from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.entries import entries
-from test.support.robots import every_robot, load
+from stiffness_monitor import compliance
+from stiffness_monitor.programs import elastic_of, followed
+from test.machine.random_machines import plain
+from test.support.robots import elastic, every_robot, load, partly_long
 
 MACHINES = Path(__file__).resolve().parents[1] / "machine"
 ASIDE = ("limits", "joint_map", "uncertainty", "member", "section", "compliance", "radius")
@@ -138,3 +146,141 @@ def test_columns_of_several_lengths_are_rejected():
         variants(
             load("delta"), {"geometry.arm_length": [0.2, 0.3], "payload.mass": [0.1, 0.2, 0.3]}
         )
+
+
+TUBE = {
+    "youngs_modulus": 7e10, "shear_modulus": 2.6e10, "density": 2700.0, "outer_diameter": 0.02,
+}  # fmt: skip
+SOFT = (
+    "arm_2r", "bolted", "delta_rcu", "elbow_motors", "five_bar", "four_bar", "linear_delta",
+    "prru3", "rcuu", "rps3", "rrr3_planar", "rrr3_spherical", "stewart", "upr_rpu",
+)  # fmt: skip
+"""Machines whose platform moves by elastic joints, some of their directions rigid."""
+RIGID = ("limits", "joint_map", "uncertainty", "azimuth", "inertia", "axis", "axes")
+
+
+def soft(name: str, rng, rigid=0.3) -> Robot:
+    """A machine of elastic joints and rods, and of bars where a body is between two joints."""
+    data = expand(plain(name))
+    for key, body in data["bodies"].items():
+        joints = [j for j in data["joints"].values() if key in j["between"]]
+        ends = [j["at"] for j in joints if "at" in j]
+        passive = not any(j.get("actuated") and j["type"] == "prismatic" for j in joints)
+        outside = key == data.get("platform", "platform") or not body.get("mass")
+        if passive and not outside and len(ends) == 2 and np.ptp(ends, axis=0).max() > 1e-3:
+            section = TUBE | {"inner_diameter": 0.015}
+            del section["density"]
+            body["member"] = {"from": ends[0], "to": ends[1], "section": section}
+    for rod in data.get("rods", {}).values():
+        rod |= {"section": TUBE, "mass": 0.4 * np.linalg.norm(np.subtract(*rod["ends"]))}
+    while True:
+        for joint in data["joints"].values():
+            values = rng.uniform(0.1, 1.0, 6) * np.repeat([1e-7, 1e-5], 3)
+            joint["compliance"] = np.where(rng.uniform(size=6) < rigid, 0.0, values).tolist()
+        robot = robot_of_data(data, name)
+        try:
+            compliance(robot, robot.home())
+        except (PkmTwinError, ValueError):
+            continue
+        return robot
+
+
+def judge_compliance(robot: Robot, numbers, rng):
+    """Compare the compliance of many with each machine's own; how many could be built."""
+    many = variants(robot, numbers)
+    assert len(many) != 3  # or poses would be by machine
+    units = np.array([robot.graph.size if u == "m" else 1.0 for u in robot.joint_units])
+    away = 0.03 * rng.uniform(-1.0, 1.0, (3, robot.joints_count)) * units
+    pose = robot.forward(robot.graph.home + away)
+    found = many.compliance(pose)
+    assert found.shape == (len(many), 3, 6, 6)
+    built = 0
+    for k in range(len(many)):
+        for i, there in enumerate(pose):
+            try:
+                own = compliance(many[k], there)
+            except (PkmTwinError, ValueError):
+                assert np.isnan(found[k, i]).all()
+                continue
+            built += 1
+            scale = np.abs(own.reshape(2, 3, 2, 3)).max((1, 3))
+            apart = np.abs(found[k, i] - own).reshape(2, 3, 2, 3).max((1, 3))
+            assert (apart <= 1e-10 * scale).all()
+    return built
+
+
+def elastic_numbers(robot: Robot) -> dict[str, float]:
+    """Numbers that a compliance hangs on, and that are not zero."""
+    found = {path: value for path, (value, _) in entries(robot).items() if value != 0.0}
+    return {p: v for p, v in found.items() if not any(word in p for word in RIGID)}
+
+
+@elastic
+def test_compliances_are_those_of_the_robots(name, rng):
+    robot = load(name)
+    known = {**elastic_numbers(robot)}
+    members = [p for p in known if "member" in p or "compliance" in p]
+    others = [p for p in known if "geometry" in p]
+    picked = [*rng.permutation(members)[:8], *rng.permutation(others)[:4]]
+    numbers = {p: known[p] * (1 + 0.05 * rng.uniform(-1, 1, 4)) for p in picked}
+    assert judge_compliance(robot, numbers, rng) > 0
+    masses = [p for p, (v, _) in entries(robot).items() if p.endswith("mass") and v > 0.0]
+    for path in masses[:2]:
+        # The wall of a tube follows from mass and density: twenty times the mass has no room.
+        values = robot.number(path) * np.array([0.9, 1.1, 20.0, 0.0])
+        assert judge_compliance(robot, {path: values}, rng) >= 2
+
+
+@pytest.mark.parametrize("name", partly_long(SOFT, "rcuu"))
+def test_compliances_of_any_machine_are_those_of_the_robots(name, rng):
+    robot = soft(name, rng)
+    known = elastic_numbers(robot)
+    for part in ("compliance", "at", "rods", "from", "section"):
+        paths = rng.permutation([p for p in known if part in p.split("[")[0].split(".")])[:2]
+        if len(paths):
+            numbers = {p: known[p] * np.array([1.0, 1.02]) for p in paths}
+            assert judge_compliance(robot, numbers, rng) > 0
+
+
+@pytest.mark.parametrize("name", partly_long(SOFT, "five_bar"))
+def test_a_compliance_that_appears_or_vanishes_is_another_structure(name, rng):
+    robot = soft(name, rng)
+    paths = [p for p in entries(robot) if p.split("[")[0].endswith("compliance")]
+    for path in rng.permutation(paths)[:2]:
+        judge_compliance(robot, {path: [0.0, 2e-8, 1e-7, np.inf]}, rng)
+
+
+def test_a_frame_that_is_singular_at_home_has_programs_of_its_own(rng):
+    data = expand(plain("four_bar"))
+    rigid = {"motor": [2, 4], "crank_pin": [1, 2, 3, 4], "rocker_foot": [], "rocker_pin": [2, 5]}
+    for name, held in rigid.items():
+        values = np.repeat([2e-8, 6e-6], 3)
+        values[held] = 0.0
+        data["joints"][name]["compliance"] = values.tolist()
+    robot = robot_of_data(data, "four_bar")
+    with pytest.raises(PkmTwinError):
+        compliance(robot, robot.home())
+    at = robot.number("joints.rocker_pin.at[0]")
+    numbers = {"joints.rocker_pin.at[0]": [at, at + 0.01], "joints.motor.compliance[0]": 3e-8}
+    assert judge_compliance(robot, numbers, rng) == 6
+
+
+def test_closures_that_are_left_out_follow_from_the_others():
+    robot = soft("bolted", np.random.default_rng(7), 0.6)
+    elastic, engine = elastic_of(robot), robot.engine
+    chosen = elastic.followers
+    assert chosen is not None
+    for x, q in engine._samples:
+        frame = elastic._frame(Motion(engine.tree, x, q))
+        assert len(chosen.rows) < len(frame.held)
+        assert np.abs(np.array(followed(frame, chosen)[2], float)).max() < 1e-12
+        fewer = replace(chosen, rows=chosen.rows[1:], chosen=chosen.chosen[1:])
+        square = frame.table()[list(fewer.rows)][:, list(fewer.chosen)].astype(float)
+        fewer = replace(fewer, pivots=pivot_order(square[None]))
+        assert np.abs(np.array(followed(frame, fewer)[2], float)).max() > 1e-3
+
+
+def test_a_robot_that_is_rigid_has_no_compliance():
+    robot = load("five_bar")
+    with pytest.raises(ParameterError):
+        variants(robot, {"payload.mass": [0.0, 1.0]}).compliance(robot.home())

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of a robot's elasticity in a row, and the same structure on expressions of them.
+
+May import: numpy, pkm_twin's core, the standard library; never rclpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from pkm_twin.codegen.expressions import SNAP, Numbers, maximum, references, sign, snapped
+from pkm_twin.machine.geometry import marks
+from pkm_twin.machine.graph import Array, Graph
+from pkm_twin.machine.members import Place, Structure
+from pkm_twin.machine.tree import Tree
+
+_LARGEST: Final = 1e300
+"""A compliance above it is infinite."""
+
+Rigidities = Mapping[str, Sequence[Any]]
+"""By beam: EA, GJ, EI, and 12 E I over the shear rigidity."""
+
+
+def numbers_of(structure: Structure) -> list[Any]:
+    """Ends and rigidities of every beam, then all compliances of joints; numbers or expressions."""
+    row: list[Any] = []
+    for beam in structure.beams:
+        row += [*beam.inner[1], *beam.outer[1], *structure.sections[beam.name].rigidities]
+    for values in structure.compliances.values():
+        row += values
+    return row
+
+
+def structure_on(
+    structure: Structure, graph: Graph, numbers: Numbers
+) -> tuple[Structure, Rigidities]:
+    """Beams and compliances on expressions of other numbers, in the order of :func:`numbers_of`.
+
+    What is so in the known case is taken for that: that a beam ends where a joint is, and which
+    compliances are zero, finite or infinite.
+    """
+    left = iter(numbers)
+    places = list(_places(graph))
+
+    def end(place: Place) -> Place:
+        values = np.empty(3, dtype=object)
+        values[:] = [next(left) for _ in range(3)]
+        k = _known(places, values)
+        if k is not None:
+            for known, value in zip(places[k], values, strict=True):
+                snapped(value - known)
+            values = places[k]
+        return place[0], values
+
+    beams, rigidities = [], {}
+    for beam in structure.beams:
+        beams.append(replace(beam, inner=end(beam.inner), outer=end(beam.outer)))
+        rigidities[beam.name] = [next(left) for _ in range(4)]
+    compliances = {
+        name: [next(left) for _ in values] for name, values in structure.compliances.items()
+    }
+    for value in (v for values in compliances.values() for v in values):
+        finite = _is_finite(value)
+        value.tape.assumed.append((finite, finite.value))
+    return replace(structure, beams=tuple(beams), compliances=compliances), rigidities
+
+
+def pattern_of(structure: Structure, tree: Tree) -> str:
+    """Text of what programs take for constant of a structure's numbers."""
+    places, parts = list(_places(tree.graph)), []
+    for beam in structure.beams:
+        for body, at in (beam.inner, beam.outer):
+            local = marks(tree.axes[body].T @ (at - tree.at[body]))
+            parts.append((beam.name, beam.element, beam.parts, body, _known(places, at), local))
+    flags = {n: [float(_is_finite(v)) for v in row] for n, row in structure.compliances.items()}
+    return repr((parts, flags, structure.order))
+
+
+def _places(graph: Graph) -> Iterator[Array]:
+    """Points of a graph in which beams may end."""
+    yield graph.origin
+    yield from (joint.at for joint in graph.joints.values())
+    for rod in graph.rods.values():
+        yield from rod.ends
+
+
+def _known(places: Sequence[Array], at: Any) -> int | None:
+    """Which of some points a place is."""
+    here = references(at)
+    near = (k for k, one in enumerate(places) if np.abs(references(one) - here).max() < SNAP)
+    return next(near, None)
+
+
+def _is_finite(compliance: Any) -> Any:
+    """One of a finite compliance above zero, else zero."""
+    return sign(compliance) * sign(maximum(0.0, _LARGEST - compliance))
