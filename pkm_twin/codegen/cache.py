@@ -25,6 +25,8 @@ _MARK: Final = b"pkm_twin compiled program 2\n"
 _ELF: Final = struct.Struct("<4s36xQ10xHH2x")
 """Magic bytes, then where the table of sections begins, the size of an entry, their number."""
 _LARGEST: Final = 64 * 1024 * 1024
+MOST: Final = 512 * 1024 * 1024
+"""Bytes of all programs above which those that were not used for the longest time are deleted."""
 _LOG: Final = logging.getLogger("pkm_twin")
 
 
@@ -79,6 +81,9 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
             if not _own(os.fstat(file.fileno())):
                 return None
             data = file.read(_LARGEST)
+            # The time of the last use, by which old programs are deleted.
+            with suppress(OSError):
+                os.utime(file.fileno())
     except OSError:
         return None
     seal = len(_MARK) + 32
@@ -131,8 +136,29 @@ def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
         with os.fdopen(handle, "wb") as file:
             file.write(_MARK + hashlib.sha256(body).digest() + body)
         os.replace(temporary, place / name)
+        _shrink(place)
     except OSError as error:
         say_once(error)
         if temporary is not None:
             with suppress(OSError):
                 os.unlink(temporary)
+
+
+def _shrink(place: Path) -> None:
+    """Delete what was not used for the longest time, down to half of :data:`MOST`."""
+    files = []
+    with os.scandir(place) as entries:
+        for entry in entries:
+            with suppress(OSError):
+                status = entry.stat(follow_symlinks=False)
+                files.append((status.st_mtime_ns, status.st_size, entry.path))
+    left = sum(size for _, size, _ in files)
+    if left <= MOST:
+        return
+    for _, size, path in sorted(files):
+        if left <= MOST // 2:
+            return
+        # Another process may have been faster.
+        with suppress(OSError):
+            os.unlink(path)
+        left -= size

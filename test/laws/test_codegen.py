@@ -11,8 +11,8 @@ import sys
 import numpy as np
 import pytest
 
+from pkm_twin.codegen import cache, kernels
 from pkm_twin.codegen import expressions as ex
-from pkm_twin.codegen import kernels
 from pkm_twin.codegen.cholesky import FLOOR, traces_over
 from pkm_twin.codegen.kernels import Code, Kernel
 from pkm_twin.codegen.lu import SparseLU, independent_rows, pivot_order
@@ -201,6 +201,23 @@ def test_the_cache_is_an_optimisation(tmp_path):
     out, lines = finished(start(blocked))
     assert out == first[0]
     assert len(lines) == 1 and "compiled programs are not kept" in lines[0]
+
+
+@compiled
+def test_the_cache_has_a_limit(tmp_path, monkeypatch):
+    """Programs that were not used for the longest time go first."""
+    monkeypatch.setenv("PKM_TWIN_CACHE", str(tmp_path))
+    code = bytes(1000)
+    monkeypatch.setattr(cache, "MOST", 12 * 1200)
+    names = [f"{k:064x}" for k in range(30)]
+    for k, name in enumerate(names):
+        cache.write(name, {}, code)
+        os.utime(tmp_path / name, ns=(k, k))
+        # Used again and again: the newest, whenever it was written.
+        assert cache.read(names[0]) == ({}, code)
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= cache.MOST
+    assert names[0] in left and names[-1] in left and names[1] not in left
 
 
 def other_name(path, other):
