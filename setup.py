@@ -26,6 +26,7 @@ setup(
         "pkm_twin.bags",
         "pkm_twin.codegen",
         "pkm_twin.config",
+        "pkm_twin.design",
         "pkm_twin.export",
         "pkm_twin.identification",
         "pkm_twin.kinematics",

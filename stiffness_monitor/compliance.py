@@ -20,11 +20,13 @@ from numpy.typing import ArrayLike, NDArray
 from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
 from pkm_twin.errors import SingularityError
-from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.machine.robot import Robot
 from stiffness_monitor.programs import NONE, PARTS, elastic_of
 
 Array = NDArray[np.float64]
 
+HELD: Final = 1e-10
+"""Least measure of a frame that holds: it goes with the square of the way to where it does not."""
 TIE: Final = 1e-9
 """Two energies tie where they differ by less than this part of the larger one."""
 _UNLOADED: Final = np.zeros(6)
@@ -98,7 +100,7 @@ def _row(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     """What the program answers, shape (..., size), rejected by sample."""
     elastic = elastic_of(robot)
     one = robot.call_one("response", lambda: elastic.response, NONE, q, wrench)
-    if one is not None and one[-1] > SINGULARITY_BOUND:
+    if one is not None and one[-1] > HELD:
         return one
     q, wrench = doubles(q, "joint positions"), vectors(wrench, 6, "the wrench")
     (rows,), status = elastic.response(NONE, q, wrench)
@@ -113,7 +115,7 @@ def check(
 
     :param measure: of the frame, 0 where it is a mechanism. ``status``: of the program.
     """
-    if status is None and (measure > SINGULARITY_BOUND).all():
+    if status is None and (measure > HELD).all():
         return
     codes = np.zeros(measure.shape) if status is None else status[..., 0]
     for index in np.ndindex(*measure.shape):
@@ -128,9 +130,9 @@ def check(
                     f"wrench, or its energy,{where} is not finite, or leads to a result that is not"
                 )
         found = 0.0 if codes[index] else float(measure[index])
-        if not found > SINGULARITY_BOUND:
+        if not found > HELD:
             frame = "the elastic frame of the pose"
-            raise SingularityError(frame, index, found, SINGULARITY_BOUND)
+            raise SingularityError(frame, index, found, HELD)
 
 
 def compliance(robot: Robot, pose: ArrayLike) -> Array:

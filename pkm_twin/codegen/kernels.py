@@ -243,7 +243,7 @@ class Code:
         if whole.ndim == 1:
             return self.run_one(prepared, arrays)
         shape = whole.shape[:-1]
-        if all(a.ndim == 1 or (a.shape[:-1] == shape and a.flags.c_contiguous) for a in arrays):
+        if all(a.flags.c_contiguous and a.shape[:-1] in ((), shape) for a in arrays):
             quick = self._quick(prepared, arrays, shape)
             if quick is not None:
                 return quick, None

@@ -26,8 +26,9 @@ from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.numbers import FileNumbers, geometry_and_masses
 from pkm_twin.machine.entries import with_entries
 from pkm_twin.machine.geometry import pattern_of
-from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.tree import Tree
+from stiffness_monitor.compliance import HELD
 from stiffness_monitor.numbers import numbers_of
 from stiffness_monitor.programs import elastic_of
 
@@ -157,7 +158,7 @@ class Variants:
         """
         _ = elastic_of(self.robot)
         (flat, measure), good = self._run(_compliance, self.inverse(pose))
-        found = np.where(good & (measure > SINGULARITY_BOUND), flat, np.nan)
+        found = np.where(good & (measure > HELD), flat, np.nan)
         return np.asarray(found.reshape(*flat.shape[:-1], 6, 6), np.float64)
 
     @cached_property

@@ -298,6 +298,15 @@ class TestChanges:
         assert heavy.gravity.tolist() == [0.0, 0.0, -1.62]
         assert heavy.name == robot.name
 
+    def test_other_lengths_make_the_machine_of_another_file(self, load_data):
+        robot = load("delta_cu")
+        other = robot.changed(geometry={"arm_length": 0.21}, payload={"mass": 0.3})
+        data = changed(DELTA, "geometry.arm_length", 0.21)
+        made = load_data(data).changed(payload={"mass": 0.3})
+        assert other.geometry.arm_length == 0.21 and other.name == robot.name
+        assert (other.engine.geometry == made.engine.geometry).all()
+        assert (other.inertial == made.inertial).all()
+
     @pytest.mark.parametrize(
         "sections",
         [
@@ -305,8 +314,8 @@ class TestChanges:
             {"payload": {"mass": 0.5}, "gravity": [0, 0]},
             {"payload": {"mass": -0.5}},
             {"payload": {"mas": 0.5}},
-            {"geometry": {"arm_length": 0.2}},
-            {"inertia": {"arm_mass": 0.2}},
+            {"geometry": {"arm_length": -0.2}},
+            {"inertia": {"arm_mass": -0.2}},
             {"mechanism": "prru"},
             {"nothing": 1},
         ],

@@ -281,9 +281,6 @@ OTHERS = {
     ("delta_dynamics/node.py", "~/joint_trajectory_ff"): "bytes, filled with ControllerNumbers",
     ("pkm_twin/ros/joints.py", ""): "the publishers themselves",
     ("pkm_twin/state/node.py", "~/joint_states"): "joints of the URDF, which are the model's",
-    ("stiffness_monitor/node.py", "~/compliance"): "no joints",
-    ("stiffness_monitor/node.py", "~/compliance_stamped"): "no joints",
-    ("stiffness_monitor/node.py", "~/strain_energy_stamped"): "no joints",
     ("stiffness_monitor/node.py", "~/natural_frequencies"): "no joints",
     ("stiffness_monitor/node.py", "~/natural_frequencies_stamped"): "no joints",
 }
