@@ -151,7 +151,16 @@ class Unit:
         """Helpers and all functions."""
         helpers = [text for op, text in HELPERS.items() if op in self._needed]
         steps = ", ".join(map(str, LADDER))
-        ladder = f"static const int @_steps[{len(LADDER)}] = {{{steps}}};\n"
+        ladder = f"""\
+/* Attempts of Newton's method; fewer shorten the worst case, and reject some valid states. */
+#ifndef PKM_ATTEMPTS
+#define PKM_ATTEMPTS {len(LADDER)}
+#endif
+#if (PKM_ATTEMPTS < 1) || (PKM_ATTEMPTS > {len(LADDER)})
+#error "PKM_ATTEMPTS: 1 to {len(LADDER)}"
+#endif
+static const int @_steps[{len(LADDER)}] = {{{steps}}};
+"""
         parts = [*helpers, _FIXED, ladder, *self._parts]
         return "\n".join(parts).replace("@", self.prefix)
 
@@ -287,7 +296,7 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
             lines += [f"    double {tables};", "    int rung;"]
             work = [
                 "        status = 1;",
-                f"        for (rung = 0; (rung < {len(LADDER)}) && (status == 1); rung++) {{",
+                "        for (rung = 0; (rung < PKM_ATTEMPTS) && (status == 1); rung++) {",
                 f"            if (@_{routine.solver}({q.target}, @_steps[rung], h, x) != 0) {{",
                 *indent("\n".join(work), "        ").split("\n"), "            }", "        }",
             ]  # fmt: skip

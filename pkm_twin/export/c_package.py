@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from delta_dynamics.virtual_work import accelerations, inverse_dynamics, masses_kernel, torques
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression
 from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import TURNS
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c99 import CORRECTIONS, LADDER, Folding, Routine, Unit, edge
 from pkm_twin.export.c_lines import HEAD, table
@@ -346,7 +347,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         names = list(self.robot.joint_names)
         return README.format(
             name=self.prefix, robot=self.prefix.removeprefix("pkm_"), joints=", ".join(names),
-            rows="\n".join(rows), corrections=f"{CORRECTIONS:,}", attempts=len(LADDER),
+            rows="\n".join(rows), corrections=f"{CORRECTIONS:,}", attempts=len(LADDER), turns=TURNS,
             stack=largest // 1000 + 3,
             dynamics="" if self.massive else MASSLESS,
             payload=PAYLOAD.format(name=self.prefix, macro=self.macro) if self.massive else "",

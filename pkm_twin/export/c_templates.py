@@ -124,6 +124,9 @@ at most {corrections} corrections and computes the rest at most {attempts} times
 input. The table counts additions, multiplications, divisions and functions of `math.h`; a sine
 and cosine are about 30 operations. `_inverse` also calls `_forward` once.
 
+The last attempts are the long ones. Compile with `-DPKM_ATTEMPTS=1` to make only the first one: at
+most {turns} corrections, but valid states far from home may be rejected with status 1.
+
 | function | operations of a correction | other operations |
 |---|---:|---:|
 {rows}

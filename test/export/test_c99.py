@@ -141,6 +141,17 @@ def test_poses_beyond_reach_or_a_singularity_are_rejected_as_in_python(exported,
     assert np.isnan(found[~good]).all()
 
 
+def test_one_attempt_rejects_more_and_never_errs(exported, rng):
+    robot, package = exported
+    q = wild(robot, rng, 300)
+    right, good = robot.try_forward(q)
+    status, found = package.run(package.build(*PLAIN, "-DPKM_ATTEMPTS=1"), "forward", q)
+    at_once = status == 0.0
+    assert at_once.any() and (good | ~at_once).all()
+    near = at_once & (robot.try_singularity(q)[0] > 1e-3)
+    np.testing.assert_allclose(found[near], right[near], 1e-9, 1e-9 * robot.graph.size)
+
+
 def test_what_is_not_finite_has_status_2(exported):
     robot, package = exported
     program = package.build(*PLAIN)
