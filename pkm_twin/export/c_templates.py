@@ -114,7 +114,7 @@ drive.
 
 The code evaluates the same formulas as the Python functions of pkm_twin, in double precision.
 Results agree to 1e-12 of the largest value, those of elasticity to 1e-11, where the singularity
-index is above 0.1. The error grows as the index falls.
+index is above 0.2. The error grows as the index falls.
 
 ## Worst case
 
