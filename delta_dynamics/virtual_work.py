@@ -13,8 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.arrays import finite, vectors
-from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, sign
+from pkm_twin.codegen.arrays import vectors
+from pkm_twin.codegen.cholesky import SparseCholesky
+from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, maximum, minimum, sign
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
@@ -26,6 +27,8 @@ from pkm_twin.machine.robot import Robot
 Array = NDArray[np.float64]
 
 _NO_WRENCH: Final = np.zeros(6)
+MASSLESS: Final = 1e-12
+"""Least pivot of the mass matrix over its diagonal entry, at which accelerations are computed."""
 
 
 def inverse_dynamics(
@@ -109,11 +112,22 @@ def forward_dynamics(
 
     :param tau: what the actuators apply, shape (..., n), N m or N; errors and the others as there.
     """
-    n = robot.joints_count
-    rest = vectors(tau, n, "efforts") - inverse_dynamics(robot, q, qd, np.zeros(n), wrench)
-    with np.errstate(over="ignore", invalid="ignore"):
-        qdd = np.linalg.solve(mass_matrix(robot, q), rest[..., None])[..., 0]
-    return finite(qdd, "an effort")
+    load = _NO_WRENCH if wrench is None else wrench
+    p = robot.inertial
+    one = robot.call_one("accelerations", lambda: accelerations(robot), p, q, qd, tau, load)
+    if one is not None:
+        return one
+    (qdd,), status = accelerations(robot)(
+        p, q, qd, vectors(tau, robot.joints_count, "efforts"), load
+    )
+    if status is not None:
+        robot.refuse_joints(status, q, (q, qd, tau, load))
+    return qdd
+
+
+def accelerations(robot: Robot) -> Kernel:
+    """The program of :func:`forward_dynamics`: q, qd, efforts and wrench to qdd."""
+    return robot.massive().kernel("accelerations", _accelerations)
 
 
 @dataclass(frozen=True)
@@ -288,11 +302,10 @@ def begun(t: Traced) -> tuple[Layout, list[Objects]]:
     return layout, layout.split(t.tape.inputs(PARAMETERS, layout.size))
 
 
-def torque_program(t: Traced) -> Program:
-    """The program of :func:`torques`, to write others with."""
-    layout, (bodies, rods, gravity, viscous, coulomb, offset, rotors, passive) = begun(t)
-    n = t.joints
-    qd, qdd, wrench = t.tape.inputs("qd", n), t.tape.inputs("qdd", n), t.tape.inputs("wrench", 6)
+def _efforts(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[Any]:
+    """Efforts for a motion under the input ``wrench``."""
+    bodies, rods, gravity, viscous, coulomb, offset, rotors, passive = parts
+    wrench = t.tape.inputs("wrench", 6)
     t.set_rates(qd)
     t.set_accelerations(qdd, gravity)
     forces = Forces(t.motion)
@@ -304,14 +317,38 @@ def torque_program(t: Traced) -> Program:
     unknown, driven = forces.generalised()
     multipliers = t.lu.solve_transposed(unknown)
     efforts = driven - t.jq[t.engine.kept].T @ multipliers
-    tau = [
+    return [
         efforts[k]
         + (viscous[k] * qd[k] + coulomb[k] * sign(qd[k]) + offset[k])
         + rotors[k] * qdd[k]
-        for k in range(n)
+        for k in range(t.joints)
     ]
+
+
+def torque_program(t: Traced) -> Program:
+    """The program of :func:`torques`, to write others with."""
+    layout, parts = begun(t)
+    n = t.joints
+    tau = _efforts(t, parts, t.tape.inputs("qd", n), t.tape.inputs("qdd", n))
     sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
     return Program(sizes, layout.size, {"efforts": t.lift(tau)}, t.equations())
+
+
+def _accelerations(t: Traced) -> Program:
+    layout, parts = begun(t)
+    n = t.joints
+    rest = t.tape.inputs("tau", n) - _efforts(t, parts, t.tape.inputs("qd", n), np.zeros(n))
+    mass = np.reshape(mass_entries(t, parts), (n, n))
+    lower = {(i, j): mass[i, j] for i in range(n) for j in range(i + 1)}
+    root = SparseCholesky(lower, list(np.diag(mass)))
+    least: Any = 1.0
+    for index, pivot in zip(root.order, root.pivots, strict=True):
+        least = minimum(least, pivot / mass[index, index])
+    # Infinite where something would move without mass: the sample is rejected.
+    sound = 1.0 / sign(maximum(least - MASSLESS, 0.0))
+    outputs = {"accelerations": t.lift([value * sound for value in root.solve(rest)])}
+    sizes = {"q": n, "qd": n, "tau": n, "wrench": 6}
+    return Program(sizes, layout.size, outputs, t.equations())
 
 
 def mass_entries(

@@ -25,7 +25,7 @@ MAY = {
     "pkm_twin.machine": CORE,
     "pkm_twin.kinematics": CORE,
     "pkm_twin.mechanisms": CORE,
-    "pkm_twin.export": CORE,
+    "pkm_twin.export": CORE | TWINS,
     "pkm_twin.design": CORE | TWINS,
     "pkm_twin.identification": CORE,
     PURE: {"pkm_twin.machine"},

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -38,7 +39,29 @@ def moveit(
     from pkm_twin.export.moveit import moveit_package
 
     loaded = load(robot)
-    files = moveit_package(loaded, _accelerations(loaded), kinematics_plugin)
+    _write(out, moveit_package(loaded, _accelerations(loaded), kinematics_plugin), overwrite)
+
+
+@app.command()
+def c(
+    robot: RobotName,
+    out: Annotated[Path, typer.Option(help="folder of the package, made anew")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
+) -> None:
+    """Write kinematics, dynamics and elasticity as C99 that needs only math.h.
+
+    For controllers in C or C++, PLCs and Simulink: no heap, no recursion, bounded loops, a status
+    from every function. The payload is that of the robot's file; functions that end in _with take
+    another one.
+    """
+    from pkm_twin import load
+    from pkm_twin.export.c_package import c_package
+
+    _write(out, c_package(load(robot)), overwrite)
+
+
+def _write(out: Path, files: Mapping[str, str], overwrite: bool) -> None:
+    """Write the files of a package; all or, where one may not be replaced, none."""
     for name in files:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         refuse_existing(out / name, overwrite)

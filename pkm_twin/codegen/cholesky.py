@@ -53,6 +53,18 @@ class SparseCholesky:
                         left[i, k] = left.get((i, k), 0.0) - self.factors[i, j] * left[k, j]
             self.below.append(column)
 
+    def solve(self, right: Sequence[Any]) -> list[Any]:
+        """X of A x = right, shape (n,)."""
+        b = [right[index] for index in self.order]
+        for j, rows in enumerate(self.below):
+            for i in rows:
+                b[i] = b[i] - self.factors[i, j] * b[j]
+        for j in reversed(range(len(b))):
+            b[j] = b[j] / self.pivots[j]
+            for i in self.below[j]:
+                b[j] = b[j] - self.factors[i, j] * b[i]
+        return [b[self.place[index]] for index in range(len(b))]
+
 
 def _order(matrix: Mapping[tuple[int, int], Any], n: int, last: int) -> list[int]:
     """Least degree first, but the first ``last`` come last."""

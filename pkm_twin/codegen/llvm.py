@@ -32,6 +32,7 @@ from pkm_twin.codegen.assembly import (
     vector,
     whole,
 )
+from pkm_twin.codegen.elementary import ATAN_P, ATAN_Q, COSINE, MORE, QUARTER, SINE
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, SAMPLE, Expression, ordered, uses
 from pkm_twin.codegen.program import (
     CHANGE,
@@ -60,29 +61,6 @@ MASK: Final = vector(BIT, LANES)
 TRUE: Final = every(Value(BIT, "true"), LANES)
 ZERO: Final = whole(0)
 ONE: Final = whole(1)
-
-# Minimax polynomials of sine and cosine up to a quarter turn, and pi / 2 in three parts
-# (Cody and Waite 1980; coefficients as in Cephes, public domain).
-_SINE: Final = (
-    1.58962301576546568060e-10, -2.50507477628578072866e-8, 2.75573136213857245213e-6,
-    -1.98412698295895385996e-4, 8.33333333332211858878e-3, -1.66666666666666307295e-1,
-)  # fmt: skip
-_COSINE: Final = (
-    -1.13585365213876817300e-11, 2.08757008419747316778e-9, -2.75573141792967388112e-7,
-    2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.16666666666665929218e-2,
-)  # fmt: skip
-_QUARTER: Final = (1.5707963267341256e00, 6.0771005065061922e-11, 2.0222662487959506e-21)
-# Arctangent up to 0.66 as x + x z P(z) / Q(z), z = x^2 (Cephes).
-_ATAN_P: Final = (
-    -8.750608600031904122785e-1, -1.615753718733365076637e1, -7.500855792314704667340e1,
-    -1.228866684490136173410e2, -6.485021904942025371773e1,
-)  # fmt: skip
-_ATAN_Q: Final = (
-    1.0, 2.485846490142306297962e1, 1.650270098316988542046e2, 4.328810604912902668951e2,
-    4.853903996359136964868e2, 1.945506571482613964425e2,
-)  # fmt: skip
-_MORE: Final = 6.123233995736765886130e-17
-"""pi / 2 less its nearest double."""
 
 
 def _initialise() -> None:
@@ -184,12 +162,12 @@ class _Emitter:
         b, n = self.b, self.number
         quarters = self.call("rint", b.fmul(x, n(2 / math.pi)))
         y = x
-        for part in _QUARTER:
+        for part in QUARTER:
             y = self.fused(quarters, n(-part), y)
         z = b.fmul(y, y)
-        sine = self.fused(b.fmul(z, y), self.polynomial(z, _SINE), y)
+        sine = self.fused(b.fmul(z, y), self.polynomial(z, SINE), y)
         cosine = b.fadd(
-            self.fused(z, n(-0.5), n(1.0)), b.fmul(b.fmul(z, z), self.polynomial(z, _COSINE))
+            self.fused(z, n(-0.5), n(1.0)), b.fmul(b.fmul(z, z), self.polynomial(z, COSINE))
         )
         k = b.fptosi(quarters, self.integer)
         odd = b.icmp("ne", b.and_(k, self.whole(1)), self.whole(0))
@@ -215,12 +193,12 @@ class _Emitter:
         high = b.fcmp("ogt", t, n(0.66))
         u = b.select(high, b.fdiv(b.fsub(t, n(1.0)), b.fadd(t, n(1.0))), t)
         z = b.fmul(u, u)
-        ratio = b.fdiv(self.polynomial(z, _ATAN_P), self.polynomial(z, _ATAN_Q))
+        ratio = b.fdiv(self.polynomial(z, ATAN_P), self.polynomial(z, ATAN_Q))
         angle = self.fused(b.fmul(u, z), ratio, u)
-        angle = b.select(high, b.fadd(b.fadd(angle, n(_MORE / 2)), n(math.pi / 4)), angle)
-        angle = b.select(steep, b.fadd(b.fsub(n(math.pi / 2), angle), n(_MORE)), angle)
+        angle = b.select(high, b.fadd(b.fadd(angle, n(MORE / 2)), n(math.pi / 4)), angle)
+        angle = b.select(steep, b.fadd(b.fsub(n(math.pi / 2), angle), n(MORE)), angle)
         back = b.icmp("slt", b.bitcast(x, self.integer), self.whole(0))
-        angle = b.select(back, b.fadd(b.fsub(n(math.pi), angle), n(2 * _MORE)), angle)
+        angle = b.select(back, b.fadd(b.fsub(n(math.pi), angle), n(2 * MORE)), angle)
         sign = b.and_(b.bitcast(y, self.integer), self.whole(-(2**63)))
         return b.bitcast(b.or_(b.bitcast(angle, self.integer), sign), self.type)
 

@@ -12,6 +12,7 @@ import pytest
 import delta_dynamics as dynamics
 import stiffness_monitor as elasticity
 from pkm_twin.codegen.arrays import doubles, later
+from pkm_twin.machine.catalogue import robot_of_data
 from stiffness_monitor.modes import natural_frequencies
 from test.support.robots import load
 
@@ -300,3 +301,26 @@ def test_times_of_samples():
     for time, last in ((np.nan, None), (np.inf, 1.0), (1.0, 1.0), (0.5, 1.0), (np.nan, 1.0)):
         with pytest.raises(ValueError, match="time of a sample"):
             later(time, last)
+
+
+def test_a_state_that_moves_no_mass_has_no_accelerations():
+    """A point mass at the end of two links: in line with both joints it has no radial motion."""
+    point = {"mass": 1.0, "com": [1.0, 0.0, 0.0], "inertia": [0.0, 0.0, 0.0]}
+    joint = {"type": "revolute", "axis": [0.0, 0.0, 1.0], "actuated": True}
+    data = {
+        "mechanism": "machine",
+        "platform": "outer",
+        "pose": ["x", "y"],
+        "bodies": {"inner": point | {"mass": 0.0}, "outer": point},
+        "joints": {
+            "shoulder": joint | {"between": ["base", "inner"], "at": [0.0, 0.0, 0.0]},
+            "elbow": joint | {"between": ["inner", "outer"], "at": [0.6, 0.5, 0.0]},
+        },
+    }
+    robot = robot_of_data(data, "point")
+    # The elbow turns the second link into the line of the first.
+    line = robot.graph.home + np.array([0.0, np.arctan2(0.5, 0.6) - np.arctan2(-0.5, 0.4)])
+    with pytest.raises(ValueError, match="finite"):
+        dynamics.forward_dynamics(robot, line, [0.0, 0.0], [1.0, 2.0])
+    beside = line + np.array([0.0, 0.1])
+    assert np.isfinite(dynamics.forward_dynamics(robot, beside, [0.0, 0.0], [1.0, 2.0])).all()

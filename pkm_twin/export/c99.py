@@ -1,0 +1,369 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Programs of one machine as C99: math.h only, no heap, no recursion, bounded loops.
+
+A machine's numbers are folded into its programs, so that the code has fewer operations than the
+one that all machines of a structure share. Newton's method makes the same tests in the same order
+as the other back ends.
+
+May import: pkm_twin's codegen, the standard library.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from textwrap import indent
+from typing import Any, Final
+
+from pkm_twin.codegen import expressions
+from pkm_twin.codegen.expressions import PARAMETER, SAMPLE, Expression, Tape, count, ordered
+from pkm_twin.codegen.kernels import STEPS
+from pkm_twin.codegen.program import (
+    CHANGE,
+    CLOSED,
+    CONTRACTION,
+    RESIDUAL,
+    STEPPED,
+    TURNS,
+    UNKNOWNS,
+    Equations,
+)
+from pkm_twin.export.c_lines import HELPERS, Lines, bare, number, table
+
+LADDER: Final = (1, *STEPS)
+"""Steps of Newton's method, one attempt after the other."""
+CORRECTIONS: Final = TURNS * sum(LADDER)
+"""Most corrections of a call."""
+_LARGE: Final = 1e300
+_OPERATIONS: Final[Mapping[str, Callable[..., Any]]] = {
+    "add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg,
+    "inv": lambda x: 1.0 / x, "sqrt": expressions.sqrt, "sin": expressions.sin,
+    "cos": expressions.cos, "abs": expressions.absolute, "sign": expressions.sign,
+    "atan2": expressions.atan2, "min": expressions.minimum, "max": expressions.maximum,
+}  # fmt: skip
+
+
+class Folding:
+    """Programs rewritten on one tape, with numbers in place of some inputs."""
+
+    def __init__(self) -> None:
+        self.tape = Tape()
+
+    def __call__(
+        self, results: Iterable[Expression], given: Mapping[str, Sequence[Any]]
+    ) -> list[Expression]:
+        """The results with numbers, or expressions of this tape, for the inputs that are given."""
+        results = list(results)
+        made: dict[int, Expression] = {}
+        for e in ordered(results):
+            value: Any
+            if e.op == "const":
+                value = e.a
+            elif e.op == "in":
+                value = given[e.a][e.b] if e.a in given else self.tape.input(e.a, e.b)
+            else:
+                value = _OPERATIONS[e.op](*(made[x.number] for x in (e.a, e.b) if x is not None))
+            made[e.number] = self.tape.lift(value)
+        return [made[e.number] for e in results]
+
+    def equations(self, q: Equations, given: Mapping[str, Sequence[Any]]) -> Equations:
+        """The same of equations; the known state is constant then."""
+        size, determinant, residual = self([q.size, q.determinant, q.residual], given)
+        return Equations(
+            q.target, self(q.home, given), self(q.origin, given),
+            None if q.start is None else self(q.start, given), self(q.corrected, given),
+            size, determinant, residual, q.guessed, self(q.branch, given),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Routine:
+    """One public function.
+
+    ``outputs``: expressions by argument. ``gates``: above zero where a sample is rejected.
+    ``equations``: name of the solver, see :meth:`Unit.solver`; empty without.
+    """
+
+    name: str
+    inputs: Mapping[str, int]
+    outputs: Mapping[str, Sequence[Expression]]
+    gates: Sequence[Expression] = ()
+    solver: str = ""
+    summary: str = ""
+
+
+_FIXED: Final = f"""\
+static int @_finite(const double *values, int count)
+{{
+    double total = 0.0;
+    int i;
+    for (i = 0; i < count; i++) {{
+        total += fabs(values[i]);
+    }}
+    return (total < HUGE_VAL) ? 1 : 0;
+}}
+
+/* Status of results r, behind which stand the square of the closures' residual, and numbers that
+   are above zero in the machine's own assembly. */
+static int @_judged(const double *r, int results, int branches)
+{{
+    int i;
+    if (!(r[results] <= {RESIDUAL**2!r})) {{
+        return 1;
+    }}
+    for (i = 1; i <= branches; i++) {{
+        if (!(r[results + i] > 0.0)) {{
+            return 1;
+        }}
+    }}
+    return (@_finite(r, results) != 0) ? 0 : 2;
+}}
+
+static void @_give(int status, const double *values, double *out, int count)
+{{
+    int i;
+    for (i = 0; i < count; i++) {{
+        out[i] = (status == 0) ? values[i] : (double)NAN;
+    }}
+}}
+"""
+
+
+class Unit:
+    """The C text of one machine's functions, which grows with each that is added.
+
+    :param prefix: of all names.
+    :param parameters: expressions of the tape that a caller gives as a table of numbers.
+    """
+
+    def __init__(self, prefix: str, parameters: Sequence[Expression]) -> None:
+        self.prefix = prefix
+        self._known = {e.number: f"p[{k}]" for k, e in enumerate(parameters)}
+        self._needed: set[str] = set()
+        self._parts: list[str] = []
+        self._solvers: dict[str, Equations] = {}
+        self._ahead: dict[str, dict[int, str]] = {}
+        self.doubles: dict[str, int] = {}
+        """Local doubles of every function, by name."""
+
+    def text(self) -> str:
+        """Helpers and all functions."""
+        helpers = [text for op, text in HELPERS.items() if op in self._needed]
+        steps = ", ".join(map(str, LADDER))
+        ladder = f"""\
+/* Attempts of Newton's method; fewer shorten the worst case, and reject some valid states. */
+#ifndef PKM_ATTEMPTS
+#define PKM_ATTEMPTS {len(LADDER)}
+#endif
+#if (PKM_ATTEMPTS < 1) || (PKM_ATTEMPTS > {len(LADDER)})
+#error "PKM_ATTEMPTS: 1 to {len(LADDER)}"
+#endif
+static const int @_steps[{len(LADDER)}] = {{{steps}}};
+"""
+        parts = [*helpers, _FIXED, ladder, *self._parts]
+        return "\n".join(parts).replace("@", self.prefix)
+
+    def add(self, text: str) -> None:
+        """A part as it is; ``@`` stands for the prefix."""
+        self._parts.append(text)
+
+    def function(
+        self,
+        name: str,
+        results: Sequence[Expression],
+        known: Mapping[int, str],
+        called: Mapping[str, str] | None = None,
+    ) -> str:
+        """A static function of what the results hang on; how to call it, ``%s`` for its target.
+
+        :param known: texts of expressions that stand in tables of its arguments.
+        :param called: what callers give for an argument of another name.
+        """
+        order = ordered(results, known)
+        below = [x for e in order for x in (e.a, e.b) if isinstance(x, Expression)]
+        tables = {known[e.number] for e in (*results, *below) if e.number in known}
+        arguments = sorted({text.partition("[")[0] for text in tables})
+        arguments += sorted({e.a for e in order if e.op == "in"})
+        made = Lines(results, known)
+        self._needed |= made.needed
+        lines = made.lines + [f"    r[{k}] = {bare(text)};" for k, text in enumerate(made.results)]
+        head = ", ".join([*(f"const double *{a}" for a in arguments), "double *r"])
+        self._parts.append(f"static void @_{name}({head})\n{{\n" + "\n".join(lines) + "\n}\n")
+        self.doubles[name] = made.doubles
+        return f"@_{name}({', '.join([*((called or {}).get(a, a) for a in arguments), '%s'])})"
+
+    def solver(self, name: str, q: Equations) -> None:
+        """Newton's method for the unknowns, in so many steps."""
+        self._solvers[name] = q
+        n, m = len(q.home), len(q.origin)
+        if not n:
+            return
+        # What the unknowns have no part in is computed once a step, and the last for the results.
+        ahead = _without(UNKNOWNS, q.results)
+        known = self._ahead[name] = {e.number: f"h[{k}]" for k, e in enumerate(ahead)}
+        aim = {q.target: "aim"}
+        prepare = self.function(f"{name}_ahead", ahead, {}, aim) % "h" if ahead else "(void)h"
+        call = self.function(f"{name}_correct", q.results, known, aim)
+        start = ""
+        if q.start is not None:
+            begin = self.function(f"{name}_start", q.start, known, aim) % "x"
+            start = f"\n        if (steps == 1) {{\n            {begin};\n        }}"
+        least, size = _choice(q.least, STEPPED), _choice(q.before, _LARGE)
+        self.add(table(f"@_{name}_home", [e.a for e in q.home]))
+        self.add(table(f"@_{name}_origin", [e.a for e in q.origin]))
+        self.add(f"""\
+/* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
+static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
+{{
+    double aim[{m}], next[{n + 2}];
+    int i, k;
+    for (i = 0; i < {n}; i++) {{
+        x[i] = @_{name}_home[i];
+    }}
+    for (k = 1; k <= steps; k++) {{
+        const double left = 1.0 - ((double)k / (double)steps);
+        const double part = 1.0 - ((left * left) * left);
+        double size = {size};
+        double before = 0.0;
+        int turn;
+        for (i = 0; i < {m}; i++) {{
+            const double from = @_{name}_origin[i];
+            aim[i] = (k == steps) ? {q.target}[i] : (from + (part * ({q.target}[i] - from)));
+        }}
+        {prepare};{start}
+        for (turn = 0; turn < {TURNS}; turn++) {{
+            double square, det;
+            {call % "next"};
+            square = next[{n}];
+            det = next[{n + 1}];
+            if (!(square <= ({CONTRACTION**2!r} * size))) {{
+                return 0;
+            }}
+            if (!(det > {least})) {{
+                return 0;
+            }}
+            if ((turn > 0) && !(before <= ({CHANGE!r} * det))) {{
+                return 0;
+            }}
+            if ((turn > 0) && !(det <= ({CHANGE!r} * before))) {{
+                return 0;
+            }}
+            for (i = 0; i < {n}; i++) {{
+                x[i] = next[i];
+            }}
+            size = square;
+            before = det;
+            if (size <= {CLOSED**2!r}) {{
+                break;
+            }}
+        }}
+        if (!(size <= {CLOSED**2!r})) {{
+            return 0;
+        }}
+    }}
+    return 1;
+}}
+""")
+
+    def signature(self, routine: Routine, *, given: bool) -> str:
+        """Head of a public function, or of its form with parameters."""
+        arguments = [f"const double *{name}" for name in routine.inputs]
+        arguments += [f"double *{name}" for name in routine.outputs]
+        first = ["const double *parameters"] if given else []
+        return f"int @_{routine.name}{'_with' if given else ''}({', '.join(first + arguments)})"
+
+    def routine(self, routine: Routine, kind: str = "") -> None:
+        """A function with parameters.
+
+        :param kind: ``static`` and what its name ends on then.
+        """
+        q = self._solvers.get(routine.solver)
+        results = [e for row in routine.outputs.values() for e in row]
+        wanted = [*results, *routine.gates]
+        judged = [] if q is None else [q.residual, *q.branch]
+        known = self._known | self._ahead.get(routine.solver, {})
+        given = {"p": "parameters"}
+        call = self.function(f"{routine.name}_of", [*wanted, *judged], known, given) % "r"
+        finite = [f"(@_finite({name}, {size}) != 0)" for name, size in routine.inputs.items()]
+        verdict = f"status = @_judged(r, {len(wanted)}, {len(judged) - 1});"
+        if q is None:
+            verdict = f"status = (@_finite(r, {len(wanted)}) != 0) ? 0 : 2;"
+        lines = [f"    double r[{len(wanted) + len(judged)}];"]
+        work = [f"        {call};", f"        {verdict}"]
+        if q is not None and q.home:
+            tables = f"h[{len(known) - len(self._known) or 1}], {UNKNOWNS}[{len(q.home)}]"
+            lines += [f"    double {tables};", "    int rung;"]
+            work = [
+                "        status = 1;",
+                "        for (rung = 0; (rung < PKM_ATTEMPTS) && (status == 1); rung++) {",
+                f"            if (@_{routine.solver}({q.target}, @_steps[rung], h, x) != 0) {{",
+                *indent("\n".join(work), "        ").split("\n"), "            }", "        }",
+            ]  # fmt: skip
+        lines.append("    int status = 2;")
+        if "parameters" not in call:
+            lines.append("    (void)parameters;")
+        lines += [f"    if ({' && '.join(finite)}) {{", *work]
+        lines.append("    }")
+        for k in range(len(routine.gates)):
+            at = len(results) + k
+            lines += [
+                f"    if ((status == 0) && !(r[{at}] <= 0.0)) {{",
+                "        status = 1;",
+                "    }",
+            ]
+        at = 0
+        for name, row in routine.outputs.items():
+            source = f"&r[{at}]" if at else "r"
+            lines.append(f"    @_give(status, {source}, {name}, {len(row)});")
+            at += len(row)
+        lines.append("    return status;")
+        self.doubles[routine.name] = len(wanted) + len(judged)
+        self.add(f"{kind}{self.signature(routine, given=True)}\n{{\n" + "\n".join(lines) + "\n}\n")
+
+    def own(self, routine: Routine) -> None:
+        """The same function with this machine's own parameters."""
+        names = ", ".join(["@_own", *routine.inputs, *routine.outputs])
+        self.add(
+            f"{self.signature(routine, given=False)}\n{{\n"
+            f"    return @_{routine.name}_with({names});\n}}\n"
+        )
+
+    def operations(self, routine: Routine) -> tuple[int, int]:
+        """Operations of one correction, and of the results."""
+        q = self._solvers.get(routine.solver)
+        judged = [] if q is None else [q.residual, *q.branch]
+        results = [e for row in routine.outputs.values() for e in row]
+        solving = count(q.results) if q is not None and q.home else 0
+        return solving, count([*results, *routine.gates, *judged])
+
+
+def edge(rows: Iterable[Sequence[Expression]]) -> list[Expression]:
+    """What hangs on parameters alone and is read by results or what hangs on samples."""
+    found: dict[int, Expression] = {}
+    for results in rows:
+        found |= {e.number: e for e in results if e.level == PARAMETER}
+        for e in ordered(results):
+            if e.level == SAMPLE and e.op != "in":
+                found |= {x.number: x for x in (e.a, e.b) if x is not None and x.level == PARAMETER}
+    return list(found.values())
+
+
+def _without(name: str, results: Sequence[Expression]) -> list[Expression]:
+    """What hangs on other inputs alone, and what hangs on this one reads."""
+    moved: set[int] = set()
+    found: dict[int, Expression] = {}
+    for e in ordered(results):
+        below = [x for x in (e.a, e.b) if isinstance(x, Expression)]
+        if (e.op == "in" and e.a == name) or any(x.number in moved for x in below):
+            moved.add(e.number)
+            still = (x for x in below if x.number not in moved and x.op not in ("in", "const"))
+            found |= {x.number: x for x in still}
+    return list(found.values())
+
+
+def _choice(once: float, stepped: float) -> str:
+    """A bound of Newton's method in one step, and in more."""
+    if once == stepped:
+        return number(once)
+    return f"((steps == 1) ? {number(once)} : {number(stepped)})"

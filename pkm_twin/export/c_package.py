@@ -1,0 +1,379 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot as a package of C99: header, source, example, CMakeLists.txt and README.
+
+May import: numpy, pkm_twin's core, delta_dynamics, stiffness_monitor, the standard library.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.virtual_work import accelerations, inverse_dynamics, masses_kernel, torques
+from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import TURNS
+from pkm_twin.errors import ParameterError
+from pkm_twin.export.c99 import CORRECTIONS, LADDER, Folding, Routine, Unit, edge
+from pkm_twin.export.c_lines import HEAD, table
+from pkm_twin.export.c_templates import (
+    ABOUT,
+    CMAKE,
+    EXAMPLE,
+    MASSLESS,
+    PARAMETERS_OF,
+    PAYLOAD,
+    README,
+)
+from pkm_twin.machine.inertia import Layout
+from pkm_twin.machine.robot import SAME_POSE, SINGULARITY_BOUND, Robot
+from stiffness_monitor.compliance import HELD
+from stiffness_monitor.programs import Elastic, elastic_of
+
+Array = NDArray[np.float64]
+
+SOLVER: Final = "assembly"
+"""Newton's method for the passive joints, of all functions of q."""
+POSED: Final = "reach"
+"""The same for the joints of a pose, where there is no closed form."""
+CANDIDATE: Final = "candidate"
+
+
+def identifier(name: str) -> str:
+    """A robot's name as a part of a C identifier."""
+    return re.sub(r"[^A-Za-z0-9_]", "_", name) or "robot"
+
+
+def c_package(robot: Robot) -> dict[str, str]:
+    """The files of the package, text by name.
+
+    A robot without masses has no functions of dynamics, one without elastic members none of
+    elasticity.
+    """
+    made = _Package(robot)
+    return {
+        f"{made.prefix}.h": made.header(),
+        f"{made.prefix}.c": made.source(),
+        "example.c": made.example(),
+        "CMakeLists.txt": made.cmake(),
+        "README.md": made.readme(),
+    }
+
+
+class _Package:
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.prefix = f"pkm_{identifier(robot.name)}"
+        self.macro = self.prefix.upper()
+        self.n, self.m = robot.joints_count, len(robot.pose_names)
+        self.massive = _has(robot.massive)
+        self.elastic: Elastic | None = elastic_of(robot) if _has(robot.structure) else None
+        self.fold = Folding()
+        self.payload = self.fold.tape.inputs(PARAMETERS, 13)
+        forward = self._read(robot.engine.forward)
+        equations = forward[0].program.equations
+        assert equations is not None  # noqa: S101
+        self.equations = self.fold.equations(equations, forward[1])
+        self.routines = self._routines()
+        rows = [[e for row in r.outputs.values() for e in row] for r in self.routines]
+        # A table of no numbers is none in C.
+        self.parameters = edge(rows) or [self.payload[0]]
+        self.unit = Unit(self.prefix, self.parameters)
+        self._write()
+
+    # Programs.
+
+    def _read(
+        self, kernel: Kernel, own: Sequence[Any] | Array = ()
+    ) -> tuple[Kernel, dict[str, Sequence[Any]]]:
+        """A kernel with what is given to its program."""
+        geometry = [float(value) for value in kernel.geometry]
+        return kernel, {GEOMETRY: geometry, PARAMETERS: list(own)}
+
+    def _rows(self, kernel: Kernel, own: Sequence[Any] | Array = ()) -> dict[str, list[Expression]]:
+        program, given = kernel.program, self._read(kernel, own)[1]
+        return {name: self.fold(row, given) for name, row in program.outputs.items()}
+
+    def _routines(self) -> list[Routine]:
+        robot, n = self.robot, self.n
+        q, rates, wrench = {"q": n}, {"q": n, "qd": n}, {"wrench": 6}
+        result: list[Routine] = []
+
+        def add(
+            name: str, summary: str, inputs: Mapping[str, int], *gates: Expression, **outputs: Any
+        ) -> None:
+            result.append(Routine(name, inputs, outputs, gates, SOLVER, summary))
+
+        if self.massive:
+            p = self._inertial()
+            (tau,) = self._rows(torques(robot), p).values()
+            add(
+                "torques", "Actuator efforts tau (N m or N) for a motion.",
+                rates | {"qdd": n} | wrench, tau=tau,
+            )  # fmt: skip
+        forward = self._rows(robot.engine.forward)
+        add("forward", "Pose of joint positions.", q, pose=forward["pose"])
+        add(
+            "platform",
+            "Position (m) of the platform's reference point in base axes, and the platform's "
+            "rotation from home, row by row.",
+            q, position=forward["position"], rotation=forward["rotation"],
+        )  # fmt: skip
+        if self.massive:
+            (masses,) = self._rows(masses_kernel(robot), p).values()
+            add("mass_matrix", "Mass matrix of the actuated joints, row by row.", q, m=masses)
+            (qdd,) = self._rows(accelerations(robot), p).values()
+            add(
+                "accelerations", "Joint accelerations that efforts tau cause.",
+                rates | {"tau": n} | wrench, qdd=qdd,
+            )  # fmt: skip
+        rates_of = self._rows(robot.engine.jacobian)["rates"]
+        add("jacobian", "Pose rates per joint rate, row by row.", q, j=rates_of)
+        (index,) = self._rows(robot.singularity_kernel()).values()
+        add("singularity", "Singularity index: 0 in a singularity, 1 at best.", q, index=index)
+        if self.elastic is not None:
+            self._add_elastic(self.elastic, add)
+        return result
+
+    def _add_elastic(self, elastic: Elastic, add: Callable[..., None]) -> None:
+        (row,) = self._rows(elastic.response).values()
+        k = len(elastic.names)
+        mechanism = self.fold.tape.lift(HELD - row[-1])
+        add(
+            "compliance",
+            "Compliance of the platform at its reference point, joints locked: x y z rx ry rz, "
+            "base axes, row by row.",
+            {"q": self.n}, mechanism, c=row[2 * k + 7 : 2 * k + 43],
+        )  # fmt: skip
+        add(
+            "strain_energy", f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
+            {"q": self.n, "wrench": 6}, mechanism, energies=row[k : 2 * k],
+        )  # fmt: skip
+
+    def _inertial(self) -> Array:
+        """Run-time inputs of the dynamics, by the payload's numbers."""
+        mass, com, inertia = self.payload[0], self.payload[1:4], self.payload[4:].reshape(3, 3)
+        layout = Layout(self.robot.engine.tree)
+        return np.asarray(self.robot.own_inertial + layout.payload(mass, com, inertia))
+
+    def _payload(self) -> list[float]:
+        load = self.robot.payload
+        return [float(load.mass), *map(float, load.com), *np.ravel(load.inertia).tolist()]
+
+    # The source.
+
+    def _write(self) -> None:
+        unit, robot = self.unit, self.robot
+        own = self.fold(self.parameters, {PARAMETERS: self._payload()})
+        unit.add(table("@_own", [e.a for e in own]))
+        unit.solver(SOLVER, self.equations)
+        if self.massive:
+            self._write_parameters()
+        for routine in self.routines:
+            unit.routine(routine)
+            unit.own(routine)
+        kernel = robot.inverse_kernel
+        given = self._read(kernel)[1]
+        outputs, gates, solver = self._rows(kernel), [], ""
+        if "faults" in outputs:
+            *misses, measure = outputs["faults"]
+            gates = [*misses, self.fold.tape.lift(SINGULARITY_BOUND - measure)]
+        if kernel.program.equations is not None:
+            solver = POSED
+            unit.solver(POSED, self.fold.equations(kernel.program.equations, given))
+        summary = "Joint positions of a pose, accepted only if _forward of them is the pose."
+        candidate = Routine(CANDIDATE, {"pose": self.m}, {"q": outputs["q"]}, gates, solver)
+        unit.routine(candidate, "static ")
+        self.inverse = Routine(
+            "inverse", {"pose": self.m}, {"q": outputs["q"]}, (), solver, summary
+        )
+        self.candidate = candidate
+        self._write_inverse()
+        unit.own(self.inverse)
+
+    def _write_parameters(self) -> None:
+        unit, size = self.unit, len(self.parameters)
+        call = unit.function("prepare", self.parameters, {})
+        unit.add(f"""\
+int @_parameters(double mass, const double *com, const double *inertia, double *out)
+{{
+    double p[13], r[{size}];
+    int i, status;
+    p[0] = mass;
+    for (i = 0; i < 3; i++) {{
+        p[1 + i] = com[i];
+    }}
+    for (i = 0; i < 9; i++) {{
+        p[4 + i] = inertia[i];
+    }}
+    {call % "r"};
+    status = ((mass >= 0.0) && (@_finite(p, 13) != 0) && (@_finite(r, {size}) != 0)) ? 0 : 2;
+    @_give(status, r, out, {size});
+    return status;
+}}
+""")
+
+    def _write_inverse(self) -> None:
+        """Joints of a pose may belong to another assembly: ``forward`` decides."""
+        robot, n, m = self.robot, self.n, self.m
+        turns = [1.0 if turn else 0.0 for turn in robot._turn_mask]
+        test = "            double apart = there[i] - pose[i];\n"
+        if any(turns):
+            self.unit.add(table("@_full_turn", [turn * 2.0 * np.pi for turn in turns]))
+            test += (
+                "            if (@_full_turn[i] > 0.0) {\n"
+                "                apart = remainder(apart, @_full_turn[i]);\n            }\n"
+            )
+        self.unit.add(table("@_same", [SAME_POSE / float(unit) for unit in robot._pose_units]))
+        self.unit.add(f"""\
+{self.unit.signature(self.inverse, given=True)}
+{{
+    double found[{n}], there[{m}];
+    int i;
+    int status = @_{CANDIDATE}_with(parameters, pose, found);
+    if (status == 0) {{
+        status = (@_forward_with(parameters, found, there) != 0) ? 1 : 0;
+        for (i = 0; (i < {m}) && (status == 0); i++) {{
+{test}            if (!(fabs(apart) <= @_same[i])) {{
+                status = 1;
+            }}
+        }}
+    }}
+    @_give(status, found, q, {n});
+    return status;
+}}
+""")
+
+    def source(self) -> str:
+        return (
+            f"/* SPDX-License-Identifier: Apache-2.0 */\n/* {self._title} */\n"
+            f'#include "{self.prefix}.h"\n\n{HEAD}\n{self.unit.text()}'
+        )
+
+    @property
+    def _title(self) -> str:
+        name = self.prefix.removeprefix("pkm_")
+        return f"{name}: written by pkm-twin export c, which overwrites changes."
+
+    @property
+    def public(self) -> list[Routine]:
+        """All functions, the inverse behind the forward."""
+        at = [r.name for r in self.routines].index("forward") + 1
+        return [*self.routines[:at], self.inverse, *self.routines[at:]]
+
+    def header(self) -> str:
+        """Declarations, with what each function takes."""
+        guard, size = f"{self.macro}_H", len(self.parameters)
+        robot = self.robot
+        joints = _listed(zip(robot.joint_names, robot.joint_units, strict=True))
+        pose = _listed(zip(robot.pose_names, robot.pose_units, strict=True))
+        sizes = [("JOINTS", self.n), ("POSE", self.m), ("PARAMETERS", size)]
+        if self.elastic is not None:
+            sizes.append(("ELEMENTS", len(self.elastic.names)))
+        # In capitals as macros are, and with the robot's own spelling as the functions have it.
+        spelled = dict.fromkeys([self.macro, f"PKM_{self.prefix.removeprefix('pkm_')}"])
+        lines = [f"#define {m}_{name} {count}" for m in spelled for name, count in sizes]
+        parts = []
+        for routine in self.public:
+            shape = ", ".join(f"{name}[{len(row)}]" for name, row in routine.outputs.items())
+            takes = ", ".join(f"{name}[{count}]" for name, count in routine.inputs.items())
+            parts.append(
+                _comment(f"{routine.summary} {takes} -> {shape}.")
+                + f"\n{self.unit.signature(routine, given=False)};\n"
+                + f"{self.unit.signature(routine, given=True)};\n"
+            )
+        if self.massive:
+            what = _comment(PARAMETERS_OF.format(size=size))
+            parts.append(
+                f"{what}\nint @_parameters(double mass, const double *com, "
+                "const double *inertia, double *out);\n"
+            )
+        about = _comment(ABOUT.format(joints=joints, pose=pose))
+        text = "\n".join([
+            "/* SPDX-License-Identifier: Apache-2.0 */", f"/* {self._title} */", f"#ifndef {guard}",
+            f"#define {guard}", "", about, "", *lines, "",
+            '#ifdef __cplusplus\nextern "C" {\n#endif', "", *parts,
+            "#ifdef __cplusplus\n}\n#endif", "", f"#endif /* {guard} */", "",
+        ])  # fmt: skip
+        return text.replace("@", self.prefix)
+
+    # Beside it.
+
+    def example(self) -> str:
+        """Home, checked against the Python functions."""
+        robot, home = self.robot, self.robot.graph.home
+        rates = np.full(self.n, 0.1)
+        tests = {
+            "pose": ("forward(q, pose)", robot.forward(home)),
+            "joints": ("inverse(pose, joints)", home),
+        }
+        given = {"q": home}
+        if self.massive:
+            tau = inverse_dynamics(robot, home, rates, rates)
+            tests["tau"] = "torques(q, rates, rates, wrench, tau)", tau
+            given |= {"rates": rates, "wrench": np.zeros(6)}
+        for name, (_, values) in tests.items():
+            given[f"right_{name}"] = np.round(values, 9) + 0.0
+        rows = [
+            table(name, values.tolist()).removeprefix("static ") for name, values in given.items()
+        ]
+        sizes = ", ".join(f"{name}[{len(values)}]" for name, (_, values) in tests.items())
+        calls = [
+            f'bad |= differs("{name}", @_{call}, {name}, right_{name}, {len(values)});\n'
+            for name, (call, values) in tests.items()
+        ]
+        declared = textwrap.indent("".join(rows) + f"double {sizes};", "    ")
+        return EXAMPLE.format(
+            title=self._title, name=self.prefix, declared=declared,
+            calls=textwrap.indent("".join(calls), "    ").rstrip().replace("@", self.prefix),
+        )  # fmt: skip
+
+    def cmake(self) -> str:
+        """A static library, and the example as a test."""
+        return CMAKE.format(name=self.prefix)
+
+    def readme(self) -> str:
+        """What the functions are, and what they cost at most."""
+        rows = []
+        newton = 0
+        for routine in self.public:
+            read = self.candidate if routine is self.inverse else routine
+            newton, results = self.unit.operations(read)
+            rows.append(f"| `{self.prefix}_{routine.name}` | {newton or '-'} | {results} |")
+        doubles = self.unit.doubles
+        largest = max(doubles.values()) * 8
+        names = list(self.robot.joint_names)
+        return README.format(
+            name=self.prefix, robot=self.prefix.removeprefix("pkm_"), joints=", ".join(names),
+            rows="\n".join(rows), corrections=f"{CORRECTIONS:,}", attempts=len(LADDER), turns=TURNS,
+            stack=largest // 1000 + 3,
+            dynamics="" if self.massive else MASSLESS,
+            payload=PAYLOAD.format(name=self.prefix, macro=self.macro) if self.massive else "",
+        )  # fmt: skip
+
+
+def _has(ask: Callable[[], object]) -> bool:
+    """Whether the robot's file gives what is asked for."""
+    try:
+        ask()
+    except ParameterError:
+        return False
+    return True
+
+
+def _listed(pairs: Any) -> str:
+    return ", ".join(f"{name} ({unit})" for name, unit in pairs)
+
+
+def _comment(text: str) -> str:
+    """A comment of lines of a readable length."""
+    # What a name may hold must neither end the comment nor be a trigraph in it.
+    safe = "".join(c if c.isprintable() else " " for c in text)
+    for bad in ("*/", "/*", "??"):
+        safe = safe.replace(bad, " ".join(bad))
+    return "/* " + "\n   ".join(textwrap.wrap(safe, 92)) + " */"

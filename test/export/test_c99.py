@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot in C: the same numbers and verdicts as in Python, and code that compilers accept."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pkm_twin import robot_names
+from pkm_twin.apps.cli import main
+from pkm_twin.export.c_package import c_package, identifier
+from test.support.robots import (
+    joint_range,
+    load,
+    loaded,
+    massless,
+    often,
+    partly_long,
+    random_joints,
+    random_motion,
+)
+
+from .c_programs import COMPILERS, SANITIZED, Package, functions, inputs_of
+
+pytestmark = pytest.mark.skipif(not COMPILERS, reason="there is no C compiler: gcc or clang")
+
+MACHINES = Path(__file__).parent.parent / "machine" / "machines"
+# Of the chain rccc every state is near a singularity.
+UNSEEN = {p.stem: p for p in sorted(MACHINES.glob("*.yaml")) if p.stem != "rccc"}
+KEPT = ("delta_cu", "stewart", "rrr3_planar", "bolted")
+"""Rods with members, six joints, revolute joints in a plane, and bars that hold twice."""
+NAMES = [*robot_names(), *(name for name in UNSEEN if name not in robot_names())]
+STRICT = (
+    "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wvla", "-Wundef",
+    "-Wfloat-equal", "-Wdouble-promotion", "-Wcast-qual", "-Werror",
+)  # fmt: skip
+CLOSE = {"compliance": 1e-11, "strain_energy": 1e-11}
+"""Of the largest value; by default 1e-12. The frame's stiffness has a condition of 1e4 to 1e6."""
+PLAIN = ("-O0",)
+"""What compiles in a moment."""
+FLAGS = [PLAIN, *((f"-O{k}", *more) for k in range(4) for more in ((), ("-mfma",)))]
+
+
+def robot_of(name):
+    return loaded(name) if name in robot_names() else load(UNSEEN[name])
+
+
+@pytest.fixture(scope="module", params=partly_long(NAMES, *KEPT))
+def exported(request, tmp_path_factory):
+    robot = robot_of(request.param)
+    return robot, Package(tmp_path_factory.mktemp("c"), c_package(robot))
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A machine whose code compiles in a moment."""
+    robot = loaded("five_bar")
+    return robot, Package(tmp_path_factory.mktemp("c"), c_package(robot))
+
+
+@pytest.mark.parametrize("count", often(200, 10_000))
+@pytest.mark.parametrize("flags", partly_long(dict.fromkeys(FLAGS), PLAIN), ids=" ".join)
+def test_numbers_are_those_of_python(exported, flags, count):
+    robot, package = exported
+    program = package.build(*flags)
+    asked = functions(robot)
+    assert set(package.heads) == set(asked)
+    motion = random_motion(robot, np.random.default_rng(5), count)
+    inputs = inputs_of(robot, motion)
+    # Nearer to a singularity rounding grows, in all back ends alike.
+    share = np.where(robot.singularity(motion[0]) > 0.2, 1.0, 10.0)[:, None]
+    for name, ask in asked.items():
+        status, found = package.run(program, name, *inputs[name])
+        right = ask(*inputs[name])
+        assert not status.any(), name
+        error = np.abs(found - right) / share
+        assert error.max() <= CLOSE.get(name, 1e-12) * np.abs(right).max(), name
+
+
+def wild(robot, rng, count):
+    """Joint positions of which many have no assembly, and not one is near the others."""
+    middle, half = joint_range(robot)
+    return middle + half * rng.uniform(-4.0, 4.0, (count, len(middle)))
+
+
+def edges(robot, bad):
+    """Joint positions on both sides of where the way from home to bad ones ends.
+
+    Nearer than this, rounding decides.
+    """
+    home, good, far = robot.graph.home, np.zeros((len(bad), 1)), np.ones((len(bad), 1))
+    for _ in range(40):
+        half = (good + far) / 2
+        fits = robot.try_forward(home + half * (bad - home))[1][:, None]
+        good, far = np.where(fits, half, good), np.where(fits, far, half)
+    sides = [good * (1.0 + side) for side in (-1e-3, -1e-5, 1e-5, 1e-3)]
+    return np.concatenate([home + side * (bad - home) for side in sides])
+
+
+@pytest.mark.parametrize("count", often(300, 10_000))
+def test_verdicts_are_those_of_python(exported, count, rng):
+    robot, package = exported
+    program = package.build(*PLAIN)
+    q = wild(robot, rng, count)
+    right, good = robot.try_forward(q)
+    status, found = package.run(program, "forward", q)
+    assert set(status) <= {0.0, 1.0}
+    np.testing.assert_array_equal(status == 0.0, good)
+    assert np.isnan(found[~good]).all()
+    # A state beside a singularity magnifies rounding.
+    clear = good & (robot.try_singularity(q)[0] > 1e-3)
+    np.testing.assert_allclose(found[clear], right[clear], 1e-9, 1e-9 * robot.graph.size)
+    if not good.all():
+        at_edge = edges(robot, q[~good][:100])
+        status, _ = package.run(program, "forward", at_edge)
+        np.testing.assert_array_equal(status == 0.0, robot.try_forward(at_edge)[1])
+    for name, rows in inputs_of(robot, (q, *np.zeros((2, *q.shape)), np.zeros((count, 6)))).items():
+        if name not in ("inverse", "compliance", "strain_energy", "accelerations"):
+            status, _ = package.run(program, name, *rows)
+            np.testing.assert_array_equal(status == 0.0, good, err_msg=name)
+
+
+@pytest.mark.parametrize("count", often(300, 10_000))
+def test_poses_beyond_reach_or_a_singularity_are_rejected_as_in_python(exported, count, rng):
+    robot, package = exported
+    near = robot.forward(random_joints(robot, rng, 20))
+    center, size = near.mean(0), np.ptp(near, axis=0)
+    away = rng.uniform(-1.0, 1.0, (count, len(center))) * rng.uniform(0.0, 4.0, (count, 1))
+    poses = center + size * away
+    right, good = robot.try_inverse(poses)
+    status, found = package.run(package.build(*PLAIN), "inverse", poses)
+    assert good.any()
+    np.testing.assert_array_equal(status == 0.0, good)
+    clear = np.array(good)
+    clear[good] = robot.singularity(right[good]) > 1e-3
+    np.testing.assert_allclose(found[clear], right[clear], 1e-9, 1e-9)
+    assert np.isnan(found[~good]).all()
+
+
+def test_one_attempt_rejects_more_and_never_errs(exported, rng):
+    robot, package = exported
+    q = wild(robot, rng, 300)
+    right, good = robot.try_forward(q)
+    status, found = package.run(package.build(*PLAIN, "-DPKM_ATTEMPTS=1"), "forward", q)
+    at_once = status == 0.0
+    assert at_once.any() and (good | ~at_once).all()
+    near = at_once & (robot.try_singularity(q)[0] > 1e-3)
+    np.testing.assert_allclose(found[near], right[near], 1e-9, 1e-9 * robot.graph.size)
+
+
+def test_what_is_not_finite_has_status_2(exported):
+    robot, package = exported
+    program = package.build(*PLAIN)
+    motion = random_motion(robot, np.random.default_rng(6), 1)
+    for name, rows in inputs_of(robot, motion).items():
+        for k, row in enumerate(rows):
+            for bad in (np.nan, np.inf, -np.inf):
+                given = [np.repeat(one, row.size, 0) for one in rows]
+                np.fill_diagonal(given[k], bad)
+                status, found = package.run(program, name, *given)
+                assert (status == 2.0).all(), (name, k, bad)
+                assert np.isnan(found).all()
+
+
+@pytest.mark.parametrize("name", partly_long(NAMES, "five_bar", "bolted"))
+def test_nothing_undefined_happens(name, tmp_path):
+    """In states of all kinds, under the sanitizers of addresses and undefined behaviour."""
+    robot = robot_of(name)
+    package = Package(tmp_path, c_package(robot))
+    program = package.build("-O1", *SANITIZED)
+    rng = np.random.default_rng(7)
+    home = robot.graph.home
+    far = [size * wild(robot, rng, 5) for size in (1.0, 4.0, 1e3, 1e12, 1e300)]
+    q = np.concatenate([random_joints(robot, rng, 5), [home, np.nan * home], *far])
+    ones = np.ones_like(q)
+    for name, rows in inputs_of(robot, (q, ones, ones, np.ones((len(q), 6)))).items():
+        if name == "inverse":
+            rows = (
+                np.concatenate([rows[0], 10.0 * np.nan_to_num(rows[0]), q[:, : rows[0].shape[1]]]),
+            )
+        status, found = package.run(program, name, *rows)
+        assert np.isnan(found[status != 0.0]).all()
+        assert np.isfinite(found[status == 0.0]).all()
+
+
+LANGUAGES = "-std=c99 -fsyntax-only", "-x c++ -std=c++17 -fsyntax-only", "-std=c99 -O2 -mfma"
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("language", partly_long(LANGUAGES, *LANGUAGES[:2]))
+def test_compilers_warn_of_nothing(exported, compiler, language):
+    """Optimisation finds more: what is not initialised, or never read."""
+    _, package = exported
+    for name in (f"{package.prefix}.c", "example.c"):
+        command = [compiler, *language.split(), *STRICT, "-c", name, "-o", os.devnull]
+        done = subprocess.run(
+            command, cwd=package.folder, capture_output=True, text=True, check=False
+        )
+        assert not done.returncode, done.stderr
+
+
+def test_only_constants_and_functions_of_the_robot_s_name(small):
+    """No heap, no variable outside of functions, no name that another program may have."""
+    _, package = small
+    text = (package.folder / f"{package.prefix}.c").read_text()
+    assert re.findall(r"#include (\S+)", text) == [f'"{package.prefix}.h"', "<math.h>"]
+    assert not re.search(r"\b(malloc|calloc|realloc|free|alloca|goto)\b", text)
+    for line in text.splitlines():
+        if line.startswith("static") and not line.rstrip().endswith(")"):
+            assert line.startswith("static const "), line
+    package.build("-O0")
+    subprocess.run(
+        [COMPILERS[0], "-std=c99", "-c", f"{package.prefix}.c", "-o", "o.o"],
+        cwd=package.folder, check=True,
+    )  # fmt: skip
+    symbols = subprocess.run(
+        ["nm", "o.o"], cwd=package.folder, capture_output=True, text=True, check=True
+    ).stdout
+    kinds = dict(re.findall(r"(\w) (\w+)$", symbols, re.MULTILINE)[::-1])
+    assert not set(kinds) & set("dDbBcC"), symbols
+    own = re.findall(r" [a-zA-TV-Z] (\w+)", symbols)
+    assert own and all(name.startswith(package.prefix) for name in own)
+
+
+@pytest.mark.parametrize("name", partly_long(robot_names(), "five_bar"))
+def test_another_payload_by_parameters(name, tmp_path, rng):
+    robot = load(name)
+    mass, com = 0.7, np.array([0.02, -0.01, 0.03])
+    inertia = np.array([[3e-4, 1e-5, -2e-5], [1e-5, 4e-4, 3e-5], [-2e-5, 3e-5, 2e-4]])
+    package = Package(tmp_path, c_package(robot))
+    size = int(re.search(r"_PARAMETERS (\d+)", package.header).group(1))
+    numbers = [mass, *com, *inertia.ravel()]
+    given = ", ".join(map(repr, map(float, numbers)))
+    driver = (package.folder / "driver.c").read_text()
+    driver = driver.replace("    long row;\n", f"""\
+    long row;
+    static const double load[13] = {{{given}}};
+    double parameters[{size}];
+    if (@_parameters(-1.0, load + 1, load + 4, parameters) != 2) {{ return 7; }}
+    if (@_parameters(load[0], load + 1, load + 4, parameters) != 0) {{ return 7; }}
+""".replace("@", package.prefix))  # fmt: skip
+    driver = re.sub(rf"(\(double\){package.prefix}_\w+)\(", r"\1_with(parameters, ", driver)
+    (package.folder / "driver.c").write_text(driver)
+    program = package.build("-O1")
+    load_section = {"mass": mass, "com": com.tolist(), "inertia": inertia.tolist()}
+    other = robot.changed(payload=load_section)
+    asked = functions(other)
+    inputs = inputs_of(other, random_motion(other, rng, 50))
+    for name, ask in asked.items():
+        status, found = package.run(program, name, *inputs[name])
+        right = ask(*inputs[name])
+        assert not status.any(), name
+        np.testing.assert_allclose(
+            found, right, 0.0, CLOSE.get(name, 1e-12) * np.abs(right).max(), err_msg=name
+        )
+
+
+def test_the_command_s_example_agrees_with_python(tmp_path, small):
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "c", "five_bar", "--out", str(tmp_path / "out")])
+    assert not ended.value.code
+    command = [COMPILERS[0], "-std=c99", "example.c", "pkm_five_bar.c", "-o", "example", "-lm"]
+    subprocess.run(command, cwd=tmp_path / "out", check=True)
+    done = subprocess.run(["./example"], cwd=tmp_path / "out", check=False, capture_output=True)
+    assert not done.returncode
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "c", "five_bar", "--out", str(tmp_path / "out")])
+    assert ended.value.code
+
+
+def test_every_run_writes_the_same_bytes(tmp_path):
+    texts = []
+    for seed in ("1", "2"):
+        out = tmp_path / seed
+        command = [sys.executable, "-m", "pkm_twin.apps.cli", "export", "c", "five_bar"]
+        environment = os.environ | {"PYTHONHASHSEED": seed}
+        subprocess.run([*command, "--out", str(out)], env=environment, check=True)
+        texts.append({path.name: path.read_bytes() for path in out.iterdir()})
+    assert texts[0] == texts[1] and len(texts[0]) == 5
+
+
+def test_a_robot_without_masses_has_kinematics_and_elasticity(tmp_path):
+    robot = load(massless(tmp_path / "hollow-1.yaml"))
+    package = Package(tmp_path / "out", c_package(robot))
+    assert set(package.heads) == set(functions(robot))
+    assert "torques" not in package.heads and "compliance" in package.heads
+    assert package.prefix == "pkm_hollow_1"
+    q = random_joints(robot, np.random.default_rng(0), 5)
+    status, found = package.run(package.build("-O0"), "forward", q)
+    assert not status.any()
+    np.testing.assert_allclose(found, robot.forward(q), 1e-12, 1e-14)
+
+
+def test_names_become_identifiers():
+    for name in ("my robot-2", "3rps", "größe", "a/b.c", "", "*/", "int"):
+        assert re.fullmatch(r"[A-Za-z0-9_]+", identifier(name))
