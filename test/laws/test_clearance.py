@@ -207,7 +207,7 @@ def test_thicker_members_leave_that_much_less(variant, rng):
     for name, times in (("prru", 2), ("upr_rpu", 3)):
         thin = load(name)
         poses = random_poses(thin, rng, 50)
-        diameter = 2 * max(beam.radius for beam in thin.beams)
+        diameter = 2 * float(max(beam.radius for beam in thin.beams))
         section = (
             {"limb": tube(times * diameter)} if name == "prru" else {"diameter": times * diameter}
         )

@@ -91,7 +91,12 @@ def test_every_joint_number_is_the_controllers(cell, peer):
         peer.send("/wrench", MAKE.wrench(push, now))
         peer.send("/setpoint", MAKE.joint_state(both.names, both.positions(near), (), (), now))
 
-    peer.until(lambda: all(peer.received(topic) for topic in TOPICS), repeat=send)
+    def answered():
+        gate = peer.received("/command_gate/commands_stamped")
+        # It begins with zeros.
+        return all(peer.received(topic) for topic in TOPICS) and any(gate[-1].effort)
+
+    peer.until(answered, repeat=send)
     last = {topic: peer.received(topic)[-1] for topic in TOPICS}
 
     def close(topic, field, expected, scale):
