@@ -246,7 +246,13 @@ class Code:
         if all(a.flags.c_contiguous and a.shape[:-1] in ((), shape) for a in arrays):
             quick = self._quick(prepared, arrays, shape)
             if quick is not None:
-                return quick, None
+                outputs, status = quick
+                if status is not None:
+                    count = len(status)
+                    rows = [a.reshape(1, 1 if a.ndim == 1 else count, a.shape[-1]) for a in arrays]
+                    flat = [output.reshape(count, output.shape[-1]) for output in outputs]
+                    status = self._finished(prepared.reshape(1, -1), rows, flat, status, count)
+                return outputs, None if status is None else status.reshape(*shape, 2)
         batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
         count = math.prod(batch)
         if count == 0:
@@ -264,8 +270,8 @@ class Code:
 
     def _quick(
         self, prepared: Array, arrays: Sequence[Array], shape: tuple[int, ...]
-    ) -> list[Array] | None:
-        """Outputs of a batch as it lies in memory; None where a sample is not good at once."""
+    ) -> tuple[list[Array], Array | None] | None:
+        """A batch as it lies in memory in one step, as :meth:`_run`; None where it is too large."""
         header, _, code, locked = self._loaded
         count = math.prod(shape)
         if locked is None or not 0 < count <= SMALL:
@@ -282,7 +288,8 @@ class Code:
             outputs.append(block[start:end].reshape(*shape, size))
             words.append(place + 8 * start)
         words.append(place + 8 * end)
-        return None if code((ctypes.c_int64 * len(words))(*words)) else outputs
+        bad = code((ctypes.c_int64 * len(words))(*words))
+        return outputs, block[end:].reshape(count, 2) if bad else None
 
     def run_each(self, prepared: Array, *inputs: Array) -> tuple[list[Array], Array | None]:
         """The same of many machines.
@@ -331,10 +338,7 @@ class Code:
             outputs = [view.reshape(1, -1).copy() for view in space.outputs]
             status = space.status.reshape(1, 2).copy()
             self._spaces.append(space)
-        if status is not None and self._stepped:
-            self._try_again(prepared.reshape(1, -1), rows, outputs, status, 1)
-            if not status[0, 0]:
-                status = None
+        status = self._finished(prepared.reshape(1, -1), rows, outputs, status, 1)
         return [output[0] for output in outputs], None if status is None else status[0]
 
     def first_of_one(self, prepared: Array) -> Callable[..., Array | None]:
@@ -361,11 +365,21 @@ class Code:
     ) -> tuple[list[Array], Array | None]:
         """All samples of all machines, with more steps where one does not do."""
         outputs, status = self._run(prepared, rows, count, 1)
-        if status is not None and self._stepped:
-            self._try_again(prepared, rows, outputs, status, count)
-            if not status[:, 0].any():
-                status = None
-        return outputs, status
+        return outputs, self._finished(prepared, rows, outputs, status, count)
+
+    def _finished(
+        self,
+        prepared: Array,
+        rows: Sequence[Array],
+        outputs: Sequence[Array],
+        status: Array | None,
+        count: int,
+    ) -> Array | None:
+        """The status after more steps, with outputs written in place; None if all is good."""
+        if status is None or not self._stepped:
+            return status
+        self._try_again(prepared, rows, outputs, status, count)
+        return status if status[:, 0].any() else None
 
     def _try_again(
         self,
