@@ -17,6 +17,7 @@ PLACES = {
     "state.node": (6.6, 4.2),
     "atlas": (2.0, 4.2),
     "export": (-1.2, 4.9),
+    "design": (4.4, 5.1),
     "paths": (-1.0, 3.4),
     "ros": (5.6, 3.3),
     "delta_dynamics": (0.6, 3.0),
