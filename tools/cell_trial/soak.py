@@ -26,8 +26,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Float64MultiArray
 
 from pkm_twin.bags.reader import inspect
+from pkm_twin.machine.catalogue import robot_path
 
-MACHINES = {"picker": "delta_cu", "head": "prru"}
+MACHINES = {
+    "picker": ("delta_cu", "friction: {viscous: 0.1, coulomb: 0.5}"),
+    "head": ("prru", "friction: {viscous: 300.0, coulomb: 80.0}"),
+}
+"""Namespace: robot and its friction. Efforts of a model alone do not hold a machine without any."""
 WARM = 15.0
 FAULTS = ("lost: ", " rejected: ", "stopped: ", "closed: ", "exceptions", "times behind")
 
@@ -67,7 +72,16 @@ class Watch:
         return found
 
 
-def simulators(period: float) -> list[Process]:
+def robots(folder: Path) -> dict[str, Path]:
+    """A parameter file for each namespace."""
+    files = {}
+    for space, (robot, friction) in MACHINES.items():
+        files[space] = folder / f"{robot}.yaml"
+        files[space].write_text(f"{robot_path(robot).read_text()}\n{friction}\n")
+    return files
+
+
+def simulators(files: dict[str, Path], period: float) -> list[Process]:
     """A machine for each namespace, moved by the efforts of its gate."""
     return [
         node(
@@ -75,13 +89,13 @@ def simulators(period: float) -> list[Process]:
             parameters=(f"mechanism:={robot}", f"period:={period}"),
             remap=(f"__ns:=/{space}", f"~/commands:=/{space}/command_gate/commands"),
         )
-        for space, robot in MACHINES.items()
+        for space, robot in files.items()
     ]
 
 
-def launched(*extra: str) -> Process:
+def launched(files: dict[str, Path], *extra: str) -> Process:
     """cell.launch.py with all nodes."""
-    machines = ",".join(f"{space}={robot}" for space, robot in MACHINES.items())
+    machines = ",".join(f"{space}={robot}" for space, robot in files.items())
     return Process(
         "ros2", "launch", "pkm_twin", "cell.launch.py", f"machines:={machines}",
         "command_gate:=true", "machine_state:=true", *extra,
@@ -133,8 +147,9 @@ def cell(other: Peer, seconds: float, extra: tuple[str, ...]) -> bool:
     watch = Watch(other)
     folder = Path(tempfile.mkdtemp())
     bag = folder / "bag"
-    sims = simulators(0.004)
-    cell_ = launched(*extra)
+    files = robots(folder)
+    sims = simulators(files, 0.004)
+    cell_ = launched(files, *extra)
     topics = [f"/{s}/{t}" for s in MACHINES for t in ("joint_states", "wrench")]
     recorder = Process("ros2", "bag", "record", "--storage", "mcap", "-o", str(bag), *topics)
     try:
@@ -182,12 +197,14 @@ def stops(other: Peer, times: int) -> bool:
     topics = {space: f"/{space}/command_gate/commands" for space in MACHINES}
     for topic in topics.values():
         watch.gate(topic)
-    sims = simulators(0.004)
+    folder = Path(tempfile.mkdtemp())
+    files = robots(folder)
+    sims = simulators(files, 0.004)
     ends: Counter[str] = Counter()
     try:
         for _ in range(times):
             watch.commands.clear()
-            cell_ = launched()
+            cell_ = launched(files)
             other.until(
                 lambda: (
                     len(watch.commands) == len(topics)
@@ -213,6 +230,7 @@ def stops(other: Peer, times: int) -> bool:
     finally:
         for sim in sims:
             sim.close()
+        shutil.rmtree(folder, ignore_errors=True)
     print("Ctrl-C of a running cell: " + "; ".join(f"{n} {end}" for end, n in ends.items()))
     return set(ends) == {"clean, zeros"}
 
