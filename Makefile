@@ -10,7 +10,7 @@ SEED ?= 1
 ENDLESS := test/bags/test_fuzz.py test/fuzz/test_nodes.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale pages clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale pages docs clean help
 
 help:
 	@echo "make demo         set up .venv, run both nodes on the recorded bags, table and picture in out/"
@@ -24,7 +24,8 @@ help:
 	@echo "make soak         ten million poses, and all nodes in all weathers, in flat memory (MINUTES)"
 	@echo "make audit        known vulnerabilities of what is installed"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
-	@echo "make pages        docs/parameters.md from the schemas, pictures of imports, robots and the page"
+	@echo "make pages        docs/parameters.md and commands.md from the code, pictures of imports, robots and the page"
+	@echo "make docs         the site, in out/site"
 	@echo "make clean        remove .venv, out and caches"
 
 # One stamp a set of extras, made anew when the requirements change.
@@ -95,10 +96,15 @@ scale: $(VENV)/test.stamp
 
 pages: $(VENV)/test.stamp
 	$(BIN)/python -m test.docs.parameters docs/parameters.md
+	$(BIN)/python -m test.docs.commands docs/commands.md
 	$(BIN)/python -m test.docs.engine docs/engine.md
 	$(BIN)/python -m test.docs.architecture docs/architecture.png
 	$(BIN)/python -m test.docs.robots docs/gallery
 	$(BIN)/python -m test.docs.view docs/gallery
+
+# Strict: a warning is an error.
+docs: $(VENV)/docs.stamp
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks

@@ -78,6 +78,7 @@ setup(
             "ros-jazzy-common-interfaces==5.3.6",
             "threadpoolctl",
         ],
+        "docs": ["mkdocs-material", "mkdocstrings[python]"],
         "test": [
             "colcon-core",
             "colcon-library-path",

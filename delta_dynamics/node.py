@@ -80,7 +80,7 @@ class DeltaDynamics(health.TwinNode):
     """Feedforward torques from the virtual-work model of any robot with masses."""
 
     def __init__(self) -> None:
-        super().__init__("delta_dynamics")
+        super().__init__("delta_dynamics", executor="events")
         robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
         # Before there is a topic to be found by: the first start compiles for many seconds.
         warm_up(robot)

@@ -24,18 +24,18 @@ from delta_dynamics.feedforward import warm_up
 from delta_dynamics.gate import effort_limits
 from delta_dynamics.simulation import (
     MachineSettings,
-    Measured,
     PayloadEvent,
     Simulation,
     WrenchSignal,
     tuned,
 )
 from pkm_twin import load
+from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.variation import KINDS, MAX_SPREAD, Variation, varied
 from pkm_twin.ros import node as health
-from pkm_twin.ros.intake import RawTrajectory
+from pkm_twin.ros.intake import DoublesTemplate, RawTrajectory
 from pkm_twin.ros.joints import FIELDS, JointPublisher
 from pkm_twin.ros.messages import SECOND
 from pkm_twin.ros.run import run
@@ -57,6 +57,7 @@ CLOCK_PERIOD: Final = 5_000_000
 ALONE: Final = 1.0
 """In lockstep: how long an answer is waited for, s of the wall."""
 LOOK: Final = 0.05
+WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 OWN_CLOCK: Final = "false: the machine has a clock of its own"
 
 
@@ -255,6 +256,15 @@ class MachineSim(health.TwinNode):
     def _create_topics(self) -> None:
         self._states = JointPublisher(self, self._simulation.robot, "joint_states", FIELDS)
         self._wrenches = self.create_guarded_publisher(WrenchStamped, "wrench")
+        self._wrench = DoublesTemplate(
+            WRENCH,
+            message_definition(WRENCH),
+            {
+                "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": self._frame},
+                "wrench": {part: dict.fromkeys("xyz", 0.0) for part in ("force", "torque")},
+            },
+            stamped=True,
+        )
         kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._drawn = self.create_publisher(DiagnosticArray, "~/drawn", kept)
         self._clock_topic = self.create_publisher(Clock, "/clock", 10) if self._simulated else None
@@ -326,11 +336,11 @@ class MachineSim(health.TwinNode):
 
     def _publish(self) -> None:
         measured = self._simulation.measured()
-        stamp = Time(nanoseconds=measured.stamp).to_msg()
         if self._clock_topic is not None and measured.stamp >= self._clock_due:
             self._clock_due = measured.stamp + CLOCK_PERIOD
-            self._clock_topic.publish(Clock(clock=stamp))
-        self._wrenches.publish(self._wrench(measured, stamp))
+            self._clock_topic.publish(Clock(clock=Time(nanoseconds=measured.stamp).to_msg()))
+        stamped = divmod(measured.stamp, SECOND)
+        self._wrenches.publish(self._wrench.fill(measured.wrench, stamped))
         own = self._simulation.robot.controller
         self._flying += 1
         # Last: who answers it has all else.
@@ -340,14 +350,6 @@ class MachineSim(health.TwinNode):
             own.controller_rates(measured.qd),
             own.controller_efforts(measured.effort),
         )
-
-    def _wrench(self, measured: Measured, stamp: Any) -> WrenchStamped:
-        message = WrenchStamped()
-        message.header.stamp, message.header.frame_id = stamp, self._frame
-        force, torque = message.wrench.force, message.wrench.torque
-        values = measured.wrench.tolist()
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = values
-        return message
 
     def _publish_drawn(self) -> None:
         """What was drawn: into the log, and kept on a topic for who comes late."""

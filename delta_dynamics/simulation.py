@@ -61,6 +61,8 @@ class WrenchSignal:
 
     def at(self, time: float) -> Array:
         """At a time after the start, s."""
+        if not self.amplitude.any():
+            return self.constant
         turn = 2.0 * np.pi * self.frequency * time
         return np.asarray(self.constant + self.amplitude * np.sin(turn), np.float64)
 
@@ -270,11 +272,16 @@ class Simulation:
         s = self.settings
         self.now += round(s.period * SECOND)
         before, self._seen = self._seen, self._encoder()
-        stepped = np.broadcast_to(s.resolution, before.shape) > 0.0
-        self._seen_rate = np.where(stepped, (self._seen - before) / s.period, self.plant.qd)
+        self._seen_rate = self.plant.qd
+        if s.resolution.any():
+            self._seen_rate = np.where(
+                s.resolution > 0.0, (self._seen - before) / s.period, self.plant.qd
+            )
 
     def _encoder(self) -> Array:
-        q, step = self.plant.q, np.broadcast_to(self.settings.resolution, self.plant.q.shape)
+        q, step = self.plant.q, self.settings.resolution
+        if not step.any():
+            return q
         steps = np.where(step > 0.0, step, 1.0)
         return np.where(step > 0.0, np.round(q / steps) * steps, q)
 

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Final, TextIO
 
 
 class PkmTwinError(Exception):
@@ -17,17 +17,33 @@ class PkmTwinError(Exception):
 
 
 class ParameterError(PkmTwinError, ValueError):
-    """A parameter file, key or value that is refused.
+    """An invalid file, key or value.
 
-    ``field`` is the dotted name, ``value`` what was given, ``bound`` what is allowed.
+    ``field`` is the dotted name, ``value`` what was given, ``bound`` what is expected.
     """
 
     def __init__(self, field: str, value: object, bound: str) -> None:
-        text = f"{field}: {short(value)} is refused; allowed: {bound}"
-        super().__init__(one_line(text, 2000))
+        found = "missing" if value is None else short(value)
+        super().__init__(one_line(f"{field}: {found}; expected {bound}", 2000))
         self.field = field
         self.value = value
         self.bound = bound
+
+
+class FileError(ParameterError):
+    """A file that cannot be read, or is not what it should be (``bound``: "a CSV file")."""
+
+    def __init__(self, path: str | Path, error: Exception, bound: str) -> None:
+        missing = isinstance(error, FileNotFoundError)
+        system = error.strerror if isinstance(error, OSError) else None
+        what = " ".join((system or str(error)).split()) or type(error).__name__
+        super().__init__(str(path), what, bound)
+        text = "no such file" if missing else what if system else f"not {bound}: {what}"
+        self.args = (one_line(f"{path}: {text}", 2000),)
+
+
+NOUNS: Final = ("robot", "mechanism", "map")
+"""Fields that are what their value is the name of."""
 
 
 class UnknownNameError(ParameterError):
@@ -37,9 +53,16 @@ class UnknownNameError(ParameterError):
         names = sorted(valid)
         match = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
         self.closest: str | None = match[0] if match else None
-        hint = f"did you mean {self.closest!r}? " if self.closest else ""
-        super().__init__(field, name, f"{hint}valid: {', '.join(names)}")
+        super().__init__(field, name, f"one of {', '.join(names)}")
         self.valid = names
+        if field == str(name) or field.endswith(f".{name}"):
+            what = f"unknown key {field!r}"
+        elif field in NOUNS:
+            what = f"unknown {field} {short(name)}"
+        else:
+            what = f"{field}: {short(name)}"
+        hint = f"did you mean {self.closest!r}? " if self.closest else ""
+        self.args = (one_line(f"{what}; {hint}expected {self.bound}", 2000),)
 
 
 class MobilityError(ParameterError):

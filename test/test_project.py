@@ -2,7 +2,6 @@
 """What holds for the whole tree: licences, sizes, and that the README is true."""
 
 import re
-import shlex
 import subprocess
 from functools import cache
 from pathlib import Path
@@ -49,6 +48,12 @@ def section(title):
     return README.split(f"\n## {title}\n")[1].split("\n## ")[0]
 
 
+def pages():
+    """The README and the pages of docs/, by name."""
+    names = [name for name in files() if name.suffix == ".md" and len(name.parts) <= 2]
+    return {str(name): (REPOSITORY / name).read_text(encoding="utf-8") for name in names}
+
+
 def first_cells(text, row):
     """Names in backquotes in the table column ``row``."""
     for line in text.splitlines():
@@ -57,36 +62,56 @@ def first_cells(text, row):
             yield from re.findall(r"`([^`]+)`", cells[row])
 
 
-def test_commands_and_make_targets_exist():
+def test_make_targets_exist():
+    makefile = (REPOSITORY / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([\w-]+):", makefile, re.MULTILINE))
+    for name, text in pages().items():
+        # In the lines to type, and in the text between backquotes.
+        named = set(re.findall(r"^    make ([\w-]+)|`make ([\w-]+)`", text, re.MULTILINE))
+        assert {word for pair in named for word in pair if word} <= targets, name
+    assert {"demo", "test"} <= set(re.findall(r"^    make (\w+)", README, re.MULTILINE))
+    assert set(re.findall(r'"make ([\w-]+)', makefile)) <= targets
+
+
+def test_the_page_of_commands_has_all():
+    """Else `make pages` writes it anew."""
     from typer.main import get_command
 
     from pkm_twin.apps.cli import app
 
-    typed = re.findall(r"^    ((?:pkm-twin|make) .*)$", README, re.MULTILINE)
-    lines = [shlex.split(line, comments=True) for line in typed]
-    twin = [line for line in lines if line[0] == "pkm-twin"]
+    text = (REPOSITORY / "docs" / "commands.md").read_text(encoding="utf-8")
+    written = dict(re.findall(r"^## `pkm-twin ([\w-]+)`\n(.*?)(?=^## |\Z)", text, re.M | re.S))
     commands = get_command(app).commands
-    assert {line[1] for line in twin} == set(commands)
-    for _, name, *words in twin:
-        command = commands[name]
-        inner = getattr(command, "commands", {})
-        parts = [command, *(inner[word] for word in words if word in inner)]
-        options = {o for part in parts for parameter in part.params for o in parameter.opts}
-        named = {word.strip("[]") for word in words if word.strip("[").startswith("--")} - {"--"}
-        assert named <= options, name
-    makefile = (REPOSITORY / "Makefile").read_text(encoding="utf-8")
-    targets = set(re.findall(r"^([\w-]+):", makefile, re.MULTILINE))
-    # In the lines to type, and in the text between backquotes.
-    named = {line[1] for line in lines if line[0] == "make"}
-    named |= set(re.findall(r"`make ([\w-]+)`", README))
-    assert named >= {"demo", "test"}
-    assert named <= targets
-    helped = re.findall(r'"make ([\w-]+)', makefile)
-    assert set(helped) <= targets
+    assert set(written) == set(commands)
+    for name, command in commands.items():
+        inner = getattr(command, "commands", {}).values()
+        options = {o for c in (command, *inner) for p in c.params for o in p.opts if o[:2] == "--"}
+        assert options <= set(re.findall(r"--[\w-]+", written[name])), name
 
 
-def test_readme_lists_every_robot_and_its_links_lead_somewhere():
-    assert set(first_cells(section("Mechanisms"), 1)) == set(robot_names())
-    for link in re.findall(r"\]\(([^)#]+)\)", README):
-        if "://" not in link:
-            assert (REPOSITORY / link).exists(), link
+def anchor(title):
+    """The name that a heading is linked by."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-")
+
+
+def test_links_lead_somewhere():
+    found = pages()
+    anchors = {
+        name: {anchor(title) for title in re.findall(r"^#+ (.+)$", text, re.MULTILINE)}
+        for name, text in found.items()
+    }
+    for name, text in found.items():
+        for link in re.findall(r"\]\(([^)\s]+)\)", text):
+            path, _, place = link.partition("#")
+            if "://" in link:
+                continue
+            target = (REPOSITORY / name).parent / path if path else REPOSITORY / name
+            assert target.exists(), f"{name}: {link}"
+            if place:
+                assert place in anchors[str(target.resolve().relative_to(REPOSITORY))], link
+
+
+def test_the_readme_lists_every_robot_and_every_page():
+    assert set(first_cells(section("Machines"), 1)) == set(robot_names())
+    linked = set(re.findall(r"\]\((docs/\w+\.md)", README))
+    assert linked == {name for name in pages() if name.startswith("docs/")}

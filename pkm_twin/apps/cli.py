@@ -368,7 +368,10 @@ def compliance(
         print_json(result)
         return
     axes = ("x", "y", "z", "rx", "ry", "rz")
-    typer.echo(f"compliance of {machine.name} at o, fixed axes: rows m and rad, per N and N m")
+    typer.echo(
+        f"compliance of {machine.name} at the platform's reference point, base axes: rows m and "
+        "rad, per N and N m"
+    )
     typer.echo(" " * 4 + "".join(f"{name:>11}" for name in ("fx", "fy", "fz", "mx", "my", "mz")))
     size = np.sqrt(np.diag(c))
     for name, row, scale in zip(axes, c, np.outer(size, size), strict=True):

@@ -15,7 +15,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError, warn
+from pkm_twin.errors import FileError, ParameterError, warn
 from pkm_twin.files import decimal, open_regular
 
 Array = NDArray[np.float64]
@@ -45,8 +45,7 @@ def read_columns(path: Path) -> dict[str, Array]:
             with io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text:
                 return _parse_columns(path, csv.reader(_lines(text, path)))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        what = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ParameterError(str(path), what, "a readable CSV file") from None
+        raise FileError(path, error, "a CSV file") from None
 
 
 def times_of(path: Path, values: Array) -> Array:

@@ -20,7 +20,7 @@ from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.loads import Load, by_load
 from pkm_twin.apps.torques import Motion, motion_of_bag, motion_of_csv
 from pkm_twin.bags.storage import is_bag
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.catalogue import config_folder
 from pkm_twin.machine.robot import Robot
@@ -131,8 +131,7 @@ def read_motors(path: Path, names: Sequence[str] = ()) -> list[Motor]:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        what = error.strerror if isinstance(error, OSError) else str(error)
-        raise ParameterError(str(path), what, "a readable YAML file of drives") from None
+        raise FileError(path, error, "a YAML file of drives") from None
     entries = data.get("drives") if isinstance(data, dict) else None
     if not isinstance(entries, dict) or not entries:
         raise ParameterError(str(path), None, "a mapping drives of names to data")

@@ -43,7 +43,7 @@ class _Kinds(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args[0] not in self.commands:
-            raise UnknownNameError("kind", args[0], tuple(self.commands))
+            raise UnknownNameError("map", args[0], tuple(self.commands))
         return super().resolve_command(ctx, args)
 
 

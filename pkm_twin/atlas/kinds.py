@@ -31,7 +31,7 @@ def kind_of(atlas: Dataset) -> Kind:
     """
     name = str(atlas.attrs["kind"])
     if name not in KINDS:
-        raise UnknownNameError("kind", name, tuple(KINDS))
+        raise UnknownNameError("map", name, tuple(KINDS))
     return KINDS[name]
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 
 MAX_FILE_SIZE: Final = 256 * 1024
 """Largest parameter file that is read, bytes; the shipped ones are below 4 kB."""
@@ -104,7 +104,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except ParameterError:
         raise
     except (OSError, ValueError) as error:
-        raise _unreadable(str(path), error) from None
+        raise FileError(path, error, "plain YAML") from None
     return parse_yaml(text, str(path))
 
 
@@ -119,15 +119,10 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         if isinstance(error, ParameterError):
             raise
-        raise _unreadable(name, error) from None
+        raise FileError(name, error, "plain YAML") from None
     if not isinstance(data, dict):
         raise ParameterError(name, type(data).__name__, "a mapping of keys to values")
     return data
-
-
-def _unreadable(name: str, error: Exception) -> ParameterError:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return ParameterError(name, text, "a readable file of plain YAML")
 
 
 def number(
@@ -420,7 +415,7 @@ def build(kind: type[T], data: object, path: str = "") -> T:
         if name in data:
             values[field.name] = field.metadata["check"](dotted, data[name])
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise ParameterError(dotted, None, "required, and missing")
+            raise ParameterError(dotted, None, "a value")
     result = kind(**values)
     verify = getattr(result, "verify", None)
     if verify is not None:

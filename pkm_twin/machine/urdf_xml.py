@@ -19,7 +19,7 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.files import decimal
 from pkm_twin.machine import schema
 from pkm_twin.machine.rotations import from_rpy
@@ -66,7 +66,7 @@ def elements(path: Path) -> ET.Element:
         with path.open("rb") as file:
             content = file.read(MAX_FILE_SIZE + 1)
     except OSError as error:
-        raise ParameterError(str(path), str(error), "a readable URDF file") from None
+        raise FileError(path, error, "a URDF file") from None
     if len(content) > MAX_FILE_SIZE:
         raise ParameterError(
             str(path), f"{path.stat().st_size} bytes", f"at most {MAX_FILE_SIZE} bytes"

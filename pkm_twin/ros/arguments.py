@@ -11,7 +11,7 @@ USAGE = """usage: {words} [--help] [--version] [--ros-args -p PARAMETER:=VALUE -
 {summary}
 
 Runs until SIGINT or SIGTERM. Its parameters: `ros2 param describe /{node} PARAMETER` while it runs,
-or the README's section {node}."""
+or docs/nodes.md, section {node}."""
 
 
 def answer(name: str, summary: str, arguments: Sequence[str], others: str = "") -> None:

@@ -152,28 +152,44 @@ def _layout(data: bytes, message: Any, arrays: Sequence[Sequence[float]]) -> _La
     )
 
 
-class DoublesTemplate:
-    """Messages that differ in their stamp and in the numbers of their arrays of doubles.
+def _doubles(value: Any) -> int:
+    """How many numbers a field has, 0 where it holds anything else."""
+    if isinstance(value, float):
+        return 1
+    inner = value.values() if isinstance(value, dict) else value
+    counts = [_doubles(v) for v in inner] if isinstance(value, dict | list) else []
+    return sum(counts) if all(counts) else 0
 
-    :param message: fields of the message; each list of numbers that is not empty is an array to
-        fill. ``stamped``: it begins with a header.
+
+def _with(value: Any, number: float) -> Any:
+    """A field whose numbers are all this one."""
+    if isinstance(value, dict):
+        return {name: _with(v, number) for name, v in value.items()}
+    return [_with(v, number) for v in value] if isinstance(value, list) else number
+
+
+class DoublesTemplate:
+    """Messages that differ in their stamp and in the doubles of some fields.
+
+    :param message: fields of the message; those of nothing but doubles, in lists or in messages,
+        are filled. ``stamped``: it begins with a header.
     """
 
     def __init__(
         self, type_name: str, definition: str, message: dict[str, Any], *, stamped: bool
     ) -> None:
         codec = MessageCodec(type_name, definition)
-        arrays = [k for k, v in message.items() if v and isinstance(v, list) and v[0] == 0.0]
+        arrays = {name: count for name, v in message.items() if (count := _doubles(v))}
         # Eight bytes that no text in UTF-8 has.
         marks = [bytes([0x80 + k] * 8) for k in range(len(arrays))]
         filled = {
-            name: list(struct.unpack("<d", mark)) * len(message[name])
+            name: _with(message[name], struct.unpack("<d", mark)[0])
             for name, mark in zip(arrays, marks, strict=True)
         }
         data = codec.encode({**message, **filled})
         self._head = data[:HEAD]
         rest, self._pieces = data[STAMP.stop if stamped else HEAD :], list[bytes]()
-        self._sizes = [8 * len(message[name]) for name in arrays]
+        self._sizes = [8 * count for count in arrays.values()]
         for mark, size in zip(marks, self._sizes, strict=True):
             piece, rest = rest.split(mark * (size // 8))
             self._pieces.append(piece)
@@ -182,7 +198,7 @@ class DoublesTemplate:
     def fill(self, values: Array, stamp: tuple[int, int] | None = None) -> bytes:
         """The message with these values, and the stamp (sec, nanosec) where it has one.
 
-        :param values: of all arrays to fill, one after the other.
+        :param values: of all fields to fill, one after the other.
         """
         numbers = values.astype("<f8", copy=False).tobytes()
         parts, at = [self._head, b"" if stamp is None else struct.pack("<iI", *stamp)], 0

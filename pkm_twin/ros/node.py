@@ -263,7 +263,7 @@ class TwinNode(ParameterNode):
         :param raw: the callback takes the message's bytes.
         :param best_effort: messages may be lost for the newest, and publishers of both kinds
             match. Otherwise none is lost, as long messages need it, until a best-effort publisher
-            comes: from there on as if true (not with the events executor).
+            comes: from there on as if true.
         :param awaited: the diagnostics warn until the first message.
         :param expires: how long a message may wait for the node, s; older ones count as lost.
         :param expiry: lifespan and deadline that publishers have to offer, s; None is any.
@@ -300,22 +300,24 @@ class TwinNode(ParameterNode):
                 self.caught(topic, error)
             statistics.handled(time.perf_counter() - began)
 
-        # By its signature rclpy knows that the information is wanted.
-        guarded.__signature__ = inspect.signature(  # type: ignore[attr-defined]
-            lambda message, info: None
-        )
-        # The events executor does not survive the end of a subscription with events.
-        given = self.executor_kind == "events" or (
-            f"qos_overrides.{name}.subscription.reliability" in self._parameter_overrides
-        )
+        given = f"qos_overrides.{name}.subscription.reliability" in self._parameter_overrides
         relaxed = False
         subscription: Any = None
 
         def subscribe() -> Any:
+            def heard(*arguments: Any, of: bool = relaxed) -> None:
+                if of == relaxed:
+                    guarded(*arguments)
+
+            callback = guarded if best_effort else heard
+            # By its signature rclpy knows that the information is wanted.
+            callback.__signature__ = inspect.signature(  # type: ignore[attr-defined]
+                lambda message, info: None
+            )
             made = self.create_subscription(
                 kind,
                 topic,
-                guarded,
+                callback,
                 input_qos(self._queue_depth, best_effort=best_effort or relaxed, expiry=expiry),
                 raw=raw,
                 qos_overriding_options=QoSOverridingOptions(
@@ -338,7 +340,9 @@ class TwinNode(ParameterNode):
             nonlocal subscription, relaxed
             if not relaxed:
                 relaxed = True
-                self.destroy_subscription(subscription)
+                # The events executor does not survive the end of a subscription with events.
+                if self.executor_kind != "events":
+                    self.destroy_subscription(subscription)
                 subscription = subscribe()
                 self.log_throttled("qos", f"{topic}: best effort from here on, as its publisher")
 

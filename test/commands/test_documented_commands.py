@@ -42,7 +42,9 @@ def pages():
         check=False,
         text=True,
     ).stdout.split("\0")
-    found = sorted(name for name in listed if name and not name.startswith("test/"))
+    # Made from the commands themselves.
+    own = ("test/", "docs/commands.md")
+    found = sorted(name for name in listed if name and not name.startswith(own))
     return found or ["README.md"]
 
 

@@ -43,7 +43,7 @@ def test_pivots():
 
 def test_bounds_of_the_stream():
     pattern = r"`singularity_warn`, `singularity_stop` \| (\S+), (\S+) \|"
-    assert numbers("README.md", pattern) == [
+    assert numbers("docs/nodes.md", pattern) == [
         Settings().singularity_warn,
         Settings().singularity_stop,
     ]

@@ -95,7 +95,7 @@ def test_factors_stand_in_the_file_and_wrong_names_are_refused():
     assert again.element_compliance == {"3U": 2.0}
     with pytest.raises(UnknownNameError, match="did you mean '3U'"):
         robot.changed(element_compliance={"3V": 3.0})
-    with pytest.raises(ParameterError, match=r"element_compliance\.3U: 0\.0 is refused"):
+    with pytest.raises(ParameterError, match=r"element_compliance\.3U: 0\.0"):
         robot.changed(element_compliance={"3U": 0.0})
     with pytest.raises(ParameterError, match="nothing is elastic"):
         load("stewart").changed(element_compliance={"3U": 3.0})

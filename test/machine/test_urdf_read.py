@@ -314,7 +314,7 @@ REFUSED = {
     "closure's part": (
         "</robot>",
         '<constraint name="k" type="link"><parent_orgin xyz="0 0 1"/></constraint></robot>',
-        "constraint.k: 'parent_orgin'.*did you mean 'parent_origin'",
+        "constraint.k: .*'parent_orgin'.*did you mean 'parent_origin'",
     ),
     "closure's nested part": (
         "</robot>",

@@ -377,7 +377,7 @@ class TestParameters:
             (["singularity_stop:=0.2"], "at least singularity_stop, 0.2"),
             (["limit_policy:=clip"], "did you mean 'clamp'"),
             (["acceleration:=guess"], "acceleration: 'guess'"),
-            (["publish_commands:=true"], "on_stop: None is refused"),
+            (["publish_commands:=true"], "on_stop: missing"),
             (["use_sim_time:=maybe"], "use_sim_time"),
             (["qos_overrides./joint_states.subscription.reliability:=best"], "`reliability`"),
         ],

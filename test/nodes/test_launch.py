@@ -59,9 +59,9 @@ class TestText:
     """What holds without launch."""
 
     @pytest.mark.parametrize("name", FILES)
-    def test_the_readme_lists_every_argument_with_its_default(self, name):
-        readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-        table = readme.split(f"| `{name}.launch.py` |")[1].split("\n\n")[0]
+    def test_the_page_lists_every_argument_with_its_default(self, name):
+        page = (REPOSITORY / "docs" / "launch.md").read_text(encoding="utf-8")
+        table = page.split(f"| `{name}.launch.py` |")[1].split("\n\n")[0]
         rows = re.findall(r"^\| `(\w+)` \|(.*?)\|", table, re.MULTILINE)
         listed = {argument: default.strip("` ") for argument, default in rows}
         assert listed == {key: default for key, (default, _) in literal(name, "ARGUMENTS").items()}

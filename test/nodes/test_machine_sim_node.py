@@ -129,9 +129,7 @@ def test_the_clock_of_others_is_refused_while_it_runs_too(peer, machine):
     request.parameters = [Parameter("use_sim_time", value=True).to_parameter_msg()]
     (result,) = peer.call(SetParameters, "/machine_sim/set_parameters", request).results
     assert not result.successful
-    assert result.reason == "use_sim_time: True is refused; allowed: false: the machine has a " + (
-        "clock of its own"
-    )
+    assert result.reason.startswith("use_sim_time: True; expected false")
 
 
 def test_what_is_refused_is_counted(peer, machine):
@@ -171,8 +169,8 @@ def test_it_ends_on_a_signal(peer, machine):
 @pytest.mark.parametrize(
     ("parameters", "word"),
     [
-        (("start:=[0.0, 2.0, 0.0]",), "start, arm_2: 2.0 is refused; allowed: -0.9 to 1.3"),
-        (("use_sim_time:=true",), "use_sim_time: True is refused; allowed: false"),
+        (("start:=[0.0, 2.0, 0.0]",), "start, arm_2: 2.0; expected -0.9 to 1.3"),
+        (("use_sim_time:=true",), "use_sim_time: True; expected false"),
         (("payload.masses:=[1.0, 2.0]",), "payload.masses"),
     ],
 )

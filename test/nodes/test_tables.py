@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The README's tables of topics and parameters are those of the running nodes."""
+"""The tables of docs/nodes.md of topics and parameters are those of the running nodes."""
 
 import re
 from importlib.util import find_spec
@@ -14,7 +14,7 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 
 from rcl_interfaces.srv import ListParameters
 
-README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+PAGE = (REPOSITORY / "docs" / "nodes.md").read_text(encoding="utf-8")
 OTHERS = re.compile(r"/(rosout|parameter_events|diagnostics|clock)|.*/transition_event")
 TF = find_spec("tf2_msgs") is not None
 MIDDLEWARE = re.compile(r"qos_overrides\..*|use_sim_time|start_type_description_service")
@@ -22,7 +22,7 @@ MIDDLEWARE = re.compile(r"qos_overrides\..*|use_sim_time|start_type_description_
 
 def rows(node):
     """Cells of the tables in the node's section."""
-    section = README.split(f"\n## {node}\n")[1].split("\n## ")[0]
+    section = PAGE.split(f"\n## {node}\n")[1].split("\n## ")[0]
     for line in section.splitlines():
         cells = [cell.strip() for cell in line.split("|")]
         if len(cells) > 3:

@@ -21,7 +21,7 @@ VIEW = REPOSITORY / "launch" / "view"
 
 
 def topics():
-    """Absolute names of all topics, and their types; the README's tables are the nodes'."""
+    """Absolute names of all topics, and their types; docs/nodes.md's tables are the nodes'."""
     found = {"/diagnostics": "diagnostic_msgs/DiagnosticArray"}
     for node in MODULES:
         for cells in rows(node):

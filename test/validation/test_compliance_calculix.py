@@ -76,9 +76,9 @@ def solids(request, tmp_path_factory):
 
 
 def told():
-    """What the README says: worst entries with the paper's and with a round bar's shear factor."""
+    """What the page says: worst entries with the paper's and with a round bar's shear factor."""
     pattern = r"within (\S+) % of every entry, (\S+) % with a round bar's shear factor"
-    return [float(number) / 100 for number in numbers("README.md", pattern)]
+    return [float(number) / 100 for number in numbers("docs/validation.md", pattern)]
 
 
 @needs_calculix

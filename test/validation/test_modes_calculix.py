@@ -20,7 +20,7 @@ from test.support.robots import parameters_of, partly_long
 from test.validation.calculix import ABSENT, CCX, frequencies
 
 CLOSE, CONTRACTED = numbers(
-    "README.md",
+    "docs/validation.md",
     r"\(isotropic\) material: within (\S+) %, (\S+) % with a Poisson's ratio of 0.3",
 )
 

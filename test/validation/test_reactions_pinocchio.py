@@ -187,4 +187,4 @@ def test_every_joint_of_random_machines(name, machines, rng):
             assert ours.determinate.all()
             error = np.abs((ours.wrenches - expected) / unit).max() / scale
             worst = max(worst, float(error))
-    assert worst < numbers("README.md", r"within (\S+) of a machine's greatest load")[0]
+    assert worst < numbers("docs/validation.md", r"within (\S+) of a machine's greatest load")[0]

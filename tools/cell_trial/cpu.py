@@ -18,7 +18,9 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 
+from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 
 NODES = ("delta_dynamics", "command_gate", "stiffness_monitor", "machine_state", "machine_sim")
@@ -48,6 +50,7 @@ def measured(process: Process, names: tuple[str, ...], given: argparse.Namespace
     """Stream to the node and print what it takes."""
     robot = load(given.robot)
     q = robot.inverse(robot.home())
+    at_rest = inverse_dynamics(robot, q, 0.0 * q, 0.0 * q)
     size = (
         0.05 * float(np.ptp(robot.limits.position)) if robot.limits.position is not None else 0.02
     )
@@ -61,10 +64,12 @@ def measured(process: Process, names: tuple[str, ...], given: argparse.Namespace
         if own:
             other.node.destroy_publisher(states)
             other.node.destroy_publisher(wrenches)
+            commands = other.node.create_publisher(Float64MultiArray, "machine_sim/commands", 10)
             heard = other.hear(JointState, "joint_states")
             other.until(lambda: heard, "joint states of machine_sim")
         else:
             other.until(lambda: set(names) <= set(other.node.get_node_names()), str(names))
+        holding = array("d", robot.controller.controller_efforts(at_rest))
         used = began = 0.0
         sent = 0
         start = time.monotonic()
@@ -72,15 +77,15 @@ def measured(process: Process, names: tuple[str, ...], given: argparse.Namespace
         while (now := time.monotonic()) < end:
             if not used and now - start > WARM:
                 used, began, sent = process.usage(), now, 0
-            if own:
-                other.spin(0.05)
-                continue
             due = start + (sent + 1) / given.rate if not began else began + (sent + 1) / given.rate
             other.spin(max(0.0, min(due - now, 0.05)))
             if time.monotonic() < due:
                 continue
             sent += 1
             t = time.monotonic() - start
+            if own:
+                commands.publish(Float64MultiArray(data=holding))
+                continue
             stamp = other.node.get_clock().now().to_msg()
             motion = size * np.sin(3.0 * t + np.arange(len(q)))
             rates = 3.0 * size * np.cos(3.0 * t + np.arange(len(q)))
@@ -98,7 +103,7 @@ def measured(process: Process, names: tuple[str, ...], given: argparse.Namespace
             wrench.wrench.force.x = 5.0
             wrenches.publish(wrench)
         share = (process.usage() - used) / (time.monotonic() - began)
-        rate = "" if own else f", {sent / (time.monotonic() - began):.0f} Hz sent"
+        rate = f", {sent / (time.monotonic() - began):.0f} Hz sent"
         memory = f"{process.memory():.0f} MB"
         text = f"{100 * share:.1f} % of a core, {memory}{rate}"
         print(f"{'+'.join(names)} {given.robot}: {text}", flush=True)

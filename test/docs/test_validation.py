@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What README.md says in numbers is so: computed again."""
+"""What docs/validation.md says in numbers is so: computed again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from test.support.workspaces import even_samples, polar_samples
 from test.validation import test_delta_cu_paper as delta_cu
 from test.validation import test_upr_rpu_paper as upr_rpu
 
-README = "README.md"
+PAGE = "docs/validation.md"
 
 
 def test_tables_of_the_delta_cu_paper():
@@ -40,9 +40,9 @@ def test_tables_of_the_delta_cu_paper():
     rms, worst = delta_cu.differences(inverse_dynamics(robot, q, qd, qdd, delta_cu.LOAD), printed)
     pattern = r"velocity rms (\S+) mm/s of (\d+), torque rms (\S+) N m of (\S+), worst (\d+\.\d+)"
     greatest = np.abs(delta_cu.VELOCITY).max(), np.abs(printed).max()
-    assert_printed(README, pattern, speed, greatest[0], rms, greatest[1], worst)
+    assert_printed(PAGE, pattern, speed, greatest[0], rms, greatest[1], worst)
     pattern = r"the home angle (\S+) rad and a platform load of (\d+) N"
-    assert_printed(README, pattern, delta_cu.HOME_ANGLE, -delta_cu.LOAD[2])
+    assert_printed(PAGE, pattern, delta_cu.HOME_ANGLE, -delta_cu.LOAD[2])
 
 
 class TestFrequenciesOfTheDeltaCu:
@@ -79,13 +79,13 @@ class TestFrequenciesOfTheDeltaCu:
             r"second axis is the limb's radial one \(first frequency (\d+) Hz; (\d+\.\d+) Hz with "
             r"an axis across the forearm\) and its rod is of aluminium \((\d+) Hz of carbon\)"
         )
-        assert_printed(README, pattern, own, self.first(self.across()), self.first(rod))
+        assert_printed(PAGE, pattern, own, self.first(self.across()), self.first(rod))
         moved = [
             abs(self.first(self.changed(tmp_path, parallelogram_width=f * width)) / own - 1)
             for f in (0.5, 2.0)
         ]
         pattern = r"half or twice the parallelograms' width moves it by (\d+) %"
-        assert_printed(README, pattern, 100 * max(moved))
+        assert_printed(PAGE, pattern, 100 * max(moved))
 
     def test_where_their_energy_is(self):
         found = modes(self.robot, self.pose)
@@ -95,19 +95,19 @@ class TestFrequenciesOfTheDeltaCu:
             r"in shapes 1 to 3 the platform has (\S+), (\S+) and (\S+) of the kinetic energy and "
             r"forearm III (\S+), (\S+) and (\S+); "
         )
-        assert_printed(README, pattern, *share[0], *share[1])
+        assert_printed(PAGE, pattern, *share[0], *share[1])
         size = np.linalg.norm(found.shapes[..., :3], axis=-1)
         ends = [found.nodes[k] for k in size[:2].argmax(-1)]
         # "in 1 and 2 that rod's elbow end moves the most"
         assert ends == ["forearm III 0/8"] * 2
         forearms = [k for k, name in enumerate(names) if name.startswith("forearm")]
         pattern = r"4 to 6 are the forearms' bending \((\d+) % of it or more\)"
-        assert_printed(README, pattern, 100 * kinetic[3:][:, forearms].sum(1).min())
+        assert_printed(PAGE, pattern, 100 * kinetic[3:][:, forearms].sum(1).min())
 
 
 class TestTablesOfTheUprRpuPaper:
     def test_deflections(self):
-        (share,) = numbers(README, r"table 1\*\* \(deflections, both rows\): within (\S+) %")
+        (share,) = numbers(PAGE, r"table 1\*\* \(deflections, both rows\): within (\S+) %")
         for pose, theory, _ in upr_rpu.TABLE_1:
             found = 1e6 * strain_energy(upr_rpu.ROBOT, pose, upr_rpu.LOAD).deflection
             allowed = np.maximum(share / 100 * np.abs(theory), upr_rpu.UNIT)
@@ -120,12 +120,12 @@ class TestTablesOfTheUprRpuPaper:
             shares.append((np.array(solid) / found - 1)[np.abs(solid) > 10 * upr_rpu.UNIT])
         softer = 100 * np.concatenate(shares)
         pattern = r"finite elements are (\d+) to (\d+) % softer"
-        assert_printed(README, pattern, softer.min(), softer.max())
+        assert_printed(PAGE, pattern, softer.min(), softer.max())
 
     @pytest.mark.long
     def test_global_factors(self):
         most, evenly, on_rays = numbers(
-            README,
+            PAGE,
             r"P2 and P3 within (\S+); P1 within (\S+) when poses are spread evenly over the "
             r"workspace, within (\S+) on polar rays",
         )
@@ -144,13 +144,13 @@ class TestTablesOfTheUprRpuPaper:
 
 
 def test_torques_of_random_machines():
-    """Some of the states that `make certificate` takes are within what the README says of all."""
+    """Some of the states that `make certificate` takes are within what the page says of all."""
     pytest.importorskip("mujoco")
     pytest.importorskip("pinocchio")
     from test.certificate.compare import compare
     from test.certificate.machines import ROBOTS
 
-    worst = numbers(README, r"at 50 digits \(\d+ states\): worst relative difference (\S+)\. ")[0]
+    worst = numbers(PAGE, r"at 50 digits \(\d+ states\): worst relative difference (\S+)\. ")[0]
     for k, name in enumerate(ROBOTS):
         found = compare(name, (20261121, k, 0), states=10, exact=0).efforts
         for route in ("Pinocchio", "MuJoCo"):
