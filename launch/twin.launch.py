@@ -111,6 +111,8 @@ def nodes(context: LaunchContext) -> list[Node]:
             load(given["robot"])
         except PkmTwinError as error:
             raise RuntimeError(f"robot: {error}") from None
+    for name in ("respawn", "use_sim_time"):
+        _flag(given, name)
     chosen = [name for name in PARAMETERS if _flag(given, name)]
     _check_deadline(given, chosen)
     together = [name for name in chosen if name != GATE]
