@@ -51,7 +51,8 @@ ALIGN: Final = 8
 SYMBOL: Final = "kernel"
 PREPARE: Final = "prepare"
 STATUS: Final = " status"
-OPTIMISATION: Final = 2
+OPTIMISATION: Final = 1
+"""LLVM's level: the next one takes up to four times as long for code that is no faster."""
 LONG: Final = 100
 """Entries of an output from which on they are stored in a loop."""
 

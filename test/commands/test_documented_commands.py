@@ -27,6 +27,8 @@ NOT_RUN = {
 """Lines that are parsed but not run, and why."""
 ENDS = {"pkm-twin recover damaged.mcap saved.mcap": 3}
 """Exit codes other than 0, as the page says."""
+SLOW = r"pkm-twin (torques \S+ \S+\.mcap|atlas|show) .*"
+"""Lines of seconds that test_torques.py and test/atlas have on other files: with `make long`."""
 PROGRAMS = ("pkm-twin ", "head -c ")
 """Ours, and what prepares a file for it."""
 INLINE_NAMES = r"ROBOT|FILE|BAG|TOPIC|COMMAND|KIND|HOST| N\b"
@@ -116,12 +118,15 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.timeout(900)
-def test_it_runs_as_it_stands(folder, twin, monkeypatch):
+@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_it_runs_as_it_stands(folder, slow, twin, monkeypatch):
     """In the order of the page, in one folder: a later line may use what an earlier one wrote."""
     monkeypatch.chdir(folder)
     done = set()
     for (page, line), block in commands().items():
         if not block or line in done or reason(line):
+            continue
+        if re.fullmatch(SLOW, line) and not slow:
             continue
         done.add(line)
         result = typed_line(twin, line)

@@ -104,7 +104,14 @@ WATCHED = partly_long(
 class TestDepartures:
     """Machines that depart from their models by a few percent, after two seconds of rest."""
 
-    @pytest.mark.parametrize("what", [what for what in OFF if "10 %" not in what])
+    @pytest.mark.parametrize(
+        "what",
+        partly_long(
+            [what for what in OFF if "10 %" not in what],
+            "each mass within 3 %",
+            "both, 3 % each",
+        ),
+    )
     def test_they_touch_nothing(self, name: str, seed: int, what: str) -> None:
         robot, rng = load(name), np.random.default_rng(seed)
         stream = measured(robot, rng, moves(robot, rng, 5, 0.7), **OFF[what])

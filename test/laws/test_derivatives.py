@@ -10,7 +10,7 @@ from delta_dynamics import inverse_dynamics, torque_derivatives, torque_gradient
 from pkm_twin import Robot, variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.entries import entries
-from test.support.robots import every_robot, load
+from test.support.robots import every_robot, load, often, some_robots
 
 POINTS = np.arange(-3.0, 4.0)
 WEIGHTS = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
@@ -49,13 +49,14 @@ def test_by_the_motion(name, rng):
     assert found.by == {}
 
 
-@every_robot
-def test_by_numbers_of_the_file(name, rng):
+@pytest.mark.parametrize("count", often(3, 8))
+@some_robots
+def test_by_numbers_of_the_file(name, count, rng):
     robot = load(name)
     given, wrench = motion(robot, rng)
     known = {p: v for p, (v, _) in entries(robot).items() if v != 0.0}
     paths = [p for p in known if not any(word in p for word in ASIDE) and "inertia[" not in p]
-    paths = rng.permutation(paths)[:8].tolist()
+    paths = rng.permutation(paths)[:count].tolist()
     found = torque_derivatives(robot, *given, wrench, by=paths)
     efforts = inverse_dynamics(robot, *given, wrench)
     assert list(found.by) == paths

@@ -15,7 +15,7 @@ from pkm_twin.machine import urdf_file, urdf_tree, urdf_xml
 from pkm_twin.machine.robot_urdf import robot_description, robot_urdf
 from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.mechanisms.machine import Machine
-from test.support.robots import load
+from test.support.robots import load, partly_long
 
 pytest.importorskip("pinocchio")
 
@@ -26,7 +26,9 @@ from .sketches import closure_rows
 STATES = 50
 
 
-@pytest.fixture(params=robot_names(), scope="module")
+@pytest.fixture(
+    params=partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu"), scope="module"
+)
 def robot(request):
     return load(request.param).changed(payload={"mass": 0.3, "com": [0.01, 0.02, -0.05]})
 

@@ -118,18 +118,19 @@ def test_a_stream_that_begins_anew_at_earlier_stamps_is_estimated_as_before(back
     estimates = Estimates(node, lambda: ROBOT, ("base_link", "platform"))
     wave = np.array([3.0, 4.0, 5.0])
     counts = []
+    t = 1e-3 * np.arange(1500)[:, None]
+    away = (
+        0.05 * np.sin(wave * t),
+        0.05 * wave * np.cos(wave * t),
+        -0.05 * wave**2 * np.sin(wave * t),
+    )
+    moved = ROBOT.inverse(ROBOT.home()) + away[0], *away[1:]
+    efforts = inverse_dynamics(ROBOT, *moved)
     for begin in (back + SECOND, SECOND):
         for topic in node.published.values():
             topic.clear()
-        for tick in range(1500):
-            t = 1e-3 * tick
-            motion = (
-                ROBOT.inverse(ROBOT.home()) + 0.05 * np.sin(wave * t),
-                0.05 * wave * np.cos(wave * t),
-                -0.05 * wave**2 * np.sin(wave * t),
-            )
-            effort = inverse_dynamics(ROBOT, *motion)
-            estimates.take(Torques(begin + 1_000_000 * tick, motion, effort, rest, False))
+        for tick, (*motion, effort) in enumerate(zip(*moved, efforts, strict=True)):
+            estimates.take(Torques(begin + 1_000_000 * tick, tuple(motion), effort, rest, False))
         counts.append({topic: len(told) for topic, told in node.published.items()})
         assert not node.published["~/contact"]
         pushed = [m.wrench.force.x for m in node.published["~/external_wrench"]]

@@ -70,6 +70,10 @@ ELASTIC = [name for name, robot in SHIPPED.items() if has(robot, "structure")]
 every_robot = pytest.mark.parametrize("name", robot_names())
 massive = pytest.mark.parametrize("name", MASSIVE)
 elastic = pytest.mark.parametrize("name", ELASTIC)
+some_robots = pytest.mark.parametrize(
+    "name", partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu")
+)
+"""By default one of each kind: parallelograms, in a plane, turning platform, overconstrained."""
 
 
 def parameters_of(name: str) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 
 import asyncio
 import math
-import time
 
 import numpy as np
 import pytest
@@ -94,9 +93,8 @@ def open_socket(page):
 
 
 async def until(page, condition):
-    end = time.monotonic() + 60
+    """Step until it is so; what never comes ends with the test's own limit."""
     while not condition():
-        assert time.monotonic() < end
         page.step()
         await asyncio.sleep(0.01)
 
@@ -160,6 +158,7 @@ def test_other_kinds_of_messages_do_nothing(page):
 def test_buttons_and_menus_do_what_they_are_for(page):
     """A bag plays to its end, whatever else is sent meanwhile."""
     bag = page.bag
+    assert bag._time.value < 1.0
     messages = [
         update(bag._speed, {"value": "4"}),
         update(bag._play, {"value": True}),
@@ -171,12 +170,11 @@ def test_buttons_and_menus_do_what_they_are_for(page):
         async with open_socket(page) as socket:
             for message in (CAMERA, *messages):
                 await socket.send(msgspec.msgpack.encode(message))
-            await until(page, lambda: bag.busy)
-            await until(page, lambda: not bag.busy)
+            # On a busy machine one step may show it from its beginning to its end.
+            await until(page, lambda: bag._time.value == 1.0 and not bag.busy)
 
     asyncio.run(talk())
     assert bag._speed.value == "4"
-    assert bag._time.value == 1.0
 
 
 def test_a_value_beyond_the_ends_is_the_end(page):
