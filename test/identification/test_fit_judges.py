@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 KINDS: Any = ("friction", "payload")
 COMMON = (
     "efforts_negated", "one_joint_negated", "time_reversed", "effort_columns_swapped",
-    "milliseconds", "half_speed", "kgf_cm", "efforts_late",
+    "milliseconds", "kgf_cm", "efforts_late",
 )  # fmt: skip
 LIKELY = {
     "gain": "gain of the efforts", "late": "efforts late", "sensor": "sensor offset",
@@ -81,6 +81,10 @@ def test_a_sound_recording_is_explained(name: str) -> None:
 @pytest.mark.parametrize("what", COMMON)
 def test_what_no_machine_of_the_file_makes_is_rejected(what: str) -> None:
     assert rejected(what, "linear_delta", 4)
+
+
+def test_half_its_speed_is_rejected_though_weight_makes_up_the_efforts() -> None:
+    assert rejected("half_speed", "prru", 5)
 
 
 @pytest.mark.long
