@@ -36,9 +36,9 @@ OF_INERTIA: Final = ("rotor", "payload", "inertia")
 RATE: Final = 8.0 / 3.0 * SIGMAS
 """Deviations by which the rate of time has to show. Twice the rate takes three quarters of the
 efforts of inertia, 3/8 of their derivative by the rate: that is a finding's."""
-INERTIA: Final = 0.04
-"""And the part of the efforts' variation that is inertia: three quarters of it are twice what a
-sound model leaves."""
+INERTIA: Final = 0.1
+"""And the part of the efforts' variation that is inertia: of less, other masses and offsets of the
+sensors, within their priors, take up three quarters."""
 
 
 def verdict_of(

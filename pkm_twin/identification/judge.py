@@ -10,9 +10,10 @@ suspect that explains more than noise does is a finding (forward selection by th
 restricted model: Rao, 1948). What a finding would have changed in the fitted numbers widens their
 standard deviations.
 
-Errors of usual size that are no findings may be there all the same. All of them together have the
-residual's posterior distribution, with their usual sizes as the prior's standard deviations; its
-second moments widen the standard deviations too (consider parameters: Schmidt, 1966).
+Errors of usual size that the residual would not show may be there all the same, and lengths that
+hide behind each other. All of them together have the residual's posterior distribution, with their
+usual sizes as the prior's standard deviations; its second moments widen the standard deviations
+too (consider parameters: Schmidt, 1966).
 
 May import: numpy, the standard library.
 """
@@ -282,21 +283,28 @@ def _unseen(
 ) -> tuple[tuple[Blind, ...], Array]:  # fmt: skip
     """Suspects of usual size that do not show, by what they would do, one of each kind.
 
-    And what all suspects of usual size change in the fitted parameters, as far as the residual
-    leaves them open: rows whose squares sum to their second moments, (rows, parameters).
+    And what these, and all whose size is known beforehand, change in the fitted parameters, as far
+    as the residual leaves them open: rows whose squares sum to second moments, (rows, parameters).
 
     :param tables: the residual and the suspects that stay after the findings; the suspects' norms
         after and before the fitted numbers were taken out.
     :param inflation: of the noise's variance.
     """
     rest, left, norms, seen = tables
-    some = [k for k, one in enumerate(suspects) if one.usual and k not in chosen]
+    hides = [
+        norms[k] * (one.usual or 0.0) < SIGMAS or norms[k] <= SEEN * seen[k]
+        for k, one in enumerate(suspects)
+    ]
+    # One that would show by itself is a finding where it is, but many lengths hide together.
+    some = [
+        k for k, one in enumerate(suspects)
+        if one.usual and k not in chosen and (hides[k] or one.known)
+    ]  # fmt: skip
     if not some:
         return (), np.zeros((0, len(deviations)))
     usual = np.array([suspects[k].usual for k in some])
     moved = response([case.suspects[..., some] * usual for case in cases])
-    hidden = (norms[some] * usual < SIGMAS) | (norms[some] <= SEEN * seen[some])
-    ratio = np.abs(moved) / np.maximum(deviations, 1e-300)[:, None] * hidden
+    ratio = np.abs(moved) / np.maximum(deviations, 1e-300)[:, None] * np.array(hides)[some]
     found: dict[str, Blind] = {}
     for place in np.argsort(-ratio.max(0)):
         one, index = suspects[some[place]], int(np.argmax(ratio[:, place]))
