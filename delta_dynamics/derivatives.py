@@ -87,15 +87,36 @@ def _derivatives(
         robot.refuse_joints(status, inputs[0], inputs)
     found: dict[str, Array] = {}
     if by:
-        kernel = engine.kernel("torque gradient by numbers", _by_numbers, free=True)
-        (of_geometry, of_masses), status = kernel(robot.inertial, *inputs)
-        if status is not None:
-            robot.refuse_joints(status, inputs[0], inputs)
-        slopes = FileNumbers(robot, tuple(by), geometry_and_masses).slopes
-        table = np.concatenate([of_geometry, of_masses], -1) @ slopes
+        table = _of_numbers(robot, inputs) @ numbers_slopes(robot, by)
         found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
     by_q, by_qd, by_qdd = outputs
     return TorqueDerivatives(by_q, by_qd, by_qdd, found)
+
+
+def numbers_slopes(robot: Robot, by: Sequence[str]) -> Array:
+    """Derivatives of geometry and masses by numbers of the file, shape (numbers, paths)."""
+    return FileNumbers(robot, tuple(by), geometry_and_masses).slopes
+
+
+def torques_by_numbers(
+    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike, slopes: Array
+) -> Array:
+    """Derivatives of the efforts by numbers of the file alone, shape (..., n, paths).
+
+    :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`numbers_slopes`.
+        Others as of :func:`torque_derivatives`.
+    """
+    inputs = [doubles(value)[..., None, :] for value in (q, qd, qdd, wrench)]
+    return _of_numbers(robot, [*inputs, np.eye(robot.joints_count)]) @ slopes
+
+
+def _of_numbers(robot: Robot, inputs: Sequence[Array]) -> Array:
+    """Of a motion, a wrench and weights: by geometry and masses, shape (..., numbers)."""
+    kernel = robot.massive().kernel("torque gradient by numbers", _by_numbers, free=True)
+    (of_geometry, of_masses), status = kernel(robot.inertial, *inputs)
+    if status is not None:
+        robot.refuse_joints(status, inputs[0], inputs)
+    return np.concatenate([of_geometry, of_masses], -1)
 
 
 def _by_motion(t: Traced) -> Program:

@@ -7,6 +7,7 @@ May import: numpy, pkm_twin's core and identification, this package, the standar
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations
 from typing import Any, Final
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics.file_parameters import FileParameters
-from delta_dynamics.fit_rows import Recorded, Rows, rows_of
+from delta_dynamics.fit_rows import Recorded, Rows, calm_table, rows_of
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.plausible import Problem, Retold, fault_of
 from pkm_twin.machine.inertia import ten_numbers
@@ -33,8 +34,7 @@ SOME: Final = 2000
 TIMES: Final = {
     "the time is in ms, not in s": 1e-3, "the time is in us, not in s": 1e-6,
     "the time is in ns, not in s": 1e-9, "the time is in minutes, not in s": 60.0,
-    "the time is in s, and was taken for ms": 1e3, "the time runs at half its rate": 0.5,
-    "the time runs at twice its rate": 2.0,
+    "the time is in s, and was taken for ms": 1e3,
 }  # fmt: skip
 ANGLES: Final = {
     "positions are in degrees": np.pi / 180.0, "positions are in rad, and were taken for degrees":
@@ -84,46 +84,61 @@ def recording_fault(
         retold.append((text, put_right(q=r.q[:, order])))
         text = f"{names[i]} and {names[k]} are exchanged"
         retold.append((text, put_right(q=r.q[:, order], effort=r.effort[:, order])))
-    return fault_of(problem_of(robot, everything, rows), names, retold, period)
+    s = rows.signals
+    still = replace(s, motion=(s.motion[0], 0.0 * s.motion[1], 0.0 * s.motion[2]))
+    both = [calm_table(robot, everything, r.carried, one) for one in (s, still)]
+    rubs = [group.kind == "friction" for group in everything.groups for _ in group.names]
+    inertial = np.where(rubs, 0.0, both[0] - both[1])
+    return fault_of(problem_of(robot, everything, rows, inertial), names, retold, period)
 
 
-def problem_of(robot: Robot, everything: FileParameters, rows: Rows) -> Problem:
-    """The machines that may have made a recording, around the robot's file."""
+def problem_of(
+    robot: Robot, everything: FileParameters, rows: Rows, inertial: Array | None = None
+) -> Problem:
+    """The machines that may have made a recording, around the robot's file.
+
+    :param inertial: the part of the rows' table that grows with the square of the rate of time.
+    """
+    tables = [rows.table] if inertial is None else [rows.table, inertial]
     told = rows.rest + rows.table @ everything.values
     size = np.sqrt(np.mean(told**2, 0))
     total = sum(body.mass for body in robot.graph.bodies.values())
     total += sum(rod.mass for rod in robot.graph.rods.values()) + robot.payload.mass
-    parts: list[Array] = []
+    parts: list[list[Array]] = []
     bounds: list[tuple[float, float]] = []
     prior: list[tuple[slice, float, float]] = []
     friction: list[bool] = []
     for where, group in zip(everything.slices, everything.groups, strict=True):
-        own, value = rows.table[..., where], float(group.values[0])
+        own, value = [table[..., where] for table in tables], float(group.values[0])
         scale, first = float(everything.scales[where][0]), len(bounds)
         rubs = group.kind == "friction" and not group.name.endswith("offset")
         bound, known = (0.0, np.inf), (value, scale)
         if group.kind == "inertia":
-            own, bound, known = (own @ group.values)[..., None], (0.3, 2.5), (1.0, HEAVIER)
+            own = [(one @ group.values)[..., None] for one in own]
+            bound, known = (0.3, 2.5), (1.0, HEAVIER)
         elif group.kind == "payload":
-            own, bound, known = own @ _points(REACH * robot.size), (0.0, total), (value, scale)
+            own = [one @ _points(REACH * robot.size) for one in own]
+            bound, known = (0.0, total), (value, scale)
         elif group.kind == "rotor" and value > 0.0:
             known = (value, HEAVIER * value)
         elif group.name.endswith("offset"):
-            most = OFFSET * float(np.max(np.abs(own).max((0, 1)) * size))
+            most = OFFSET * float(np.max(np.abs(own[0]).max((0, 1)) * size))
             bound, known = (-np.inf, np.inf), (value, most)
         parts.append(own)
-        bounds += [bound] * own.shape[-1]
-        friction += [rubs] * own.shape[-1]
+        bounds += [bound] * own[0].shape[-1]
+        friction += [rubs] * own[0].shape[-1]
         if not rubs and known[1] > 0.0:
             prior.append((slice(first, len(bounds)), *known))
     rows_of_prior = np.zeros((len(prior), len(bounds)))
     for row, (columns, _, spread) in zip(rows_of_prior, prior, strict=True):
         row[columns] = 1.0 / spread
     low, high = np.array(bounds).T
+    wholes = [np.concatenate(each, -1) for each in zip(*parts, strict=True)]
     return Problem(
-        rows.effort, rows.change, rows.rest, np.concatenate(parts, -1), low, high, rows_of_prior,
+        rows.effort, rows.change, rows.rest, wholes[0], low, high, rows_of_prior,
         np.array([value / spread for _, value, spread in prior]), np.array(friction), rows.counts,
         rows.signals.noise * np.sqrt(rows.signals.band), float(np.median(np.diff(rows.time))),
+        None if inertial is None else wholes[1],
     )  # fmt: skip
 
 

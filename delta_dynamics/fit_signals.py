@@ -27,7 +27,7 @@ LATE: Final = "efforts late"
 LOAD: Final = "friction that grows with the load"
 OFFSET: Final = "sensor offset"
 ELASTIC: Final = "elastic drive"
-GEOMETRY: Final = "geometry"
+SPEED: Final = "time at another rate"
 STRIBECK: Final = (0.05, 0.1, 0.2)
 """Speeds below which static friction shows, over the rms speed."""
 NOISE_BAND: Final = 0.898
@@ -195,13 +195,8 @@ def suspects_of(robot: Robot) -> list[Suspect]:
     ]
     found += [
         Suspect(GAIN, "all joints", usual=0.05), Suspect(LATE, "all joints", "s"),
-        Suspect(LOAD, "all joints", usual=0.05),
+        Suspect(LOAD, "all joints", usual=0.05), Suspect(SPEED, "all joints"),
     ]  # fmt: skip
-    found += [
-        Suspect(GEOMETRY, f"limb of {n}", u)
-        for n, u in zip(names, units, strict=True)
-        for _ in names
-    ]
     return found
 
 
@@ -243,8 +238,7 @@ def columns_of(robot: Robot, signals: Signals, efforts: Efforts) -> tuple[Array,
         back = [size * one[:, [j]] * eye[j] for one in signals.load]
         moved = efforts(*(a - b for a, b in zip(signals.motion, back, strict=True)))
         gives.append((moved - here) / size)
-    place = q - q.mean(0)
-    place = place / np.maximum(np.abs(place).max(0), 1e-300)
-    bent = [offset * place[:, [i]] for offset in offsets for i in range(n)]
-    columns = [*alone, *offsets, *gives, told, -change, laws[0], *bent]
+    fast, slow = (efforts(q, rate * qd, rate**2 * qdd) for rate in (1.0 + STEP, 1.0 - STEP))
+    speed = (fast - slow) / (2.0 * STEP)
+    columns = [*alone, *offsets, *gives, told, -change, laws[0], speed]
     return np.stack(columns, -1), (missed - here)[..., None] * eye

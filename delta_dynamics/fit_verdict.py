@@ -6,28 +6,20 @@ May import: numpy, scipy, pkm_twin's core and identification, this package, the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.file_parameters import FileParameters, file_parameters
+from delta_dynamics.file_parameters import FileParameters
+from delta_dynamics.fit_lengths import GEOMETRY, Lengths
 from delta_dynamics.fit_rows import Recorded, Rows, calm_table, efforts_of
-from delta_dynamics.fit_signals import (
-    ELASTIC,
-    GEOMETRY,
-    OFFSET,
-    STEP,
-    columns_of,
-    suspects_of,
-)
+from delta_dynamics.fit_signals import SPEED, columns_of, suspects_of
 from delta_dynamics.fit_solved import Solved
-from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.judge import Evidence, judge
-from pkm_twin.identification.verdict import Finding, Suspect, Verdict
-from pkm_twin.machine.entries import entries, with_entries
+from pkm_twin.identification.judge import SIGMAS, Evidence, judge
+from pkm_twin.identification.verdict import Suspect, Verdict
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -39,10 +31,14 @@ OF_THE_FILE: Final = {
     "inertia": "mass or inertia other than the file's",
 }
 """Suspects that were not fitted, by the kind of the file's numbers."""
-LIKE_GEOMETRY: Final = (GEOMETRY, OFFSET, ELASTIC, OF_THE_FILE["inertia"], OF_THE_FILE["rotor"])
-"""Suspects in whose place a number of the geometry may stand."""
-LENGTHS: Final = 12
-"""Most numbers of the geometry that are looked at, as each is another robot."""
+OF_INERTIA: Final = ("rotor", "payload", "inertia")
+"""Kinds of numbers that only an accelerated motion tells."""
+RATE: Final = 8.0 / 3.0 * SIGMAS
+"""Deviations by which the rate of time has to show. Twice the rate takes three quarters of the
+efforts of inertia, 3/8 of their derivative by the rate: that is a finding's."""
+INERTIA: Final = 0.1
+"""And the part of the efforts' variation that is inertia: of less, other masses and offsets of the
+sensors, within their priors, take up three quarters."""
 
 
 def verdict_of(
@@ -56,23 +52,22 @@ def verdict_of(
     """
     values = everything.values.copy()
     values[chosen] = solved.estimate.values
+    lengths = Lengths.of(robot)
     made = [
-        _Recording.of(robot, everything, recording, made, delay, values)
+        _Recording.of(robot, everything, recording, made, delay, values, lengths)
         for recording, made, delay in zip(recordings, rows, solved.delays, strict=True)
     ]
-    court = _Court(robot, everything, chosen, values, solved, made)
-    verdict = court.judged(chosen, {})
-    masses = np.array([group.kind == "inertia" for group in everything.groups for _ in group.names])
-    frozen = court.judged(chosen & ~masses, {}) if (chosen & masses).any() else None
-    if any(one.suspect.kind in LIKE_GEOMETRY for one in _found(verdict, frozen)):
-        lengths = court.lengths()
-        verdict = court.judged(chosen, lengths)
-        frozen = frozen and court.judged(chosen & ~masses, lengths)
-    return verdict if frozen is None else _simpler(verdict, frozen)
-
-
-def _found(*verdicts: Verdict | None) -> list[Finding]:
-    return [one for verdict in verdicts if verdict is not None for one in verdict.findings]
+    suspects = (*suspects_of(robot), *lengths.suspects)
+    court = _Court(robot, everything, chosen, values, solved, made, suspects)
+    verdict = court.judged(chosen)
+    kinds = court.kinds
+    masses = kinds == "inertia"
+    if (chosen & masses).any():
+        verdict = _simpler(verdict, court.judged(chosen & ~masses))
+    if (chosen & np.isin(kinds, OF_INERTIA)).any() and not court.inertia_shown():
+        answer = "explains partly" if verdict.answer == "explains" else verdict.answer
+        verdict = replace(verdict, answer=answer, slow=True)
+    return verdict
 
 
 def _simpler(verdict: Verdict, frozen: Verdict) -> Verdict:
@@ -81,7 +76,9 @@ def _simpler(verdict: Verdict, frozen: Verdict) -> Verdict:
     :param frozen: with the file's masses.
     """
     kinds = {one.suspect.kind for one in frozen.findings}
-    if verdict.findings or not kinds or OF_THE_FILE["inertia"] in kinds or len(kinds) > 1:
+    if verdict.findings or OF_THE_FILE["inertia"] in kinds or len(kinds) != 1:
+        return verdict
+    if kinds == {GEOMETRY} and len(frozen.findings) > 1:
         return verdict
     if frozen.answer != "explains partly" or any(c.left_ratio > 1.0 for c in frozen.channels):
         return verdict
@@ -101,6 +98,7 @@ class _Recording:
     rows: Rows
     delay: float
     columns: Array
+    """By the suspects' sizes."""
     missed: Array
     calm: Array
     """All parameters' columns, without noise."""
@@ -108,13 +106,15 @@ class _Recording:
     @classmethod
     def of(
         cls, robot: Robot, everything: FileParameters, recorded: Recorded, rows: Rows,
-        delay: float, values: Array,
+        delay: float, values: Array, lengths: Lengths,
     ) -> _Recording:  # fmt: skip
-        """With the signals of the errors that every robot may have."""
+        """With the signals of the errors that every robot may have, and of its lengths."""
         smooth = _smooth(everything, values)
         efforts = efforts_of(robot, everything, recorded.carried, smooth, rows.signals)
         columns, missed = columns_of(robot, rows.signals, efforts)
         calm = calm_table(robot, everything, recorded.carried, rows.signals)
+        own = lengths.columns(robot, everything, recorded.carried, values, rows.signals)
+        columns = np.concatenate([columns, own], -1)
         return cls(recorded, rows, delay, columns, missed, calm)
 
 
@@ -128,75 +128,67 @@ class _Court:
     values: Array
     solved: Solved
     recordings: Sequence[_Recording]
+    suspects: Sequence[Suspect]
+    """Whose columns the recordings have."""
 
-    def judged(
-        self, free: NDArray[np.bool_], lengths: Mapping[str, tuple[str, Sequence[Array]]]
-    ) -> Verdict:
-        """With some parameters free to explain the residual, the others as the file has them.
+    @property
+    def kinds(self) -> NDArray[np.str_]:
+        """Of all parameters of the file."""
+        return np.array([group.kind for group in self.everything.groups for _ in group.names])
 
-        :param lengths: numbers of the geometry, their units, and their columns by recording.
-        """
-        kinds = np.array([g.kind for g in self.everything.groups for _ in g.names])
-        file = self.everything
-        values = np.where(free, self.values, file.values)
-        general = suspects_of(self.robot)
-        kept = [k for k, one in enumerate(general) if not lengths or one.kind != GEOMETRY]
-        suspects = [general[k] for k in kept]
-        suspects += [Suspect(GEOMETRY, path, unit) for path, (unit, _) in lengths.items()]
+    def judged(self, free: NDArray[np.bool_]) -> Verdict:
+        """With some parameters free to explain the residual, the others as the file has them."""
+        kinds, file = self.kinds, self.everything
+        suspects = [*self.suspects]
         suspects += [
             Suspect(OF_THE_FILE[kinds[k]], file.names[k], file.units[k])
             for k in np.flatnonzero(~free)
         ]
-        cases = []
-        for i, one in enumerate(self.recordings):
-            rows, effort = one.rows, one.rows.effort
-            # The sign of a rate is filtered as the efforts are.
-            others = np.where(kinds == "friction", rows.table, one.calm)[..., ~free]
-            named = [columns[i][..., None] for _, columns in lengths.values()]
-            cases.append(
-                Evidence(
-                    effort - rows.rest - rows.table @ values + one.delay * rows.change,
-                    rows.table[..., free],
-                    np.concatenate([rows.change[..., None], one.missed], -1),
-                    np.sqrt(np.sum(np.mean(one.missed**2, 0), -1)),
-                    np.concatenate([one.columns[..., kept], *named, others], -1),
-                    rows.signals.noise, rows.signals.band, rows.counts, self.solved.counts[i],
-                    np.sqrt(np.mean(effort**2, 0)), np.std(effort, 0),
-                )
-            )  # fmt: skip
+        cases = [self._evidence(i, free) for i in range(len(self.recordings))]
         e = self.solved.estimate
+        values = np.where(free, self.values, file.values)
         prior = (
             (values - file.values)[free], e.prior[free[self.chosen]],
             np.sqrt(np.diag(e.covariance)),
         )  # fmt: skip
         return judge(self.robot.joint_names, suspects, cases, prior, self.solved.response)
 
-    def lengths(self) -> dict[str, tuple[str, list[Array]]]:
-        """Derivatives of the measured efforts by numbers of the file's geometry."""
-        found = {}
-        known = entries(self.robot)
-        for path in [path for path in known if path.startswith("geometry.")][:LENGTHS]:
-            value, unit = known[path]
-            step = STEP * (self.robot.size if unit == "m" else 1.0)
-            try:
-                pair = [with_entries(self.robot, {path: value + h}) for h in (-step, step)]
-                found[path] = (
-                    unit,
-                    [self._apart(pair, one) / (2.0 * step) for one in self.recordings],
-                )
-            except (PkmTwinError, ValueError):
-                continue  # a number that cannot change alone
-        return found
+    def inertia_shown(self) -> bool:
+        """Whether the recordings would show time at twice or half its rate, friction being any."""
+        friction = self.kinds == "friction"
+        which = [one.kind for one in self.suspects].index(SPEED)
+        square, part, count = 0.0, 0.0, 0.0
+        for i in range(len(self.recordings)):
+            case = self._evidence(i, friction)
+            weight = case.weight[..., None]
+            table = np.concatenate([case.explained, case.nuisance], -1) * weight
+            table = table.reshape(-1, table.shape[-1])
+            table = table / np.maximum(np.linalg.norm(table, axis=0), 1e-300)
+            column = (case.suspects[..., which] * weight[..., 0]).ravel()
+            left = column - table @ np.linalg.lstsq(table, column, rcond=None)[0]
+            square += float(left @ left)
+            # The derivative by the rate is twice the efforts of inertia.
+            own = 0.5 * left.reshape(case.residual.shape) * case.floor
+            part += float(np.sum((own / np.maximum(case.variation, 1e-300)) ** 2))
+            count += float(case.counts.sum())
+        return square > RATE**2 and part > INERTIA**2 * count
 
-    def _apart(self, pair: Sequence[Robot], one: _Recording) -> Array:
-        """Efforts of the second robot less those of the first, shape (k, n)."""
-        told = []
-        for robot in pair:
-            parameters = file_parameters(robot)
-            values = _smooth(parameters, self.values)
-            efforts = efforts_of(robot, parameters, one.recorded.carried, values, one.rows.signals)
-            told.append(efforts(*one.rows.signals.motion))
-        return told[1] - told[0]
+    def _evidence(self, i: int, free: NDArray[np.bool_]) -> Evidence:
+        """Of one recording; the suspects' columns, then those of what is not free."""
+        one = self.recordings[i]
+        rows, effort = one.rows, one.rows.effort
+        values = np.where(free, self.values, self.everything.values)
+        # The sign of a rate is filtered as the efforts are.
+        others = np.where(self.kinds == "friction", rows.table, one.calm)[..., ~free]
+        return Evidence(
+            effort - rows.rest - rows.table @ values + one.delay * rows.change,
+            rows.table[..., free],
+            np.concatenate([rows.change[..., None], one.missed], -1),
+            np.sqrt(np.sum(np.mean(one.missed**2, 0), -1)),
+            np.concatenate([one.columns, others], -1),
+            rows.signals.noise, rows.signals.band, rows.counts, self.solved.counts[i],
+            np.sqrt(np.mean(effort**2, 0)), np.std(effort, 0),
+        )  # fmt: skip
 
 
 def _smooth(everything: FileParameters, values: Array) -> Array:

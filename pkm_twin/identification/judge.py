@@ -10,6 +10,11 @@ suspect that explains more than noise does is a finding (forward selection by th
 restricted model: Rao, 1948). What a finding would have changed in the fitted numbers widens their
 standard deviations.
 
+Errors of usual size that the residual would not show may be there all the same, and lengths that
+hide behind each other. All of them together have the residual's posterior distribution, with their
+usual sizes as the prior's standard deviations; its second moments widen the standard deviations
+too (consider parameters: Schmidt, 1966).
+
 May import: numpy, the standard library.
 """
 
@@ -128,8 +133,9 @@ def judge(
     seen = np.linalg.norm(left, axis=0)
     basis = _basis(base)
     y, left = y - basis @ (basis.T @ y), left - basis @ (basis.T @ left)
-    chosen, after = _select(y, left, seen, _least(few))
-    sizes = _sizes(y, left, [one.index for one in chosen])
+    prior_sizes = np.array([one.usual or 0.0 if one.known else np.inf for one in suspects])
+    chosen, after, rest = _select(y, left, seen, _least(few), prior_sizes)
+    sizes = _sizes(y, left, prior_sizes, [one.index for one in chosen])
     found = [_finding(suspects, one, pair) for one, pair in zip(chosen, sizes, strict=True)]
     clear = [one for one in found if one.sigmas >= SIGMAS]
     count = sum(case.residual.size for case in few)
@@ -149,12 +155,14 @@ def judge(
         for one, (size, _) in zip(chosen, sizes, strict=True)
         for k, size in ((one.index, size), *zip(one.near, one.sizes, strict=True))
     ]
-    blind, unseen = _blind(
-        suspects, cases, (left, seen), prior[2], response, {o.index for o in chosen}
-    )
+    inflation = float(max([1.0, *loud]) ** 2)
+    blind, unseen = _unseen(
+        suspects, cases, (after, rest, np.linalg.norm(left, axis=0), seen), inflation, prior[2],
+        response, {o.index for o in chosen},
+    )  # fmt: skip
     return Verdict(
         answer, told, tuple(clear), tuple(one for one in found if one.sigmas < SIGMAS), blind,
-        np.reshape(shifts, (-1, len(prior[2]))), float(max([1.0, *loud]) ** 2), unseen,
+        np.reshape(shifts, (-1, len(prior[2]))), inflation, unseen,
     )  # fmt: skip
 
 
@@ -216,69 +224,97 @@ def _least(cases: Sequence[Evidence]) -> Array:
     return np.asarray(MISSED * np.sqrt(missed / np.maximum(size, 1e-300)), np.float64)
 
 
-def _select(y: Array, table: Array, seen: Array, least: Array) -> tuple[list[_Chosen], Array]:
-    """Suspects that the residual shows, the last one perhaps not clearly, and what stays of it.
+def _select(
+    y: Array, table: Array, seen: Array, least: Array, prior: Array
+) -> tuple[list[_Chosen], Array, Array]:
+    """Suspects that the residual shows, the last perhaps not clearly; what stays of it and of them.
 
     :param seen: norms of the suspects before the fitted numbers were taken out, (s,).
     :param least: sizes from which they count, (s,).
+    :param prior: standard deviations that are known of their sizes, else infinite, (s,).
     """
     chosen: list[_Chosen] = []
     left, rest = table.copy(), y
+    known = np.isfinite(prior)
     while len(chosen) < FINDINGS and left.shape[1]:
         norms = np.linalg.norm(left, axis=0)
         good = norms > SEEN * np.maximum(seen, 1e-300)
         norms = np.where(good, norms, 1.0)
         scores = np.where(good, (rest @ left) / norms, 0.0)
         scores = np.where(np.abs(scores) > least * norms, scores, 0.0)
+        # What a size that is likely beforehand explains.
+        share = np.where(known, norms * np.where(known, prior, 0.0), np.inf)
+        share = 1.0 / (1.0 + np.maximum(share, 1e-300) ** -2.0)
+        scores = scores * np.sqrt(share)
+        # Between a hint and a finding the prior says as much as the residual.
+        if np.abs(scores).max() < SIGMAS:
+            scores = np.where(known, 0.0, scores)
         best = int(np.argmax(np.abs(scores)))
         sigmas = float(abs(scores[best]))
         if sigmas < HINT:
             break
         order = np.argsort(-np.abs(scores))
         near = [int(k) for k in order if k != best and abs(scores[k]) > NEAR * sigmas][:CHOICES]
-        own = tuple(float(scores[k] / norms[k]) for k in near)
+        own = tuple(float(np.sqrt(share[k]) * scores[k] / norms[k]) for k in near)
         chosen.append(_Chosen(best, sigmas, tuple(near), own))
         if sigmas < SIGMAS:
             break
         unit = left[:, best] / norms[best]
         rest = rest - unit * (unit @ rest)
         left = left - np.outer(unit, unit @ left)
-    return chosen, rest
+    return chosen, rest, left
 
 
-def _sizes(y: Array, table: Array, chosen: Sequence[int]) -> list[tuple[float, float]]:
+def _sizes(
+    y: Array, table: Array, prior: Array, chosen: Sequence[int]
+) -> list[tuple[float, float]]:
     """Of all suspects that were chosen together, with standard deviations."""
-    inverse = np.linalg.pinv(table[:, list(chosen)])
-    sizes, deviations = inverse @ y, np.linalg.norm(inverse, axis=1)
+    those = list(chosen)
+    whole = np.concatenate([table[:, those], np.diag(1.0 / prior[those])])
+    inverse = np.linalg.pinv(whole)
+    sizes, deviations = inverse[:, : len(y)] @ y, np.linalg.norm(inverse, axis=1)
     return list(zip(sizes.tolist(), deviations.tolist(), strict=True))
 
 
-def _blind(
-    suspects: Sequence[Suspect], cases: Sequence[Evidence], tables: tuple[Array, Array],
-    deviations: Array, response: Callable[[Sequence[Array]], Array], chosen: set[int],
+def _unseen(
+    suspects: Sequence[Suspect], cases: Sequence[Evidence],
+    tables: tuple[Array, Array, Array, Array], inflation: float, deviations: Array,
+    response: Callable[[Sequence[Array]], Array], chosen: set[int],
 ) -> tuple[tuple[Blind, ...], Array]:  # fmt: skip
     """Suspects of usual size that do not show, by what they would do, one of each kind.
 
-    And what each of them would change in the fitted parameters, (suspects, p).
+    And what these, and all whose size is known beforehand, change in the fitted parameters, as far
+    as the residual leaves them open: rows whose squares sum to second moments, (rows, parameters).
+
+    :param tables: the residual and the suspects that stay after the findings; the suspects' norms
+        after and before the fitted numbers were taken out.
+    :param inflation: of the noise's variance.
     """
-    left, seen = tables
-    norms = np.linalg.norm(left, axis=0)
-    hidden = [
+    rest, left, norms, seen = tables
+    hides = [
+        norms[k] * (one.usual or 0.0) < SIGMAS or norms[k] <= SEEN * seen[k]
+        for k, one in enumerate(suspects)
+    ]
+    # One that would show by itself is a finding where it is, but many lengths hide together.
+    some = [
         k for k, one in enumerate(suspects)
-        if one.usual is not None and k not in chosen
-        and (norms[k] * one.usual < SIGMAS or norms[k] <= SEEN * seen[k])
+        if one.usual and k not in chosen and (hides[k] or one.known)
     ]  # fmt: skip
-    if not hidden:
+    if not some:
         return (), np.zeros((0, len(deviations)))
-    usual = np.array([suspects[k].usual for k in hidden])
-    moved = response([case.suspects[..., hidden] * usual for case in cases])
-    ratio = np.abs(moved) / np.maximum(deviations, 1e-300)[:, None]
+    usual = np.array([suspects[k].usual for k in some])
+    moved = response([case.suspects[..., some] * usual for case in cases])
+    ratio = np.abs(moved) / np.maximum(deviations, 1e-300)[:, None] * np.array(hides)[some]
     found: dict[str, Blind] = {}
     for place in np.argsort(-ratio.max(0)):
-        one, index = suspects[hidden[place]], int(np.argmax(ratio[:, place]))
+        one, index = suspects[some[place]], int(np.argmax(ratio[:, place]))
         if ratio[index, place] > HARM and one.kind not in found and len(found) < UNSEEN:
             found[one.kind] = Blind(one, index, float(moved[index, place]))
-    return tuple(found.values()), moved.T
+    scaled = left[:, some] * usual
+    values, vectors = np.linalg.eigh(scaled.T @ scaled / inflation)
+    open_ = vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
+    middle = open_ @ (open_.T @ (scaled.T @ rest)) / inflation
+    return tuple(found.values()), np.concatenate([open_, middle[:, None]], 1).T @ moved.T
 
 
 def _channel(

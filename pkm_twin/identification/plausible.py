@@ -55,6 +55,8 @@ SCALES: Final = tuple(2.0 ** (k / 4.0) for k in range(-6, 7))
 """Around the scale of least squares."""
 TURNS: Final = 4
 """Most solutions for one recording, each with what the one before has left."""
+RATES: Final = (2.0, 0.5, 3.0, 1.0 / 3.0, 4.0, 0.25, 5.0, 0.2, 10.0, 0.1)
+"""Of time steps that were taken for others'."""
 LIKE_A_UNIT: Final = 1.25
 """A scale that is so near to a unit's is named by it."""
 
@@ -67,7 +69,8 @@ class Problem:
     ``columns``: by what is not, (k, n, c), about ``usual``, as far off as ``spread`` (infinite:
     nobody knows), between ``low`` and ``high``, (c,). ``friction``: which columns turn round with
     time, (c,). ``counts``: 1 for what is judged. ``noise``: deviation of the rows, (n,).
-    ``period``: of the rows, s.
+    ``period``: of the rows, s. ``inertial``: the part of the columns that grows with the square of
+    the rate of time, (k, n, c); None where that is not asked.
     """
 
     effort: Array
@@ -82,10 +85,16 @@ class Problem:
     counts: Array
     noise: Array
     period: float
+    inertial: Array | None = None
 
     def backwards(self) -> Problem:
         """The same with time reversed: friction helps the motion."""
         return replace(self, columns=np.where(self.friction, -1.0, 1.0) * self.columns)
+
+    def faster(self, rate: float) -> Problem:
+        """The same where time runs so many times as fast as recorded."""
+        extra = 0.0 if self.inertial is None else (rate**2 - 1.0) * self.inertial
+        return replace(self, columns=self.columns + extra)
 
     @property
     def variation(self) -> Array:
@@ -234,6 +243,10 @@ def _efforts(problem: Problem, joints: Sequence[str]) -> Iterator[tuple[str, Pro
         other = replace(problem, effort=problem.effort[:, order], late=problem.late[:, order])
         yield text, other, RARE
     yield from ((text, other, RARE) for text, other in _delays(problem, joints))
+    if problem.inertial is not None:
+        for rate in RATES:
+            text = f"the motion was {rate:.2g} times as fast as its time stamps are (time steps?)"
+            yield text, problem.faster(rate), UNIT
 
 
 def _signs(scales: Array) -> list[Array]:

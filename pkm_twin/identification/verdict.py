@@ -24,13 +24,15 @@ class Suspect:
     """An error that a machine or a recording may have.
 
     ``kind``: in words; ``where``: a joint, a direction, or a number of the file; ``unit``: of its
-    size, empty for a ratio; ``usual``: a size that is common, None where there is none.
+    size, empty for a ratio; ``usual``: a size that is common, None where there is none; ``known``:
+    it is the standard deviation, and much larger sizes explain nothing.
     """
 
     kind: str
     where: str
     unit: str = ""
     usual: float | None = None
+    known: bool = False
 
     def __str__(self) -> str:
         return f"{self.kind} ({self.where})"
@@ -94,8 +96,9 @@ class Verdict:
     ``hints``: suspects that the residual does not show clearly, but does not clear either.
     ``blind``: what the recordings would not show. ``shifts``: what findings and hints changed in
     the fitted parameters, shape (shifts, p). ``inflation``: factor on the covariance for what
-    stays unexplained. ``unseen``: what errors of usual size, which the recordings would not show,
-    would change in the fitted parameters, (errors, p).
+    stays unexplained. ``unseen``: what errors of usual size change in the fitted parameters, as far
+    as the residual leaves them open: rows whose squares sum to a covariance, (rows, p). ``slow``:
+    the motion is too slow to show any inertia.
     """
 
     answer: Answer
@@ -106,6 +109,7 @@ class Verdict:
     shifts: Array
     inflation: float
     unseen: Array
+    slow: bool = False
 
     def widened(self, covariance: Array) -> Array:
         """A covariance of the fitted parameters (p, p) with what the model does not explain.
@@ -129,6 +133,11 @@ class Verdict:
         """
         told = [f"the model {self.answer} the recordings"]
         told += [f"found: {one}" for one in self.findings]
+        if self.slow:
+            told.append(
+                "the motion is too slow to show inertia above the noise: numbers of inertia are "
+                "undetermined, and a wrong rate of time would not show"
+            )
         for channel, unit in zip(self.channels, units, strict=True):
             if channel.left_ratio > 1.0 or self.answer == "does not explain":
                 told.append(
@@ -164,6 +173,7 @@ class Verdict:
         return {
             "model": self.answer,
             "standard_deviations": self.deviations,
+            "too_slow_for_inertia": self.slow,
             "findings": [_as_json(one) for one in self.findings],
             "not_excluded": [_as_json(one) for one in self.hints],
             "would_not_show": [

@@ -60,7 +60,7 @@ def factors_of(robot: Robot) -> tuple[Factor, ...]:
 
     found = []
     for name, entry in robot.uncertainty.items():
-        known = _below(robot, name)
+        known = numbers_below(robot, name)
         sides = []
         for sign in (-STEP, STEP):
             if entry.deviation is not None:
@@ -73,7 +73,7 @@ def factors_of(robot: Robot) -> tuple[Factor, ...]:
     return tuple(found)
 
 
-def _below(robot: Robot, name: str) -> dict[str, float]:
+def numbers_below(robot: Robot, name: str) -> dict[str, float]:
     """The numbers that an entry is about."""
     from pkm_twin.machine.entries import entries
 
@@ -94,7 +94,7 @@ def check_uncertainty(robot: Robot) -> None:
     :raises ParameterError: by the field.
     """
     for name in robot.uncertainty:
-        _below(robot, name)
+        numbers_below(robot, name)
 
 
 def deviation(robot: Robot, call: Callable[[Robot], Any]) -> Array:

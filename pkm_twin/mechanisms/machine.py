@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +32,10 @@ from pkm_twin.machine.graph import (
     array,
     rotation_about_z,
 )
+from pkm_twin.machine.graph_drives import driven, drives_of
 from pkm_twin.machine.graph_file import (
     KINDS,
     PER_COPY,
-    JointSpec,
-    LimitSpec,
     Source,
     graph_of_entries,
     number_of_entry,
@@ -47,7 +46,7 @@ from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.robot_urdf import robot_description
-from pkm_twin.machine.sections import DriveSpec, Payload, friction_of, limits_of
+from pkm_twin.machine.sections import DriveSpec, Payload
 from pkm_twin.machine.shared import (
     Key,
     Shared,
@@ -59,6 +58,7 @@ from pkm_twin.machine.shared import (
 from pkm_twin.machine.uncertainty import UncertaintyEntry, check_uncertainty
 
 Array = NDArray[np.float64]
+M = TypeVar("M", bound="Machine")
 
 MOST_JOINTS: Final = 6
 """Most actuated joints."""
@@ -106,7 +106,7 @@ class Machine(Robot):
         if names is None:
             names = choose_coordinates(graph)
         coordinates = schema.checked(schema.words(*COORDINATES), "pose", names)
-        sections = _drives(graph, specs["joints"]) | {
+        sections = drives_of(graph, specs["joints"]) | {
             "payload": schema.build(Payload, data.get("payload") or {}, "payload"),
             "joint_map": schema.checked(
                 schema.mapping(JointMapEntry), "joint_map", data.get("joint_map") or {}
@@ -146,6 +146,21 @@ class Machine(Robot):
         graph.check()
         return graph
 
+    def changed(self: M, **sections: Mapping[str, object] | object) -> M:
+        """As of every robot; friction and limits are those of the joints' entries too."""
+        made = super().changed(**sections)
+        if not {"friction", "limits"} & set(sections):
+            return made
+        joints = dict(made.specs["joints"])
+        for k, name in enumerate(made.joint_names):
+            joints[name] = driven(joints[name], made.friction, made.limits, k)
+        specs = {**made.specs, "joints": joints}
+        described = dataclasses.replace(
+            graph_of_entries({"platform": made.described.platform}, specs),
+            origin=made.described.origin,
+        )
+        return made._with(specs=specs, described=described)
+
     def numbered(self, values: Mapping[str, Any]) -> Machine:
         """Paths of entries, ``joints.ball_1.at[0]``, or of a limb's, ``limbs.joints.ball.at[0]``.
 
@@ -167,7 +182,7 @@ class Machine(Robot):
             graph_of_entries({"platform": self.described.platform}, specs), origin=origin
         )
         made = super().numbered(rest)
-        return made._with(described=described, specs=specs, **_drives(described, specs["joints"]))
+        return made._with(described=described, specs=specs, **drives_of(described, specs["joints"]))
 
     def check_number(self, path: str) -> None:
         """As a file's, in each of the entries that have it."""
@@ -445,40 +460,10 @@ class Machine(Robot):
         return Structure(beams, sections, compliances)
 
 
-def _drives(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
-    """Friction and limits of the actuated joints."""
-    drives = graph.actuated
-    limits = [joints[j].limits or LimitSpec() for j in drives]
-    n = len(drives)
-    return {
-        "friction": friction_of(n)(
-            viscous=array([graph.joints[j].viscous for j in drives]),
-            coulomb=array([graph.joints[j].coulomb for j in drives]),
-            offset=array([_offset(joints[j]) for j in drives]),
-        ),
-        "limits": limits_of(n)(
-            position=_together([v.position for v in limits], [-math.inf, math.inf]),
-            velocity=_together([v.velocity for v in limits], math.inf),
-            effort=_together([v.effort for v in limits], math.inf),
-        ),
-    }
-
-
 def _root(inertia: Array) -> Array:
     """A matrix whose square is a symmetric one."""
     values, vectors = np.linalg.eigh(inertia)
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, np.float64)
-
-
-def _together(values: list[Any], absent: Any) -> Array | None:
-    """One array of what joints have; None where none has it."""
-    if all(value is None for value in values):
-        return None
-    return array([absent if value is None else value for value in values])
-
-
-def _offset(joint: JointSpec) -> float:
-    return 0.0 if joint.friction is None else joint.friction.offset
 
 
 def _limbs(graph: Graph) -> dict[str, int]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from delta_dynamics import inverse_dynamics, mass_matrix
 from delta_dynamics.estimation import estimate
 from delta_dynamics.file_parameters import file_parameters
 from delta_dynamics.fit import Fit, fit
@@ -19,15 +21,14 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.shared import above_zero
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy
 from test.laws.test_fit import truths
-from test.support.robots import load
+from test.support.robots import load, partly_long
 
 Array = NDArray[np.float64]
 
 KINDS: Any = ("friction", "payload")
 COMMON = (
-    "efforts_negated", "one_effort_negated", "one_joint_negated", "positions_negated",
-    "time_reversed", "effort_columns_swapped", "position_columns_swapped", "milliseconds",
-    "kgf_cm", "three_times", "efforts_late",
+    "efforts_negated", "one_joint_negated", "time_reversed", "effort_columns_swapped",
+    "milliseconds", "kgf_cm", "efforts_late",
 )  # fmt: skip
 LIKELY = {
     "gain": "gain of the efforts", "late": "efforts late", "sensor": "sensor offset",
@@ -82,6 +83,10 @@ def test_what_no_machine_of_the_file_makes_is_rejected(what: str) -> None:
     assert rejected(what, "linear_delta", 4)
 
 
+def test_half_its_speed_is_rejected_though_weight_makes_up_the_efforts() -> None:
+    assert rejected("half_speed", "prru", 5)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["delta", "prru", "rps3", "upr_rpu", "linear_delta"])
 @pytest.mark.parametrize("what", IMPOSSIBLE)
@@ -89,9 +94,44 @@ def test_others_are_rejected_too(what: str, name: str) -> None:
     assert rejected(what, name, 5)
 
 
-@pytest.mark.parametrize("what", WRONG)
+@pytest.mark.parametrize("what", partly_long(list(WRONG), "gains", "sensors", "lengths"))
 def test_another_machine_of_the_file_s_kind_is_not_rejected(what: str) -> None:
     assert not rejected(what, "linear_delta", 4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("factor", [2.0, 4.0, 8.0, 16.0])
+@pytest.mark.parametrize("rate", [0.5, 2.0])
+@pytest.mark.parametrize("name", ["prru", "linear_delta", "upr_rpu", "five_bar"])
+def test_another_rate_of_time_is_rejected_said_or_within_the_deviations(
+    name: str, rate: float, factor: float
+) -> None:
+    """Also of motions so slow that weight and friction make nearly all of the efforts."""
+    m = drawn(name, 6)
+    slow = Drawn(m.robot, m.truth, factor * m.time, m.q, m.qd / factor, m.qdd / factor**2,
+                 inverse_dynamics(m.truth, m.q, m.qd / factor, m.qdd / factor**2))  # fmt: skip
+    sound = noisy(slow.recorded(), np.random.default_rng(7))
+    assert fit(m.robot, [sound], KINDS).accepted == ()
+    try:
+        result = fit(m.robot, [replace(sound, time=rate * sound.time)], KINDS)
+    except PkmTwinError:
+        return
+    assert result.verdict.answer != "explains" or worst(result, slow) < 4.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("share", [1.0, 3.0])
+@pytest.mark.parametrize("name", ["delta_cu", "prru", "upr_rpu"])
+def test_rotors_that_the_file_does_not_have_are_no_other_rate_of_time(
+    name: str, share: float
+) -> None:
+    m = drawn(name, 6)
+    home = m.robot.graph.home
+    rotors = share * float(np.diag(mass_matrix(m.robot, home)).max()) * m.qdd
+    record = noisy(m.recorded(effort=m.efforts + rotors), np.random.default_rng(7))
+    everything = file_parameters(m.robot)
+    rows, _ = rows_of(m.robot, everything, record, None)
+    assert recording_fault(m.robot, everything, record, rows) is None
 
 
 @pytest.mark.parametrize(

@@ -275,7 +275,7 @@ def test_energy_never_grows_without_input(name, trials, machine):
     assert moved > 15 * trials
 
 
-@every_machine("delta_cu", "rps3", "random hinged_platform")
+@every_machine("five_bar", "rps3", "random hinged_platform")
 def test_an_impact_is_the_least_change_that_all_stops_allow(name, machine, rng):
     robot = machine(name)
     n = robot.joints_count

@@ -16,7 +16,7 @@ from pkm_twin.codegen.lu import pivot_order
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.entries import entries
+from pkm_twin.machine.entries import entries, with_entries
 from stiffness_monitor import compliance
 from stiffness_monitor.programs import elastic_of, followed
 from test.machine.random_machines import plain
@@ -142,6 +142,23 @@ def test_a_path_that_there_is_not_is_rejected(path):
     with pytest.raises(ParameterError) as caught:
         variants(load("delta"), {path: [1.0, 2.0]})
     assert path in caught.value.field
+
+
+@pytest.mark.parametrize("name", ["delta_cu", "five_bar", "linear_delta"])
+def test_what_was_changed_stays_when_another_number_changes(name, rng):
+    robot = load(name)
+    n = robot.joints_count
+    friction = {key: rng.uniform(1.0, 2.0, n).tolist() for key in ("viscous", "coulomb")}
+    changed = robot.changed(friction=friction, payload={"mass": 0.3}, limits={"velocity": 7.0})
+    path = next(path for path, (_, unit) in entries(changed).items() if unit == "kg")
+    again = with_entries(changed, {path: entries(changed)[path][0]})
+    state = motion(robot, rng, 3)
+    expected = inverse_dynamics(changed, *state)
+    np.testing.assert_allclose(inverse_dynamics(again, *state), expected, rtol=1e-12)
+    many = variants(changed, {path: changed.number(path)})
+    np.testing.assert_allclose(many.inverse_dynamics(*state)[0], expected, rtol=1e-12)
+    for robot in (again, many[0]):
+        assert (np.asarray(robot.limits.velocity) == 7.0).all()
 
 
 def test_columns_of_several_lengths_are_rejected():

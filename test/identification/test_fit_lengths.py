@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lengths that a fit takes for certain: their derivatives, their sizes, slow motions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from delta_dynamics.file_parameters import file_parameters
+from delta_dynamics.fit import fit
+from delta_dynamics.fit_lengths import USUAL, Lengths
+from delta_dynamics.fit_rows import Recorded, rows_of
+from pkm_twin import Robot
+from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.entries import data_of, with_entries
+from test.identification.machines import machine, noisy
+from test.machine.random_machines import variant
+from test.support.robots import load
+
+KINDS: Any = ("friction", "payload")
+
+
+def robot_named(name: str) -> Robot:
+    """A shipped robot, or one of random dimensions."""
+    kind, _, what = name.partition(" ")
+    if kind != "random":
+        return load(name)
+    return robot_of_data(variant(what, np.random.default_rng(len(what))), what)
+
+
+def unsure(robot: Robot, uncertainty: dict[str, dict[str, float]]) -> Robot:
+    return type(robot).from_data(data_of(robot) | {"uncertainty": uncertainty}, robot.name)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["delta_cu", "linear_delta",
+     *(pytest.param(n, marks=pytest.mark.long)
+       for n in ("prru", "upr_rpu", "delta", "stewart", "random five_bar", "random rsur"))],
+)  # fmt: skip
+def test_columns_are_differences_of_the_efforts(name: str) -> None:
+    """Of the machine as fitted, with the payload while it is held."""
+    robot = robot_named(name)
+    m = machine(robot, np.random.default_rng(3), 6.0)
+    held = (m.time > 3.0).astype(float)
+    record = replace(noisy(m.recorded(), np.random.default_rng(4)), held=held)
+    everything = file_parameters(robot)
+    rows, _ = rows_of(robot, everything, record, None)
+    heavy = robot.changed(payload={"mass": 0.4})
+    none = robot.changed(payload={"mass": 0.0, "inertia": [0.0, 0.0, 0.0]})
+    values = file_parameters(heavy).values
+    lengths = Lengths.of(robot)
+    found = lengths.columns(robot, everything, None, values, rows.signals)
+    size = np.abs(inverse_dynamics(robot, *rows.signals.motion)).max() / robot.graph.size
+    tried = 0
+    for k in np.random.default_rng(5).permutation(len(lengths.paths))[:8]:
+        (where,) = np.flatnonzero(lengths.mixing[:, k])
+        path = lengths.paths[where]
+        step = 1e-5 * robot.graph.size
+        sides = []
+        try:
+            for one in (heavy, none):
+                pair = [with_entries(one, {path: one.number(path) + h}) for h in (-step, step)]
+                low, high = (inverse_dynamics(other, *rows.signals.motion) for other in pair)
+                sides.append((high - low) / (2.0 * step))
+        except ValueError:
+            continue  # a closure that only this number's own value meets
+        loaded = rows.signals.held[:, None]
+        expected = loaded * sides[0] + (1.0 - loaded) * sides[1]
+        np.testing.assert_allclose(found[..., k], expected, rtol=0, atol=1e-4 * size)
+        tried += 1
+    assert tried > 2
+
+
+def test_the_file_says_how_well_its_lengths_are_known() -> None:
+    robot = load("delta_cu")
+    usual = {one.where: one.usual for one in Lengths.of(robot).suspects}
+    assert usual["geometry.arm_length"] == USUAL * robot.graph.size
+    own = unsure(robot, {"geometry.arm_length": {"deviation": 1e-4}, "inertia": {"relative": 0.1}})
+    usual = {one.where: one.usual for one in Lengths.of(own).suspects}
+    assert usual["geometry.arm_length"] == 1e-4
+    assert usual["geometry.forearm_length"] == USUAL * robot.graph.size
+    all_in_one = Lengths.of(unsure(robot, {"geometry": {"relative": 1e-3}}))
+    assert len(all_in_one.suspects) == 1
+    assert all_in_one.mixing[all_in_one.paths.index("geometry.arm_length"), 0] == robot.number(
+        "geometry.arm_length"
+    )
+
+
+def test_lengths_that_are_known_better_make_a_payload_known_better() -> None:
+    robot = load("linear_delta")
+    record = noisy(machine(robot, np.random.default_rng(1)).recorded(), np.random.default_rng(2))
+    sure = {"joints": {"relative": 1e-6}, "rods": {"relative": 1e-6}}
+    wide, narrow = (
+        next(n for n in fit(one, [record], KINDS).numbers if n.name == "payload.mass")
+        for one in (robot, unsure(robot, sure))
+    )
+    assert wide.after == pytest.approx(narrow.after)
+    assert narrow.deviation < 0.7 * wide.deviation
+
+
+def slower(name: str, factor: float) -> tuple[Robot, Recorded]:
+    """A sound recording of a motion that takes so many times as long."""
+    robot = load(name)
+    m = machine(robot, np.random.default_rng(6))
+    efforts = inverse_dynamics(m.truth, m.q, m.qd / factor, m.qdd / factor**2)
+    record = Recorded("slow", factor * m.time, m.q, efforts)
+    return robot, noisy(record, np.random.default_rng(7))
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "slow"),
+    [("linear_delta", 60.0, True), ("linear_delta", 1.0, False),
+     *(pytest.param(*case, marks=pytest.mark.long)
+       for case in (("prru", 60.0, True), ("five_bar", 30.0, True), ("prru", 2.0, False)))],
+)  # fmt: skip
+def test_a_motion_too_slow_for_inertia_explains_none(name: str, factor: float, slow: bool) -> None:
+    robot, record = slower(name, factor)
+    verdict = fit(robot, [record], KINDS).verdict
+    assert verdict.slow == slow
+    assert (verdict.answer == "explains") != slow
+    # Friction does not need it.
+    assert not fit(robot, [record], ("friction",)).verdict.slow
