@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterable
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from itertools import combinations
 from typing import Any, Final
 from xml.sax.saxutils import escape
 
@@ -45,15 +46,11 @@ def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]
     """The files of the package, text by path.
 
     :param bandwidth: of the controller's gains by the masses at home, Hz; zero: no gains.
-    :raises ParameterError: a robot whose file gives no masses, a bandwidth below zero, or a pose
-        that is not made of x y z roll pitch yaw.
+    :raises ParameterError: a robot whose file gives no masses, or a bandwidth below zero.
     """
     if not (math.isfinite(bandwidth) and bandwidth >= 0.0):
         raise ParameterError("bandwidth", bandwidth, "a frequency of at least 0 Hz")
     robot.massive()
-    pose = list(robot.pose_names)
-    if not set(pose) <= set(POSE):
-        raise ParameterError("pose", pose, f"of {', '.join(POSE)}")
     package = package_name(robot)
     words = _words(robot, package)
     result = {f"c/{name}": text for name, text in c_package(robot).items()}
@@ -81,6 +78,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
     shown = re.sub(r"[^\w .:+-]", "_", robot.name or robot.mechanism)
     load, controller = robot.payload, robot.controller
     home = robot.graph.home
+    directions = _directions(robot)
     steps = np.abs(controller.factors) * _range(robot, home)
     return {
         "ROBOT": shown,
@@ -90,8 +88,8 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "PREFIX": f"pkm_{own}",
         "MACRO": f"PKM_{own}".upper(),
         "JOINTNAMES": ", ".join(f"`{name}`" for name in controller.names),
-        "POSENAMES": ", ".join(robot.pose_names),
-        "POSE": _row(POSE.index(name) for name in robot.pose_names),
+        "POSENAMES": ", ".join(POSE[k] for k in directions),
+        "POSE": _row(directions),
         "PAYLOAD": "{"
         + ", ".join([_number(load.mass), _row(load.com), _row(np.ravel(load.inertia))])
         + "}",
@@ -99,6 +97,23 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "START": _row(controller.controller_positions(home)),
         "RANGE": _row(steps),
     }
+
+
+def _directions(robot: Robot) -> list[int]:
+    """Rows of the platform's twist that are the pose's.
+
+    Of a pose with coordinates of its own, those in which the joints move the platform best at home.
+    """
+    names = robot.pose_names
+    if set(names) <= set(POSE):
+        return [POSE.index(name) for name in names]
+    twist = robot.platform_jacobian(robot.graph.home)
+    twist[:3] /= robot.graph.size
+    twist /= np.linalg.norm(twist, axis=0)
+    choices = list(combinations(range(len(POSE)), len(names)))
+    # Rounded: equals stay in their order, whatever the arithmetic.
+    sizes = [round(abs(np.linalg.det(twist[list(rows)])), 6) for rows in choices]
+    return list(choices[int(np.argmax(sizes))])
 
 
 def _drives(robot: Robot) -> str:

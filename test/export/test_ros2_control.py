@@ -236,8 +236,8 @@ def test_files_are_complete_and_well_formed(files, tmp_path):
     cmake = files["CMakeLists.txt"]
     for name in files:
         if name.startswith("src/"):
-            plugin = f"add_plugin({Path(name).stem} "
-            assert name in cmake or plugin in cmake, name
+            plugin = rf"add_plugin\({Path(name).stem}\s"
+            assert name in cmake or re.search(plugin, cmake), name
     for name, base in (
         ("feedforward_controller", "controller_interface"),
         ("kinematics", "kinematics_interface"),

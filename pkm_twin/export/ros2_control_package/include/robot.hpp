@@ -31,7 +31,7 @@ constexpr std::array<Drive, JOINTS> DRIVES{{
 @DRIVES@
 }};
 
-/// Rows of the twist (x y z, then rotations about them) that are the robot's pose.
+/// Rows of the twist (x y z, then rotations about them) in which the joints move the platform.
 constexpr std::array<std::size_t, JOINTS> POSE{@POSE@};
 
 struct Payload

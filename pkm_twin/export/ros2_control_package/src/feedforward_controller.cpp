@@ -226,10 +226,12 @@ void FeedforwardController::check_names() const
       known.insert("limits." + joint + "." + leaf);
     }
   }
-  const auto listed = get_node()->list_parameters({"gains", "limits", "payload"}, 0).names;
-  for (const std::string & name : listed) {
-    if (known.count(name) == 0) {
-      throw std::invalid_argument(name + ": unknown parameter; joints: " + joints_[0] + ", ...");
+  const auto & given = get_node()->get_node_parameters_interface()->get_parameter_overrides();
+  for (const auto & [name, value] : given) {
+    const std::string group = name.substr(0, name.find('.'));
+    const bool ours = group == "gains" || group == "limits" || group == "payload";
+    if (ours && known.count(name) == 0) {
+      throw std::invalid_argument(name + ": unknown parameter; the first joint is " + joints_[0]);
     }
   }
 }

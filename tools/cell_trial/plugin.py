@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exported controller under joint_trajectory_controller: its efforts compared with the twin's.
+
+    python3 tools/cell_trial/plugin.py [--robot delta_cu] [mock] [sim]
+
+``mock``: mock hardware, which does not move. ``sim``: machine_sim, through the hardware in
+tools/cell_trial/topic_hardware. Needs a sourced Jazzy workspace with pkm_twin, ros2_control,
+joint_trajectory_controller and the package that ``pkm-twin export ros2-control ROBOT`` wrote; for
+``sim`` also pkm_topic_hardware. The references that the controller has followed go to a running
+delta_dynamics as a JointTrajectory, and its efforts are compared with the controller's.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Duration
+from cell import Peer, Process, closing, node, peer
+from control_msgs.msg import JointTrajectoryControllerState
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import QoSProfile
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from pkm_twin import Robot, load
+from pkm_twin.export.ros2_control import CONTROLLER, TRAJECTORIES
+
+HARDWARE = {"mock": "mock_components/GenericSystem", "sim": "pkm_topic_hardware/TopicSystem"}
+BANDWIDTH = {"mock": 0.0, "sim": 5.0}
+"""Of the gains, Hz: mock hardware does not follow, and gains would push against it."""
+
+
+def stamped(seconds: float) -> Duration:
+    """A duration."""
+    sec, nanosec = divmod(round(seconds * 1e9), 10**9)
+    return Duration(sec=sec, nanosec=nanosec)
+
+
+def trajectory(names: list[str], times: Any, *columns: Any) -> JointTrajectory:
+    """Positions, velocities and accelerations (points, n) as a message."""
+    points = [
+        JointTrajectoryPoint(
+            positions=q.tolist(),
+            velocities=qd.tolist(),
+            accelerations=qdd.tolist(),
+            time_from_start=stamped(float(t)),
+        )
+        for t, q, qd, qdd in zip(times, *columns, strict=True)
+    ]
+    return JointTrajectory(joint_names=names, points=points)
+
+
+def there_and_back(robot: Robot, start: Any, seconds: float) -> JointTrajectory:
+    """A tenth of the range, in the controller's numbers; three times."""
+    limits = robot.limits.position
+    size = 0.1 * (1.0 if limits is None else float(np.ptp(limits, axis=1).min()))
+    toward = np.ones(len(start)) if limits is None else np.sign(limits.mean(1) - start)
+    aim = np.where(toward == 0.0, 1.0, toward) * size * robot.controller.factors
+    t = np.linspace(0.0, 1.0, 201)
+    w = 6.0 * np.pi
+    # Begins and ends at rest: a quintic of the phase.
+    phase = t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
+    rate = 30.0 * t**2 * (1.0 - t) ** 2
+    second = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t)
+    shape = (1.0 - np.cos(w * phase)) / 2.0
+    first = w / 2.0 * np.sin(w * phase) * rate / seconds
+    twice = w / 2.0 * (w * np.cos(w * phase) * rate**2 + np.sin(w * phase) * second) / seconds**2
+    home = robot.controller.controller_positions(start)
+    return trajectory(
+        list(robot.controller.names), 0.05 + seconds * t,
+        home + np.outer(shape, aim), np.outer(first, aim), np.outer(twice, aim),
+    )  # fmt: skip
+
+
+def followed(other: Peer, robot: Robot, part: str) -> list[Any]:
+    """States of the controller while joint_trajectory_controller goes there and back."""
+    states = other.hear(JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 50000)
+    counts = other.hear(DiagnosticArray, "/diagnostics", 1000)
+    send = other.node.create_publisher(
+        JointTrajectory, f"/{TRAJECTORIES}/joint_trajectory", QoSProfile(depth=10)
+    )
+    launched = Process(
+        "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={robot.name}", "use:=plugin",
+        f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={BANDWIDTH[part] or ''}",
+    )  # fmt: skip
+    with closing(launched):
+        try:
+            other.until(lambda: states, "the controller's state")
+            other.until(send.get_subscription_count, "joint_trajectory_controller")
+        except TimeoutError:
+            print(launched.output)
+            raise
+        # Both controllers become active one after the other.
+        other.spin(5.0)
+        states.clear()
+        # The twin's numbers, from the controller's.
+        start = robot.controller.positions(np.array(states_of(other, states).feedback.positions))
+        motion = there_and_back(robot, start, 4.0)
+        states.clear()
+        send.publish(motion)
+        other.until(lambda: any(states[-1].reference.velocities) if states else False, "motion")
+        other.spin(5.0)
+        other.until(lambda: not any(states[-1].reference.velocities), "the end of the motion")
+        other.spin(1.5)
+        mine = [s for m in counts for s in m.status if s.name.endswith(": feedforward")]
+        text = ", ".join(f"{v.key} {v.value}" for v in mine[-1].values) if mine else "none"
+        print(f"{part}: diagnostics: {mine[-1].message if mine else ''}; {text}")
+    return [s for s in states if any(s.reference.velocities)]
+
+
+def states_of(other: Peer, states: list[Any]) -> Any:
+    """The next state."""
+    other.until(lambda: states, "a state of the controller")
+    return states[-1]
+
+
+def twin_s_efforts(other: Peer, robot: Robot, states: list[Any]) -> Any:
+    """Efforts of a running delta_dynamics for the references of these states, (count, n)."""
+    answers = other.hear(JointTrajectory, "/delta_dynamics/joint_trajectory_ff", 10)
+    send = other.node.create_publisher(
+        JointTrajectory, "/delta_dynamics/joint_trajectory", QoSProfile(depth=10)
+    )
+    references = [s.reference for s in states]
+    columns = [
+        np.array([getattr(r, name) for r in references])
+        for name in ("positions", "velocities", "accelerations")
+    ]
+    # Times only have to rise: efforts are those of each point.
+    message = trajectory(
+        list(robot.controller.names), 1e-3 * np.arange(1, len(states) + 1), *columns
+    )
+    with closing(node("delta_dynamics", parameters=[f"mechanism:={robot.name}"])):
+        other.until(send.get_subscription_count, "delta_dynamics")
+        other.spin(1.0)
+        send.publish(message)
+        other.until(lambda: answers, "the twin's efforts")
+    return np.array([p.effort for p in answers[-1].points])
+
+
+def show(other: Peer, robot: Robot, part: str) -> None:
+    """One hardware."""
+    simulated = []
+    if part == "sim":
+        simulated.append(
+            node(
+                "machine_sim",
+                parameters=[f"mechanism:={robot.name}", "period:=0.002"],
+                remap=["joint_states:=/machine_sim/joint_states"],
+            )
+        )
+    with closing(*simulated):
+        states = followed(other, robot, part)
+    found = np.array([s.reference.effort for s in states])
+    right = twin_s_efforts(other, robot, states)
+    error = np.abs(found - right).max()
+    print(
+        f"{part}: {len(states)} states of the motion, effort less that of delta_dynamics "
+        f"{error:.2e} at most, {error / np.abs(right).max():.1e} of the peak"
+    )
+    if part == "sim":
+        miss = np.array([s.error.positions for s in states])
+        print(f"sim: tracking error {np.sqrt((miss**2).mean()):.2e} RMS, with gains of 5 Hz")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("parts", nargs="*", default=list(HARDWARE), help=", ".join(HARDWARE))
+    parser.add_argument("--robot", default="delta_cu")
+    given = parser.parse_args()
+    with peer() as other:
+        for part in given.parts:
+            show(other, load(given.robot), part)
+
+
+if __name__ == "__main__":
+    main()
