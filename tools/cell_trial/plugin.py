@@ -82,7 +82,7 @@ def followed(other: Peer, robot: Robot, part: str) -> list[Any]:
     )
     launched = Process(
         "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={robot.name}", "use:=plugin",
-        f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={BANDWIDTH[part] or ''}",
+        f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={BANDWIDTH[part]}",
     )  # fmt: skip
     with closing(launched):
         try:

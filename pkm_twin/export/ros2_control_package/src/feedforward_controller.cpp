@@ -103,7 +103,7 @@ private:
   // Parameters. Throw std::invalid_argument with the name and what would be right.
   void declare();
   Settings read(const std::vector<rclcpp::Parameter> & changes) const;
-  void check_names() const;
+  void check_names();
 
   // In the control loop: nothing below allocates.
   void measure();
@@ -215,7 +215,7 @@ void FeedforwardController::declare()
 }
 
 /// A misspelt joint would else keep its gain of zero without a word.
-void FeedforwardController::check_names() const
+void FeedforwardController::check_names()
 {
   std::set<std::string> known{"payload.mass", "payload.com", "payload.inertia"};
   for (const std::string & joint : joints_) {
