@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exported controller under joint_trajectory_controller: its efforts compared with the twin's.
 
-    python3 tools/cell_trial/plugin.py [--robot delta_cu] [mock] [sim]
+    python3 tools/cell_trial/plugin.py [--robot delta_cu] [mock] [sim] [beyond]
 
 ``mock``: mock hardware, which does not move. ``sim``: machine_sim, through the hardware in
-tools/cell_trial/topic_hardware. Needs a sourced Jazzy workspace with pkm_twin, ros2_control,
-joint_trajectory_controller and the package that ``pkm-twin export ros2-control ROBOT`` wrote; for
-``sim`` also pkm_topic_hardware. The references that the controller has followed go to a running
-delta_dynamics as a JointTrajectory, and its efforts are compared with the controller's.
+tools/cell_trial/topic_hardware. Of both, the references that the controller has followed go to a
+running delta_dynamics as a JointTrajectory, and its efforts are compared with the controller's.
+``beyond``: mock hardware, and a trajectory through a position limit: the controller holds, and
+after its hold_time the chain is deactivated.
+
+Needs a sourced Jazzy workspace with pkm_twin, ros2_control, joint_trajectory_controller and the
+package that ``pkm-twin export ros2-control ROBOT`` wrote; for ``sim`` also pkm_topic_hardware.
 """
 
 from __future__ import annotations
 
 import argparse
+import subprocess
 from typing import Any
 
 import numpy as np
@@ -23,11 +27,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot, load
 from pkm_twin.export.ros2_control import CONTROLLER, TRAJECTORIES
 
-HARDWARE = {"mock": "mock_components/GenericSystem", "sim": "pkm_topic_hardware/TopicSystem"}
-BANDWIDTH = {"mock": 0.0, "sim": 5.0}
+MOCK = "mock_components/GenericSystem"
+HARDWARE = {"mock": MOCK, "sim": "pkm_topic_hardware/TopicSystem", "beyond": MOCK}
+BANDWIDTH = {"mock": 0.0, "sim": 5.0, "beyond": 0.0}
 """Of the gains, Hz: mock hardware does not follow, and gains would push against it."""
 
 
@@ -73,49 +79,83 @@ def there_and_back(robot: Robot, start: Any, seconds: float) -> JointTrajectory:
     )  # fmt: skip
 
 
-def followed(other: Peer, robot: Robot, part: str) -> list[Any]:
-    """States of the controller while joint_trajectory_controller goes there and back."""
-    states = other.hear(JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 50000)
-    counts = other.hear(DiagnosticArray, "/diagnostics", 1000)
-    send = other.node.create_publisher(
-        JointTrajectory, f"/{TRAJECTORIES}/joint_trajectory", QoSProfile(depth=10)
-    )
-    launched = Process(
-        "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={robot.name}", "use:=plugin",
-        f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={BANDWIDTH[part]}",
-    )  # fmt: skip
-    with closing(launched):
-        try:
-            other.until(lambda: states, "the controller's state")
-            other.until(send.get_subscription_count, "joint_trajectory_controller")
-        except TimeoutError:
-            print(launched.output)
-            raise
-        # Both controllers become active one after the other.
-        other.spin(5.0)
-        states.clear()
-        # The twin's numbers, from the controller's.
-        start = robot.controller.positions(np.array(states_of(other, states).feedback.positions))
-        motion = there_and_back(robot, start, 4.0)
-        states.clear()
-        send.publish(motion)
-        other.until(lambda: any(states[-1].reference.velocities) if states else False, "motion")
-        other.spin(5.0)
-        other.until(lambda: not any(states[-1].reference.velocities), "the end of the motion")
-        other.spin(1.5)
-        mine = [s for m in counts for s in m.status if s.name.endswith(": feedforward")]
-        text = ", ".join(f"{v.key} {v.value}" for v in mine[-1].values) if mine else "none"
-        print(f"{part}: diagnostics: {mine[-1].message if mine else ''}; {text}")
-    return [s for s in states if any(s.reference.velocities)]
+class Chain:
+    """joint_trajectory_controller in front of the exported controller, by the launch file."""
+
+    def __init__(self, other: Peer, given: str, part: str) -> None:
+        self.other, self.robot, self.part = other, load(given), part
+        self.states = other.hear(
+            JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 50000
+        )
+        self.counts = other.hear(DiagnosticArray, "/diagnostics", 1000)
+        self.send = other.node.create_publisher(
+            JointTrajectory, f"/{TRAJECTORIES}/joint_trajectory", QoSProfile(depth=10)
+        )
+        self.process = Process(
+            "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={given}", "use:=plugin",
+            f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={BANDWIDTH[part]}",
+        )  # fmt: skip
+
+    def start(self) -> Any:
+        """Wait for both controllers; the model's joint positions."""
+        self.other.until(lambda: self.states, f"the controller\n{self.process.output}")
+        self.other.until(self.send.get_subscription_count, TRAJECTORIES)
+        # They become active one after the other.
+        self.other.spin(5.0)
+        return self.robot.controller.positions(np.array(self.states[-1].feedback.positions))
+
+    def go(self, motion: JointTrajectory) -> None:
+        """Send a trajectory and wait until it begins."""
+        self.states.clear()
+        self.send.publish(motion)
+        self.other.until(lambda: self.states and any(self.last.reference.velocities), "motion")
+
+    @property
+    def last(self) -> Any:
+        """The last state."""
+        return self.states[-1]
+
+    def followed(self) -> list[Any]:
+        """States of a motion there and back."""
+        self.go(there_and_back(self.robot, self.start(), 4.0))
+        self.other.spin(5.0)
+        self.other.until(lambda: not any(self.last.reference.velocities), "the motion's end")
+        self.other.spin(1.5)
+        self.report()
+        return [s for s in self.states if any(s.reference.velocities)]
+
+    def beyond(self) -> None:
+        """A trajectory through the position limit of the first joint."""
+        robot, start = self.robot, self.start()
+        aim = np.array(start)
+        aim[0] = robot.limits.position[0, 1] + 0.2 * np.ptp(robot.limits.position[0])
+        end, rest = robot.controller.controller_positions(aim)[None], np.zeros((1, len(start)))
+        self.go(trajectory(list(robot.controller.names), [4.0], end, rest, rest))
+        self.other.until(lambda: not any(self.last.reference.velocities), "the hold")
+        held = robot.controller.positions(np.array(self.last.reference.positions))
+        weight = inverse_dynamics(robot, held, 0.0 * held, 0.0 * held)
+        found = robot.controller.efforts(np.array(self.last.output.effort))
+        print(
+            f"beyond: held {robot.limits.position[0, 1] - held[0]:.1e} before the limit, "
+            f"effort less that of the weight {np.abs(found - weight).max():.1e}"
+        )
+        self.other.spin(3.0)
+        self.report()
+        print(_output("ros2", "control", "list_controllers"))
+
+    def report(self) -> None:
+        """The controller's last diagnostics."""
+        mine = [s for m in self.counts for s in m.status if s.name.endswith(": feedforward")]
+        text = ", ".join(f"{v.key} {v.value}" for v in mine[-1].values)
+        print(f"{self.part}: {mine[-1].message}; {text}")
 
 
-def states_of(other: Peer, states: list[Any]) -> Any:
-    """The next state."""
-    other.until(lambda: states, "a state of the controller")
-    return states[-1]
+def _output(*command: str) -> str:
+    """What a command prints."""
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
 
-def twin_s_efforts(other: Peer, robot: Robot, states: list[Any]) -> Any:
+def twin_s_efforts(other: Peer, robot: Robot, given: str, states: list[Any]) -> Any:
     """Efforts of a running delta_dynamics for the references of these states, (count, n)."""
     answers = other.hear(JointTrajectory, "/delta_dynamics/joint_trajectory_ff", 10)
     send = other.node.create_publisher(
@@ -130,7 +170,7 @@ def twin_s_efforts(other: Peer, robot: Robot, states: list[Any]) -> Any:
     message = trajectory(
         list(robot.controller.names), 1e-3 * np.arange(1, len(states) + 1), *columns
     )
-    with closing(node("delta_dynamics", parameters=[f"mechanism:={robot.name}"])):
+    with closing(node("delta_dynamics", parameters=[f"mechanism:={given}"])):
         other.until(send.get_subscription_count, "delta_dynamics")
         other.spin(1.0)
         send.publish(message)
@@ -138,21 +178,26 @@ def twin_s_efforts(other: Peer, robot: Robot, states: list[Any]) -> Any:
     return np.array([p.effort for p in answers[-1].points])
 
 
-def show(other: Peer, robot: Robot, part: str) -> None:
-    """One hardware."""
-    simulated = []
+def show(other: Peer, given: str, part: str) -> None:
+    """One part."""
+    robot, simulated = load(given), []
     if part == "sim":
         simulated.append(
             node(
                 "machine_sim",
-                parameters=[f"mechanism:={robot.name}", "period:=0.002"],
+                parameters=[f"mechanism:={given}", "period:=0.002"],
                 remap=["joint_states:=/machine_sim/joint_states"],
             )
         )
     with closing(*simulated):
-        states = followed(other, robot, part)
+        chain = Chain(other, given, part)
+        with closing(chain.process):
+            if part == "beyond":
+                chain.beyond()
+                return
+            states = chain.followed()
     found = np.array([s.reference.effort for s in states])
-    right = twin_s_efforts(other, robot, states)
+    right = twin_s_efforts(other, robot, given, states)
     error = np.abs(found - right).max()
     print(
         f"{part}: {len(states)} states of the motion, effort less that of delta_dynamics "
@@ -166,11 +211,11 @@ def show(other: Peer, robot: Robot, part: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("parts", nargs="*", default=list(HARDWARE), help=", ".join(HARDWARE))
-    parser.add_argument("--robot", default="delta_cu")
+    parser.add_argument("--robot", default="delta_cu", help="name or path")
     given = parser.parse_args()
     with peer() as other:
         for part in given.parts:
-            show(other, load(given.robot), part)
+            show(other, given.robot, part)
 
 
 if __name__ == "__main__":

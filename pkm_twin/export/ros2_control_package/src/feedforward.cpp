@@ -72,8 +72,9 @@ void Feedforward::hold()
     return;
   }
   target_.velocity = target_.acceleration = {};
+  // The position was accepted before: settings that have changed since do not reject it.
   Vector weight;
-  if (compute(target_, weight) == REJECTIONS) {
+  if (efforts(settings_.parameters, target_.position, {}, {}, weight) == 0) {
     feedforward_ = weight;
   }
   resting_ = true;
