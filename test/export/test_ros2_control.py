@@ -135,6 +135,15 @@ def mapped(request, tmp_path_factory):
     return both, core
 
 
+def clipped(core, efforts):
+    """At most the limits, in the controller's numbers."""
+    robot = core.robot
+    if robot.limits.effort is None:
+        return efforts
+    limit = robot.limits.effort / np.abs(robot.controller.factors)
+    return np.clip(efforts, -limit, limit)
+
+
 @needs_compiler
 class TestCore:
     @pytest.mark.parametrize("count", often(50, 5000))
@@ -154,9 +163,7 @@ class TestCore:
         assert sound.all() and set(names) == {"NONE"}
         np.testing.assert_allclose(forward, right, 0.0, 1e-11 * np.abs(right).max())
         right = right + p * both.rates(miss[0]) + d * both.rates(miss[1])
-        if model.limits.effort is not None:
-            limit = np.abs(both.efforts(model.limits.effort))
-            right = np.clip(right, -limit, limit)
+        right = clipped(core, right)
         np.testing.assert_allclose(effort, right, 0.0, 1e-9 * np.abs(right).max())
 
     def test_a_rejected_reference_is_held_for_a_while_and_then_fails(self, mapped):
@@ -170,13 +177,17 @@ class TestCore:
         bad[[0, 1, 2], [0, core.n, 3 * core.n - 1]] = np.nan, np.inf, -np.inf
         rows = np.concatenate([good, *[bad] * 10, good, bad[:1]])
         weight = both.efforts(inverse_dynamics(model, q, 0.0 * qd, 0.0 * qdd))[0]
-        sound, names, effort, forward = core.run(rows, good[0, : core.n], hold=0.0205)
+        sound, names, effort, forward = core.run(
+            rows, good[0, : core.n], p=0.3, d=1e-3, hold=0.0205
+        )
         assert names == ["NONE", *["NOT_FINITE"] * 30, "NONE", "NOT_FINITE"]
         np.testing.assert_array_equal(sound, [True] * 21 + [False] * 10 + [True] * 2)
         scale = 1e-11 * np.abs(weight).max()
         np.testing.assert_allclose(forward[1:-2], np.tile(weight, (30, 1)), 0.0, scale)
         np.testing.assert_allclose(forward[[-2]], forward[[0]], 0.0, scale)
-        assert np.isfinite(effort).all()
+        # It brakes, towards the place that it holds.
+        brake = clipped(core, weight - 1e-3 * both.rates(qd[0]))
+        np.testing.assert_allclose(effort[1:-2], np.tile(brake, (30, 1)), 0.0, 10 * scale)
 
     def test_each_reason_to_reject(self, mapped):
         both, core = mapped
