@@ -77,7 +77,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
     # A comment, a Markdown table and a string literal bear these.
     shown = re.sub(r"[^\w .:+-]", "_", robot.name or robot.mechanism)
     load, controller = robot.payload, robot.controller
-    home = robot.graph.home
+    home = _start(robot)
     directions = _directions(robot)
     steps = np.abs(controller.factors) * _range(robot, home)
     return {
@@ -133,6 +133,15 @@ def _drives(robot: Robot) -> str:
         for k, name in enumerate(controller.names)
     ]
     return "\n".join(lines)
+
+
+def _start(robot: Robot) -> Array:
+    """Home, or the middle of the limits where these leave home out, shape (n,)."""
+    home, limits = robot.graph.home, robot.limits.position
+    if limits is None or ((limits[:, 0] <= home) & (home <= limits[:, 1])).all():
+        return home
+    middle = np.where(np.isfinite(limits).all(1), limits.mean(1), home)
+    return middle if robot.try_forward(middle)[1] else home
 
 
 def _range(robot: Robot, home: Array) -> Array:
