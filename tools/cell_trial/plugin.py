@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exported controller under joint_trajectory_controller: its efforts compared with the twin's.
 
-    python3 tools/cell_trial/plugin.py [--robot delta_cu] [mock] [sim] [beyond]
+    python3 tools/cell_trial/plugin.py [--robot delta_cu] [--bandwidth 5] [mock] [sim] [beyond]
 
 ``mock``: mock hardware, which does not move. ``sim``: machine_sim, through the hardware in
 tools/cell_trial/topic_hardware. Of both, the references that the controller has followed go to a
@@ -33,8 +33,6 @@ from pkm_twin.export.ros2_control import CONTROLLER, TRAJECTORIES
 
 MOCK = "mock_components/GenericSystem"
 HARDWARE = {"mock": MOCK, "sim": "pkm_topic_hardware/TopicSystem", "beyond": MOCK}
-BANDWIDTH = {"mock": 0.0, "sim": 5.0, "beyond": 0.0}
-"""Of the gains, Hz: mock hardware does not follow, and gains would push against it."""
 
 
 def stamped(seconds: float) -> Duration:
@@ -82,7 +80,7 @@ def there_and_back(robot: Robot, start: Any, seconds: float) -> JointTrajectory:
 class Chain:
     """joint_trajectory_controller in front of the exported controller, by the launch file."""
 
-    def __init__(self, other: Peer, given: str, part: str) -> None:
+    def __init__(self, other: Peer, given: str, part: str, bandwidth: float) -> None:
         self.other, self.robot, self.part = other, load(given), part
         self.states = other.hear(
             JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 50000
@@ -93,7 +91,7 @@ class Chain:
         )
         self.process = Process(
             "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={given}", "use:=plugin",
-            f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={BANDWIDTH[part]}",
+            f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={bandwidth}",
         )  # fmt: skip
 
     def start(self) -> Any:
@@ -178,7 +176,7 @@ def twin_s_efforts(other: Peer, robot: Robot, given: str, states: list[Any]) -> 
     return np.array([p.effort for p in answers[-1].points])
 
 
-def show(other: Peer, given: str, part: str) -> None:
+def show(other: Peer, given: str, part: str, bandwidth: float) -> None:
     """One part."""
     robot, simulated = load(given), []
     if part == "sim":
@@ -190,7 +188,8 @@ def show(other: Peer, given: str, part: str) -> None:
             )
         )
     with closing(*simulated):
-        chain = Chain(other, given, part)
+        # Mock hardware does not follow: gains would push against it.
+        chain = Chain(other, given, part, bandwidth if part == "sim" else 0.0)
         with closing(chain.process):
             if part == "beyond":
                 chain.beyond()
@@ -205,17 +204,18 @@ def show(other: Peer, given: str, part: str) -> None:
     )
     if part == "sim":
         miss = np.array([s.error.positions for s in states])
-        print(f"sim: tracking error {np.sqrt((miss**2).mean()):.2e} RMS, with gains of 5 Hz")
+        print(f"sim: tracking error {np.sqrt((miss**2).mean()):.2e} RMS, gains of {bandwidth:g} Hz")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("parts", nargs="*", default=list(HARDWARE), help=", ".join(HARDWARE))
     parser.add_argument("--robot", default="delta_cu", help="name or path")
+    parser.add_argument("--bandwidth", type=float, default=5.0, help="Hz, of the gains for sim")
     given = parser.parse_args()
     with peer() as other:
         for part in given.parts:
-            show(other, given.robot, part)
+            show(other, given.robot, part, given.bandwidth)
 
 
 if __name__ == "__main__":
