@@ -142,10 +142,12 @@ class Chain:
         print(_output("ros2", "control", "list_controllers"))
 
     def report(self) -> None:
-        """The controller's last diagnostics."""
-        mine = [s for m in self.counts for s in m.status if s.name.endswith(": feedforward")]
-        text = ", ".join(f"{v.key} {v.value}" for v in mine[-1].values)
-        print(f"{self.part}: {mine[-1].message}; {text}")
+        """The last diagnostics of the controller, and of what is simulated."""
+        for name in (": feedforward", "machine_sim"):
+            mine = [s for m in self.counts for s in m.status if s.name.endswith(name)]
+            if mine:
+                text = ", ".join(f"{v.key} {v.value}" for v in mine[-1].values)
+                print(f"{self.part}: {mine[-1].message}; {text}")
 
 
 def _output(*command: str) -> str:
