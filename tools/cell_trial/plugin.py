@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exported controller under joint_trajectory_controller: its efforts compared with the twin's.
 
-    python3 tools/cell_trial/plugin.py [--robot delta_cu] [--bandwidth 5] [mock] [sim] [beyond]
+    python3 tools/cell_trial/plugin.py [--robot delta_cu] [--bandwidth 2] [mock] [sim] [beyond]
 
-``mock``: mock hardware, which does not move. ``sim``: machine_sim, through the hardware in
-tools/cell_trial/topic_hardware. Of both, the references that the controller has followed go to a
+``mock``: mock hardware, which does not move. ``sim``: machine_sim in lockstep, through the hardware
+in tools/cell_trial/topic_hardware. Of both, the references that the controller has followed go to a
 running delta_dynamics as a JointTrajectory, and its efforts are compared with the controller's.
 ``beyond``: mock hardware, and a trajectory through a position limit: the controller holds, and
 after its hold_time the chain is deactivated.
@@ -17,9 +17,13 @@ from __future__ import annotations
 
 import argparse
 import subprocess
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
+from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Duration
 from cell import Peer, Process, closing, node, peer
 from control_msgs.msg import JointTrajectoryControllerState
@@ -29,7 +33,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot, load
-from pkm_twin.export.ros2_control import CONTROLLER, TRAJECTORIES
+from pkm_twin.export.ros2_control import CONTROLLER, TRAJECTORIES, package_name
 
 MOCK = "mock_components/GenericSystem"
 HARDWARE = {"mock": MOCK, "sim": "pkm_topic_hardware/TopicSystem", "beyond": MOCK}
@@ -89,10 +93,26 @@ class Chain:
         self.send = other.node.create_publisher(
             JointTrajectory, f"/{TRAJECTORIES}/joint_trajectory", QoSProfile(depth=10)
         )
+        settings = [f"controllers:={self._by_its_clock()}"] if part == "sim" else []
         self.process = Process(
             "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={given}", "use:=plugin",
-            f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={bandwidth}",
+            f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={bandwidth}", *settings,
         )  # fmt: skip
+
+    def _by_its_clock(self) -> Path:
+        """The package's settings with simulated time: a period of machine_sim a command.
+
+        Of 5 ms, as often as machine_sim sends /clock.
+        """
+        share = Path(get_package_share_directory(package_name(self.robot)))
+        sections = yaml.safe_load((share / "config" / "controllers.yaml").read_text())
+        sections["joint_state_broadcaster"] = {"ros__parameters": {}}
+        for section in sections.values():
+            section["ros__parameters"]["use_sim_time"] = True
+        sections["controller_manager"]["ros__parameters"]["update_rate"] = 200
+        file = Path(tempfile.mkdtemp()) / "controllers.yaml"
+        file.write_text(yaml.safe_dump(sections))
+        return file
 
     def start(self) -> Any:
         """Wait for both controllers; the model's joint positions."""
@@ -185,7 +205,7 @@ def show(other: Peer, given: str, part: str, bandwidth: float) -> None:
         simulated.append(
             node(
                 "machine_sim",
-                parameters=[f"mechanism:={given}", "period:=0.002"],
+                parameters=[f"mechanism:={given}", "period:=0.005", "clock:=lockstep"],
                 remap=["joint_states:=/machine_sim/joint_states"],
             )
         )
@@ -213,7 +233,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("parts", nargs="*", default=list(HARDWARE), help=", ".join(HARDWARE))
     parser.add_argument("--robot", default="delta_cu", help="name or path")
-    parser.add_argument("--bandwidth", type=float, default=5.0, help="Hz, of the gains for sim")
+    parser.add_argument("--bandwidth", type=float, default=2.0, help="Hz, of the gains for sim")
     given = parser.parse_args()
     with peer() as other:
         for part in given.parts:
