@@ -6,7 +6,6 @@
 #include <cstdint>
 #include <limits>
 #include <memory>
-#include <set>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -22,6 +21,7 @@
 #include "trajectory_msgs/msg/joint_trajectory_point.hpp"
 
 #include "@PACKAGE@/feedforward.hpp"
+#include "@PACKAGE@/parameters.hpp"
 
 namespace @PACKAGE@
 {
@@ -100,11 +100,6 @@ private:
     return result;
   }
 
-  // Parameters. Throw std::invalid_argument with the name and what would be right.
-  void declare();
-  Settings read(const std::vector<rclcpp::Parameter> & changes) const;
-  void check_names();
-
   // In the control loop: nothing below allocates.
   void measure();
   void read_reference();
@@ -139,140 +134,12 @@ void fill(Motion & motion, double value)
   motion.velocity.fill(value);
   motion.acceleration.fill(value);
 }
-
-double number(const rclcpp::Parameter & parameter)
-{
-  if (parameter.get_type() == rclcpp::ParameterType::PARAMETER_INTEGER) {
-    return static_cast<double>(parameter.as_int());
-  }
-  if (parameter.get_type() != rclcpp::ParameterType::PARAMETER_DOUBLE) {
-    throw std::invalid_argument(parameter.get_name() + ": expected a number");
-  }
-  return parameter.as_double();
-}
-
-template<std::size_t SIZE>
-std::array<double, SIZE> numbers(const rclcpp::Parameter & parameter)
-{
-  const std::string wrong =
-    parameter.get_name() + ": expected " + std::to_string(SIZE) + " numbers, all written as 0.0";
-  if (parameter.get_type() != rclcpp::ParameterType::PARAMETER_DOUBLE_ARRAY) {
-    throw std::invalid_argument(wrong);
-  }
-  const std::vector<double> values = parameter.as_double_array();
-  if (values.size() != SIZE) {
-    throw std::invalid_argument(wrong);
-  }
-  std::array<double, SIZE> result;
-  std::copy(values.begin(), values.end(), result.begin());
-  return result;
-}
-
-double within(const std::string & name, double value, double least, double most)
-{
-  if (!(value >= least && value <= most)) {
-    throw std::invalid_argument(
-            name + ": " + std::to_string(value) + ", expected at least " +
-            std::to_string(least) + (std::isinf(most) ? "" : " and finite"));
-  }
-  return value;
-}
 }  // namespace
-
-constexpr double MOST = std::numeric_limits<double>::max();
-
-void FeedforwardController::declare()
-{
-  const auto node = get_node();
-  const auto add = [&node](const std::string & name, const auto & value) {
-      if (!node->has_parameter(name)) {
-        node->declare_parameter(name, rclcpp::ParameterValue(value));
-      }
-    };
-  std::vector<std::string> own;
-  for (const Drive & drive : DRIVES) {
-    own.emplace_back(drive.name);
-  }
-  add("joints", own);
-  joints_ = node->get_parameter("joints").as_string_array();
-  if (joints_.size() != JOINTS) {
-    throw std::invalid_argument("joints: expected " + std::to_string(JOINTS) + " names");
-  }
-  for (std::size_t i = 0; i < JOINTS; ++i) {
-    add("gains." + joints_[i] + ".p", 0.0);
-    add("gains." + joints_[i] + ".d", 0.0);
-    add("limits." + joints_[i] + ".lower", DRIVES[i].lower);
-    add("limits." + joints_[i] + ".upper", DRIVES[i].upper);
-    add("limits." + joints_[i] + ".effort", DRIVES[i].effort);
-  }
-  add("payload.mass", PAYLOAD.mass);
-  add("payload.com", std::vector<double>(PAYLOAD.com.begin(), PAYLOAD.com.end()));
-  add("payload.inertia", std::vector<double>(PAYLOAD.inertia.begin(), PAYLOAD.inertia.end()));
-  add("singularity_stop", Settings().singularity_stop);
-  add("hold_time", Settings().hold_time);
-  add("reference_timeout", reference_timeout_);
-  add("state_publish_rate", 1.0 / state_period_);
-}
-
-/// A misspelt joint would else keep its gain of zero without a word.
-void FeedforwardController::check_names()
-{
-  std::set<std::string> known{"payload.mass", "payload.com", "payload.inertia"};
-  for (const std::string & joint : joints_) {
-    for (const char * leaf : {"p", "d"}) {
-      known.insert("gains." + joint + "." + leaf);
-    }
-    for (const char * leaf : {"lower", "upper", "effort"}) {
-      known.insert("limits." + joint + "." + leaf);
-    }
-  }
-  const auto & given = get_node()->get_node_parameters_interface()->get_parameter_overrides();
-  for (const auto & [name, value] : given) {
-    const std::string group = name.substr(0, name.find('.'));
-    const bool ours = group == "gains" || group == "limits" || group == "payload";
-    if (ours && known.count(name) == 0) {
-      throw std::invalid_argument(name + ": unknown parameter; the first joint is " + joints_[0]);
-    }
-  }
-}
-
-Settings FeedforwardController::read(const std::vector<rclcpp::Parameter> & changes) const
-{
-  const auto get = [&](const std::string & name) {
-      for (const rclcpp::Parameter & change : changes) {
-        if (change.get_name() == name) {
-          return change;
-        }
-      }
-      return get_node()->get_parameter(name);
-    };
-  const auto bounded = [&](const std::string & name, double least, double most) {
-      return within(name, number(get(name)), least, most);
-    };
-  Settings result;
-  for (std::size_t i = 0; i < JOINTS; ++i) {
-    result.p[i] = bounded("gains." + joints_[i] + ".p", 0.0, MOST);
-    result.d[i] = bounded("gains." + joints_[i] + ".d", 0.0, MOST);
-    const std::string limits = "limits." + joints_[i];
-    result.lower[i] = bounded(limits + ".lower", -UNLIMITED, UNLIMITED);
-    result.upper[i] = bounded(limits + ".upper", result.lower[i], UNLIMITED);
-    result.effort[i] = bounded(limits + ".effort", 0.0, UNLIMITED);
-  }
-  result.singularity_stop = bounded("singularity_stop", 0.0, 1.0);
-  result.hold_time = bounded("hold_time", 0.0, UNLIMITED);
-  const double mass = bounded("payload.mass", 0.0, MOST);
-  const auto com = numbers<3>(get("payload.com"));
-  const auto inertia = numbers<9>(get("payload.inertia"));
-  if (payload_parameters(mass, com, inertia, result.parameters) != 0) {
-    throw std::invalid_argument("payload: expected finite numbers");
-  }
-  return result;
-}
 
 CallbackReturn FeedforwardController::on_init()
 {
   try {
-    declare();
+    joints_ = declare_parameters(*get_node());
   } catch (const std::exception & error) {
     RCLCPP_ERROR(get_node()->get_logger(), "%s", error.what());
     return CallbackReturn::ERROR;
@@ -285,9 +152,9 @@ CallbackReturn FeedforwardController::on_configure(const rclcpp_lifecycle::State
   const auto node = get_node();
   Revision first;
   try {
-    declare();
-    check_names();
-    first.settings = read({});
+    joints_ = declare_parameters(*node);
+    check_names(*node, joints_);
+    first.settings = read_settings(*node, joints_, {});
     reference_timeout_ = within(
       "reference_timeout", number(node->get_parameter("reference_timeout")), 0.0, UNLIMITED);
     state_period_ = 1.0 / within(
@@ -316,7 +183,8 @@ CallbackReturn FeedforwardController::on_configure(const rclcpp_lifecycle::State
             throw std::invalid_argument(name + ": cannot change after the configuration");
           }
         }
-        Revision next{read(changes), settings_.readFromNonRT()->number + 1};
+        Revision next{
+          read_settings(*get_node(), joints_, changes), settings_.readFromNonRT()->number + 1};
         settings_.writeFromNonRT(next);
       } catch (const std::exception & error) {
         result.successful = false;

@@ -120,7 +120,9 @@ TEST_F(Plugins, without_a_reference_the_start_is_held)
 
 TEST_F(Plugins, gains_act_on_the_error)
 {
-  const double p = 2.0, d = 0.5, size = 1e-3;
+  // Whole numbers are numbers.
+  const int p = 2;
+  const double d = 0.5, size = 1e-3;
   std::vector<rclcpp::Parameter> gains;
   for (const Drive & drive : DRIVES) {
     const std::string name = std::string("gains.") + drive.name;
@@ -181,6 +183,8 @@ TEST_F(Plugins, parameters_change_while_it_runs_or_are_rejected)
   const auto before = bench.effort(0);
   EXPECT_FALSE(bench.node()->set_parameter({"payload.mass", -1.0}).successful);
   EXPECT_FALSE(bench.node()->set_parameter({"payload.mass", NaN}).successful);
+  EXPECT_FALSE(bench.node()->set_parameter({"payload.mass", "heavy"}).successful);
+  EXPECT_FALSE(bench.node()->set_parameter({"singularity_stop", 1.5}).successful);
   EXPECT_TRUE(bench.node()->set_parameter({"payload.mass", PAYLOAD.mass + 1.0}).successful);
   ASSERT_TRUE(bench.update(0.0, 1e-3));
   Parameters parameters;
