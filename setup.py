@@ -44,6 +44,7 @@ setup(
     package_data={
         "pkm_twin": ["py.typed"],
         "pkm_twin.config": ["*.yaml", "drives/*.yaml"],
+        "pkm_twin.export": ["ros2_control_package/*.*", "ros2_control_package/*/*.*"],
         "delta_dynamics": ["py.typed"],
         "stiffness_monitor": ["py.typed"],
     },

@@ -3,7 +3,9 @@
 
 Trajectories go to ``delta_dynamics/joint_trajectory``, or as goals of the action
 ``delta_dynamics/follow_joint_trajectory``, and on to joint_trajectory_controller with effort. With
-``command_gate:=true`` the stamped torques go through the gate to effort_controller instead.
+``command_gate:=true`` the stamped torques go through the gate to effort_controller instead. With
+``use:=plugin`` there is no node between: joint_trajectory_controller is chained to the controller
+that ``pkm-twin export ros2-control`` has written, and takes the trajectories itself.
 """
 
 import subprocess
@@ -12,7 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from ament_index_python.packages import get_package_prefix
+from ament_index_python.packages import (
+    PackageNotFoundError,
+    get_package_prefix,
+    get_package_share_directory,
+)
 from launch.actions import (
     DeclareLaunchArgument,
     GroupAction,
@@ -30,23 +36,28 @@ from launch_ros.actions import Node
 
 from delta_dynamics.simulation import tuned
 from launch import LaunchDescription
-from pkm_twin import load
+from pkm_twin import Robot, load
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.export.ros2_control import CONTROLLER as FEEDFORWARD
+from pkm_twin.export.ros2_control import TRAJECTORIES, package_name
 
 HERE = Path(__file__).parent
-CONTROLLER = "joint_trajectory_controller"
 EFFORTS = "effort_controller"
 
 ARGUMENTS = {
     "robot": ("delta_cu", "a name or a path"),
+    "use": (
+        "twin",
+        "twin: efforts of delta_dynamics; plugin: those of the robot's exported package",
+    ),
     "namespace": ("", "of everything"),
     "description": ("", "a URDF with a ros2_control element; default: what pkm-twin urdf writes"),
-    "controllers": ("", "settings of ros2_control; default: controllers.yaml beside this file"),
-    "hardware_plugin": ("mock_components/GenericSystem", "of that description"),
-    "bandwidth": (
+    "controllers": (
         "",
-        "Hz: gains of joint_trajectory_controller by the machine's masses; default: the file's",
+        "settings of ros2_control; default: controllers.yaml beside this file, or the package's",
     ),
+    "hardware_plugin": ("mock_components/GenericSystem", "of that description"),
+    "bandwidth": ("", "Hz: gains by the machine's masses; default: the file's"),
     "command_gate": ("false", f"true: torques through command_gate to {EFFORTS}"),
     "robot_state_publisher": ("true", "false where another node publishes robot_description"),
     "params_file": ("", "parameters of delta_dynamics, a YAML file"),
@@ -73,7 +84,14 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     gate = given["command_gate"].lower()
     if gate not in ("true", "false"):
         raise RuntimeError(f"command_gate: {given['command_gate']!r} is neither true nor false")
-    controller = EFFORTS if gate == "true" else CONTROLLER
+    if given["use"] not in ("twin", "plugin"):
+        raise RuntimeError(f"use: {given['use']!r} is neither twin nor plugin")
+    plugin = given["use"] == "plugin"
+    if plugin and gate == "true":
+        raise RuntimeError("command_gate: with use:=plugin no torques pass through topics")
+    controller = EFFORTS if gate == "true" else TRAJECTORIES
+    # Whose gains hold the machine.
+    holding = FEEDFORWARD if plugin else controller
     space = f"/{namespace}".rstrip("/")
     folder = tempfile.TemporaryDirectory(prefix="pkm_twin_")
     file = Path(folder.name) / "controllers.yaml"
@@ -85,15 +103,15 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         namespace=namespace,
         parameters=[{"robot_description": _description(given)}],
     )
-    settings = sections.get(f"{space}/{CONTROLLER}", {}).get("ros__parameters", {})
+    settings = sections.get(f"{space}/{holding}", {}).get("ros__parameters", {})
     gains = settings.get("gains", {})
     loose = [joint for joint, gain in gains.items() if not gain.get("p")]
     warning = (
-        f"{CONTROLLER} has no gain for {', '.join(loose)}: the machine is carried and not held in "
+        f"{holding} has no gain for {', '.join(loose)}: the machine is carried and not held in "
         "place; see bandwidth:=HZ"
     )
     return [
-        *([LogInfo(msg=warning)] if loose and controller == CONTROLLER else []),
+        *([LogInfo(msg=warning)] if loose and holding != EFFORTS else []),
         RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: folder.cleanup())),
         *([publisher] if given["robot_state_publisher"] == "true" else []),
         Node(
@@ -110,35 +128,41 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             namespace=namespace,
             arguments=[
                 "joint_state_broadcaster",
+                *([FEEDFORWARD] if plugin else []),
                 controller,
                 *("--param-file", str(file)),
                 *("--controller-manager", f"{space}/controller_manager"),
             ],
             output="screen",
         ),
-        GroupAction(
-            [
-                IncludeLaunchDescription(
-                    PythonLaunchDescriptionSource(str(HERE / "twin.launch.py")),
-                    launch_arguments={
-                        "robot": given["robot"],
-                        "namespace": namespace,
-                        "params_file": given["params_file"],
-                        "log_level": given["log_level"],
-                        "stiffness_monitor": "false",
-                        **(
-                            {"command_gate": "true", "commands": f"{EFFORTS}/commands"}
-                            if controller == EFFORTS
-                            else {
-                                "joint_trajectory_ff": f"{CONTROLLER}/joint_trajectory",
-                                "controller_action": f"{CONTROLLER}/follow_joint_trajectory",
-                            }
-                        ),
-                    }.items(),
-                )
-            ]
-        ),
+        *([] if plugin else [_twin(given, controller)]),
     ]
+
+
+def _twin(given: dict[str, str], controller: str) -> LaunchDescriptionEntity:
+    """delta_dynamics, and the gate where there is one."""
+    return GroupAction(
+        [
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(str(HERE / "twin.launch.py")),
+                launch_arguments={
+                    "robot": given["robot"],
+                    "namespace": given["namespace"],
+                    "params_file": given["params_file"],
+                    "log_level": given["log_level"],
+                    "stiffness_monitor": "false",
+                    **(
+                        {"command_gate": "true", "commands": f"{EFFORTS}/commands"}
+                        if controller == EFFORTS
+                        else {
+                            "joint_trajectory_ff": f"{TRAJECTORIES}/joint_trajectory",
+                            "controller_action": f"{TRAJECTORIES}/follow_joint_trajectory",
+                        }
+                    ),
+                }.items(),
+            )
+        ]
+    )
 
 
 def _description(given: dict[str, str]) -> str:
@@ -158,13 +182,13 @@ def _description(given: dict[str, str]) -> str:
 
 def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[str, Any]]]:
     """The settings with the robot's joints, each section under its node's full name."""
-    path = Path(given["controllers"] or HERE / "controllers.yaml")
-    sections = yaml.safe_load(path.read_text(encoding="utf-8"))
     try:
         robot = load(given["robot"])
         strong, damped = tuned(robot, float(given["bandwidth"] or 0.0))
     except (PkmTwinError, ValueError) as error:
         raise RuntimeError(f"robot {given['robot']}, bandwidth: {error}") from None
+    path = Path(given["controllers"] or _settings_file(given, robot))
+    sections = yaml.safe_load(path.read_text(encoding="utf-8"))
     joints = list(robot.controller.names)
     # Efforts of the controller's numbers per the controller's numbers.
     scale = robot.controller.factors**2
@@ -174,13 +198,30 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[
     }
     for name, section in sections.items():
         parameters = section["ros__parameters"]
-        if name not in ("controller_manager", "joint_state_broadcaster"):
+        if name not in ("controller_manager", "joint_state_broadcaster", FEEDFORWARD):
             parameters.setdefault("joints", list(joints))
         gains = parameters.get("gains", {})
         if "each" in gains:
             each = gains.pop("each")
             # Copies: the middleware's reader takes no YAML with references.
             parameters["gains"] = {joint: dict(gains.get(joint, each)) for joint in joints}
-        if given["bandwidth"] and name == CONTROLLER:
+        if given["bandwidth"] and name == FEEDFORWARD:
+            parameters["gains"] = {
+                joint: {key: gain[key] for key in ("p", "d")} for joint, gain in tuned_gains.items()
+            }
+        elif given["bandwidth"] and name == TRAJECTORIES and FEEDFORWARD not in sections:
             parameters["gains"] = tuned_gains
     return {f"{space}/{name}": section for name, section in sections.items()}
+
+
+def _settings_file(given: dict[str, str], robot: Robot) -> Path:
+    if given["use"] == "twin":
+        return HERE / "controllers.yaml"
+    package = package_name(robot)
+    try:
+        return Path(get_package_share_directory(package), "config", "controllers.yaml")
+    except PackageNotFoundError:
+        raise RuntimeError(
+            f"use: package {package} is not in the workspace; write it by pkm-twin export "
+            f"ros2-control {given['robot']} --out src/{package}, and build it"
+        ) from None

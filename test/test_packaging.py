@@ -70,13 +70,18 @@ def modules():
     return {str(name) for name in tracked() if name.parts[0] in tops and name.suffix == ".py"}
 
 
+def templates():
+    """Sources of the exported ROS package."""
+    return {str(name) for name in tracked() if "ros2_control_package" in name.parts}
+
+
 def robots():
     return {name.stem for name in tracked() if name.match("config/*.yaml")}
 
 
 def check_installation(site, folder):
     """Load every robot from an unpacked installation, away from the tree."""
-    for name in modules():
+    for name in modules() | templates():
         assert (site / name).is_file(), f"{name} is not installed: is its package in setup.py?"
     for typed in ("pkm_twin", "delta_dynamics", "stiffness_monitor"):
         assert (site / typed / "py.typed").is_file()

@@ -60,6 +60,26 @@ def c(
     _write(out, c_package(load(robot)), overwrite)
 
 
+@app.command("ros2-control")
+def ros2_control(
+    robot: RobotName,
+    out: Annotated[Path, typer.Option(help="folder of the package, made anew")],
+    bandwidth: Annotated[
+        float, typer.Option(help="of the gains, by the masses at home; 0: no gains", metavar="HZ")
+    ] = 0.0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
+) -> None:
+    """Write a package of plugins for ros2_control, in C++ and without pkm_twin.
+
+    A chainable feedforward controller (inverse dynamics plus PD), a kinematics_interface and an
+    inverse_dynamics_solver, on the robot's exported C. Build it with colcon.
+    """
+    from pkm_twin import load
+    from pkm_twin.export.ros2_control import ros2_control_package
+
+    _write(out, ros2_control_package(load(robot), bandwidth), overwrite)
+
+
 def _write(out: Path, files: Mapping[str, str], overwrite: bool) -> None:
     """Write the files of a package; all or, where one may not be replaced, none."""
     for name in files:

@@ -132,8 +132,14 @@ class _Package:
                 "accelerations", "Joint accelerations that efforts tau cause.",
                 rates | {"tau": n} | wrench, qdd=qdd,
             )  # fmt: skip
-        rates_of = self._rows(robot.engine.jacobian)["rates"]
-        add("jacobian", "Pose rates per joint rate, row by row.", q, j=rates_of)
+        jacobians = self._rows(robot.engine.jacobian)
+        add("jacobian", "Pose rates per joint rate, row by row.", q, j=jacobians["rates"])
+        add(
+            "platform_jacobian",
+            "Velocity of the platform's reference point and angular velocity, base axes, per "
+            "joint rate, row by row.",
+            q, j=jacobians["twist"],
+        )  # fmt: skip
         (index,) = self._rows(robot.singularity_kernel()).values()
         add("singularity", "Singularity index: 0 in a singularity, 1 at best.", q, index=index)
         if self.elastic is not None:

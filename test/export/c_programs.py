@@ -39,6 +39,7 @@ def functions(robot: Robot) -> dict[str, Callable[..., Any]]:
         "inverse": robot.inverse,
         "platform": placed,
         "jacobian": lambda q: flat(robot.jacobian(q)),
+        "platform_jacobian": lambda q: flat(robot.platform_jacobian(q)),
         "singularity": lambda q: robot.singularity(q)[:, None],
     }
     if has(robot, "massive"):

@@ -131,8 +131,9 @@ def row(name):
 
 if __name__ == "__main__":
     page = Path(sys.argv[1])
-    lines = page.read_text(encoding="utf-8").splitlines()
-    kept = [line for line in lines if not line.startswith("| `")]
-    at = next(k for k, line in enumerate(kept) if line.startswith("|---"))
+    # The last table of the page.
+    head, rule, rest = page.read_text(encoding="utf-8").rpartition("|---|---:")
+    ends, *old = rest.split("\n")
+    kept = [line for line in old if not line.startswith("| `")]
     rows = [row(name) for name in robot_names()]
-    page.write_text("\n".join([*kept[: at + 1], *rows, *kept[at + 1 :], ""]), encoding="utf-8")
+    page.write_text("\n".join([head + rule + ends, *rows, *kept]), encoding="utf-8")

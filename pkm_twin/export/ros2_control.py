@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot as a ROS package of plugins for ros2_control, on its exported C.
+
+The sources stand in ``ros2_control_package`` as they are written; words between two ``@`` stand for
+the robot's names and numbers, most of them in ``include/robot.hpp``.
+
+May import: numpy, PyYAML, the standard library, pkm_twin's core, this package, delta_dynamics.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from itertools import combinations
+from typing import Any, Final
+from xml.sax.saxutils import escape
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from delta_dynamics.simulation import tuned
+from pkm_twin.errors import ParameterError
+from pkm_twin.export.c_package import c_package, identifier
+from pkm_twin.machine.graph import POSE
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+CONTROLLER: Final = "feedforward_controller"
+TRAJECTORIES: Final = "joint_trajectory_controller"
+CLEAR: Final = 0.05
+"""Least singularity index of the motions that the package's own test makes."""
+
+
+def package_name(robot: Robot) -> str:
+    """Name of the robot's ROS package: lower case, digits and single underscores (REP 144)."""
+    name = re.sub(r"_+", "_", identifier(robot.name or robot.mechanism).lower()).strip("_")
+    return f"{name if name[:1].isalpha() else f'robot_{name}'.rstrip('_')}_ros2_control"
+
+
+def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]:
+    """The files of the package, text by path.
+
+    :param bandwidth: of the controller's gains by the masses at home, Hz; zero: no gains.
+    :raises ParameterError: a robot whose file gives no masses, or a bandwidth below zero.
+    """
+    if not (math.isfinite(bandwidth) and bandwidth >= 0.0):
+        raise ParameterError("bandwidth", bandwidth, "a frequency of at least 0 Hz")
+    robot.massive()
+    package = package_name(robot)
+    words = _words(robot, package)
+    result = {f"c/{name}": text for name, text in c_package(robot).items()}
+    result["config/controllers.yaml"] = _controllers(robot, package, bandwidth)
+    for path, text in _templates(files("pkm_twin.export") / "ros2_control_package"):
+        # Headers are included as PACKAGE/NAME.hpp.
+        target = path.replace("include/", f"include/{package}/")
+        result[target] = re.sub(r"@([A-Z]+)@", lambda word: words[word[1]], text)
+    return dict(sorted(result.items()))
+
+
+def _templates(folder: Traversable, above: str = "") -> Iterable[tuple[str, str]]:
+    """Paths and texts of all files below a folder."""
+    for item in sorted(folder.iterdir(), key=lambda item: item.name):
+        if item.is_dir():
+            yield from _templates(item, f"{above}{item.name}/")
+        else:
+            yield f"{above}{item.name}", item.read_text(encoding="utf-8")
+
+
+def _words(robot: Robot, package: str) -> dict[str, str]:
+    """What stands for the words between two ``@``."""
+    own = identifier(robot.name)
+    # A comment, a Markdown table and a string literal bear these.
+    shown = re.sub(r"[^\w .:+-]", "_", robot.name or robot.mechanism)
+    load, controller = robot.payload, robot.controller
+    home = _start(robot)
+    directions = _directions(robot)
+    steps = np.abs(controller.factors) * _range(robot, home)
+    return {
+        "ROBOT": shown,
+        "XMLROBOT": escape(shown),
+        "PACKAGE": package,
+        "GUARD": package.upper(),
+        "PREFIX": f"pkm_{own}",
+        "MACRO": f"PKM_{own}".upper(),
+        "JOINTNAMES": ", ".join(f"`{name}`" for name in controller.names),
+        "POSENAMES": ", ".join(POSE[k] for k in directions),
+        "POSE": _row(directions),
+        "PAYLOAD": "{"
+        + ", ".join([_number(load.mass), _row(load.com), _row(np.ravel(load.inertia))])
+        + "}",
+        "DRIVES": _drives(robot),
+        "START": _row(controller.controller_positions(home)),
+        "RANGE": _row(steps),
+    }
+
+
+def _directions(robot: Robot) -> list[int]:
+    """Rows of the platform's twist that are the pose's.
+
+    Of a pose with coordinates of its own, those in which the joints move the platform best at home.
+    """
+    names = robot.pose_names
+    if set(names) <= set(POSE):
+        return [POSE.index(name) for name in names]
+    twist = robot.platform_jacobian(robot.graph.home)
+    twist[:3] /= robot.graph.size
+    twist /= np.linalg.norm(twist, axis=0)
+    choices = list(combinations(range(len(POSE)), len(names)))
+    # Rounded: equals stay in their order, whatever the arithmetic.
+    sizes = [round(abs(np.linalg.det(twist[list(rows)])), 6) for rows in choices]
+    return list(choices[int(np.argmax(sizes))])
+
+
+def _drives(robot: Robot) -> str:
+    """The actuated joints, a line each; limits in the controller's numbers."""
+    controller, limits, friction = robot.controller, robot.limits, robot.friction
+    n = robot.joints_count
+    position = np.array([[-np.inf, np.inf]] * n) if limits.position is None else limits.position
+    # A negative sign turns them round; ends without a limit stay without one.
+    ends = np.sort(controller.offsets[:, None] + controller.factors[:, None] * position, axis=1)
+    effort = np.full(n, np.inf) if limits.effort is None else np.asarray(limits.effort)
+    columns = (
+        controller.factors, controller.offsets, ends[:, 0], ends[:, 1],
+        effort / np.abs(controller.factors), friction.viscous, friction.coulomb,
+    )  # fmt: skip
+    lines = [
+        f"  {{{_string(name)}, {', '.join(_number(column[k]) for column in columns)}}},"
+        for k, name in enumerate(controller.names)
+    ]
+    return "\n".join(lines)
+
+
+def _start(robot: Robot) -> Array:
+    """Home, or the middle of the limits where these leave home out, shape (n,)."""
+    home, limits = robot.graph.home, robot.limits.position
+    if limits is None or ((limits[:, 0] <= home) & (home <= limits[:, 1])).all():
+        return home
+    middle = np.where(np.isfinite(limits).all(1), limits.mean(1), home)
+    return middle if robot.try_forward(middle)[1] else home
+
+
+def _range(robot: Robot, home: Array) -> Array:
+    """How far every joint may go from home, all at once and in any direction, shape (n,)."""
+    units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
+    if robot.limits.position is not None:
+        room = np.abs(robot.limits.position - home[:, None]).min(1)
+        units = np.where(room > 0.0, np.minimum(units, room), units)
+    signs = np.array(np.meshgrid(*[(-1.0, 0.0, 1.0)] * len(home))).reshape(len(home), -1).T
+    size = 0.2
+    for _ in range(20):
+        index, good = robot.try_singularity(home + size * units * signs)
+        if good.all() and (index > CLEAR).all():
+            break
+        size /= 2.0
+    return np.asarray(size * units, np.float64)
+
+
+def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
+    controller = robot.controller
+    joints = list(controller.names)
+    # Efforts of the controller's numbers per the controller's numbers.
+    gains = [values / controller.factors**2 for values in tuned(robot, bandwidth)]
+    own: dict[str, Any] = {
+        "gains": {
+            # Digits that other arithmetic does not change.
+            name: {"p": float(f"{p:.6g}"), "d": float(f"{d:.6g}")}
+            for name, p, d in zip(joints, *gains, strict=True)
+        },
+        "hold_time": 0.5,
+    }
+    settings = {
+        "controller_manager": {
+            "update_rate": 500,
+            "joint_state_broadcaster": {"type": "joint_state_broadcaster/JointStateBroadcaster"},
+            CONTROLLER: {"type": f"{package}/FeedforwardController"},
+            TRAJECTORIES: {"type": "joint_trajectory_controller/JointTrajectoryController"},
+        },
+        CONTROLLER: own,
+        TRAJECTORIES: {
+            "joints": joints,
+            "command_joints": [f"{CONTROLLER}/{joint}" for joint in joints],
+            "command_interfaces": ["position", "velocity", "acceleration"],
+            "state_interfaces": ["position", "velocity"],
+            "allow_nonzero_velocity_at_trajectory_end": False,
+        },
+    }
+    sections = {name: {"ros__parameters": section} for name, section in settings.items()}
+    head = "# Written by pkm-twin export ros2-control. Effort per controller's unit and its rate.\n"
+    return head + yaml.safe_dump(sections, sort_keys=False)
+
+
+def _number(value: float) -> str:
+    """A double as C++ has it, exactly."""
+    value = float(value)
+    if math.isinf(value):
+        return "UNLIMITED" if value > 0.0 else "-UNLIMITED"
+    return repr(value)
+
+
+def _row(values: Iterable[Any]) -> str:
+    """A std::array's numbers."""
+    items = [str(v) if isinstance(v, int) else _number(v) for v in values]
+    return "{" + ", ".join(items) + "}"
+
+
+def _string(text: str) -> str:
+    """A string literal of C++; what is not plain is written in octal."""
+    plain = re.compile(rb"[A-Za-z0-9 _./:+-]")
+    return '"' + "".join(
+        chr(byte) if plain.match(bytes([byte])) else f"\\{byte:03o}" for byte in text.encode()
+    ) + '"'  # fmt: skip

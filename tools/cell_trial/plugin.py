@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exported controller under joint_trajectory_controller: its efforts compared with the twin's.
+
+    python3 tools/cell_trial/plugin.py [--robot delta_cu] [--bandwidth 2] [mock] [sim] [beyond]
+
+``mock``: mock hardware, which does not move. ``sim``: machine_sim in lockstep, through the hardware
+in tools/cell_trial/topic_hardware. Of both, the references that the controller has followed go to a
+running delta_dynamics as a JointTrajectory, and its efforts are compared with the controller's.
+``beyond``: mock hardware, and a trajectory through a position limit: the controller holds, and
+after its hold_time the chain is deactivated.
+
+Needs a sourced Jazzy workspace with pkm_twin, ros2_control, joint_trajectory_controller and the
+package that ``pkm-twin export ros2-control ROBOT`` wrote; for ``sim`` also pkm_topic_hardware.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from ament_index_python.packages import get_package_share_directory
+from builtin_interfaces.msg import Duration
+from cell import Peer, Process, closing, node, peer
+from control_msgs.msg import JointTrajectoryControllerState
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import QoSProfile
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import Robot, load
+from pkm_twin.export.ros2_control import CONTROLLER, TRAJECTORIES, package_name
+
+MOCK = "mock_components/GenericSystem"
+HARDWARE = {"mock": MOCK, "sim": "pkm_topic_hardware/TopicSystem", "beyond": MOCK}
+
+
+def stamped(seconds: float) -> Duration:
+    """A duration."""
+    sec, nanosec = divmod(round(seconds * 1e9), 10**9)
+    return Duration(sec=sec, nanosec=nanosec)
+
+
+def trajectory(names: list[str], times: Any, *columns: Any) -> JointTrajectory:
+    """Positions, velocities and accelerations (points, n) as a message."""
+    points = [
+        JointTrajectoryPoint(
+            positions=q.tolist(),
+            velocities=qd.tolist(),
+            accelerations=qdd.tolist(),
+            time_from_start=stamped(float(t)),
+        )
+        for t, q, qd, qdd in zip(times, *columns, strict=True)
+    ]
+    return JointTrajectory(joint_names=names, points=points)
+
+
+def there_and_back(robot: Robot, start: Any, seconds: float) -> JointTrajectory:
+    """A tenth of the range, in the controller's numbers; three times."""
+    limits = robot.limits.position
+    size = 0.1 * (1.0 if limits is None else float(np.ptp(limits, axis=1).min()))
+    toward = np.ones(len(start)) if limits is None else np.sign(limits.mean(1) - start)
+    aim = np.where(toward == 0.0, 1.0, toward) * size * robot.controller.factors
+    t = np.linspace(0.0, 1.0, 201)
+    w = 6.0 * np.pi
+    # Begins and ends at rest: a quintic of the phase.
+    phase = t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
+    rate = 30.0 * t**2 * (1.0 - t) ** 2
+    second = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t)
+    shape = (1.0 - np.cos(w * phase)) / 2.0
+    first = w / 2.0 * np.sin(w * phase) * rate / seconds
+    twice = w / 2.0 * (w * np.cos(w * phase) * rate**2 + np.sin(w * phase) * second) / seconds**2
+    home = robot.controller.controller_positions(start)
+    return trajectory(
+        list(robot.controller.names), 0.05 + seconds * t,
+        home + np.outer(shape, aim), np.outer(first, aim), np.outer(twice, aim),
+    )  # fmt: skip
+
+
+class Chain:
+    """joint_trajectory_controller in front of the exported controller, by the launch file."""
+
+    def __init__(self, other: Peer, given: str, part: str, bandwidth: float) -> None:
+        self.other, self.robot, self.part = other, load(given), part
+        self.states = other.hear(
+            JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 50000
+        )
+        self.counts = other.hear(DiagnosticArray, "/diagnostics", 1000)
+        self.send = other.node.create_publisher(
+            JointTrajectory, f"/{TRAJECTORIES}/joint_trajectory", QoSProfile(depth=10)
+        )
+        settings = [f"controllers:={self._by_its_clock()}"] if part == "sim" else []
+        self.process = Process(
+            "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={given}", "use:=plugin",
+            f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={bandwidth}", *settings,
+        )  # fmt: skip
+
+    def _by_its_clock(self) -> Path:
+        """The package's settings with simulated time: a period of machine_sim a command.
+
+        Of 5 ms, as often as machine_sim sends /clock.
+        """
+        share = Path(get_package_share_directory(package_name(self.robot)))
+        sections = yaml.safe_load((share / "config" / "controllers.yaml").read_text())
+        sections["joint_state_broadcaster"] = {"ros__parameters": {}}
+        for section in sections.values():
+            section["ros__parameters"]["use_sim_time"] = True
+        sections["controller_manager"]["ros__parameters"]["update_rate"] = 200
+        file = Path(tempfile.mkdtemp()) / "controllers.yaml"
+        file.write_text(yaml.safe_dump(sections))
+        return file
+
+    def start(self) -> Any:
+        """Wait for both controllers; the model's joint positions."""
+        self.other.until(lambda: self.states, f"the controller\n{self.process.output}")
+        self.other.until(self.send.get_subscription_count, TRAJECTORIES)
+        # They become active one after the other.
+        self.other.spin(5.0)
+        return self.robot.controller.positions(np.array(self.states[-1].feedback.positions))
+
+    def go(self, motion: JointTrajectory) -> None:
+        """Send a trajectory and wait until it begins."""
+        self.states.clear()
+        self.send.publish(motion)
+        self.other.until(lambda: self.states and any(self.last.reference.velocities), "motion")
+
+    @property
+    def last(self) -> Any:
+        """The last state."""
+        return self.states[-1]
+
+    def followed(self) -> list[Any]:
+        """States of a motion there and back."""
+        self.go(there_and_back(self.robot, self.start(), 4.0))
+        self.other.spin(5.0)
+        self.other.until(lambda: not any(self.last.reference.velocities), "the motion's end")
+        self.other.spin(1.5)
+        self.report()
+        return [s for s in self.states if any(s.reference.velocities)]
+
+    def beyond(self) -> None:
+        """A trajectory through the position limit of the first joint."""
+        robot, start = self.robot, self.start()
+        aim = np.array(start)
+        aim[0] = robot.limits.position[0, 1] + 0.2 * np.ptp(robot.limits.position[0])
+        end, rest = robot.controller.controller_positions(aim)[None], np.zeros((1, len(start)))
+        self.go(trajectory(list(robot.controller.names), [4.0], end, rest, rest))
+        self.other.until(lambda: not any(self.last.reference.velocities), "the hold")
+        held = robot.controller.positions(np.array(self.last.reference.positions))
+        weight = inverse_dynamics(robot, held, 0.0 * held, 0.0 * held)
+        found = robot.controller.efforts(np.array(self.last.output.effort))
+        print(
+            f"beyond: held {robot.limits.position[0, 1] - held[0]:.1e} before the limit, "
+            f"effort less that of the weight {np.abs(found - weight).max():.1e}"
+        )
+        self.other.spin(3.0)
+        self.report()
+        print(_output("ros2", "control", "list_controllers"))
+
+    def report(self) -> None:
+        """The last diagnostics of the controller, and of what is simulated."""
+        for name in (": feedforward", "machine_sim"):
+            mine = [s for m in self.counts for s in m.status if s.name.endswith(name)]
+            if mine:
+                text = ", ".join(f"{v.key} {v.value}" for v in mine[-1].values)
+                print(f"{self.part}: {mine[-1].message}; {text}")
+
+
+def _output(*command: str) -> str:
+    """What a command prints."""
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
+def twin_s_efforts(other: Peer, robot: Robot, given: str, states: list[Any]) -> Any:
+    """Efforts of a running delta_dynamics for the references of these states, (count, n)."""
+    answers = other.hear(JointTrajectory, "/delta_dynamics/joint_trajectory_ff", 10)
+    send = other.node.create_publisher(
+        JointTrajectory, "/delta_dynamics/joint_trajectory", QoSProfile(depth=10)
+    )
+    references = [s.reference for s in states]
+    columns = [
+        np.array([getattr(r, name) for r in references])
+        for name in ("positions", "velocities", "accelerations")
+    ]
+    # Times only have to rise: efforts are those of each point.
+    message = trajectory(
+        list(robot.controller.names), 1e-3 * np.arange(1, len(states) + 1), *columns
+    )
+    with closing(node("delta_dynamics", parameters=[f"mechanism:={given}"])):
+        other.until(send.get_subscription_count, "delta_dynamics")
+        other.spin(1.0)
+        send.publish(message)
+        other.until(lambda: answers, "the twin's efforts")
+    return np.array([p.effort for p in answers[-1].points])
+
+
+def show(other: Peer, given: str, part: str, bandwidth: float) -> None:
+    """One part."""
+    robot, simulated = load(given), []
+    if part == "sim":
+        simulated.append(
+            node(
+                "machine_sim",
+                parameters=[f"mechanism:={given}", "period:=0.005", "clock:=lockstep"],
+                remap=["joint_states:=/machine_sim/joint_states"],
+            )
+        )
+    with closing(*simulated):
+        # Mock hardware does not follow: gains would push against it.
+        chain = Chain(other, given, part, bandwidth if part == "sim" else 0.0)
+        with closing(chain.process):
+            if part == "beyond":
+                chain.beyond()
+                return
+            states = chain.followed()
+    found = np.array([s.reference.effort for s in states])
+    right = twin_s_efforts(other, robot, given, states)
+    error = np.abs(found - right).max()
+    print(
+        f"{part}: {len(states)} states of the motion, effort less that of delta_dynamics "
+        f"{error:.2e} at most, {error / np.abs(right).max():.1e} of the peak"
+    )
+    if part == "sim":
+        miss = np.array([s.error.positions for s in states])
+        print(f"sim: tracking error {np.sqrt((miss**2).mean()):.2e} RMS, gains of {bandwidth:g} Hz")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("parts", nargs="*", default=list(HARDWARE), help=", ".join(HARDWARE))
+    parser.add_argument("--robot", default="delta_cu", help="name or path")
+    parser.add_argument("--bandwidth", type=float, default=2.0, help="Hz, of the gains for sim")
+    given = parser.parse_args()
+    with peer() as other:
+        for part in given.parts:
+            show(other, given.robot, part, given.bandwidth)
+
+
+if __name__ == "__main__":
+    main()
