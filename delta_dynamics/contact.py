@@ -102,7 +102,7 @@ class ContactMonitor:
         :raises ValueError: a bandwidth or a number of deviations that is not positive.
         """
         if not sigmas > 0.0:
-            raise ValueError(f"sigmas is {sigmas:g}, allowed above 0")
+            raise ValueError(f"sigmas is {sigmas:g}; expected more than 0")
         self.sigmas = sigmas
         self.observer = MomentumObserver(robot, bandwidth)
         self.change_robot(robot)

@@ -45,7 +45,7 @@ class MomentumObserver:
         :raises ValueError: a bandwidth that is not positive and finite.
         """
         if not 0.0 < bandwidth < np.inf:
-            raise ValueError(f"bandwidth is {bandwidth:g} 1/s, allowed above 0")
+            raise ValueError(f"bandwidth is {bandwidth:g} 1/s; expected more than 0")
         self.robot = robot
         self.bandwidth = bandwidth
         self._still = np.zeros(robot.joints_count)

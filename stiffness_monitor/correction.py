@@ -63,7 +63,9 @@ def setpoint_correction(
     """
     limit = doubles(bound, "the bound")
     if limit.shape not in ((), (robot.joints_count,)) or not (limit >= 0.0).all():
-        raise ValueError(f"bound is {limit.tolist()}, allowed 0 and above, one or one a joint")
+        raise ValueError(
+            f"bound is {limit.tolist()}; expected 0 or more, one number or one per joint"
+        )
     moved = vectors(deflection, 6, "the deflection")
     _, rotation = robot.platform(q)
     lever = skew((rotation @ vectors(tool, 3, "the tool point")[..., None])[..., 0])

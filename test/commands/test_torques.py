@@ -348,7 +348,7 @@ def test_a_motion_is_never_replaced_by_its_own_torques(twin, tmp_path):
     link.symlink_to("motion.csv")
     for target in (source, link):
         result = twin("torques", "delta", source, "--out", target, "--overwrite", "--no-picture")
-        assert "the target is the source itself" in result.one_line_error()
+        assert "the same file" in result.one_line_error()
         assert source.read_bytes() == before
 
 
