@@ -135,10 +135,10 @@ def _torques(figures: dict[str, Figures], judge: Judge) -> str:
 
 Each machine has random dimensions, limb azimuths up to {AZIMUTH_ERROR} rad off, masses and
 inertias, a payload with its own centre of mass and full inertia matrix, gravity in any direction,
-and friction. Each state has random positions, rates, accelerations and a wrench on the platform. The
-R-C-U limb is any of the limbs. The 3-PRRU's sliders are above or below, and the links of {THIN:.0%} of
-its machines are rods without inertia about their axes. States whose Jacobian, as computed by
-pkm_twin, has a condition number above {1 / LEAST_MEASURE:.0f} are left out.
+and friction. Each state has random positions, rates, accelerations and a wrench on the platform.
+The R-C-U limb is any of the limbs. The 3-PRRU's sliders are above or below, and the links of
+{THIN:.0%} of its machines are rods without inertia about their axes. States whose Jacobian, as
+computed by pkm_twin, has a condition number above {1 / LEAST_MEASURE:.0f} are left out.
 
 - **Pinocchio**: an open tree of bodies and loop constraints; tree motion by Newton's method and
   the constraints' Jacobian, efforts from recursive Newton-Euler sweeps and the multipliers.
@@ -154,7 +154,8 @@ A difference is the largest difference of the three efforts, divided by the larg
 other method. The last column is the largest difference of the platform's position by forward
 kinematics.
 
-| robot | method | machines | states | worst | median | bound | position, m (bound {PLACE_BOUND:.0e}) |
+| robot | method | machines | states | worst | median | bound \
+| position, m (bound {PLACE_BOUND:.0e}) |
 |---|---|---|---|---|---|---|---|
 {table}
 """
@@ -186,9 +187,9 @@ Computed for the same states; the last two for the states of the Lagrange method
   energy; the difference, divided by the sum of the absolute powers.
 - Energy: kinetic and potential energy of pkm_twin, compared with the Lagrange method.
 
-The first two compare reactions with pkm_twin's own inertia forces. A couple that does no work in any
-motion of the machine, such as the gyroscopic one of a 3-PRRU's upper link, occurs in the reactions
-but not in torques or energies; `test/validation/test_reactions_pinocchio.py` checks it.
+The first two compare reactions with pkm_twin's own inertia forces. A couple that does no work in
+any motion of the machine, such as the gyroscopic one of a 3-PRRU's upper link, occurs in the
+reactions but not in torques or energies; `test/validation/test_reactions_pinocchio.py` checks it.
 
 | balance | robot | states | worst | median | bound |
 |---|---|---|---|---|---|
@@ -219,24 +220,26 @@ def _swings(swings: list[Swing], judge: Judge) -> str:
     return f"""## Free swing of {DURATION:.0f} s
 
 The robots are the shipped parameter files without friction. The actuators apply constant efforts
-that balance the weight at a stable equilibrium. Both Deltas have arms at {DELTA_REST} rad and start at
-rest {_list(DELTA_DEVIATION)} rad away from there. (Without efforts a Delta of these dimensions swings
-about stretched limbs, and most starts reach the edge of its workspace.) The sliders of the 3-PRRU are
-vertical, so without efforts it would fall. It hangs from its sliders (`branch: above`) with a
-tool of {TOOL["mass"]:.0f} kg, {-TOOL["com"][2]} m below the platform, which makes the tilt stable. It
-starts with slider rates of {_list(PRRU_RATES)} m/s; their mean is zero because its height is free.
+that balance the weight at a stable equilibrium. Both Deltas have arms at {DELTA_REST} rad and
+start at rest {_list(DELTA_DEVIATION)} rad away from there. (Without efforts a Delta of these
+dimensions swings about stretched limbs, and most starts reach the edge of its workspace.) The
+sliders of the 3-PRRU are vertical, so without efforts it would fall. It hangs from its sliders
+(`branch: above`) with a tool of {TOOL["mass"]:.0f} kg, {-TOOL["com"][2]} m below the platform,
+which makes the tilt stable. It starts with slider rates of {_list(PRRU_RATES)} m/s; their mean is
+zero because its height is free.
 
-DOP853 integrates `forward_dynamics` of pkm_twin and of Pinocchio with tolerances of {TOLERANCE:.0e},
-Pinocchio's whole tree without closing the loops again. Pinocchio's own step is RK4 at
-{1e3 * STEP:.0f} ms with the loops closed after each step. Energy: the Lagrange method's function at
-{SAMPLES} instants minus the work of the constant efforts; its largest change, divided by the largest
-kinetic energy. Closure: the limbs' lengths and planes between actuators and platform; pkm_twin
-solves its loops for each state. Travel of one actuator, and differences from pkm_twin at the end, in
-rad, rad/s (Delta) and m, m/s (3-PRRU). Bounds: energy {SWING_BOUNDS["drift"]:.0e},
-closure {SWING_BOUNDS["closure"]:.0e} m, end states {SWING_BOUNDS["DOP853"]:.0e} with DOP853 and
-{SWING_BOUNDS["its own step"]:.0e} with the step.
+DOP853 integrates `forward_dynamics` of pkm_twin and of Pinocchio with tolerances of
+{TOLERANCE:.0e}, Pinocchio's whole tree without closing the loops again. Pinocchio's own step is
+RK4 at {1e3 * STEP:.0f} ms with the loops closed after each step. Energy: the Lagrange method's
+function at {SAMPLES} instants minus the work of the constant efforts; its largest change, divided
+by the largest kinetic energy. Closure: the limbs' lengths and planes between actuators and
+platform; pkm_twin solves its loops for each state. Travel of one actuator, and differences from
+pkm_twin at the end, in rad, rad/s (Delta) and m, m/s (3-PRRU). Bounds: energy
+{SWING_BOUNDS["drift"]:.0e}, closure {SWING_BOUNDS["closure"]:.0e} m, end states
+{SWING_BOUNDS["DOP853"]:.0e} with DOP853 and {SWING_BOUNDS["its own step"]:.0e} with the step.
 
-| robot | engine | travel | kinetic energy, J | energy drift | closure, m | difference of q | of q' |
+| robot | engine | travel | kinetic energy, J | energy drift | closure, m \
+| difference of q | of q' |
 |---|---|---|---|---|---|---|---|
 {table}
 """
@@ -272,8 +275,8 @@ between displacements; the platform is rigid.
 
 Differences are relative: those of all 36 entries to sqrt(C_ii C_jj), those of the diagonal entries
 each to its own value, and those of the six deflections under the load of the paper's table 1,
-{_wrench(LOAD)} in N and N m, each to its own value, however small. The bound is {BOUND:.0e}, for the
-mesh a quarter of it. Mesh: {MESH} bricks per bar compared with {FINE}.
+{_wrench(LOAD)} in N and N m, each to its own value, however small. The bound is {BOUND:.0e}, for
+the mesh a quarter of it. Mesh: {MESH} bricks per bar compared with {FINE}.
 
 | pose | z (m), beta, gamma (deg) | entries | diagonal | deflections | Cowper | rigid ends | mesh |
 |---|---|---|---|---|---|---|---|
@@ -302,7 +305,10 @@ def _paper_rows(rows: PaperRows, links: dict[str, Links], judge: Judge) -> str:
     beams = ""
     if links:
         apart = max(_worst(found.shipped.diagonal) for found in links.values())
-        beams = f"Beam theory does not explain it either: solid bars are within {_percent(apart)} (above)."
+        beams = (
+            "Beam theory does not explain it either: solid bars are within "
+            f"{_percent(apart)} (above)."
+        )
     # Where joints hardly matter.
     bent = (0, 5)
     joints = _worst(rows.rigid[:, bent] / rows.twin[:, bent] - 1)

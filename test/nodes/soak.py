@@ -289,12 +289,13 @@ def write(folder, summary, watched, ages):
 
 TEXT = """## Long run
 
-Printed by `make soak MINUTES={minutes:g}`: two `delta_dynamics` (the player replays a looping bag to one of
-them), `stiffness_monitor` and `command_gate`, at 1 kHz or as fast as the computer allowed
-({sent:,} joint states, one in a hundred invalid, and a fifth as many wrenches). Meanwhile there were
-{parameters:,} valid and invalid requests for parameters, {trajectory:,} trajectories of 500 points,
-{suspend:,} suspensions of a node for {suspension:g} s (SIGSTOP, SIGCONT), and {kill:,} kills of the
-player. The first fifth is warm-up. `stale_after` and the gate's `deadline` were {stale:g} s.
+Printed by `make soak MINUTES={minutes:g}`: two `delta_dynamics` (the player replays a looping bag
+to one of them), `stiffness_monitor` and `command_gate`, at 1 kHz or as fast as the computer
+allowed ({sent:,} joint states, one in a hundred invalid, and a fifth as many wrenches). Meanwhile
+there were {parameters:,} valid and invalid requests for parameters, {trajectory:,} trajectories of
+500 points, {suspend:,} suspensions of a node for {suspension:g} s (SIGSTOP, SIGCONT), and {kill:,}
+kills of the player. The first fifth is warm-up. `stale_after` and the gate's `deadline` were
+{stale:g} s.
 
 ![Memory, descriptors, threads and ages of a long run](soak.png)
 
