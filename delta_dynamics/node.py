@@ -414,8 +414,7 @@ class DeltaDynamics(health.TwinNode):
             ),
             extra_joints=self.declare(
                 "extra_joints", d.extra_joints, "joints of a trajectory that the model does not "
-                "have: refuse rejects the trajectory, "
-                "zero gives them zero effort",
+                "have: reject the trajectory, or give them zero effort",
                 choices=("refuse", "zero"),
             ),
             on_stop=self.declare(

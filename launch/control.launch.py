@@ -41,7 +41,7 @@ ARGUMENTS = {
     "robot": ("delta_cu", "the robot, a name or path"),
     "namespace": ("", "namespace of all nodes and topics"),
     "description": ("", "a URDF with a ros2_control element; default: what pkm-twin urdf writes"),
-    "controllers": ("", "settings of ros2_control; default: controllers.yaml beside this file"),
+    "controllers": ("", "settings of ros2_control; default: controllers.yaml in this folder"),
     "hardware_plugin": ("mock_components/GenericSystem", "plugin in the default description"),
     "bandwidth": (
         "",

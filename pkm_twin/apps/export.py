@@ -24,7 +24,7 @@ SHARE = 0.5
 @app.command()
 def moveit(
     robot: RobotName,
-    out: Annotated[Path, typer.Option(help="folder of the package, made anew")],
+    out: Annotated[Path, typer.Option(help="folder of the new package")],
     kinematics_plugin: Annotated[
         str, typer.Option(help="MoveIt's plugin for the inverse kinematics", metavar="NAME")
     ] = "",
@@ -45,7 +45,7 @@ def moveit(
 @app.command()
 def c(
     robot: RobotName,
-    out: Annotated[Path, typer.Option(help="folder of the package, made anew")],
+    out: Annotated[Path, typer.Option(help="folder of the new package")],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
 ) -> None:
     """Write kinematics, dynamics and elasticity as C99 that needs only math.h.

@@ -100,7 +100,7 @@ def fit(
     if COMPLIANCE in [word.strip() for word in what.split(",")]:
         if per_copy or payload is not None or load_times is not None:
             raise ParameterError(
-                "what", what, "without --per-copy, --payload and --load-times: of efforts they tell"
+                "what", what, "no --per-copy, --payload or --load-times, which are for efforts"
             )
         _fit_compliance(
             robot, recordings, what, topic, out, page if report else None, json_output,

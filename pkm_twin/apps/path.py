@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin path``: a motion along way-points, a cycle or a circle, as a trajectory or table."""
+"""``pkm-twin path``: a motion along waypoints, a cycle or a circle, as a trajectory or table."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Array = NDArray[np.float64]
 
 ENDINGS: Final = (".mcap", ".csv")
 OPTIONS: Final = ("blend", "dwell", "arc")
-"""Columns of way-points beside their coordinates."""
+"""Columns of waypoints beside their coordinates."""
 MILLIMETRES: Final = 1e-3
 LEAST_CYCLE: Final = 1.0
 """Millimetres below which a cycle's numbers look like metres."""
 
 
 def read_waypoints(file: Path, robot: Robot, blend: float | None) -> Way:
-    """The path of a CSV of way-points, see :func:`path_command`.
+    """The path of a CSV of waypoints, see :func:`path_command`.
 
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
     """

@@ -283,7 +283,9 @@ class Robot:
         if self.drive is None:
             return given
         if given:
-            raise ParameterError("inertia.rotor_inertia", given, "0 beside a section drive")
+            raise ParameterError(
+                "inertia.rotor_inertia", given, "0, because the section drive has the rotor"
+            )
         return self.drive.reflected(slides, "drive")
 
     def shared_parameters(self) -> tuple[Shared, ...]:

@@ -121,7 +121,7 @@ def read(path: Path, robot: ET.Element) -> Urdf:
         raise ParameterError(
             str(path),
             f"no loop closure, and passive joints: {', '.join(idle)}",
-            "<constraint> or <loop> elements, or closed_loop in a YAML file beside it",
+            "<constraint> or <loop> elements, or closed_loop in a YAML file next to it",
         )
     name = robot.get("name") or path.stem
     initial = _initial(robot, actuated)
@@ -142,7 +142,7 @@ def _link(element: ET.Element, name: str) -> Link:
         raise ParameterError(f"{where}.mass", value, "zero or more, kg")
     inertia = urdf_xml.single(inertial, "inertia", where)
     if inertia is None:
-        raise ParameterError(f"{where}.inertia", None, "an <inertia> beside the mass, kg m2")
+        raise ParameterError(f"{where}.inertia", None, "an <inertia> for the mass, kg m2")
     xx, xy, xz, yy, yz, zz = (
         urdf_xml.number(
             inertia.get(key, "0" if key[1] != key[2] else None), f"{where}.inertia.{key}"
@@ -221,7 +221,7 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
             raise ParameterError(
                 f"joint.{joint.name}.child",
                 joint.child,
-                f"a tree of links: {joint.child!r} hangs on {parents[joint.child].name!r} already; "
+                f"a tree of links: {joint.child!r} already has the parent joint {parents[joint.child].name!r}; "
                 "a loop is closed by a <constraint> element",
             )
         parents[joint.child] = joint
@@ -317,7 +317,7 @@ def _actuated(
         raise ParameterError(
             str(path),
             "no actuated joint",
-            "command interfaces in a <ros2_control> element, or name_mot in a YAML file beside it",
+            "command interfaces in a <ros2_control> element, or name_mot in a YAML file next to it",
         )
     if len(set(names)) != len(names):
         raise ParameterError(source, names, "each joint once")

@@ -63,12 +63,12 @@ def round_trip(trip):
     priority = "at real-time priority" if trip["real_time"] else "at normal priority"
     lines = [
         "",
-        "Round trip over DDS at 1 kHz, `joint_states` to `~/joint_torques`, beside a node that "
-        f"sends the same message back: {trip['slices']} slices of each in turn, medians, "
-        f"{priority}; processor time is that of all threads of the process. Ratios are to the echo "
-        "with the same executor, slice by slice.",
+        "Round trip over DDS at 1 kHz, `joint_states` to `~/joint_torques`, compared with a node "
+        f"that sends the same message back (echo): {trip['slices']} slices of each in turn, "
+        f"medians, {priority}. Processor time is that of all threads of the process. Ratios are "
+        "relative to the echo with the same executor, slice by slice.",
         "",
-        "| node | p50 (us) | p99 (us) | CPU a message (us) | p50, p99, CPU to the echo |",
+        "| node | p50 (us) | p99 (us) | CPU per message (us) | p50, p99, CPU relative to the echo |",
         "|---|---:|---:|---:|---|",
     ]
     missed = []
