@@ -59,8 +59,8 @@ def singular_home(engine: Engine, rank: int, beside: int) -> ParameterError:
     )
     return ParameterError(
         "joints", f"rank {rank} of the closures at home, {beside} near it",
-        f"a home that is not a singularity; at this home {', '.join(names[:8])} can move without the "
-        "others, so choose another pose",
+        f"a home that is not a singularity; at this home {', '.join(names[:8])} can move without "
+        "the others, so choose another pose",
     )  # fmt: skip
 
 

@@ -221,8 +221,8 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
             raise ParameterError(
                 f"joint.{joint.name}.child",
                 joint.child,
-                f"a tree of links: {joint.child!r} already has the parent joint {parents[joint.child].name!r}; "
-                "a loop is closed by a <constraint> element",
+                f"a tree of links: {joint.child!r} already has the parent joint "
+                f"{parents[joint.child].name!r}; close the loop with a <constraint> element",
             )
         parents[joint.child] = joint
     roots = [name for name in links if name not in parents]

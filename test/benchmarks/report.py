@@ -68,7 +68,7 @@ def round_trip(trip):
         f"medians, {priority}. Processor time is that of all threads of the process. Ratios are "
         "relative to the echo with the same executor, slice by slice.",
         "",
-        "| node | p50 (us) | p99 (us) | CPU per message (us) | p50, p99, CPU relative to the echo |",
+        "| node | p50 (us) | p99 (us) | CPU per message (us) | p50, p99, CPU over the echo's |",
         "|---|---:|---:|---:|---|",
     ]
     missed = []

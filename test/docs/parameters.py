@@ -18,10 +18,10 @@ from pkm_twin.mechanisms import delta, prru, upr_rpu
 
 HEAD = """# Robot files
 
-Every key of a robot's YAML with its unit, its valid values and its default. SI units, angles in rad,
-z up. An unknown key, a value of another type and a value out of its bounds are rejected, with the
-name of the key. Of two units, the first is for joints that rotate and the second for joints that
-slide; `pkm-twin info ROBOT` prints a robot's values with the units of its joints.
+Every key of a robot's YAML with its unit, its valid values and its default. SI units, angles in
+rad, z up. An unknown key, a value of another type and a value out of its bounds are rejected, with
+the name of the key. Of two units, the first is for joints that rotate and the second for joints
+that slide; `pkm-twin info ROBOT` prints a robot's values with the units of its joints.
 
 Written by `make pages`.
 """
@@ -54,11 +54,11 @@ azimuth; the names get _1, _2 and so on. A copy uses its own copy of the bodies 
 other bodies are shared."""
 
 
-FRICTION = """Friction of the actuated joints, opposite to the rate: viscous friction is proportional
-to the rate, Coulomb friction depends on its sign. `offset` is a constant effort."""
+FRICTION = """Friction of the actuated joints, opposite to the rate: viscous friction is
+proportional to the rate, Coulomb friction depends on its sign. `offset` is a constant effort."""
 LIMITS = "Nodes and commands reject values beyond these limits, or warn. The default is no limit."
-UNCERTAINTY = """The uncertainty of a number, by its dotted path in this file (`inertia.arm_mass`), or
-of all numbers below a name together (`joints_compliance`). Each entry is an independent cause;
+UNCERTAINTY = """The uncertainty of a number, by its dotted path in this file (`inertia.arm_mass`),
+or of all numbers below a name together (`joints_compliance`). Each entry is an independent cause;
 `torque_deviation` and `compliance_deviation` propagate them. Give either `deviation`, the standard
 deviation in the number's own unit, or `relative`, that of a common factor."""
 
