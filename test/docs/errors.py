@@ -116,9 +116,10 @@ def reasons() -> set[str]:
     for folder in ("pkm_twin", "delta_dynamics", "stiffness_monitor"):
         for path in (ROOT / folder).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Call) and ast.unparse(node.func) == "MessageError":
-                    if isinstance(node.args[0], ast.Constant):
-                        found.add(node.args[0].value)
+                if not isinstance(node, ast.Call) or ast.unparse(node.func) != "MessageError":
+                    continue
+                if isinstance(node.args[0], ast.Constant):
+                    found.add(node.args[0].value)
     return found
 
 
