@@ -59,13 +59,13 @@ def robot_path(robot: str | Path) -> Path:
 def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     """A robot by its name in ``config/``, from a parameter file, or from a URDF with its loops.
 
-    Of a user's file what was done to it, and numbers that are hardly meant, are given as warnings
+    Changes that the import made to a user's file, and implausible numbers in it, give warnings
     (:class:`pkm_twin.errors.RobotWarning`), each once.
 
     :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF or MJCF file.
     :param platform: of a URDF the link that carries the tool; default by its name.
     :raises UnknownNameError: no such name; the closest one is named.
-    :raises ParameterError: a file, key, type or value that is refused, by its dotted name.
+    :raises ParameterError: an invalid file, key, type or value, with its dotted name.
     """
     path = robot_path(robot)
     if path.suffix in TREES:
