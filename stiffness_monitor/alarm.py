@@ -185,7 +185,8 @@ class _Window:
 class StiffnessAlarm:
     """Finds elements whose compliance differs from the file, from samples of load and deflection.
 
-    Times are arguments, s."""
+    Times are arguments, s.
+    """
 
     robot: Robot
     settings: AlarmSettings = field(default_factory=AlarmSettings)
