@@ -93,7 +93,7 @@ def through(robot: Robot, points: ArrayLike, *, space: Space = "pose") -> Path:
     """A smooth curve through waypoints without a stop: a cubic spline over the chords' lengths.
 
     :param points: shape (k, m), coordinates of the pose, or joint positions (k, n).
-    :raises ParameterError: fewer than two different waypoints, or no numbers.
+    :raises ParameterError: fewer than two different waypoints, or values that are not finite.
     """
     values, new = _points(robot, points, space)
     values = values[new]
@@ -124,7 +124,7 @@ def lines(
     :param dwell: rest in each waypoint, s, shape (k,) or one for all; above 0 it is a stop.
     :param arc: which waypoints (k,) are points in the middle of an arc, from the waypoint before
         to the one behind. An arc and a tangent line meet without a stop.
-    :raises ParameterError: by the waypoint.
+    :raises ParameterError: with the waypoint.
     """
     values, new = _points(robot, points, space)
     count = len(values)
@@ -251,7 +251,7 @@ def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0
     :param centre: the pose in the middle, shape (m,).
     :param radius: m.
     :param turns: how often; negative turns the other way.
-    :raises ParameterError: a pose without two of x, y, z, or a radius that is none.
+    :raises ParameterError: a pose without two of x, y, z, or an invalid radius.
     """
     middle = np.asarray(centre, float)
     places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")][:2]
@@ -288,7 +288,7 @@ def cycle(
     :param blend: rounding of the upper corners, m; default 0.8 of the smaller rise.
     :param dwell: rest in both places, s.
     :param back: whether the path goes back to the first place.
-    :raises ParameterError: a robot that cannot move up and across, or no way.
+    :raises ParameterError: a robot that cannot move up and across, or lengths of zero.
     """
     fall = height if lift is None else lift
     for name, value in (("height", height), ("width", width), ("lift", fall)):
