@@ -76,8 +76,8 @@ def fastest(
     :returns: the motion: ``.times``, ``.q``, ``.qd``, ``.qdd``, ``.effort`` and ``.pose`` at its
         points, the same of ``.uniform(rate)`` and ``.sample(times)``; ``.bounds``, which limit
         binds when; ``.duration``, s.
-    :raises ParameterError: with the position: a pose out of reach, beyond a joint's limit or close to
-        a singularity, or a drive that cannot hold the machine; or no limit bounds the speed.
+    :raises ParameterError: with the position: a pose out of reach, beyond a joint's limit or close
+        to a singularity, or a drive that cannot hold the machine; or no limit bounds the speed.
     """
     made = path if isinstance(path, Path) else through(robot, path)
     limits = Limits.of(
