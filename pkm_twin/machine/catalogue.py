@@ -47,7 +47,9 @@ def robot_path(robot: str | Path) -> Path:
     if text.endswith(".xacro"):
         written = Path(text.removesuffix(".xacro")).with_suffix(".urdf").name
         raise ParameterError(
-            text, "a xacro file", f"a URDF: run `xacro {Path(text).name} > {written}` and give that"
+            text,
+            "a xacro file",
+            f"a URDF: run `xacro {Path(text).name} > {written}` and use that file",
         )
     if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
         return Path(robot)
@@ -75,7 +77,7 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
         robot_read = robot_of_data(reading.description, path.stem)
         return _told(path, replace(robot_read, home_choice=reading.home))
     if platform is not None:
-        raise ParameterError("platform", platform, "none: the file names its own platform")
+        raise ParameterError("platform", platform, "none, because the file names its platform")
     return _told(path, robot_of_data(schema.read_yaml(path), path.stem))
 
 

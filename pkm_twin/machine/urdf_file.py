@@ -162,7 +162,7 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     if kind not in JOINTS:
         raise UnknownNameError(f"{where}.type", kind, JOINTS)
     if element.find("mimic") is not None:
-        raise ParameterError(f"{where}.mimic", "<mimic>", "joints that move by themselves")
+        raise ParameterError(f"{where}.mimic", "<mimic>", "joints without coupling")
     parent, child = (
         urdf_xml.reference(urdf_xml.single(element, end, where), f"{where}.{end}", links)
         for end in ("parent", "child")
@@ -227,7 +227,7 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
         parents[joint.child] = joint
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
-        raise ParameterError("robot", roots, "one root link: exactly one that is no child")
+        raise ParameterError("robot", roots, "exactly one root link (a link that is not a child)")
     known = {roots[0]}
     for link in links:
         # Up to what is known to hang on the root: every link is passed once.
@@ -236,7 +236,7 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
             if link in way:
                 circle = sorted(way)
                 raise ParameterError(
-                    f"joint.{parents[link].name}", circle, "a tree: these go in a circle"
+                    f"joint.{parents[link].name}", circle, "a tree; these links form a circle"
                 )
             way[link] = None
             link = parents[link].parent
@@ -265,7 +265,7 @@ def _retyped(joints: dict[str, Joint], beside: dict[str, Any]) -> dict[str, Join
     """Joints that the YAML file calls spherical, universal or fixed."""
     names, kinds = beside.get("joint_name", []), beside.get("joint_type", [])
     if len(names) != len(kinds):
-        raise ParameterError("joint_type", kinds, f"one a name of joint_name: {len(names)}")
+        raise ParameterError("joint_type", kinds, f"{len(names)}, one per name in joint_name")
     unit = dict(zip("XYZ", np.eye(3), strict=True))
     universal = {f"UJOINT_{a}{b}": (a, b) for a in "XYZ" for b in "XYZ" if a != b}
     joints = dict(joints)
@@ -377,7 +377,7 @@ def _warn_of_units(
     if size > LARGE:
         warn(
             path,
-            f"{where}: an offset of {size:g} m; a URDF is in metres, does it say millimetres?",
+            f"{where}: an offset of {size:g} m; a URDF uses metres; are these millimetres?",
         )
     for top in robot:
         angles = [word for e in top.iter() for word in e.get("rpy", "").split()]
@@ -385,6 +385,6 @@ def _warn_of_units(
         if largest > 2.0 * math.pi + 1e-6:
             warn(
                 path,
-                f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF is in radians, does it "
-                "say degrees?",
+                f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF uses radians; "
+                "are these degrees?",
             )

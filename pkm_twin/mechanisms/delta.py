@@ -201,7 +201,9 @@ class Delta(Robot):
         if platform is None:
             g = self.geometry
             raise ParameterError(
-                "geometry.forearm_length", g.forearm_length, "one with which limbs can be assembled"
+                "geometry.forearm_length",
+                g.forearm_length,
+                "a length with which the limbs can be assembled",
             )
         return q, platform
 

@@ -296,7 +296,9 @@ class Prru(Robot):
         g, travel = self.geometry, self.limits.position
         if travel is None:
             raise ParameterError(
-                "limits.position", None, "limits of the sliders: without them z has no end"
+                "limits.position",
+                None,
+                "limits of the sliders; without them the workspace is unbounded",
             )
         reach, right = g.limb_length + g.platform_radius, np.pi / 2
         z = float(travel.min()) - reach, float(travel.max()) + reach

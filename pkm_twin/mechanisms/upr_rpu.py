@@ -406,7 +406,9 @@ class UprRpu(Robot):
         lengths = self.limits.limb_length
         if lengths is None:
             raise ParameterError(
-                "limits.limb_length", None, "limits of the limbs: without them z has no end"
+                "limits.limb_length",
+                None,
+                "limits of the limbs; without them the workspace is unbounded",
             )
         right = math.pi / 2
         return np.array([(-float(lengths[:2].max()), 0.0), (-right, right), (-right, right)])

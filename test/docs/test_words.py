@@ -77,6 +77,11 @@ def test_pages(page):
     assert banned((ROOT / page).read_text(encoding="utf-8")) == []
 
 
+def test_the_newest_changes():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert banned(text.split("\n## ")[1]) == []
+
+
 def helps(command):
     """Help of a command, of its options and of the commands in it."""
     yield command.help or ""
