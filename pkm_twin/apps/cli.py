@@ -194,11 +194,11 @@ def urdf(
         bool, typer.Option("--no-ros2-control", help="write no ros2_control element")
     ] = False,
 ) -> None:
-    """Print a robot as a URDF: a tree, and a <constraint> element for each loop that was cut.
+    """Print a robot as a URDF, with its loops as constraints.
 
-    It has all joints, actuated and passive. The base is the link base_link, the platform the link
-    platform. Parsers that know only trees ignore the <constraint> elements. The same robot always
-    gives the same bytes.
+    The URDF is a tree with all joints, actuated and passive, and a <constraint> element for each
+    loop that was cut. Parsers that know only trees ignore these elements. The base is the link
+    base_link, the platform the link platform. The same robot always gives the same bytes.
     """
     from pkm_twin import load
     from pkm_twin.machine.robot_urdf import robot_urdf
@@ -213,9 +213,10 @@ def urdf(
 
 @app.command()
 def convert(robot: RobotName, platform: Platform = None) -> None:
-    """Print a robot, or a URDF with its loops, as a commented YAML of bodies, joints and rods.
+    """Convert a robot, or a URDF with its loops, to a YAML.
 
-    The file is a complete robot: edit it, and use its path in place of a robot's name.
+    Prints a commented YAML of bodies, joints and rods. It is a complete robot: edit it, and use its
+    path in place of a robot's name.
     """
     from pkm_twin import load
     from pkm_twin.machine.catalogue import TREES
@@ -253,7 +254,7 @@ def torques(
         bool, typer.Option("--overwrite", help="replace the table and the picture")
     ] = False,
 ) -> None:
-    """Compute torques, their terms and the joint reactions of a motion.
+    """Compute torques, their terms and joint reactions.
 
     CSV columns: time (s) and JOINT.position (rad or m) for every actuated joint. Optional:
     JOINT.velocity and JOINT.acceleration, which are otherwise differentiated from the positions,
@@ -320,7 +321,7 @@ def compliance(
     beyond_limits: BeyondLimits = False,
     as_json: Json = False,
 ) -> None:
-    """Compute the platform's compliance at a pose, and the strain energy under a wrench.
+    """Compute compliance at a pose and strain energy under a load.
 
     Example: `pkm-twin compliance upr_rpu -0.6 0 0 --wrench 30,-50,-40,10,-20,50`.
 
@@ -510,7 +511,7 @@ def certify(
     ] = [],  # noqa: B006  typer copies it
     as_json: Json = False,
 ) -> None:
-    """Cross-check a robot's torques and kinematics with independent engines.
+    """Cross-check a robot with independent engines.
 
     Three engines compute the machine from its description and share no mechanics code with
     pkm_twin: maximal (free bodies, every joint as equations), pinocchio and mujoco (a tree with

@@ -66,12 +66,13 @@ def fit(
     ] = False,
     json_output: Json = False,
 ) -> None:
-    """Fit friction, rotors, payload and masses to recorded efforts, or compliance to deflections.
+    """Fit friction, masses or compliance to recordings.
 
-    Positions and efforts are enough: velocities and accelerations are differentiated without delay,
-    and regressor and efforts pass the same filter. CSV columns: time (s); JOINT.position and
-    JOINT.effort for every actuated joint; optionally the wrench fx fy fz mx my mz. The last third
-    of each recording is held out for validation.
+    Fits friction, rotors, payload and masses to recorded efforts, or compliance to measured
+    deflections. Positions and efforts are enough: velocities and accelerations are differentiated
+    without delay, and regressor and efforts pass the same filter. CSV columns: time (s);
+    JOINT.position and JOINT.effort for every actuated joint; optionally the wrench fx fy fz mx my
+    mz. The last third of each recording is held out for validation.
 
     The YAML is the robot's file with the fitted values, each with its standard deviation in a
     comment. The command lists the parameters that the motion does not excite; they keep the file's
