@@ -111,6 +111,8 @@ def nodes(context: LaunchContext) -> list[Node]:
             load(given["robot"])
         except PkmTwinError as error:
             raise RuntimeError(f"robot: {error}") from None
+    for name in ("respawn", "use_sim_time"):
+        _flag(given, name)
     chosen = [name for name in PARAMETERS if _flag(given, name)]
     _check_deadline(given, chosen)
     together = [name for name in chosen if name != GATE]
@@ -232,9 +234,12 @@ class _Again:
         if context.is_shutdown or not (gate or _flag(given, "respawn")):
             return []
         if event.returncode != REJECTED or time.monotonic() - self._began > SETTLED:
-            # The gate's absence is the time that a controller holds the last torque.
             again = _process(names, given)
-            return [again] if gate else [TimerAction(period=RESPAWN_DELAY, actions=[again])]
+            # A gate that has failed is missing for as long as a controller holds the last torque.
+            # One that was ended has sent zeros; what ended it may be about to end the launch.
+            if gate and event.returncode:
+                return [again]
+            return [TimerAction(period=RESPAWN_DELAY, actions=[again])]
         if self._tries == RETRIES:
             text = f"{', '.join(names)}: the configuration is rejected; not started again"
             return [LogInfo(msg=text)]

@@ -6,7 +6,6 @@ May import: numpy, llvmlite if present, this package, the standard library.
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
 import threading
@@ -42,7 +41,9 @@ MOST: Final = 1_000_000
 _WRITERS: Final = ("codegen", "machine", "kinematics", "mechanisms", "streams")
 """Folders beside this one whose sources write programs."""
 SMALL: Final = 4096
-"""Samples of a batch whose results are made in one block of memory."""
+"""Samples of a batch that is copied into a room of its own."""
+KEPT_ROOMS: Final = 16
+"""Sizes of small batches whose rooms are kept."""
 MISSED: Final = 1e-24
 """Sum of squares by which a geometry may miss what a program takes for constant: rounding."""
 _F8: Final = np.dtype(np.float64)
@@ -76,21 +77,25 @@ def _sources() -> str:
 
 
 class _Space:
-    """Room for one sample of a kernel, with everything where the code looks for it."""
+    """Room for samples of a kernel, with everything where the code looks for it.
 
-    def __init__(self, inputs: Sequence[int], outputs: Sequence[int]) -> None:
+    Inputs, outputs and status have shape (size,) each, or (samples, size) for several samples.
+    """
+
+    def __init__(self, inputs: Sequence[int], outputs: Sequence[int], samples: int = 1) -> None:
         sizes = [*inputs, *outputs, 2]
-        ends = np.cumsum([0, *sizes])
-        self.numbers = np.zeros(ends[-1])
+        ends = samples * np.cumsum([0, *sizes])
+        self.numbers = _aligned(1, ends[-1])[0]
+        self.numbers[:] = 0.0
         views = [self.numbers[a:b] for a, b in pairwise(ends)]
+        if samples > 1:
+            views = [view.reshape(samples, -1) for view in views]
         self.inputs = views[: len(inputs)]
-        # A memory view takes doubles of exactly its length and nothing else.
-        self.takers = [memoryview(view.data) for view in self.inputs]
         self.outputs = views[len(inputs) : -1]
         self.status = views[-1]
-        words = [1, 1, 1, 0, 0]
-        for view in self.inputs:
-            words += [view.ctypes.data, 0, 0]
+        words = [1, samples, 1, 0, 0]
+        for view, size in zip(self.inputs, inputs, strict=True):
+            words += [view.ctypes.data, size, 0]
         words += [view.ctypes.data for view in [*self.outputs, self.status]]
         self.words = np.array(words, np.int64)
         self.address = self.words.ctypes.data
@@ -100,6 +105,10 @@ class _Space:
         """Use what was prepared of these parameters; kept, so that its address stays its."""
         self.prepared = prepared
         self.words[3] = prepared.ctypes.data
+
+    def takers(self) -> list[memoryview]:
+        """Of one sample's inputs: each takes doubles of exactly its length and nothing else."""
+        return [memoryview(view.data) for view in self.inputs]
 
 
 def _take_none(*_: Any) -> Array | None:
@@ -121,14 +130,19 @@ def _caller(inputs: int) -> Callable[..., Any]:
         "    take, give = free.pop, free.append",
         f"    def call({', '.join(names)}):",
         # A masked array is no array here: its buffer tells nothing of the mask.
-        f"        if not ({' is '.join(['array', *(f'type({name})' for name in names)])}):",
+        f"        if not ({' is '.join(['array', *(f'type({name})' for name in names)])})"
+        " or a0.ndim != 1:",
         "            raise TypeError",
         "        try:",
         "            place = take()",
         "        except IndexError:",
         "            place = room()",
         f"        {takers}, address, copy, _ = place",
-        *(f"        t{k}[:] = a{k}" for k in range(inputs)),
+        "        try:",
+        *(f"            t{k}[:] = a{k}" for k in range(inputs)),
+        "        except (TypeError, ValueError):",
+        "            give(place)",
+        "            raise",
         "        result = None if code(address) else copy()",
         "        give(place)",
         "        return result",
@@ -163,7 +177,8 @@ class Code:
     def __init__(self, build: Callable[[], Program], key: str) -> None:
         self._build, self._key = build, key
         self._lock = threading.Lock()
-        self._spaces: list[_Space] = []
+        self._spaces: dict[int, list[_Space]] = {}
+        """Rooms that nobody uses, by their number of samples."""
 
     @cached_property
     def program(self) -> Program:
@@ -271,25 +286,43 @@ class Code:
     def _quick(
         self, prepared: Array, arrays: Sequence[Array], shape: tuple[int, ...]
     ) -> tuple[list[Array], Array | None] | None:
-        """A batch as it lies in memory in one step, as :meth:`_run`; None where it is too large."""
-        header, _, code, locked = self._loaded
+        """A small batch in one step, as :meth:`_run`; None where it is too large."""
+        _, _, code, locked = self._loaded
         count = math.prod(shape)
         if locked is None or not 0 < count <= SMALL:
             return None
-        sizes = header["outputs"]
-        # One block for all: what it costs to make an array counts here.
-        block = np.empty(count * (sum(sizes) + 2))
-        words = [1, count, 1, prepared.ctypes.data, 0]
-        for array in arrays:
-            words += [array.ctypes.data, 0 if array.ndim == 1 else array.shape[-1], 0]
-        outputs, place, end = [], block.ctypes.data, 0
-        for size in sizes:
-            start, end = end, end + count * size
-            outputs.append(block[start:end].reshape(*shape, size))
-            words.append(place + 8 * start)
-        words.append(place + 8 * end)
-        bad = code((ctypes.c_int64 * len(words))(*words))
-        return outputs, block[end:].reshape(count, 2) if bad else None
+        # Copies into a room cost less than to find where arrays lie.
+        space = self._room(prepared, count)
+        for view, array in zip(space.inputs, arrays, strict=True):
+            view[...] = array if array.ndim <= 2 else array.reshape(count, -1)
+        bad = code(space.address)
+        outputs = [view.copy() for view in space.outputs]
+        if len(shape) > 1 or count == 1:
+            outputs = [output.reshape(*shape, -1) for output in outputs]
+        status = space.status.reshape(count, 2).copy() if bad else None
+        self._give(space, count)
+        return outputs, status
+
+    def _room(self, prepared: Array, count: int) -> _Space:
+        """A room for so many samples of a machine, for :meth:`_give` to have back."""
+        free = self._spaces.get(count)
+        if free is None:
+            if len(self._spaces) >= KEPT_ROOMS:
+                self._spaces = {}
+            free = self._spaces[count] = []
+        try:
+            space = free.pop()
+        except IndexError:
+            space = _Space(*self.sizes, count)
+        if prepared is not space.prepared:
+            space.point_at(prepared)
+        return space
+
+    def _give(self, space: _Space, count: int) -> None:
+        """Give a room back; one whose kind is not kept any more goes."""
+        free = self._spaces.get(count)
+        if free is not None:
+            free.append(space)
 
     def run_each(self, prepared: Array, *inputs: Array) -> tuple[list[Array], Array | None]:
         """The same of many machines.
@@ -322,22 +355,17 @@ class Code:
             rows = [np.asarray(value, _F8).reshape(1, 1, -1) for value in inputs]
             outputs, status = self._run(prepared.reshape(1, -1), rows, 1, 1)
         else:
-            try:
-                space = self._spaces.pop()
-            except IndexError:
-                space = _Space(*self.sizes)
-            if prepared is not space.prepared:
-                space.point_at(prepared)
+            space = self._room(prepared, 1)
             for view, value in zip(space.inputs, inputs, strict=True):
                 view[:] = value
             if not code(space.address):
                 results = [view.copy() for view in space.outputs]
-                self._spaces.append(space)
+                self._give(space, 1)
                 return results, None
             rows = [view.reshape(1, 1, -1).copy() for view in space.inputs]
             outputs = [view.reshape(1, -1).copy() for view in space.outputs]
             status = space.status.reshape(1, 2).copy()
-            self._spaces.append(space)
+            self._give(space, 1)
         status = self._finished(prepared.reshape(1, -1), rows, outputs, status, 1)
         return [output[0] for output in outputs], None if status is None else status[0]
 
@@ -355,7 +383,7 @@ class Code:
         def room() -> tuple[Any, ...]:
             space = _Space(*sizes)
             space.point_at(prepared)
-            return (*space.takers, space.address, space.outputs[0].copy, space)
+            return (*space.takers(), space.address, space.outputs[0].copy, space)
 
         result: Callable[..., Array | None] = _caller(len(sizes[0]))(code, room, np.ndarray)
         return result
@@ -492,17 +520,9 @@ class BoundCall:
 
     def __init__(self, kernel: Kernel, p: Array, samples: int = 1) -> None:
         self._kernel, self._p = kernel, p
-        taken, given = kernel.sizes
-        shape = () if samples == 1 else (samples,)
-        self.inputs = [np.zeros((*shape, size)) for size in taken]
-        self.outputs = [np.zeros((*shape, size)) for size in given]
-        self._status, self._prepared = np.zeros((samples, 2)), kernel.prepared(p)
-        words = [1, samples, 1, self._prepared.ctypes.data, 0]
-        for array, size in zip(self.inputs, taken, strict=True):
-            words += [array.ctypes.data, size, 0]
-        words += [array.ctypes.data for array in [*self.outputs, self._status]]
-        self._words = np.array(words, np.int64)
-        self._address = self._words.ctypes.data
+        self._space = space = _Space(*kernel.sizes, samples)
+        space.point_at(kernel.prepared(p))
+        self.inputs, self.outputs, self._address = space.inputs, space.outputs, space.address
         # Other threads may run while many samples are computed; one is over before they could.
         code = kernel.code.functions
         self._code = None if code is None else code[samples == 1]
