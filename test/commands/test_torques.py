@@ -149,8 +149,11 @@ def spoiled(change):
         (lambda c: c["arm_1.position"].__setitem__(2, float("nan")), "line 4"),
         (lambda c: c["arm_1.position"].__setitem__(2, ""), "line 4"),
         (lambda c: c["arm_1.position"].__setitem__(2, "0,5"), "line 4"),
-        (lambda c: c["arm_1.position"].__setitem__(2, 3.0), "arm_1.position at sample 2: 3.0 is"),
-        (lambda c: c["arm_1.velocity"].__setitem__(2, 1e300), "allowed: -15 to 15 rad/s"),
+        (
+            lambda c: c["arm_1.position"].__setitem__(2, 3.0),
+            "arm_1.position at sample 2: 3.0; expected -0.9 to 1.3 rad",
+        ),
+        (lambda c: c["arm_1.velocity"].__setitem__(2, 1e300), "expected -15 to 15 rad/s"),
         (lambda c: [values.clear() for values in c.values()], "a header row and rows"),
     ],
 )
