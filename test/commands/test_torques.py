@@ -299,7 +299,7 @@ def test_only_regular_files_and_sizes_first(twin, tmp_path):
     assert "at most" in twin("torques", "delta", huge, *out).one_line_error()
     long = tmp_path / "long.csv"
     long.write_text("time" + "," * 3_000_000)
-    assert "below" in twin("torques", "delta", long, *out).one_line_error()
+    assert "at most" in twin("torques", "delta", long, *out).one_line_error()
 
 
 def test_parquet_without_pyarrow_is_refused_before_the_work(twin, tmp_path, monkeypatch):
