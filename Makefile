@@ -13,19 +13,19 @@ BIN := $(VENV)/bin
 .PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale pages docs clean help
 
 help:
-	@echo "make demo         set up .venv, run both nodes on the recorded bags, table and picture in out/"
+	@echo "make demo         set up .venv, run the main nodes on the recorded bags, table and picture in out/"
 	@echo "make test         lint, types and tests"
-	@echo "make long         more robots, states and points of what make test has some of"
-	@echo "make bags         record the bags anew (Pinocchio, PyNite)"
-	@echo "make bench        side-by-side timings into docs/benchmarks.md"
-	@echo "make certificate  torques and compliance against other engines, into docs/certificate*.md"
-	@echo "make fuzz         every bit of a bag; messages, files and command lines at random (SECONDS, SEED)"
-	@echo "make faults       the catalogue of faults row by row, into docs/faults.md"
-	@echo "make soak         ten million poses, and all nodes in all weathers, in flat memory (MINUTES)"
-	@echo "make audit        known vulnerabilities of what is installed"
-	@echo "make scale        what sweeps cost, into docs/scale.md"
-	@echo "make pages        docs/parameters.md and commands.md from the code, pictures of imports, robots and the page"
-	@echo "make docs         the site, in out/site"
+	@echo "make long         the same tests with more robots, states and points"
+	@echo "make bags         record the bags again (Pinocchio, PyNite)"
+	@echo "make bench        measure times, into docs/benchmarks.md and docs/latency.md"
+	@echo "make certificate  cross-check torques and compliance, into docs/certificate.md"
+	@echo "make fuzz         random bags, messages, files and command lines (SECONDS, SEED)"
+	@echo "make faults       run the tests of every row of docs/faults.md"
+	@echo "make soak         ten million poses, and all nodes under load, with constant memory (MINUTES)"
+	@echo "make audit        known vulnerabilities of the installed packages"
+	@echo "make scale        measure the cost of workspace maps, into docs/scale.md"
+	@echo "make pages        write the generated pages and pictures of docs/"
+	@echo "make docs         build the site, in out/site"
 	@echo "make clean        remove .venv, out and caches"
 
 # One stamp a set of extras, made anew when the requirements change.
@@ -97,6 +97,7 @@ scale: $(VENV)/test.stamp
 pages: $(VENV)/test.stamp
 	$(BIN)/python -m test.docs.parameters docs/parameters.md
 	$(BIN)/python -m test.docs.commands docs/commands.md
+	$(BIN)/python -m test.docs.errors docs/errors.md
 	$(BIN)/python -m test.docs.engine docs/engine.md
 	$(BIN)/python -m test.docs.architecture docs/architecture.png
 	$(BIN)/python -m test.docs.robots docs/gallery

@@ -124,7 +124,7 @@ class EffortAction:
         if moving:
             self._stop(moving[-1])
         for goal in list(self._goals.values()):
-            self._abort(goal, "the twin has ended")
+            self._abort(goal, "delta_dynamics is shutting down")
 
     @property
     def parting(self) -> bool:
@@ -143,7 +143,7 @@ class EffortAction:
             if goal.handle.is_cancel_requested:
                 self._finish(goal, GoalStatus.STATUS_CANCELED, Result())
             elif time.monotonic() - goal.filled > MATCHING:
-                self._abort(goal, f"no controller serves {self._controller}")
+                self._abort(goal, f"no action server at {self._controller}")
         self._look_for_life()
         self._look_for_rest()
 
@@ -155,7 +155,7 @@ class EffortAction:
             for goal in sent:
                 if goal.controller is not None:
                     goal.controller.cancel_goal_async()
-                self._abort(goal, f"{self._controller} has gone with the goal")
+                self._abort(goal, f"{self._controller} disappeared during the goal")
         elif self._silent and self._silent % PING == 0:
             # Nobody's goal: cancelling it changes nothing, and whoever serves the action answers.
             request = CancelGoal.Request()
@@ -174,7 +174,7 @@ class EffortAction:
         goal = self._goals[_key(handle)] = _Goal(handle)
 
         def refused(error: MessageError) -> None:
-            self._abort(goal, f"the twin refused the trajectory, {error.reason}: {error}")
+            self._abort(goal, f"delta_dynamics rejected the trajectory, {error.reason}: {error}")
 
         def steps() -> health.Task:
             try:
@@ -232,8 +232,8 @@ class EffortAction:
         if not handle.accepted:
             self._abort(
                 goal,
-                f"{self._controller} refused the trajectory; its log says why (without an effort "
-                "command interface it takes no efforts)",
+                f"{self._controller} rejected the trajectory; see its log (without an effort "
+                "command interface it accepts no efforts)",
             )
             return
         goal.controller = handle
@@ -251,7 +251,7 @@ class EffortAction:
         if _key(goal.handle) not in self._goals:
             return
         if end.status == GoalStatus.STATUS_UNKNOWN:
-            self._abort(goal, f"{self._controller} was started again and has lost the goal")
+            self._abort(goal, f"{self._controller} was restarted and lost the goal")
             return
         last = goal.handle.request.trajectory.points[-1]
         if end.status == GoalStatus.STATUS_SUCCEEDED:

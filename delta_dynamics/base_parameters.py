@@ -45,10 +45,10 @@ SMALL: Final = 1e-7
 class BaseParameters:
     """Combinations of parameters that the efforts determine: ``matrix`` times the parameters.
 
-    ``names``: of the combinations, in words. ``parameters``: names of the parameters.
+    ``names``: of the combinations, in words. ``parameters``: names of all parameters.
     ``columns``: index of the parameter that leads each combination. ``matrix``: shape (b, p), one
     at the leading parameter. ``values``: the robot's own, shape (b,). ``unseen``: names of
-    parameters that no motion shows.
+    parameters that no motion excites.
     """
 
     names: tuple[str, ...]
@@ -69,7 +69,7 @@ def base_parameters(robot: Robot, *, seed: int = 0) -> BaseParameters:
 
     With the columns of ``columns`` alone, Y[..., columns] (matrix pi) = inverse_dynamics.
 
-    :param seed: of the random states; the count does not hang on it.
+    :param seed: of the random states; the number of combinations does not depend on it.
     """
     names, pi = parameter_names(robot), parameter_values(robot)
     states = random_states(robot, max(60, 3 * len(names) // robot.joints_count), seed)

@@ -49,8 +49,8 @@ MOST_DRAG: Final = 0.2
 class Contact:
     """External efforts and their bound, shape (n,), N m or N; the wrench (6,) that explains them.
 
-    ``touching``: whether an effort is beyond its bound. ``idle``: the drives are off or braked, so
-    that the efforts say nothing; ``touching`` is then the verdict of before.
+    ``touching``: whether an effort exceeds its bound. ``idle``: the drives are off or braked, so
+    the efforts contain no information; ``touching`` then keeps its last value.
     """
 
     external: Array
@@ -87,13 +87,13 @@ class Drag:
 
 
 class ContactMonitor:
-    """The momentum observer with a bound that follows from how sure the model and its input are.
+    """The momentum observer with a contact bound from the uncertainty of the model and its input.
 
-    The bound is ``sigmas`` standard deviations: those of the model's efforts, by the robot's file
-    or :meth:`~delta_dynamics.uncertainty.EffortParts.default_deviation`, and the noise that the
-    estimate itself shows while nothing pushes. On top come friction at rest, :class:`Drag`,
-    and what the doubt of the rates makes of the momentum. All but the noise goes through the
-    observer's own low pass: the estimate lags, and its bound with it.
+    The bound is ``sigmas`` standard deviations: those of the model's efforts, from the robot's file
+    or :meth:`~delta_dynamics.uncertainty.EffortParts.default_deviation`, and the noise of the
+    estimate without contact. Friction at rest (:class:`Drag`) and the effect of the rates'
+    uncertainty on the momentum are added. All parts except the noise pass the observer's low-pass
+    filter, so that the bound has the same delay as the estimate.
     """
 
     def __init__(self, robot: Robot, bandwidth: float = 60.0, sigmas: float = SIGMAS) -> None:
@@ -102,14 +102,14 @@ class ContactMonitor:
         :raises ValueError: a bandwidth or a number of deviations that is not positive.
         """
         if not sigmas > 0.0:
-            raise ValueError(f"sigmas is {sigmas:g}, allowed above 0")
+            raise ValueError(f"sigmas is {sigmas:g}; expected more than 0")
         self.sigmas = sigmas
         self.observer = MomentumObserver(robot, bandwidth)
         self.change_robot(robot)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream, as after a gap."""
+        """Discard all samples, for example after a gap."""
         n = self.robot.joints_count
         self.observer.reset()
         self.drives = DriveWatch()
@@ -122,7 +122,7 @@ class ContactMonitor:
         self._drag = Drag(n)
 
     def change_robot(self, robot: Robot) -> None:
-        """Take a robot with another payload, gravity or friction."""
+        """Use a robot with another payload, gravity or friction."""
         self.robot = self.observer.robot = robot
         self.stated = states_efforts(robot)
         """Whether the robot's file says how sure its efforts are."""

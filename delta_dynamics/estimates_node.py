@@ -65,7 +65,7 @@ class Estimates:
         if not node.declare(
             "estimate_payload",
             False,
-            "publish ~/payload: what the platform carries, from the measured efforts",
+            "publish ~/payload: the payload estimated from the measured efforts",
             read_only=True,
         ):
             return None
@@ -79,13 +79,13 @@ class Estimates:
         wanted = node.declare(
             "observe_wrench",
             False,
-            "publish ~/external_wrench and ~/contact: who pushes, from the measured efforts",
+            "publish ~/external_wrench and ~/contact, estimated with a momentum observer",
             read_only=True,
         )
         bandwidth = node.declare(
             "observer.bandwidth",
             60.0,
-            "of ~/external_wrench: the inverse of its time constant",
+            "bandwidth of ~/external_wrench, the inverse of its time constant",
             unit="1/s",
             low=0.1,
             high=1e4,
@@ -94,7 +94,7 @@ class Estimates:
         sigmas = node.declare(
             "observer.sigmas",
             SIGMAS,
-            "deviations of model and noise together that are a contact",
+            "contact threshold in standard deviations of model and noise together",
             low=1.0,
             high=1e3,
             read_only=True,
@@ -111,9 +111,9 @@ class Estimates:
         if self._contact is None or self._contact.stated:
             return ""
         return (
-            "the robot's file does not say how sure its efforts are (section uncertainty); by "
-            f"default their standard deviation is {100 * MASSES:g} % of what masses need and "
-            f"{100 * FRICTION:g} % of the greatest effort"
+            "the robot's file has no section uncertainty; the default standard deviation of the "
+            f"model's efforts is {100 * MASSES:g} % of the efforts due to masses plus "
+            f"{100 * FRICTION:g} % of the largest effort"
         )
 
     def reset(self) -> None:
@@ -168,7 +168,7 @@ class Estimates:
             found = self._payload.estimate()
             value = f"{found.mass:.4g} +- {found.mass_deviation:.2g}"
             if found.asked < 0.0:
-                value += f", held at zero: the efforts ask for {found.asked:.4g}"
+                value += f", bounded to zero: the efforts give {found.asked:.4g}"
             values["payload estimate (kg)"] = value
             values["payload changes seen"] = found.resets
         return values
@@ -218,5 +218,5 @@ class Estimates:
     def _reset_payload(self, _request: Any, response: Any) -> Any:
         if self._payload is not None:
             self._payload.reset()
-        response.success, response.message = True, "the load is forgotten"
+        response.success, response.message = True, "the payload estimate was reset"
         return response

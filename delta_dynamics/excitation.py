@@ -120,7 +120,7 @@ class Judge:
         known = np.where(np.isnan(parameters.scales), 0.0, parameters.scales)
         scales = np.where(known > 0.0, known, 1.0 / np.where(norms > 0.0, norms, 1.0))
         if not (rows * scales).any():
-            raise PkmTwinError("no motion of this robot tells anything of what is asked for")
+            raise PkmTwinError("no motion of this robot excites the parameters to identify")
         columns, _ = independent(rows * scales)
         return cls(robot, parameters, columns, scales, weights)
 
@@ -185,8 +185,8 @@ def excite(
             progress(trial + 1)
     if best is None:
         raise PkmTwinError(
-            "no trajectory keeps to the limits and clear of singularities: a smaller --singularity "
-            "or wider limits.position"
+            "no trajectory found inside the limits and away from singularities; try a smaller "
+            "--singularity or wider limits.position"
         )
     final = _clear_of(robot, keep, duration, harmonics, centre, best[2], whole.time, whole.margin)
     if final is None:
@@ -217,7 +217,7 @@ def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: Bo
     if terms / duration > highest:
         raise PkmTwinError(
             f"{terms} harmonics in {duration:g} s reach {terms / duration:.3g} Hz; {keep.rate:g} "
-            f"points a second allow {highest:.3g} Hz: use fewer --harmonics, a longer --duration "
+            f"points per second allow {highest:.3g} Hz: use fewer --harmonics, a longer --duration "
             "or a higher --rate"
         )
     top = min(FREQUENCY, highest)

@@ -304,8 +304,9 @@ class Feedforward:
         if not measures[worst] >= stop:
             raise MessageError(
                 "singular",
-                f"point {first + worst}: too close to a singularity or the edge of reach: measure "
-                f"{measures[worst]:.3g}, singularity_stop is {stop:g}",
+                f"point {first + worst}: close to a singularity or the edge of the workspace: "
+                "index "
+                f"{measures[worst]:.3g}, allowed {stop:g} or more (singularity_stop)",
             )
         self.near_singularities += int((measures < self.settings.singularity_warn).sum())
 

@@ -27,7 +27,7 @@ from pkm_twin.ros.run import run
 
 PAYLOAD = {
     "payload.mass": ("mass", "kg"),
-    "payload.com": ("com", "m, from the platform's origin"),
+    "payload.com": ("com", "m, from the platform's reference point"),
 }
 """What of the payload may change while the gate runs: the part that has a weight."""
 TORQUES = "delta_dynamics/joint_torques"
@@ -45,7 +45,11 @@ class CommandGate(health.TwinNode):
 
     def __init__(self) -> None:
         super().__init__("command_gate")
-        robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
+        robot = load(
+            self.declare(
+                "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
+            )
+        )
         settings = self._declare_settings()
         self._gate = Gate(robot, settings)
         self._closed = True
@@ -144,8 +148,9 @@ class CommandGate(health.TwinNode):
                 name = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
                 bound = f"{promised:g} s" if promised < MAX_DEADLINE else "none"
                 return (
-                    f"{name} promises torques with deadline {bound}, the gate demands "
-                    f"{deadline:g} s, so none arrive: stale_after has to be that or less"
+                    f"{name} offers torques with deadline {bound}, command_gate requests "
+                    f"{deadline:g} s, so none arrive: set stale_after of {name} to at most "
+                    f"{deadline:g} s"
                 )
         return ""
 
@@ -155,22 +160,26 @@ class CommandGate(health.TwinNode):
         seconds: dict[str, Any] = {"unit": "s", "high": 3600.0, "read_only": True}
         return GateSettings(
             on_stop=self.declare(
-                "on_stop", d.on_stop, "sent while no torques come", choices=("zeros", "gravity"),
+                "on_stop", d.on_stop, "command while no torques "
+                "arrive", choices=("zeros", "gravity"),
                 read_only=True,
             ),
             deadline=self.declare(
-                "deadline", d.deadline, "greatest age of a torque, and longest silence",
+                "deadline", d.deadline, "largest age of a torque, and longest gap between torques",
                 low=1e-3, **seconds,
             ),
             future_tolerance=self.declare(
-                "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
+                "future_tolerance", d.future_tolerance, "how far time stamps may be ahead of the "
+                "clock",
                 low=0.0, **seconds,
             ),
             trip_count=self.declare(
-                "trip_count", d.trip_count, "refused torques in a row that close the gate", **counts
+                "trip_count", d.trip_count, "rejected torques in a row that close the "
+                "gate", **counts
             ),
             recovery_count=self.declare(
-                "recovery_count", d.recovery_count, "good ones in a row that open it", **counts
+                "recovery_count", d.recovery_count, "accepted torques in a row that open the "
+                "gate", **counts
             ),
         )  # fmt: skip
 
@@ -178,15 +187,15 @@ class CommandGate(health.TwinNode):
         """Effort limits of every robot; the payload where its weight is borne."""
         robot = self._gate.robot
         limits = effort_limits(robot)
-        text = "a torque beyond is not forwarded"
-        unit = "N m or N, one a joint"
+        text = "largest effort that is forwarded"
+        unit = "N m or N, one per joint"
         values = {"effort_limits": self.declare("effort_limits", limits.tolist(), text, unit=unit)}
         if settings.on_stop == "gravity":
             payload: Any = getattr(robot, "payload")  # noqa: B009
             for name, (key, unit) in PAYLOAD.items():
                 value = getattr(payload, key)
                 default = value.tolist() if isinstance(value, np.ndarray) else value
-                text = f"the robot's {name}, by default its file's"
+                text = f"{name} of the robot; default: the robot file's"
                 values[name] = self.declare(name, default, text, unit=unit)
         # Not every robot's file has a place for what is not given.
         given = {k: v for k, v in values.items() if k in self._parameter_overrides}

@@ -48,7 +48,7 @@ class JointMotion(NamedTuple):
 
 
 class Extremes(NamedTuple):
-    """Least and greatest value over all directions, shape (...), and where they are reached.
+    """Least and largest value over all directions, shape (...), and their directions.
 
     ``directions``: unit vectors of pose rates, shape (..., 2, m), least then greatest.
     """
@@ -59,7 +59,7 @@ class Extremes(NamedTuple):
 
     @property
     def spread(self) -> Array:
-        """Greatest less least, shape (...)."""
+        """Maximum minus minimum, shape (...)."""
         return self.greatest - self.least
 
 
@@ -68,7 +68,7 @@ def joint_motion(
 ) -> JointMotion:
     """Joint motion of a pose motion: qd = J^-1 Xdot, qdd = J^-1 (Xddot - Jdot qd).
 
-    Exact: Jdot qd is the pose's acceleration at zero qdd, told by the bodies' motion (3-PRRU
+    Exact: Jdot qd is the pose's acceleration at qdd = 0, computed from the bodies' motion (3-PRRU
     paper, equations 24 and 25, without its Hessian).
 
     :param pose: shape (..., m); ``rates`` and ``accelerations`` are its derivatives in time.
@@ -204,14 +204,14 @@ def max_driving_force_range(
 
 
 def spread(values: ArrayLike) -> Array:
-    """Greatest less least over the last axis, shape (...): of an index on a sphere's directions."""
+    """Maximum minus minimum over the last axis, shape (...), for an index over all directions."""
     return np.asarray(np.ptp(finite(doubles(values), "a value"), axis=-1), np.float64)
 
 
 def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array:
     """Pose (z, alpha, beta) of tilt-and-torsion angles with zero torsion, shape (..., 3).
 
-    The platform's axis leans by ``tilt`` towards ``azimuth`` (rad), as on the paper's atlas.
+    The platform's axis leans by ``tilt`` towards ``azimuth`` (rad), as in the paper's maps.
     """
     given = (finite(doubles(v), "a height or an angle") for v in (height, azimuth, tilt))
     z, a, t = np.broadcast_arrays(*given)

@@ -50,13 +50,13 @@ CHANGES = {
 """Parameters of the robot that may change while the node runs, and its section and key."""
 UNITS = {
     "payload.mass": "kg",
-    "payload.com": "m, from the platform's origin",
+    "payload.com": "m, from the platform's reference point",
     "payload.inertia": "kg m2 about the com, 3 or 9 numbers",
-    "friction.viscous": "N m s or N s/m, one a joint",
-    "friction.coulomb": "N m or N, one a joint",
-    "friction.offset": "N m or N, one a joint",
+    "friction.viscous": "N m s or N s/m, one per joint",
+    "friction.coulomb": "N m or N, one per joint",
+    "friction.offset": "N m or N, one per joint",
     "gravity": "m/s2",
-    "effort_limits": "N m or N, one a joint",
+    "effort_limits": "N m or N, one per joint",
 }
 SETTINGS = {
     "acceleration": "differentiate",
@@ -81,7 +81,11 @@ class DeltaDynamics(health.TwinNode):
 
     def __init__(self) -> None:
         super().__init__("delta_dynamics", executor="events")
-        robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
+        robot = load(
+            self.declare(
+                "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
+            )
+        )
         # Before there is a topic to be found by: the first start compiles for many seconds.
         warm_up(robot)
         robot = _changed(robot, self._declare_changes(robot))
@@ -94,7 +98,9 @@ class DeltaDynamics(health.TwinNode):
         if commands and "on_stop" not in self._parameter_overrides:
             # A controller of plain commands holds the last one for ever.
             raise ParameterError(
-                "on_stop", None, "nothing, zeros or gravity, by name where publish_commands is true"
+                "on_stop",
+                None,
+                "nothing, zeros or gravity, explicitly set, because publish_commands is true",
             )
         self._trajectory = self.create_guarded_publisher(JointTrajectory, "~/joint_trajectory_ff")
         # A torque is worth nothing once the stream that it answers would be stale.
@@ -192,11 +198,11 @@ class DeltaDynamics(health.TwinNode):
         measure = core.singularity()
         if core.last_reject or core.saturations or core.near_singular:
             level = health.WARN
-            message = "an effort limit was passed"
+            message = "an effort exceeded its limit"
         if core.last_reject:
             message = f"last reject: {core.last_reject}"
         if core.near_singular:
-            message = f"close to a singularity or the edge of reach: measure {measure:.3g}"
+            message = f"close to a singularity or the edge of the workspace: index {measure:.3g}"
         if core.stream.stopped:
             level, message = health.ERROR, f"stopped: {core.stream.reason}: {core.stream.text}"
         values: dict[str, object] = {
@@ -215,7 +221,7 @@ class DeltaDynamics(health.TwinNode):
         values |= {f"stopped: {k}": v for k, v in core.stream.stops.items()}
         values |= self._estimates.diagnose()
         if self._estimates.idle and level == health.OK:
-            message = "the drives are off or braked: their efforts are left out"
+            message = "the drives are off or braked: their efforts are ignored"
         elif self._estimates.touching and level == health.OK:
             level, message = health.WARN, "contact detected: an external effort is beyond its bound"
         if core.wrenches is not None:
@@ -239,8 +245,8 @@ class DeltaDynamics(health.TwinNode):
         hold = self.declare(
             "on_cancel",
             "hold",
-            "what a goal that ends early leaves to its controller: a hold point with the effort "
-            "of the machine's weight, or what the controller does itself",
+            "what happens when a goal ends early: hold sends a hold point with the effort against "
+            "gravity, controller leaves the reaction to the controller",
             choices=("hold", "controller"),
             read_only=True,
         )
@@ -273,14 +279,19 @@ class DeltaDynamics(health.TwinNode):
         wanted = self.declare(
             "use_wrench",
             False,
-            "torques and residual of the stream bear the measured wrench",
+            "include the measured wrench in torques and residual of joint states",
             read_only=True,
         )
         age = self.declare(
-            "max_wrench_age", 0.1, "from a joint state to its wrench", read_only=True, **SECONDS
+            "max_wrench_age",
+            0.1,
+            "largest time between a joint state and its wrench",
+            read_only=True,
+            **SECONDS,
         )
         policy = self.declare(
-            "no_wrench", "ignore", "without a fresh wrench: none is taken, or the stream stops",
+            "no_wrench", "ignore", "without a fresh wrench: ignore computes without one, stop "
+            "stops the stream",
             choices=("ignore", "stop"), read_only=True,
         )  # fmt: skip
         wrench = declare_wrench(
@@ -313,7 +324,7 @@ class DeltaDynamics(health.TwinNode):
         rate = self.declare(
             "reactions_rate",
             50.0,
-            "of ~/reactions/*",
+            "rate of ~/reactions/*",
             unit="Hz",
             low=1e-3,
             high=1e4,
@@ -346,7 +357,7 @@ class DeltaDynamics(health.TwinNode):
             given = self.declare(
                 name,
                 default,
-                f"the robot's {name}, by default its file's",
+                f"{name} of the robot; default: the robot file's",
                 unit=UNITS[name],
                 **bounds,
             )
@@ -359,7 +370,8 @@ class DeltaDynamics(health.TwinNode):
         acceleration = self.declare(
             "acceleration",
             "trajectory",
-            "what to do about derivatives that are absent: refuse, or differentiate",
+            "for messages without velocities or accelerations: trajectory rejects them, "
+            "differentiate computes them",
             choices=("trajectory", "differentiate"),
         )
         counts: dict[str, Any] = {"low": 1, "high": 10**6}
@@ -368,46 +380,54 @@ class DeltaDynamics(health.TwinNode):
         return Settings(
             differentiate=acceleration == "differentiate",
             order=self.declare(
-                "differentiator.order", d.order, "degree of the velocity's polynomial",
+                "differentiator.order", d.order, "polynomial degree of the velocity",
                 low=1, high=4,
             ),
             window=self.declare(
-                "differentiator.window", d.window, "samples of the fit", low=3, high=1000
+                "differentiator.window", d.window, "samples in the window", low=3, high=1000
             ),
             limit_policy=self.declare(
-                "limit_policy", d.limit_policy, "beyond effort_limits: publish, refuse or clip",
+                "limit_policy", d.limit_policy, "efforts beyond effort_limits: warn publishes, "
+                "reject rejects, clamp limits them",
                 choices=("warn", "reject", "clamp"),
             ),
             stale_after=self.declare(
-                "stale_after", d.stale_after, "age at which a joint state is refused, and silence "
-                "that stops the stream", low=1e-3, **seconds,
+                "stale_after", d.stale_after, "largest age of a joint state, and longest gap "
+                "before "
+                "the stream stops", low=1e-3, **seconds,
             ),
             future_tolerance=self.declare(
-                "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
+                "future_tolerance", d.future_tolerance, "how far time stamps may be ahead of the "
+                "clock",
                 low=0.0, **seconds,
             ),
             accept_zero_stamp=self.declare(
-                "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
+                "accept_zero_stamp", d.accept_zero_stamp, "accept a zero stamp, as the arrival time"
             ),
             trip_count=self.declare(
-                "trip_count", d.trip_count, "rejects in a row that stop the stream", **counts
+                "trip_count", d.trip_count, "rejected joint states in a row that stop the "
+                "stream", **counts
             ),
             recovery_count=self.declare(
-                "recovery_count", d.recovery_count, "good samples that start it again", **counts
+                "recovery_count", d.recovery_count, "accepted joint states in a row that restart "
+                "it", **counts
             ),
             extra_joints=self.declare(
-                "extra_joints", d.extra_joints, "a trajectory's joints that the model lacks",
+                "extra_joints", d.extra_joints, "joints of a trajectory that the model does not "
+                "have: reject the trajectory, or give them zero effort",
                 choices=("refuse", "zero"),
             ),
             on_stop=self.declare(
-                "on_stop", d.on_stop, "sent once on a stop",
+                "on_stop", d.on_stop, "command sent once when the stream stops",
                 choices=("nothing", "zeros", "gravity"),
             ),
             singularity_warn=self.declare(
-                "singularity_warn", d.singularity_warn, "measure below which to warn", **measure
+                "singularity_warn", d.singularity_warn, "warn below this singularity "
+                "index", **measure
             ),
             singularity_stop=self.declare(
-                "singularity_stop", d.singularity_stop, "measure below which to stop", **measure
+                "singularity_stop", d.singularity_stop, "stop below this singularity "
+                "index", **measure
             ),
         )  # fmt: skip
 

@@ -24,8 +24,8 @@ RANK: Final = 1e-9
 class MomentumObserver:
     """External efforts at the joints by their generalised momentum, a first-order estimate.
 
-    With the mass matrix M, the momentum M qd, what the motion needs without acceleration b (the
-    inverse dynamics at qdd = 0) and the measured efforts tau, external efforts e obey
+    With the mass matrix M, the momentum M qd, the inverse dynamics b at qdd = 0 and the measured
+    efforts tau, external efforts e obey
 
         M qdd + b = tau + e,    and the estimate r obeys    r' = bandwidth (e - r)
 
@@ -45,14 +45,14 @@ class MomentumObserver:
         :raises ValueError: a bandwidth that is not positive and finite.
         """
         if not 0.0 < bandwidth < np.inf:
-            raise ValueError(f"bandwidth is {bandwidth:g} 1/s, allowed above 0")
+            raise ValueError(f"bandwidth is {bandwidth:g} 1/s; expected more than 0")
         self.robot = robot
         self.bandwidth = bandwidth
         self._still = np.zeros(robot.joints_count)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the stream, as after a gap."""
+        """Discard all samples, for example after a gap."""
         self._last: tuple[float, Array, Array, Array] | None = None
         self._estimate = np.zeros_like(self._still)
         self.jump = np.zeros_like(self._still)
@@ -99,14 +99,14 @@ class MomentumObserver:
 
 
 def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
-    """The platform's wrench that external joint efforts stand for, base axes, shape (..., 6).
+    """The wrench on the platform that explains external joint efforts, base axes, shape (..., 6).
 
-    A machine with fewer than six actuated joints feels only as many of the wrench's directions; of
-    the wrenches that explain the efforts this is the least one, moments taken at the platform's
-    size as lever. Nothing tells a wrench at the platform from a push against a limb.
+    A machine with n < 6 actuated joints measures only n directions of the wrench. Of all wrenches
+    that explain the efforts this is the smallest one, with moments divided by the platform's size.
+    A wrench at the platform cannot be distinguished from a contact with a limb.
 
     :param q: joint positions, shape (..., n), rad or m.
-    :param external: efforts that the surroundings apply in terms of the joints, shape (..., n):
+    :param external: external efforts at the joints, shape (..., n):
         J' wrench with the platform's Jacobian J.
     """
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])

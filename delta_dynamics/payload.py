@@ -48,9 +48,10 @@ SHARE: Final = 0.01
 class PayloadEstimate:
     """Mass, kg, and centre of mass (3,), m from the platform's reference point, platform axes.
 
-    With standard deviations; a centre that the motion does not tell has an infinite one and is that
-    of the robot's own payload. ``asked``: the mass that the efforts ask for without the bound at
-    zero; where it is below zero the mass is zero and its standard deviation covers the difference.
+    With standard deviations. If the motion does not determine the centre of mass, its standard
+    deviation is infinite and its value is that of the robot's own payload. ``asked``: the estimate
+    of the mass without the bound at zero; if it is negative, the mass is zero and its standard
+    deviation covers the difference.
     """
 
     mass: float
@@ -62,14 +63,15 @@ class PayloadEstimate:
 
 
 class PayloadEstimator:
-    """Recursive least squares on measured less computed efforts, without inertia of the payload.
+    """Recursive least squares on measured minus computed efforts, without inertia of the payload.
 
-    Efforts are linear in mass and first moments (:mod:`delta_dynamics.regressor`). Information of a
-    sample counts by the time that it stands for, at most the correlation time of the errors, and
-    fades slowly. Where what is left jumps, the load has changed: all is forgotten but the noise.
+    Efforts are linear in mass and first moments (:mod:`delta_dynamics.regressor`). A sample is
+    weighted by its time span, at most the correlation time of the errors, and its weight decays
+    slowly. A jump in the residual means that the load has changed: it resets the estimate, but not
+    the noise.
 
-    A joint with dry friction that stands still tells its effort within the friction, as often as it
-    stops. Where the drives are off or braked, efforts tell nothing.
+    A joint with Coulomb friction at rest gives its effort only within the friction, once per stop.
+    While the drives are off or braked, efforts contain no information.
     """
 
     def __init__(self, robot: Robot, *, mass_range: float = 5.0, reach: float = 0.2) -> None:
@@ -101,7 +103,7 @@ class PayloadEstimator:
         return 1.0 if limits is None else float(np.abs(limits).max())
 
     def reset(self) -> None:
-        """Forget the load, not the noise."""
+        """Reset the estimate of the load, but not that of the noise."""
         self.resets += 1
         self._information = np.diag(self._prior**-2.0)
         self._weighted = self._information @ self._own
@@ -116,7 +118,7 @@ class PayloadEstimator:
         self._kept = self._information, self._weighted, self._average, self._since, noise
 
     def begin_anew(self) -> None:
-        """Forget when the last sample was, as where the clock goes back; the load stays."""
+        """Forget the time of the last sample, for a clock that jumps back; keep the estimate."""
         self._last: float | None = None
         self.drives.reset()
         self._rest.reset()
@@ -125,7 +127,7 @@ class PayloadEstimator:
         self, time: float, q: Array, qd: Array, qdd: Array, effort: Array,
         wrench: Array | None = None, doubt: Array | None = None,
     ) -> PayloadEstimate | None:  # fmt: skip
-        """Take a sample; None for the first one after a beginning, and where efforts tell nothing.
+        """Add a sample; None for the first one, and while efforts contain no information.
 
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), with rates, accelerations and measured efforts (n,).
@@ -188,7 +190,7 @@ class PayloadEstimator:
         return bool((np.abs(self._average) > THRESHOLD * spread).any())
 
     def estimate(self) -> PayloadEstimate:
-        """What is known now."""
+        """The present estimate."""
         values = self._solution()
         covariance = np.linalg.inv(self._information)
         mass = float(values[0])

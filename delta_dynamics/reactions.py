@@ -44,9 +44,10 @@ BALANCE_BOUND: Final = 1e-6
 
 @dataclass(frozen=True)
 class Reactions:
-    """What each joint's inner body (on the base's side) applies to its outer body.
+    """The wrench that each joint's inner body (on the base's side) applies to its outer body.
 
-    Arrays are read-only. What statics of rigid bodies cannot tell is NaN and False in the masks.
+    Arrays are read-only. Components that rigid-body statics does not determine are NaN, and False
+    in the masks.
     """
 
     names: tuple[str, ...]
@@ -78,9 +79,9 @@ class Reactions:
 
     @property
     def efforts(self) -> Array:
-        """What reaches the bodies of the actuators' efforts, shape (..., n), positive as in q.
+        """The actuators' efforts that act on the bodies, shape (..., n), positive as in q.
 
-        N m or N; the efforts less friction and what the rotors need.
+        N m or N; the efforts minus friction and the rotors' inertial efforts.
         """
         return self.values[..., [self.components.index(name) for name in self.actuated]]
 
@@ -95,17 +96,17 @@ def reactions(
     """Constraint forces and moments at every joint, for a motion.
 
     Force and moment balance of each body (Delta-CU paper, d'Alembert's principle, section 3: at
-    A, B and C of each limb), the payload fixed to the platform. The actuated components are
-    what reaches the bodies: motor effort less the joint's friction and its rotor's inertia.
+    A, B and C of each limb), the payload fixed to the platform. The actuated components are the
+    efforts on the bodies: motor effort minus the joint's friction and its rotor's inertial effort.
 
-    Which components the mechanism's statics determines is decided by the rank of the balance;
-    the others are NaN, see ``Reactions.determinate`` and ``Reactions.indeterminate``.
+    The rank of the balance decides which components the mechanism's statics determines; the others
+    are NaN, see ``Reactions.determinate`` and ``Reactions.indeterminate``.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param qd: joint rates, shape (..., n).
     :param qdd: joint accelerations, shape (..., n).
-    :param wrench: force and moment that the surroundings apply to the platform at its
-        origin, world axes, shape (..., 6), N and N m; None is none.
+    :param wrench: external force and moment on the platform at its reference point, base axes,
+        shape (..., 6), N and N m; None: no wrench.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises SingularityError: the Jacobian of the closure has no inverse, or the joints cannot
         hold the loads (a constraint singularity).
@@ -125,9 +126,9 @@ def least_norm_reactions(
 ) -> Reactions:
     """As :func:`reactions`, with indeterminate components filled by the least-norm solution.
 
-    Of all solutions of the balance the one with the least sum of squares, moments counted as
-    forces at the mechanism's size (root mean square distance of the joints from their centre). In
-    a real machine elasticity and tolerances decide; this is one of many possible answers.
+    This is the solution of the balance with the smallest sum of squares, with moments divided by
+    the mechanism's size (root mean square distance of the joints from their centre). In a real
+    machine elasticity and tolerances determine these components; this is one of many solutions.
     """
     engine = robot.massive()
     load = np.zeros(6) if wrench is None else vectors(wrench, 6, "the wrench")

@@ -38,11 +38,11 @@ WRENCH: Final = "wrench"
 def parameter_names(robot: Robot) -> tuple[str, ...]:
     """Names of the columns of :func:`regressor`, shape (p,): ``OWNER.WHAT``, and ``wrench``.
 
-    Of every body and the payload ``mass``, first moments ``mx my mz`` and inertia ``ixx iyy izz
-    ixy ixz iyz``, in base axes at home; a body's about its frame's origin at home
-    (``robot.engine.tree.at``), the payload's about the platform's reference point. Of a rod its
-    ``mass``. Of an actuated joint ``viscous``, ``coulomb``, ``offset`` and ``rotor_inertia``; of a
-    passive joint to which the file gives friction or a rotor those but ``offset``.
+    Every body and the payload have ``mass``, first moments ``mx my mz`` and inertia ``ixx iyy izz
+    ixy ixz iyz``, in base axes at home: a body about its frame's origin at home
+    (``robot.engine.tree.at``), the payload about the platform's reference point. A rod has its
+    ``mass``. An actuated joint has ``viscous``, ``coulomb``, ``offset`` and ``rotor_inertia``. A
+    passive joint with friction or a rotor in the file has these without ``offset``.
     """
     return tuple(name for name, _ in _columns(robot))
 
@@ -73,16 +73,16 @@ def parameter_values(robot: Robot) -> Array:
 def regressor(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Array:
-    """Efforts of a motion by a unit of each parameter: Y pi = inverse_dynamics, exactly.
+    """The regressor Y of the efforts of a motion: Y pi = inverse_dynamics, exactly.
 
-    Only the geometry, gravity and which passive joints are loaded are taken from the robot; pi is
-    :func:`parameter_values`, or others. The last column is what the wrench needs (zero without
-    one), its parameter's value 1.
+    It depends only on the robot's geometry, gravity and the set of loaded passive joints. pi is
+    :func:`parameter_values`, or other values. The last column is the effort due to the wrench (zero
+    without one); the value of its parameter is 1.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param qd: joint rates, shape (..., n).
     :param qdd: joint accelerations, shape (..., n).
-    :param wrench: as in ``inverse_dynamics``, shape (..., 6); None is none.
+    :param wrench: as in ``inverse_dynamics``, shape (..., 6); None: no wrench.
     :returns: Y, shape (..., n, p), N m or N per unit of the parameter.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises SingularityError: a singularity on the way from home.

@@ -58,7 +58,7 @@ ALONE: Final = 1.0
 """In lockstep: how long an answer is waited for, s of the wall."""
 LOOK: Final = 0.05
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
-OWN_CLOCK: Final = "false: the machine has a clock of its own"
+OWN_CLOCK: Final = "false, because machine_sim has its own clock"
 
 
 class MachineSim(health.TwinNode):
@@ -66,7 +66,11 @@ class MachineSim(health.TwinNode):
 
     def __init__(self) -> None:
         super().__init__("machine_sim")
-        robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
+        robot = load(
+            self.declare(
+                "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
+            )
+        )
         robot.massive()
         self._variation = self._declare_spread(robot)
         self._declare_clock()
@@ -80,7 +84,9 @@ class MachineSim(health.TwinNode):
             np.zeros_like(settings.start), np.zeros(6), settings.period / settings.substeps
         )
         self._simulation.restart()
-        self._frame = self.declare("wrench_frame", "platform", "frame id of wrench", read_only=True)
+        self._frame = self.declare(
+            "wrench_frame", "platform", "frame id of ~/wrench", read_only=True
+        )
         self._base = self.declare(
             "base_frame", "base_link", "frame of ~/applied_wrench", read_only=True
         )
@@ -117,7 +123,7 @@ class MachineSim(health.TwinNode):
         """Back to the start, braked."""
         text = self._simulation.failure
         self._simulation.restart()
-        return text or "the machine stands at its start"
+        return text or "the machine is at its start"
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
@@ -142,25 +148,28 @@ class MachineSim(health.TwinNode):
     def _declare_spread(self, robot: Robot) -> Variation:
         fixed: dict[str, Any] = {"read_only": True}
         size = self.declare(
-            "spread", 0.0, "how far the machine's parameters are from its file's, relative",
+            "spread", 0.0, "relative perturbation of the robot file's parameters",
             low=0.0, high=MAX_SPREAD, **fixed,
         )  # fmt: skip
-        kinds = self.declare("spread_kinds", list(KINDS), f"of {', '.join(KINDS)}", **fixed)
-        seed = self.declare("seed", 1, "of the draws", low=0, high=2**31 - 1, **fixed)
+        kinds = self.declare(
+            "spread_kinds", list(KINDS), f"parameters to perturb: {', '.join(KINDS)}", **fixed
+        )
+        seed = self.declare("seed", 1, "seed of the perturbation", low=0, high=2**31 - 1, **fixed)
         distribution = self.declare(
-            "distribution", "normal", "spread is the standard deviation, or the bound",
+            "distribution", "normal", "normal: spread is the standard deviation; uniform: the "
+            "bound",
             choices=("normal", "uniform"), **fixed,
         )  # fmt: skip
         return varied(robot, dict.fromkeys(kinds, size), seed, distribution)
 
     def _declare_clock(self) -> None:
         self._clock_kind = self.declare(
-            "clock", "wall", "wall; or the source of /clock: simulated, by real_time_factor, or "
-            "lockstep, a period with each effort command",
+            "clock", "wall", "wall: the computer's clock; simulated: publishes /clock at "
+            "real_time_factor; lockstep: publishes /clock, one period per effort command",
             choices=("wall", "simulated", "lockstep"), read_only=True,
         )  # fmt: skip
         self._factor = self.declare(
-            "real_time_factor", 1.0, "of the simulated clock; 0: as fast as can be",
+            "real_time_factor", 1.0, "speed of the simulated clock; 0: as fast as possible",
             low=0.0, high=1000.0, read_only=True,
         )  # fmt: skip
         self._simulated = self._clock_kind != "wall"
@@ -176,42 +185,47 @@ class MachineSim(health.TwinNode):
         fixed: dict[str, Any] = {"read_only": True}
         seconds: dict[str, Any] = {"unit": "s", "high": 10.0, "read_only": True}
         bandwidth = self.declare(
-            "bandwidth", 10.0, "of the position control, critically damped", unit="Hz",
+            "bandwidth", 10.0, "bandwidth of the position control, critically damped", unit="Hz",
             low=0.01, high=1000.0, **fixed,
         )  # fmt: skip
         stiffness, damping = tuned(robot, bandwidth)
         home = robot.inverse(robot.home())
-        period = self.declare("period", 1e-3, "of the sensors", low=1e-4, **seconds)
+        period = self.declare("period", 1e-3, "sampling period of the sensors", low=1e-4, **seconds)
         return MachineSettings(
             start=self._row("start", home, "joint positions at the start, rad or m"),
             effort_limits=self._row(
-                "effort_limits", effort_limits(robot), "what the drives give at most, N m or N", 0.0
+                "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N", 0.0
             ),
             stiffness=self._row(
-                "stiffness", stiffness, "of the position control, by default bandwidth's", 0.0
+                "stiffness", stiffness, "of the position control; default: from bandwidth", 0.0
             ),
-            damping=self._row("damping", damping, "as stiffness, per rate", 0.0),
+            damping=self._row("damping", damping, "of the position control; default: from "
+            "bandwidth", 0.0),
             period=period,
             substeps=self.declare(
-                "substeps", 1, "of the integration in a period", low=1, high=100, **fixed
+                "substeps", 1, "integration steps per period", low=1, high=100, **fixed
             ),
             resolution=self._row(
-                "encoder_resolution", np.zeros(len(home)), "rad or m; 0 is exact", 0.0
+                "encoder_resolution", np.zeros(len(home)), "resolution of the encoders, rad or "
+                "m; 0: exact", 0.0
             ),
-            delay=self.declare("command_delay", 0.0, "of every effort", low=0.0, **seconds),
+            delay=self.declare("command_delay", 0.0, "delay of every effort "
+            "command", low=0.0, **seconds),
             deadline=self.declare(
-                "deadline", 0.1, "longest silence of effort commands", low=1e-3, **seconds
+                "deadline", 0.1, "longest gap between effort commands", low=1e-3, **seconds
             ),
             on_silence=self.declare(
-                "on_silence", "zeros", "what the drives do then",
+                "on_silence", "zeros", "efforts of the drives after that gap",
                 choices=("zeros", "hold"), **fixed,
             ),
             payloads=self._declare_payloads(robot),
             wrench=WrenchSignal(
-                self._row("wrench.constant", np.zeros(6), "N and N m, base axes"),
-                self._row("wrench.amplitude", np.zeros(6), "of a sine beside it"),
+                self._row("wrench.constant", np.zeros(6), "wrench on the platform, N and N m, "
+                "base axes"),
+                self._row("wrench.amplitude", np.zeros(6), "amplitude of a sine added to it"),
                 self.declare(
-                    "wrench.frequency", 1.0, "of the sine", unit="Hz", low=0.0, high=1e4, **fixed
+                    "wrench.frequency", 1.0, "frequency of the "
+                    "sine", unit="Hz", low=0.0, high=1e4, **fixed
                 ),
             ),
         )  # fmt: skip
@@ -222,14 +236,20 @@ class MachineSim(health.TwinNode):
         times, masses, coms = (
             self.declare(name, default, text, read_only=True)
             for name, default, text in (
-                ("payload.times", [0.0], "s after the start"),
-                ("payload.masses", [own.mass], "kg, one a time"),
-                ("payload.coms", own.com.tolist(), "m, from the platform's origin, three a time"),
+                ("payload.times", [0.0], "times at which the payload changes, s after the start"),
+                ("payload.masses", [own.mass], "payload from each time on, kg"),
+                (
+                    "payload.coms",
+                    own.com.tolist(),
+                    "its centre of mass, m from the platform's reference point, three per time",
+                ),
             )
         )
         if len(masses) != len(times) or len(coms) != 3 * len(times):
             raise ParameterError(
-                "payload.masses", list(masses), f"{len(times)} numbers, and payload.coms three each"
+                "payload.masses",
+                list(masses),
+                f"{len(times)} numbers, and three for each in payload.coms",
             )
         events = tuple(
             PayloadEvent(float(t), float(m), tuple(map(float, coms[3 * i : 3 * i + 3])))

@@ -24,8 +24,8 @@ class Terms:
     """Actuator efforts by cause, shape (..., n) each, N m or N.
 
     ``gravity``, ``inertia`` (linear in qdd) and ``velocity`` (quadratic in qd) are those of the
-    robot without its payload; ``payload`` is what the payload adds, its own gravity, inertia
-    and velocity parts together; ``friction`` is viscous, Coulomb and offset; ``external`` balances
+    robot without its payload; ``payload`` is the gravity, inertia and velocity part of the
+    payload together; ``friction`` is viscous, Coulomb and offset; ``external`` balances
     the wrench on the platform.
     """
 
@@ -73,15 +73,15 @@ def dynamics_terms(
 ) -> Terms:
     """Split the actuator efforts of a motion by cause, exactly.
 
-    There is no second formula: each term is the inverse dynamics (virtual work; Delta-CU paper,
-    step 4; 3-PRRU paper, equation 41) with the other causes switched off, or for payload and
-    friction the difference of with and without, because the efforts are linear in gravity, qdd,
-    the masses, the friction coefficients and the wrench.
+    Each term is the inverse dynamics (virtual work; Delta-CU paper, step 4; 3-PRRU paper, equation
+    41) with the other causes set to zero. The terms of payload and friction are differences of the
+    efforts with and without them. This is exact because the efforts are linear in gravity, qdd, the
+    masses, the friction coefficients and the wrench.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param qd: joint rates, shape (..., n).
     :param qdd: joint accelerations, shape (..., n).
-    :param wrench: as in ``inverse_dynamics``, shape (..., 6); None is none.
+    :param wrench: as in ``inverse_dynamics``, shape (..., 6); None: no wrench.
     :returns: the terms, each of the common batch shape.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises SingularityError: the Jacobian of the closure has no inverse.

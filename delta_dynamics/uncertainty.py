@@ -79,12 +79,12 @@ def states_efforts(robot: Robot) -> bool:
 def torque_deviation(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Array:
-    """Standard deviation of :func:`inverse_dynamics` by the file's ``uncertainty``.
+    """Standard deviation of :func:`inverse_dynamics`, propagated from the file's ``uncertainty``.
 
     To first order in the deviations, independent causes. Zero for a file that names none.
 
     :param q: joint positions, shape (..., n), rad or m; rates ``qd``, accelerations ``qdd``.
-    :param wrench: as in ``inverse_dynamics``, shape (..., 6); None is none.
+    :param wrench: as in ``inverse_dynamics``, shape (..., 6); None: no wrench.
     :returns: shape (..., n), N m or N.
     :raises ParameterError: a number that cannot vary as the file says.
     """

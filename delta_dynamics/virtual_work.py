@@ -42,9 +42,9 @@ def inverse_dynamics(
     :param q: joint positions, shape (..., n), rad or m.
     :param qd: joint rates, shape (..., n).
     :param qdd: joint accelerations, shape (..., n).
-    :param wrench: force and moment that the surroundings apply to the platform at its reference
-        point, base axes, shape (..., 6), N and N m; None is none.
-    :returns: what the actuators must apply, shape (..., n), N m or N.
+    :param wrench: external force and moment on the platform at its reference point, base axes,
+        shape (..., 6), N and N m; None: no wrench.
+    :returns: efforts of the actuators, shape (..., n), N m or N.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises SingularityError: a singularity on the way from home.
     :raises ValueError: a wrong last axis, or a value that is not finite.
@@ -110,7 +110,9 @@ def forward_dynamics(
 ) -> Array:
     """Joint accelerations that efforts cause, shape (..., n): the inverse of inverse_dynamics.
 
-    :param tau: what the actuators apply, shape (..., n), N m or N; errors and the others as there.
+    :param tau: efforts of the actuators, shape (..., n), N m or N. Other parameters and errors as
+        in
+        :func:`inverse_dynamics`.
     """
     load = _NO_WRENCH if wrench is None else wrench
     p = robot.inertial

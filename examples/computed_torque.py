@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A guarded computed-torque controller: joint states in, efforts out, zeros when in doubt.
+"""A computed-torque controller that checks its input and sends zeros when a check fails.
 
-It holds the robot where its first joint state finds it, then goes a smooth path there and back:
+It holds the position of the first joint state, then follows a smooth path there and back:
 tau = inverse_dynamics(q, qd, qdd_wanted + 2 w (qd_wanted - qd) + w^2 (q_wanted - q)).
 
     ros2 run pkm_twin machine_sim --ros-args -p mechanism:=delta_cu -p clock:=lockstep
@@ -31,12 +31,12 @@ SECOND = 1e9
 
 
 class Controller(Node):
-    """Commands a robot's efforts; the first thing that is wrong stops it for good."""
+    """Commands a robot's efforts; the first fault stops it permanently."""
 
     def __init__(self, options):
         super().__init__("computed_torque")
         self.robot = load(options.robot)
-        # The controller's names and numbers of the joints: messages carry these.
+        # Messages use the controller's joint names and values.
         self.controller = self.robot.controller
         self.options = options
         self.errors, self.stopped, self.done = [], "", False
@@ -88,7 +88,7 @@ class Controller(Node):
             self.stop(str(refusal))
 
     def _trouble(self, message, stamp):
-        """What is wrong with a joint state, or nothing."""
+        """The fault of a joint state, or an empty text."""
         missing = set(self.controller.names) - set(message.name)
         if missing:
             return f"no joint {', '.join(sorted(missing))}"
@@ -107,7 +107,7 @@ class Controller(Node):
         return ""
 
     def wanted(self, t):
-        """Position, rate and acceleration of the path there and back; None behind its end."""
+        """Position, rate and acceleration of the path there and back; None after its end."""
         x = t / self.options.seconds
         if x > 1.0:
             return None
@@ -118,7 +118,7 @@ class Controller(Node):
         return self._start + p * self._reach, v * self._reach, a * self._reach
 
     def send(self, effort):
-        """Command efforts; none that is not finite, none beyond the limits, leaves."""
+        """Command efforts, unless one is not finite or beyond the limits."""
         limits = self.robot.limits.effort
         if not np.isfinite(effort).all() or (limits is not None and (abs(effort) > limits).any()):
             self.stop(f"effort {effort.round(3).tolist()} is beyond the limits")
@@ -127,30 +127,30 @@ class Controller(Node):
         self._publisher.publish(Float64MultiArray(data=command.tolist()))
 
     def stop(self, why):
-        """Zeros, and nothing after them."""
+        """Send zeros, and nothing after them."""
         if not self.stopped:
             self.stopped = why
             self.get_logger().error(f"stopped: {why}")
             self.end()
 
     def end(self):
-        """Zeros, and the controller has them before this process ends."""
+        """Send zeros, and wait until the controller has received them."""
         zeros = [0.0] * self.robot.joints_count
         self._publisher.publish(Float64MultiArray(data=zeros))
         self._publisher.wait_for_all_acked(Duration(seconds=0.5))
 
 
 def main():
-    """0 where the path was gone to its end, 1 where a guard stopped it."""
+    """0 after the whole path, 1 if a check stopped it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robot", default="delta_cu")
     parser.add_argument("--commands", default="machine_sim/commands")
     parser.add_argument("--seconds", type=float, default=1.0, help="duration of the path")
-    parser.add_argument("--reach", type=float, default=0.1, help="part of the joints' range")
-    parser.add_argument("--bandwidth", type=float, default=8.0, help="Hz")
+    parser.add_argument("--reach", type=float, default=0.1, help="fraction of the joints' range")
+    parser.add_argument("--bandwidth", type=float, default=8.0, help="of the control, Hz")
     parser.add_argument("--deadline", type=float, default=0.1, help="longest silence, s")
-    parser.add_argument("--age", type=float, default=0.05, help="greatest age of a state, s")
-    parser.add_argument("--gap", type=float, default=0.01, help="between two stamps, s")
+    parser.add_argument("--age", type=float, default=0.05, help="largest age of a joint state, s")
+    parser.add_argument("--gap", type=float, default=0.01, help="longest time between stamps, s")
     options = parser.parse_args(rclpy.utilities.remove_ros_args()[1:])
     # Ctrl-C must leave the topics open for the zeros.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
@@ -168,7 +168,7 @@ def main():
     if controller.done:
         controller.end()
         worst = abs(np.array(controller.errors)).max()
-        print(f"{len(controller.errors)} samples, greatest tracking error {worst:.3e}")
+        print(f"{len(controller.errors)} samples, largest tracking error {worst:.3e}")
     controller.destroy_node()
     rclpy.try_shutdown()
     return 0 if controller.done else 1

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feed by stiffness: a straight cut that is slower where the machine is softer.
 
-The cutting force grows with the feed, F = k v against the motion, and bends the machine by C F. So
-that the tool's place is within a tolerance everywhere, v = tolerance / (k |C t|), at most the
-programmed feed; C is the platform's compliance at the pose, t the cut's direction. The feed rises
-and falls within an acceleration. The cut goes to the machine by the twin, with effort.
+The cutting force is proportional to the feed, F = k v against the motion, and deflects the machine
+by C F. To keep the tool within a tolerance, the feed is v = tolerance / (k |C t|), at most the
+programmed feed. C is the platform's compliance at the pose, t the direction of the cut. The feed
+changes with a limited acceleration. delta_dynamics adds the effort to the trajectory.
 
     ros2 run pkm_twin machine_sim --ros-args -p mechanism:=delta_cu
     ros2 run pkm_twin delta_dynamics --ros-args -p mechanism:=delta_cu
@@ -69,10 +69,10 @@ def main():
     parser.add_argument(
         "--by", type=float, nargs="+", default=[0.15, 0.0, 0.0], help="cut, in pose coordinates"
     )
-    parser.add_argument("--feed", type=float, default=0.2, help="programmed, m/s")
-    parser.add_argument("--tolerance", type=float, default=1e-4, help="m")
-    parser.add_argument("--force", type=float, default=50.0, help="N per m/s of feed")
-    parser.add_argument("--acceleration", type=float, default=1.0, help="m/s2 along the cut")
+    parser.add_argument("--feed", type=float, default=0.2, help="programmed feed, m/s")
+    parser.add_argument("--tolerance", type=float, default=1e-4, help="largest deflection, m")
+    parser.add_argument("--force", type=float, default=50.0, help="cutting force, N per m/s")
+    parser.add_argument("--acceleration", type=float, default=1.0, help="along the cut, m/s2")
     options = parser.parse_args(rclpy.utilities.remove_ros_args()[1:])
     try:
         robot = load(options.robot)
@@ -83,7 +83,7 @@ def main():
     except PkmTwinError as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
-    # Messages carry the controller's names and numbers of the joints.
+    # Messages use the controller's joint names and values.
     joints = robot.controller
     q = joints.controller_positions(motion[0])
     qd, qdd = (joints.controller_rates(rates) for rates in motion[1:])

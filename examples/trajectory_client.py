@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trajectory client: has a trajectory filled with effort by the twin, forwards it, watches it.
+"""Sends a trajectory to delta_dynamics, forwards the answer with effort, and checks its end.
 
     ros2 run pkm_twin machine_sim --ros-args -p mechanism:=delta_cu
     ros2 run pkm_twin delta_dynamics --ros-args -p mechanism:=delta_cu
     python3 trajectory_client.py --robot delta_cu
 
-A controller that is to take the twin's answer directly needs no client in between: remap
-delta_dynamics' ~/joint_trajectory_ff to its topic.
+To connect a controller directly, no client is needed: remap ~/joint_trajectory_ff of
+delta_dynamics to the controller's topic.
 """
 
 import argparse
@@ -85,7 +85,7 @@ class Client(Node):
         return [a for a in self.answers if [list(p.positions) for p in a.points] == wanted]
 
     def at_rest(self, goal, names):
-        """Whether the newest joint state stands at the goal, but for a percent of the way."""
+        """Whether the newest joint state is at the goal, within a percent of the path."""
         if not self.states:
             return False
         q, first = (positions(self.states[i], names) for i in (-1, 0))
@@ -121,12 +121,12 @@ def reaches(robot, share):
 
 
 def main():
-    """Go a part of every joint's range, from where the machine stands at the start."""
+    """Move every joint by a fraction of its range, from the position at the start."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robot", default="delta_cu")
     parser.add_argument("--controller", default="machine_sim/joint_trajectory")
     parser.add_argument("--seconds", type=float, default=1.0)
-    parser.add_argument("--reach", type=float, default=0.1, help="part of the joints' range")
+    parser.add_argument("--reach", type=float, default=0.1, help="fraction of the joints' range")
     options = parser.parse_args(rclpy.utilities.remove_ros_args()[1:])
     rclpy.init()
     client = Client(options.controller)

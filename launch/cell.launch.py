@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several machines of one cell, each with its robot and its topics in a namespace of its own."""
+"""The machines of one cell, each with its own robot, namespace and topics."""
 
 from pathlib import Path
 
@@ -19,14 +19,14 @@ TWIN = str(Path(__file__).with_name("twin.launch.py"))
 MACHINES = "picker=delta_cu,head=prru"
 
 ARGUMENTS = {
-    "machines": (MACHINES, "NAMESPACE=ROBOT for each machine, commas between"),
-    "params_file": ("", "parameters, a YAML file with a section /NAMESPACE/NODE a node"),
+    "machines": (MACHINES, "the machines: NAMESPACE=ROBOT,NAMESPACE=ROBOT,..."),
+    "params_file": ("", "YAML file of parameters, with a section /NAMESPACE/NODE for each node"),
     "command_gate": ("false", "run this node in every namespace"),
     "machine_state": ("false", "run this node in every namespace"),
-    "composed": ("false", "the nodes of each machine in one process, command_gate apart"),
-    "use_sim_time": ("false", "true where a bag is replayed with --clock"),
-    "respawn": ("true", "start a node again that has ended"),
-    "log_level": ("info", "debug, info, warn, error or fatal"),
+    "composed": ("false", "run the nodes of each machine, except command_gate, in one process"),
+    "use_sim_time": ("false", "use simulated time, for a bag replayed with --clock"),
+    "respawn": ("true", "restart a node that has ended"),
+    "log_level": ("info", "log level: debug, info, warn, error or fatal"),
 }
 
 

@@ -45,23 +45,23 @@ HERE = Path(__file__).parent
 EFFORTS = "effort_controller"
 
 ARGUMENTS = {
-    "robot": ("delta_cu", "a name or a path"),
+    "robot": ("delta_cu", "the robot, a name or path"),
     "use": (
         "twin",
         "twin: efforts of delta_dynamics; plugin: those of the robot's exported package",
     ),
-    "namespace": ("", "of everything"),
+    "namespace": ("", "namespace of all nodes and topics"),
     "description": ("", "a URDF with a ros2_control element; default: what pkm-twin urdf writes"),
     "controllers": (
         "",
-        "settings of ros2_control; default: controllers.yaml beside this file, or the package's",
+        "settings of ros2_control; default: controllers.yaml in this folder, or the package's",
     ),
-    "hardware_plugin": ("mock_components/GenericSystem", "of that description"),
+    "hardware_plugin": ("mock_components/GenericSystem", "plugin in the default description"),
     "bandwidth": ("", "Hz: gains by the machine's masses; default: the file's"),
     "command_gate": ("false", f"true: torques through command_gate to {EFFORTS}"),
-    "robot_state_publisher": ("true", "false where another node publishes robot_description"),
-    "params_file": ("", "parameters of delta_dynamics, a YAML file"),
-    "log_level": ("info", "of delta_dynamics: debug, info, warn, error or fatal"),
+    "robot_state_publisher": ("true", "false if another node publishes robot_description"),
+    "params_file": ("", "YAML file of parameters of delta_dynamics"),
+    "log_level": ("info", "log level of delta_dynamics: debug, info, warn, error or fatal"),
 }
 
 

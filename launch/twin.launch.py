@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The twin of one robot: its nodes, in one namespace. Every argument has a default.
+"""The nodes of one robot, in one namespace. Every argument has a default.
 
-A node that ends is started again. One that rejects its configuration would reject it again: it is
-tried a few times only, with growing pauses.
+A node that ends is restarted. A node that rejects its configuration would reject it again, so it
+is restarted only a few times, with increasing pauses.
 """
 
 import atexit
@@ -43,30 +43,30 @@ SETTLED = 30.0
 """A node that ran for so long had a good configuration, s."""
 
 ARGUMENTS = {
-    "robot": ("", f"robot of all nodes, a name or a path; default: params_file's, else {ROBOT}"),
-    "namespace": ("", "of the nodes and of every topic"),
-    "params_file": ("", "parameters, a YAML file with a section a node"),
+    "robot": ("", f"the robot, a name or path; default: that of params_file, else {ROBOT}"),
+    "namespace": ("", "namespace of the nodes and topics"),
+    "params_file": ("", "YAML file of parameters, with a section for each node"),
     "delta_dynamics": ("true", "run this node"),
     "stiffness_monitor": ("true", "run this node"),
-    "command_gate": ("false", "run this node: torques that end, for effort controllers"),
+    "command_gate": ("false", "run this node, which forwards torques to an effort controller"),
     "machine_state": (
         "false",
-        "run this node: all joints, transforms, markers; see view.launch.py",
+        "run this node, which publishes all joints, transforms and markers; see view.launch.py",
     ),
     "joint_states": ("joint_states", "topic of the measured joint states"),
     "wrench": ("wrench", "topic of the measured wrench"),
     "measured_deflection": ("measured_deflection", "topic of the platform's measured deflection"),
     "joint_trajectory_ff": ("~/joint_trajectory_ff", "topic of the trajectories with effort"),
-    "controller_action": ("", "of delta_dynamics: the controller's action that goals go on to"),
-    "commands": ("~/commands", "topic that command_gate sends to, an effort controller's"),
-    "acceleration": ("", "of delta_dynamics: trajectory or differentiate"),
-    "use_wrench": ("", "of delta_dynamics: true where torques bear the measured wrench"),
-    "wrench_frame": ("", "frame of the measured wrench"),
-    "use_sim_time": ("false", "true where a bag is replayed with --clock"),
+    "controller_action": ("", "parameter of delta_dynamics: the controller's action"),
+    "commands": ("~/commands", "topic of an effort controller that command_gate publishes to"),
+    "acceleration": ("", "parameter of delta_dynamics: trajectory or differentiate"),
+    "use_wrench": ("", "parameter of delta_dynamics: true includes the measured wrench"),
+    "wrench_frame": ("", "frame id of the measured wrench"),
+    "use_sim_time": ("false", "use simulated time, for a bag replayed with --clock"),
     "executor": ("", "of all nodes: single or events; default: each node's own, composed: events"),
-    "composed": ("false", "all nodes but command_gate in one process, which takes less time"),
-    "respawn": ("true", "start a node again that has ended; command_gate always is"),
-    "log_level": ("info", "debug, info, warn, error or fatal"),
+    "composed": ("false", "run all nodes except command_gate in one process, which saves time"),
+    "respawn": ("true", "restart a node that has ended; command_gate is always restarted"),
+    "log_level": ("info", "log level: debug, info, warn, error or fatal"),
 }
 
 PARAMETERS = {

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot to look at: machine_state and, where they are installed, robot_state_publisher and rviz2.
+"""View a robot: machine_state and, if they are installed, robot_state_publisher and rviz2.
 
-``machine_state`` gives every joint of the tree, passive ones too; robot_state_publisher makes the
-transforms of all links of them. Without it machine_state publishes that of the platform.
+``machine_state`` publishes every joint of the tree, also the passive ones; robot_state_publisher
+publishes the transforms of all links. Without it machine_state publishes that of the platform.
 """
 
 import tempfile
@@ -23,15 +23,15 @@ HERE = Path(__file__).parent
 LAYOUT = "view/machine.rviz"
 
 ARGUMENTS = {
-    "robot": ("delta_cu", "a name or a path"),
-    "namespace": ("", "of the nodes and of every topic; and the prefix of all frames"),
-    "params_file": ("", "parameters of machine_state, a YAML file"),
+    "robot": ("delta_cu", "the robot, a name or path"),
+    "namespace": ("", "namespace of the nodes and topics, and prefix of all frames"),
+    "params_file": ("", "YAML file of parameters of machine_state"),
     "joint_states": ("joint_states", "topic of the measured joint states"),
     "wrench": ("wrench", "topic of the measured wrench"),
-    "robot_state_publisher": ("auto", "true, false, or auto: where it is installed"),
-    "rviz": ("auto", "true, false, or auto: where rviz2 is installed"),
-    "use_sim_time": ("false", "true where a bag is replayed with --clock"),
-    "log_level": ("info", "of machine_state: debug, info, warn, error or fatal"),
+    "robot_state_publisher": ("auto", "true, false, or auto: if it is installed"),
+    "rviz": ("auto", "true, false, or auto: if rviz2 is installed"),
+    "use_sim_time": ("false", "use simulated time, for a bag replayed with --clock"),
+    "log_level": ("info", "log level of machine_state: debug, info, warn, error or fatal"),
 }
 
 

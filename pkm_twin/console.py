@@ -59,7 +59,7 @@ def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
 
 
 def parse_numbers(text: str) -> list[float]:
-    """Finite numbers with commas between; empty where it is anything else."""
+    """Finite numbers separated by commas; an empty list for any other text."""
     try:
         numbers = [decimal(word) for word in text.split(",")]
     except ValueError:
@@ -74,7 +74,7 @@ def numbers(text: str, count: int, expected: str = "") -> list[float]:
     """
     values = parse_numbers(text)
     if len(values) != count:
-        expected = expected or f"{count} numbers with commas between"
+        expected = expected or f"{count} numbers separated by commas"
         raise typer.BadParameter(f"{text!r} is not {expected}")
     return values
 
@@ -96,7 +96,7 @@ def file_name(option: typer.CallbackParam, path: Path | None) -> Path | None:
     :raises PkmTwinError: by the option's name.
     """
     if path is not None and path.name in ("", ".."):
-        raise PkmTwinError(f"{option.opts[-1]}: a file's name is needed, {str(path)!r} is a folder")
+        raise PkmTwinError(f"{option.opts[-1]}: {str(path)!r} is a folder; expected a file name")
     return path
 
 
@@ -109,9 +109,9 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
     :raises PkmTwinError: such a target.
     """
     if source is not None and path.exists() and source.exists() and path.samefile(source):
-        raise PkmTwinError(f"{path}: the target is the source itself")
+        raise PkmTwinError(f"{path}: target and source are the same file")
     if os.path.lexists(path) and not overwrite:
-        raise PkmTwinError(f"{path} exists; give --overwrite to replace it")
+        raise PkmTwinError(f"{path} exists; use --overwrite to replace it")
     if not path.parent.is_dir():
         raise PkmTwinError(f"{path} cannot be written: there is no folder {path.parent}")
     try:

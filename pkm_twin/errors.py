@@ -13,13 +13,13 @@ from typing import Any, Final, TextIO
 
 
 class PkmTwinError(Exception):
-    """Base of everything that pkm_twin raises on purpose."""
+    """Base of all errors that pkm_twin raises for invalid input."""
 
 
 class ParameterError(PkmTwinError, ValueError):
     """An invalid file, key or value.
 
-    ``field`` is the dotted name, ``value`` what was given, ``bound`` what is expected.
+    ``field`` is the dotted name, ``value`` the given value, ``bound`` what is expected.
     """
 
     def __init__(self, field: str, value: object, bound: str) -> None:
@@ -31,7 +31,10 @@ class ParameterError(PkmTwinError, ValueError):
 
 
 class FileError(ParameterError):
-    """A file that cannot be read, or is not what it should be (``bound``: "a CSV file")."""
+    """A file that cannot be read or has another format.
+
+    ``bound`` is the expected format, such as "a CSV file".
+    """
 
     def __init__(self, path: str | Path, error: Exception, bound: str) -> None:
         missing = isinstance(error, FileNotFoundError)
@@ -43,11 +46,14 @@ class FileError(ParameterError):
 
 
 NOUNS: Final = ("robot", "mechanism", "map")
-"""Fields that are what their value is the name of."""
+"""Fields whose value is a name of this kind of thing."""
 
 
 class UnknownNameError(ParameterError):
-    """A key or name that does not exist; ``closest`` is the nearest valid one, or None."""
+    """A key or name that does not exist.
+
+    ``valid`` are the valid names, ``closest`` is the nearest of them, or None.
+    """
 
     def __init__(self, field: str, name: object, valid: Iterable[str]) -> None:
         names = sorted(valid)
@@ -66,9 +72,9 @@ class UnknownNameError(ParameterError):
 
 
 class MobilityError(ParameterError):
-    """A machine whose actuated joints do not determine it, or cannot all move.
+    """A machine whose number of actuated joints differs from its degrees of freedom.
 
-    ``actuated`` joints stand against ``freedoms``; ``causes`` are texts, the likeliest first.
+    ``actuated`` and ``freedoms`` are the two numbers; ``causes`` are texts, the likeliest first.
     """
 
     def __init__(self, actuated: int, freedoms: int, causes: Sequence[str]) -> None:
@@ -80,22 +86,22 @@ class MobilityError(ParameterError):
 
 
 class RobotWarning(UserWarning):
-    """Something in a robot's file that is taken as it stands and may be a mistake."""
+    """An implausible number in a robot's file; the file is used as it is."""
 
 
 _warned: dict[str, dict[Any, Any]] = {}
-"""By file, what it was warned of: once, whoever loads it again."""
+"""The warnings given for each file, so that a file that is loaded again does not repeat them."""
 
 
 def warn(path: str | Path, text: str) -> None:
-    """Warn of something in a robot's file, by the file and not by a line of the program."""
+    """Warn about a robot's file; the warning names the file, not a line of the program."""
     known = _warned.setdefault(str(path), {})
     warnings.warn_explicit(text, RobotWarning, str(path), 0, registry=known)
 
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Warnings of a robot's file are a line on stderr, without a line of the program."""
+    """Print warnings about a robot's file as one line on stderr, without a line of the program."""
     usual = warnings.showwarning
 
     def show(
@@ -115,11 +121,11 @@ def plain_warnings() -> Iterator[None]:
 
 
 class UnreachableError(PkmTwinError, ValueError):
-    """A pose or joint state that the mechanism cannot be assembled in.
+    """A pose or joint state in which the mechanism cannot be assembled.
 
     ``limb`` is the name of the limb or joint, ``index`` the sample's index in the batch (``()`` for
-    one sample), ``miss`` by how much it falls short (m), ``reached`` the part of the straight
-    way from home up to which there is an assembly, None where no way was gone.
+    one sample), ``miss`` the gap that remains (m), ``reached`` the fraction of the straight line
+    from home up to which there is an assembly, None if no line was followed.
     """
 
     def __init__(
@@ -142,11 +148,11 @@ class UnreachableError(PkmTwinError, ValueError):
 
 
 class SingularityError(PkmTwinError, ValueError):
-    """A pose in which the Jacobian has no usable inverse.
+    """A pose at or beyond a singularity.
 
-    ``measure`` is the reciprocal condition number, lengths scaled out; ``bound`` the least allowed;
-    ``reached`` the part of the straight path from home at which the singularity is met, None at the
-    place itself; ``beyond`` whether the place is on the far side of one.
+    ``measure`` is the dimensionless reciprocal condition number, ``bound`` the least valid one;
+    ``reached`` the fraction of the straight line from home at which the singularity occurs, None at
+    the pose itself; ``beyond`` whether the pose is on the other side of one.
     """
 
     def __init__(
@@ -176,18 +182,18 @@ class SingularityError(PkmTwinError, ValueError):
 
 
 class SearchError(PkmTwinError):
-    """A search that has not ended within its bound: ``done`` steps, ``most`` that are allowed."""
+    """A search that did not finish: ``done`` steps of at most ``most``."""
 
     def __init__(self, what: str, done: int, most: int) -> None:
-        super().__init__(f"{what} is not found within {done} steps; allowed: {most}")
+        super().__init__(f"{what} not found in {done} steps, at most {most}")
         self.done = done
         self.most = most
 
 
 class MessageError(PkmTwinError, ValueError):
-    """A ROS message that is rejected whole.
+    """A ROS message that is rejected.
 
-    ``reason`` is a short stable code for counting, the text says what, with values and bounds.
+    ``reason`` is a short stable code for counting; the text contains values and bounds.
     """
 
     def __init__(self, reason: str, text: str) -> None:
@@ -196,9 +202,9 @@ class MessageError(PkmTwinError, ValueError):
 
 
 class BagError(PkmTwinError):
-    """A bag that cannot be read or written as asked.
+    """A bag that cannot be read or written.
 
-    ``reason`` is a short stable code, ``offset`` the byte in the file where it shows, if known.
+    ``reason`` is a short stable code, ``offset`` the byte in the file, if known.
     """
 
     def __init__(
@@ -218,9 +224,9 @@ class BagError(PkmTwinError):
 
 
 def one_line(text: str, limit: int = 400) -> str:
-    """A text from elsewhere as part of a line: unprintable characters escaped, the middle cut.
+    """A text for one line: unprintable characters escaped, the middle cut.
 
-    ``limit`` is the most characters that come back.
+    ``limit`` is the largest number of characters of the result.
     """
     # Each character may become ten: what cannot be shown is not escaped first.
     half = limit // 2
@@ -231,11 +237,11 @@ def one_line(text: str, limit: int = 400) -> str:
 
 
 def short(value: object, limit: int = 80) -> str:
-    """A value as an error shows it, its end cut."""
+    """A value for an error message, its end cut."""
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
 def install(extra: str) -> str:
-    """What to type for an extra: from a clone, as no package index has pkm_twin."""
+    """The command that installs an extra, from a clone, because no package index has pkm_twin."""
     return f"pip install '.[{extra}]' in a clone of pkm_twin"

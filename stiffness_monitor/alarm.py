@@ -58,11 +58,11 @@ MOST_ALIKE: Final = 0.95
 
 @dataclass(frozen=True)
 class AlarmSettings:
-    """When an element has departed.
+    """Conditions of an alarm.
 
-    ``sigmas``: deviations of model and noise. ``least``: of a factor from 1, however sure.
-    ``window``: stamps that are judged together, s. ``directions``: which of x y z rx ry rz are
-    measured.
+    ``sigmas``: threshold in standard deviations of model and noise. ``least``: smallest difference
+    of a factor from 1. ``window``: time span of the samples that are evaluated together, s.
+    ``directions``: the measured ones of x y z rx ry rz.
     """
 
     sigmas: float = 6.0
@@ -75,8 +75,8 @@ class AlarmSettings:
 class Departure:
     """An element whose compliance is ``factor`` times the file's, with its standard deviation.
 
-    ``bound``: how far from 1 is no departure. ``others``: elements that would explain the samples
-    as well in its place, with their factors.
+    ``bound``: largest difference from 1 that gives no alarm. ``others``: elements that would
+    explain the samples equally well, with their factors.
     """
 
     element: str
@@ -87,7 +87,7 @@ class Departure:
 
     @property
     def candidates(self) -> str:
-        """All elements that it may be, in words."""
+        """All possible elements, as text."""
         return " or ".join((self.element, *(name for name, _ in self.others)))
 
 
@@ -183,7 +183,10 @@ class _Window:
 
 @dataclass
 class StiffnessAlarm:
-    """Samples of load and deflection in, departures out; times are arguments, s."""
+    """Finds elements whose compliance differs from the file, from samples of load and deflection.
+
+    Times are arguments, s.
+    """
 
     robot: Robot
     settings: AlarmSettings = field(default_factory=AlarmSettings)
@@ -208,7 +211,7 @@ class StiffnessAlarm:
         return len(self._samples)
 
     def reset(self) -> None:
-        """Forget all samples."""
+        """Discard all samples."""
         self._samples.clear()
 
     def push(self, time: float, pose: Array, wrench: Array, deflection: Array) -> None:
@@ -232,7 +235,7 @@ class StiffnessAlarm:
             self._samples.popleft()
 
     def judge(self) -> tuple[Departure, ...] | None:
-        """The elements that have departed, the surest first; None where too little is loaded."""
+        """The elements with an alarm, the most certain first; None if too little is loaded."""
         work = self.judging()
         while True:
             try:

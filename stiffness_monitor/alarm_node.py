@@ -42,18 +42,23 @@ class StiffnessAlarmTopics:
         wanted = node.declare(
             "watch_stiffness",
             True,
-            "take measured_deflection and publish ~/stiffness_alarm: elements that have departed "
-            "from the file",
+            "subscribe to measured_deflection and publish ~/stiffness_alarm: elements whose "
+            "compliance differs from the file",
             read_only=True,
         )
         settings = self._declare_settings()
         seconds: dict[str, Any] = {"unit": "s", "high": 3600.0, "read_only": True}
         age = node.declare(
-            "alarm.wrench_age", 0.02, "from a deflection to the wrench on either side of it",
+            "alarm.wrench_age", 0.02, "largest time between a deflection and the wrenches before "
+            "and after it",
             low=0.0, **seconds,
         )  # fmt: skip
         period = node.declare(
-            "alarm.period", 0.1, "least time between two deflections that count", low=0.0, **seconds
+            "alarm.period",
+            0.1,
+            "shortest time between two deflections that are used",
+            low=0.0,
+            **seconds,
         )
         if not wanted:
             return
@@ -69,26 +74,29 @@ class StiffnessAlarmTopics:
     def _declare_settings(self) -> AlarmSettings:
         node, d = self._node, AlarmSettings()
         sigmas = node.declare(
-            "alarm.sigmas", d.sigmas, "deviations of model and noise that are a departure",
+            "alarm.sigmas", d.sigmas, "alarm threshold in standard deviations of model and noise "
+            "together",
             low=1.0, high=1e3, read_only=True,
         )  # fmt: skip
         least = node.declare(
-            "alarm.least", d.least, "least departure of a factor on an element's compliance",
+            "alarm.least", d.least, "smallest change of an element's compliance factor that "
+            "raises an alarm",
             low=0.0, high=10.0, read_only=True,
         )  # fmt: skip
         window = node.declare(
-            "alarm.window", d.window, "stamps that are judged together", unit="s", low=1.0,
+            "alarm.window", d.window, "time span of the deflections that are evaluated "
+            "together", unit="s", low=1.0,
             high=3600.0, read_only=True,
         )  # fmt: skip
         words = node.declare(
-            "alarm.directions", list(DIRECTIONS), "which of x y z rx ry rz are measured",
+            "alarm.directions", list(DIRECTIONS), "measured directions, of x y z rx ry rz",
             read_only=True,
         )  # fmt: skip
         for word in words:
             if word not in DIRECTIONS:
                 raise UnknownNameError("alarm.directions", word, DIRECTIONS)
         if not words:
-            raise ParameterError("alarm.directions", [], "one of x y z rx ry rz or more")
+            raise ParameterError("alarm.directions", [], "at least one of x y z rx ry rz")
         measured = tuple(word in words for word in DIRECTIONS)
         return AlarmSettings(sigmas, least, window, measured)
 
@@ -116,7 +124,7 @@ class StiffnessAlarmTopics:
     def warning(self) -> str:
         """What the diagnostics warn of; empty where nothing has departed."""
         told = (
-            f"{d.candidates} is {d.factor:.3g} +- {d.deviation:.2g} times as soft as the file says"
+            f"compliance of {d.candidates} is {d.factor:.3g} +- {d.deviation:.2g} times the file's"
             for d in self.departures
         )
         return "; ".join(told)
@@ -193,5 +201,5 @@ class StiffnessAlarmTopics:
 
     def _on_reset(self, _request: Any, response: Any) -> Any:
         self.reset()
-        response.success, response.message = True, "the deflections are forgotten"
+        response.success, response.message = True, "the stored deflections were deleted"
         return response

@@ -34,13 +34,13 @@ _UNLOADED: Final = np.zeros(6)
 
 @dataclass(frozen=True, eq=False)
 class PlatformResponse:
-    """What a wrench does to the platform, and where its energy goes; arrays are read-only.
+    """Deflection and strain energy under a wrench; arrays are read-only.
 
     ``compliance``: C of the platform at its reference point, shape (..., 6, 6), exactly symmetric.
     ``deflection``: C P there, shape (..., 6), m and rad; base axes. ``elements``: the frame's
     members and elastic joints, of upr_rpu limb number and R joint, bar or U joint. ``energies``:
-    strain energy of each, shape (..., elements), J. ``factors``: its part of the total, sum 1; all
-    zero, which says absent, where the wrench is zero. ``total``: P' C P / 2, shape (...), J.
+    strain energy of each, shape (..., elements), J. ``factors``: its share of the total, sum 1; all
+    zero for a zero wrench. ``total``: P' C P / 2, shape (...), J.
     ``dominant``: name of the element with the largest factor, ``"none"`` for a zero wrench; a
     string for one sample, an array of strings for a batch. ``tie``: whether the largest two factors
     are within 1e-9 of each other; the dominant one is then the first in ``elements``.
@@ -64,8 +64,8 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     """Compliance, deflection and strain energies at joint positions, from one factorisation.
 
     :param q: joint positions, shape (..., n), rad or m; locked.
-    :param wrench: force and moment that the surroundings apply to the platform at its reference
-        point, base axes, shape (..., 6), N and N m; broadcast against q.
+    :param wrench: external force and moment on the platform at its reference point, base axes,
+        shape (..., 6), N and N m; broadcast against q.
     :raises ParameterError: the robot's file lacks a section that elasticity needs.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises SingularityError: a singularity on the way from home, or a frame that is a mechanism.

@@ -25,11 +25,11 @@ alone: they would cost offsets of fifty times the deflection."""
 
 @dataclass(frozen=True)
 class Correction:
-    """Joint offsets and what they leave.
+    """Joint offsets and the remaining displacement.
 
-    ``offset``: what to add to the joints' set points, shape (..., n), rad or m. ``before`` and
-    ``left``: displacement of the tool point and rotation of the platform without and with it, base
-    axes, shape (..., 6), m and rad. ``bounded``: whether the bound cut it down, shape (...).
+    ``offset``: added to the joints' set points, shape (..., n), rad or m. ``before`` and ``left``:
+    displacement of the tool point and rotation of the platform without and with the offset, base
+    axes, shape (..., 6), m and rad. ``bounded``: whether the bound reduced it, shape (...).
     """
 
     offset: Array
@@ -46,24 +46,26 @@ def setpoint_correction(
     tool: ArrayLike = (0.0, 0.0, 0.0),
     bound: ArrayLike = np.inf,
 ) -> Correction:
-    """Joint offsets that bring the tool point back where it would be without load.
+    """Joint offsets that move the tool point back to its position without load.
 
-    To first order: the offsets' displacement of the tool point is the opposite of the deflection's.
-    The tool point's place comes first; joints that are left over turn the platform back. A machine
-    with fewer freedoms than six turns a little more where that brings its tool point back.
+    To first order, the offsets move the tool point opposite to the deflection. The position of the
+    tool point has priority; remaining joints rotate the platform back. A machine with fewer than
+    six degrees of freedom may rotate slightly more to move its tool point back.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param deflection: of the platform at its reference point, base axes, shape (..., 6), m and
         rad, as ``strain_energy`` gives it.
     :param tool: from the platform's reference point, platform axes, shape (..., 3), m.
-    :param bound: largest offset of a joint, shape (n,) or one for all; beyond it the whole offset
-        is made smaller, its direction kept.
+    :param bound: largest offset of a joint, shape (n,) or one for all; a larger offset is scaled
+        down, with its direction kept.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises ValueError: a wrong last axis, a value that is not finite, or a bound below zero.
     """
     limit = doubles(bound, "the bound")
     if limit.shape not in ((), (robot.joints_count,)) or not (limit >= 0.0).all():
-        raise ValueError(f"bound is {limit.tolist()}, allowed 0 and above, one or one a joint")
+        raise ValueError(
+            f"bound is {limit.tolist()}; expected 0 or more, one number or one per joint"
+        )
     moved = vectors(deflection, 6, "the deflection")
     _, rotation = robot.platform(q)
     lever = skew((rotation @ vectors(tool, 3, "the tool point")[..., None])[..., 0])

@@ -42,14 +42,14 @@ class SetpointCorrection:
         wanted = node.declare(
             "correct_setpoint",
             False,
-            "publish joint offsets that cancel the tool point's deflection",
+            "publish joint offsets that compensate the tool point's deflection",
             read_only=True,
         )
         self._tool = np.array(
             node.declare(
                 "tool.xyz",
                 [0.0, 0.0, 0.0],
-                "tool point from the platform's reference point, platform axes",
+                "position of the tool point from the platform's reference point, platform axes",
                 unit="m",
                 read_only=True,
             ),
@@ -60,7 +60,7 @@ class SetpointCorrection:
         self._bound = node.declare(
             "correction_bound",
             1e-3,
-            "largest joint offset; beyond it all are made smaller alike",
+            "largest joint offset; larger offsets are all scaled down by one factor",
             unit="rad or m",
             low=0.0,
             high=MAX_BOUND,
@@ -69,7 +69,7 @@ class SetpointCorrection:
         self._age = node.declare(
             "correction_age",
             0.1,
-            "from a set point back to the wrench that corrects it",
+            "largest time from a wrench to the set point that it corrects",
             unit="s",
             low=0.0,
             high=3600.0,
@@ -130,13 +130,13 @@ class SetpointCorrection:
     def _correct(self, data: bytes) -> None:
         sample = self._reader.positions(self._decode(data), self._node.now(), self._rules)
         if self._offset is None:
-            raise MessageError("no wrench", "no wrench has arrived that tells a correction")
+            raise MessageError("no wrench", "no wrench to compute a correction from has arrived")
         stamp, offset = self._offset
         age = abs(sample.stamp - stamp) / SECOND
         if age > self._age:
             raise MessageError(
                 "no wrench",
-                f"the last wrench is {age:.3f} s away, allowed {self._age:g} s",
+                f"the last wrench is {age:.3f} s old, allowed {self._age:g} s",
             )
         own = self._robot.controller
         self._corrected.publish(sample.stamp, own.controller_positions(sample.q + offset))

@@ -150,7 +150,7 @@ class Frame:
     def _moved(self, body: str, end: int, at: Any) -> Node:
         """The point of a body that is at a place."""
         if (body, end) not in self.nodes:
-            raise ValueError(f"{body} hangs nowhere")
+            raise ValueError(f"{body} is not connected to the base")
         node = self.nodes[body, end]
         return Node(node.own, rigid_offset(at - node.at) @ node.map, at)
 
@@ -230,7 +230,10 @@ class Frame:
         """
         rows = independent_rows(tables[..., PLATFORM:])
         if len(independent_rows(tables)) > len(rows):
-            raise ValueError("closures hold the platform itself: its compliance is not positive")
+            raise ValueError(
+                "the platform's compliance is not positive: closures constrain the platform "
+                "directly"
+            )
         # First what closures let through, which is in one equation or two alone.
         weight = np.where(np.arange(PLATFORM, self.size) < self.last, 1.0, 10.0)
         chosen = independent_rows((tables[:, rows, PLATFORM:] * weight).swapaxes(-1, -2))

@@ -96,7 +96,7 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     strain: list[Array] = []
     kinetic: list[Array] = []
     if not np.prod(batch, dtype=int):
-        raise ValueError("modes of no pose")
+        raise ValueError("modes: no poses given")
     for index in np.ndindex(*batch):
         system = _system(robot, q[index], elements)
         values, vectors = _solve(system, count, index, vectors=True)

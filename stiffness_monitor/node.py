@@ -53,15 +53,19 @@ class StiffnessMonitor(health.TwinNode):
 
     def __init__(self) -> None:
         super().__init__("stiffness_monitor", executor="events")
-        robot = load(self.declare("mechanism", "upr_rpu", "robot: name or path", read_only=True))
+        robot = load(
+            self.declare(
+                "mechanism", "upr_rpu", "robot: a name, or the path of a file", read_only=True
+            )
+        )
         for kernel in kernels(robot):
             kernel.warm_up()
         settings = self._declare_settings()
         given = self.declare(
             "platform_frame",
             "",
-            "frame of ~/deflection; empty: wrench_frame, or platform where that is base_frame or "
-            "the sensor stands elsewhere",
+            "frame of ~/deflection; empty: wrench_frame, or platform if wrench_frame is base_frame "
+            "or the sensor is not at the platform's reference point",
             read_only=True,
         )
         mounts = declare_mounts(self, given or PLATFORM)
@@ -69,7 +73,8 @@ class StiffnessMonitor(health.TwinNode):
         self._monitor = Monitor(robot, settings, mounts)
         self._monitor.pace = Pace(
             self.declare(
-                "rate", 0.0, "wrenches answered a second at most, by their stamps, 0: every one",
+                "rate", 0.0, "largest rate of answers, by the stamps of the wrenches; 0: every "
+                "wrench",
                 unit="Hz", low=0.0, high=1e4, read_only=True,
             )
         )  # fmt: skip
@@ -94,7 +99,7 @@ class StiffnessMonitor(health.TwinNode):
         self._known = 0
         """Stamp of the joint state whose frequencies were published last."""
         rate = self.declare(
-            "frequencies_rate", 10.0, "natural frequencies a second at most, 0: none",
+            "frequencies_rate", 10.0, "largest rate of ~/natural_frequencies; 0: none",
             unit="Hz", low=0.0, high=1000.0, read_only=True,
         )  # fmt: skip
         if rate > 0.0 and has_modes(robot):
@@ -161,18 +166,20 @@ class StiffnessMonitor(health.TwinNode):
         return declare_wrench(
             self,
             base_frame=self.declare(
-                "base_frame", d.base_frame, "name of the fixed frame", read_only=True
+                "base_frame", d.base_frame, "frame id of the base", read_only=True
             ),
             max_state_age=self.declare(
-                "max_state_age", d.max_state_age, "from a wrench to the nearest joint state",
+                "max_state_age", d.max_state_age, "largest time between a wrench and the nearest "
+                "joint state",
                 **SECONDS,
             ),
             future_tolerance=self.declare(
-                "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
+                "future_tolerance", d.future_tolerance, "how far time stamps may be ahead of the "
+                "clock",
                 **SECONDS,
             ),
             accept_zero_stamp=self.declare(
-                "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
+                "accept_zero_stamp", d.accept_zero_stamp, "accept a zero stamp, as the arrival time"
             ),
         )  # fmt: skip
 
@@ -204,7 +211,7 @@ class StiffnessMonitor(health.TwinNode):
                 take(answer)
             except (PkmTwinError, ValueError) as error:
                 # Close to a singularity, say: the compliance is sound all the same.
-                self.log_throttled("beside", f"no correction or judgement: {error}")
+                self.log_throttled("beside", f"no correction or alarm: {error}")
 
     def _publish_frequencies(self) -> None:
         """Of the latest joint state: a pose costs milliseconds, so not of every one."""

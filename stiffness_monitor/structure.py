@@ -301,7 +301,7 @@ class _Planner:
         """What stands at a place on a body, and at which end."""
         part = self._part(body)
         if part not in self.points:
-            raise ValueError(f"{part} hangs nowhere")
+            raise ValueError(f"{part} is not connected to the base")
         apart = [reference(size(point - at)) for point in self.points[part]]
         return part, int(np.argmin(apart))
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def compliance_deviation(robot: Robot, pose: ArrayLike) -> Array:
-    """Standard deviation of :func:`compliance` by the file's ``uncertainty``, shape (..., 6, 6).
+    """Standard deviation of :func:`compliance`, propagated from ``uncertainty``, (..., 6, 6).
 
     To first order in the deviations, independent causes. Zero for a file that names none.
 

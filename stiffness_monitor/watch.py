@@ -102,7 +102,7 @@ class StiffnessWatch:
         self._pair()
         if len(self._waiting) > WAITING:
             self._waiting.pop()
-            text = f"{WAITING} deflections wait for the wrench behind them already"
+            text = f"{WAITING} deflections are already waiting for the wrench after them"
             self._refuse(MessageError("no wrench", text))
 
     def judgement(self) -> Generator[None, None, bool] | None:
@@ -169,11 +169,12 @@ class StiffnessWatch:
         """
         found = self._answers.around(stamp)
         if found is None:
-            raise MessageError("no wrench", "no wrench around the deflection's stamp")
+            raise MessageError("no wrench", "no wrenches before and after the deflection")
         age = max(stamp - found[0][0], found[1][0] - stamp) / SECOND
         if age > self.max_age:
             raise MessageError(
                 "no wrench",
-                f"the wrench beside the deflection is {age:.3f} s away, allowed {self.max_age:g} s",
+                f"the wrench next to the deflection is {age:.3f} s away, allowed "
+                f"{self.max_age:g} s",
             )
         return found[0][1], found[1][1]

@@ -154,7 +154,7 @@ def certify(
         first = Maximal(description)
         drawn = random_states(first, np.random.default_rng(seed), states)
     except UnfitError as error:
-        raise PkmTwinError(f"{robot.name} cannot be judged: {error}") from None
+        raise PkmTwinError(f"{robot.name} cannot be cross-checked: {error}") from None
     judges: dict[str, Judge] = {}
     missing: dict[str, str] = {}
     for name in engines:
@@ -167,9 +167,7 @@ def certify(
         except ImportError as error:
             if error.name is None or error.name.startswith("pkm_twin"):
                 raise
-            missing[name] = (
-                f"{ENGINES[name][1]} is not installed; {install('certificate')} brings it"
-            )
+            missing[name] = f"{ENGINES[name][1]} is not installed; {install('certificate')}"
         except UnfitError as error:
             missing[name] = str(error)
     items = [*_own(robot, drawn), *_compared(robot, judges, drawn, progress)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The headless verdict: whether a recorded bag is what the twin says of its machine."""
+"""``pkm-twin check``: compare a recording with the model of its machine."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ class ModelBand:
         shares = ", ".join(f"{100 * share:.3g}" for share in self.share_within.values())
         counts = ", ".join(map(str, self.share_within))
         return (
-            f"{shares} % inside {counts} deviations of the model (RMS {self.deviation_rms:.3g} "
-            f"{self.unit})"
+            f"{shares} % inside {counts} standard deviations of the model (RMS "
+            f"{self.deviation_rms:.3g} {self.unit})"
         )
 
 
@@ -125,7 +125,7 @@ def check_bag(
     topics: Sequence[str] = (),
     carried: Load | None = None,
 ) -> CheckReport:
-    """Judge a bag against the twin.
+    """Compare a bag with the model.
 
     :param topics: joint-state and wrench topic, where names and joints do not tell.
     :param carried: the payload, by default the one that the bag tells of.
@@ -252,7 +252,7 @@ def _residuals(r: Recording, bounds: Bounds) -> tuple[list[Item], dict[str, Mode
     peak = np.abs(r.effort).max(0)
     units = r.robot.effort_units
     good = rms <= bounds.residual * peak
-    hint = "" if r.load or good.all() else "; a payload that nobody told of? --payload"
+    hint = "" if r.load or good.all() else "; unknown payload? use --payload"
     items += [
         _item(
             f"{what} of {name}",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``pkm-twin``. Exit codes: 0 good, 1 refused, 2 usage, 3 salvaged with loss."""
+"""The command ``pkm-twin``. Exit codes: 0 good, 1 rejected, 2 usage, 3 recovered with loss."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _version(asked: bool) -> None:
         try:
             typer.echo(f"pkm-twin {version('pkm_twin')}")
         except PackageNotFoundError:
-            typer.echo("pkm-twin, not installed: run from its sources")
+            typer.echo("pkm-twin, version unknown (not installed, runs from its sources)")
         raise typer.Exit
 
 
@@ -77,21 +77,21 @@ def _application(
         typer.Option("--version", help="print the version", callback=_version, is_eager=True),
     ] = False,
 ) -> None:
-    """Digital twin of parallel kinematic machines, without ROS but for `play`.
+    """Digital twin of parallel kinematic machines.
 
-    SI units, world z up. Begin with `pkm-twin robots`, then `pkm-twin info delta_cu`, or
-    judge a recording with `pkm-twin check BAG`.
+    Start with `pkm-twin robots`, then `pkm-twin info delta_cu`; or check a recording with
+    `pkm-twin check BAG`. SI units, world z up. Only play, guard-check and view --live need ROS.
 
-    Exit codes: 0 good, 1 refused or bad, 2 usage, 3 salvaged with loss. An error is one line on
-    stderr; stdout is for results, and with --json for JSON alone.
+    Exit codes: 0 good, 1 bad or invalid, 2 wrong usage, 3 recovered with loss. An error is one line
+    on stderr. Results go to stdout, with --json as JSON only.
     """
 
 
 @app.command()
 def play(
     bag: BagPath,
-    rate: Annotated[float, typer.Option(help="speed, 1 is the recorded one")] = 1.0,
-    loop: Annotated[bool, typer.Option("--loop", help="begin again at the end")] = False,
+    rate: Annotated[float, typer.Option(help="speed factor; 1 is the recorded speed")] = 1.0,
+    loop: Annotated[bool, typer.Option("--loop", help="restart at the end")] = False,
     clock: Annotated[
         Optional[float],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
         typer.Option(help="publish /clock at this many Hz, for nodes with use_sim_time"),
@@ -107,11 +107,12 @@ def play(
 ) -> None:
     """Replay a bag onto ROS topics.
 
-    What `ros2 bag play` does, for machines without it.
+    Works like `ros2 bag play`, on machines that do not have it. The whole bag is checked before
+    anything is published. Messages are published in the order of their log time, byte for byte as
+    recorded.
 
-    The bag is checked whole before anything is published. Messages go out ordered by log time, as
-    the bytes that were recorded. Stamps are old: give the nodes use_sim_time and this command
-    --clock 200.
+    Time stamps in a bag are old, so the nodes reject them unless you use simulated time: set
+    use_sim_time on the nodes and give this command --clock 200.
     """
     from pkm_twin.ros.player import play as play_bag
 
@@ -132,7 +133,7 @@ def play(
 
 @app.command()
 def robots() -> None:
-    """List the robots that can be named."""
+    """List the robots that ship with pkm_twin."""
     from pkm_twin import load, robot_names
     from pkm_twin.apps.describe import summary
 
@@ -153,10 +154,10 @@ def info(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the picture")] = False,
 ) -> None:
-    """Print all of a robot, with units.
+    """Show a robot's parameters, with units.
 
-    Dimensions, masses, limits, home pose, mobility, and which reactions rigid bodies do not
-    determine because the mechanism is overconstrained.
+    Prints dimensions, masses, limits, home pose and mobility. For an overconstrained mechanism it
+    also lists the joint reactions that rigid-body equations do not determine.
     """
     from pkm_twin import load
     from pkm_twin.apps.describe import describe, lines
@@ -184,19 +185,20 @@ def urdf(
     robot: RobotName,
     platform: Platform = None,
     hardware_plugin: Annotated[
-        str, typer.Option(help="of ros2_control", metavar="NAME")
+        str, typer.Option(help="hardware plugin of ros2_control", metavar="NAME")
     ] = "mock_components/GenericSystem",
     prefix: Annotated[
-        str, typer.Option(help="of the names of all links and joints", metavar="TEXT")
+        str, typer.Option(help="prefix for the names of all links and joints", metavar="TEXT")
     ] = "",
     no_ros2_control: Annotated[
-        bool, typer.Option("--no-ros2-control", help="no ros2_control element")
+        bool, typer.Option("--no-ros2-control", help="write no ros2_control element")
     ] = False,
 ) -> None:
-    """Print a robot as a URDF that parsers of trees read, its cut loops as <constraint> elements.
+    """Print a robot as a URDF, with its loops as constraints.
 
-    Its joints are the actuated and the passive ones; its ground is base_link, its platform's link
-    platform. The same robot gives the same bytes.
+    The URDF is a tree with all joints, actuated and passive, and a <constraint> element for each
+    loop that was cut. Parsers that know only trees ignore these elements. The base is the link
+    base_link, the platform the link platform. The same robot always gives the same bytes.
     """
     from pkm_twin import load
     from pkm_twin.machine.robot_urdf import robot_urdf
@@ -211,9 +213,10 @@ def urdf(
 
 @app.command()
 def convert(robot: RobotName, platform: Platform = None) -> None:
-    """Print a robot, or a URDF with its loops, as a commented YAML of bodies, joints and rods.
+    """Convert a robot, or a URDF with its loops, to a YAML.
 
-    That file is a robot of its own: edit it, and give its path wherever a robot's name goes.
+    Prints a commented YAML of bodies, joints and rods. It is a complete robot: edit it, and use its
+    path in place of a robot's name.
     """
     from pkm_twin import load
     from pkm_twin.machine.catalogue import TREES
@@ -238,10 +241,11 @@ def torques(
     out: Annotated[
         Path,
         typer.Option(
-            help="table to write, .csv or .parquet; the picture goes beside it", callback=file_name
+            help="table to write, .csv or .parquet; the picture has the same name with .png",
+            callback=file_name,
         ),
     ] = Path("torques.csv"),
-    picture: Annotated[bool, typer.Option(help="draw efforts and terms as a PNG")] = True,
+    picture: Annotated[bool, typer.Option(help="plot efforts and terms as a PNG")] = True,
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
     load_times: LoadTimes = None,
@@ -250,16 +254,18 @@ def torques(
         bool, typer.Option("--overwrite", help="replace the table and the picture")
     ] = False,
 ) -> None:
-    """Torques, terms and joint reactions of a motion.
+    """Compute torques, their terms and joint reactions.
 
-    CSV columns: time (s); JOINT.position for every actuated joint, and, where known,
-    JOINT.velocity and JOINT.acceleration (rad or m), else differentiated; and a
-    wrench on the platform, fx fy fz mx my mz (N, N m, fixed axes). Joint names: `pkm-twin info`.
+    CSV columns: time (s) and JOINT.position (rad or m) for every actuated joint. Optional:
+    JOINT.velocity and JOINT.acceleration, which are otherwise differentiated from the positions,
+    and the wrench on the platform, fx fy fz mx my mz (N, N m, base axes). `pkm-twin info` lists the
+    joint names.
 
-    The table has, by sample, each joint's effort (N m or N) and the terms that sum to it
-    (JOINT.effort_gravity, _inertia, _velocity, _payload, _friction, _external), a bag's measured
-    effort, and force and moment in every joint; empty where rigid bodies do not determine it. With
-    --beyond-limits a column beyond_limits is 1 where a joint is outside its limits.
+    The table has one row per sample: each joint's effort (N m or N), the terms that sum to it
+    (JOINT.effort_gravity, _inertia, _velocity, _payload, _friction, _external), the measured effort
+    of a bag, and force and moment in every joint. A reaction that rigid-body equations do not
+    determine is empty. With --beyond-limits, the column beyond_limits is 1 where a joint is outside
+    its limits.
     """
     from pkm_twin.apps.limits import beyond_limits as find_beyond
     from pkm_twin.apps.limits import refuse_beyond
@@ -301,26 +307,27 @@ def compliance(
     pose: Annotated[
         list[float],
         typer.Argument(
-            help="the pose's numbers, of upr_rpu z (m), beta, gamma (rad)",
+            help="the pose's coordinates, for upr_rpu z (m), beta, gamma (rad)",
             show_default=False,
         ),
     ],
     wrench: Annotated[
         str,
         typer.Option(
-            help="load case, six numbers with commas: force (N), moment (N m), fixed axes"
+            help="load case, FX,FY,FZ,MX,MY,MZ at the platform's reference point, N and N m, base "
+            "axes"
         ),
     ] = "0,0,1,0,0,0",
     beyond_limits: BeyondLimits = False,
     as_json: Json = False,
 ) -> None:
-    """Platform compliance at a pose, and a wrench's strain energy.
+    """Compute compliance at a pose and strain energy under a load.
 
-    For example `pkm-twin compliance upr_rpu -0.6 0 0 --wrench 30,-50,-40,10,-20,50`.
+    Example: `pkm-twin compliance upr_rpu -0.6 0 0 --wrench 30,-50,-40,10,-20,50`.
 
-    The elements of the strain energy are, of upr_rpu, the limb's number and R (revolute joint), B
-    (bar) or U (universal joint), of the others the members and elastic joints of their frame; the
-    dominant one is where stiffening pays.
+    The strain energy is given by element: the members and elastic joints of the robot's structure.
+    For upr_rpu an element is the limb's number with R (revolute joint), B (bar) or U (universal
+    joint). Stiffen the dominant element first: it stores the largest share.
     """
     from pkm_twin import load
     from pkm_twin.apps.limits import beyond_limits as find_beyond
@@ -394,7 +401,7 @@ def compliance(
     if machine.uncertainty:
         turned = deviation(machine, lambda r: strain_energy(r, pose, load_case).deflection)
         doubts = ", ".join(f"{n} {1e6 * v:.2g}" for n, v in zip(axes, turned, strict=True))
-        typer.echo(f"its standard deviation by the file's uncertainty: {doubts}")
+        typer.echo(f"standard deviation (from the robot file's uncertainty): {doubts}")
     typer.echo(f"strain energy {energy.total:.4g} J, {dominant}")
     if energy.dominant != "none":
         typer.echo("shares: " + ", ".join(f"{name} {100 * part:.1f} %" for part, name in shares))
@@ -411,7 +418,7 @@ def check(
         typer.Option(
             min=0.0,
             max=1.0,
-            help="allowed RMS of the torque residual, part of the peak: 0.05 is 5 %",
+            help="largest RMS torque residual that is good, as a fraction of the peak: 0.05 is 5 %",
         ),
     ] = 0.05,
     topic: BagTopics = [],  # noqa: B006  typer copies it
@@ -419,15 +426,16 @@ def check(
     load_times: LoadTimes = None,
     as_json: Json = False,
 ) -> None:
-    """Judge a recorded bag against the twin.
+    """Compare a recording with the model.
 
-    Are the file's bytes whole, would a node take every joint state and wrench, are there gaps, are
-    limits kept, is it far from singularities, and are the measured efforts what the model says? An
-    item without evidence (no CRCs, no efforts, a robot without masses) is unknown, not good; it
-    does not make the bag bad. Which topics and which payload were taken is printed first.
+    Checks that the file is complete, that a node would accept every joint state and wrench, that
+    there are no gaps, that joints stay inside their limits and away from singularities, and that
+    the measured efforts agree with the model. An item without data (no CRCs, no efforts, a robot
+    without masses) is unknown, which is neither good nor bad. The first lines report which topics
+    and which payload were used.
 
-    Exit code 0: nothing is bad. 1: something is, or it is no bag. 3: the file is damaged, but part
-    of it can be saved with `pkm-twin recover`.
+    Exit code 0: nothing is bad. 1: an item is bad, or the file is not a bag. 3: the file is
+    damaged, but `pkm-twin recover` can save part of it.
     """
     from pkm_twin.apps.check import Bounds, check_bag
     from pkm_twin.apps.verdict import Verdict, items_table
@@ -452,7 +460,7 @@ def check(
         typer.echo(f"{report.topics}")
         typer.echo(f"payload: {report.load or 'the robot file alone'}")
         if not report.unsure:
-            typer.echo("uncertainty: the robot file gives none, so the model has no band")
+            typer.echo("uncertainty: none in the robot file, so the model has no uncertainty band")
         table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
         bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
         text = f"bad: {', '.join(bad)}" if bad else "good"
@@ -468,11 +476,12 @@ def recover(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the target")] = False,
     as_json: Json = False,
 ) -> None:
-    """Save what is whole of a damaged bag.
+    """Save the intact messages of a damaged bag.
 
-    Every whole message of a damaged or cut bag goes into a new one. The old one stays as it is.
+    Copies every intact message of a damaged or truncated bag into a new bag. The old bag does not
+    change.
 
-    Exit code 0: nothing was lost. 3: saved with loss. 1: nothing could be saved.
+    Exit code 0: nothing was lost. 3: some messages were lost. 1: nothing could be saved.
     """
     from dataclasses import asdict
 
@@ -495,23 +504,23 @@ def recover(
 @app.command()
 def certify(
     robot: RobotName,
-    states: Annotated[int, typer.Option(min=1, max=100000, help="random states")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="where the random numbers begin")] = 1,
+    states: Annotated[int, typer.Option(min=1, max=100000, help="number of random states")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the random states")] = 1,
     engine: Annotated[
-        list[str], typer.Option(help="ask only these: maximal, pinocchio, mujoco")
+        list[str], typer.Option(help="use only this engine: maximal, pinocchio or mujoco")
     ] = [],  # noqa: B006  typer copies it
     as_json: Json = False,
 ) -> None:
-    """Compare a robot's torques and places with other engines.
+    """Cross-check a robot with independent engines.
 
-    Three engines compute the machine anew from its description alone, with no line of the twin's
-    mechanics: bodies free in space with every joint as equations (needs nothing more), Pinocchio
-    and MuJoCo (`pip install '.[certificate]'`), each as a tree with loops. Compared are
-    torques with wrench, payload and friction, the platform's place and Jacobian, and the mass
-    matrix, over random states inside the limits; and the twin's own round trip from joints to pose
-    and back.
+    Three engines compute the machine from its description and share no mechanics code with
+    pkm_twin: maximal (free bodies, every joint as equations), pinocchio and mujoco (a tree with
+    loop constraints each; `pip install '.[certificate]'`). The command compares torques with
+    wrench, payload and friction, the platform's pose and Jacobian, and the mass matrix, at random
+    states inside the limits. It also checks the round trip from joint positions to pose and back.
 
-    Exit code 0: all bounds are kept. 1: one is not, or the machine cannot be judged.
+    Exit code 0: all differences are within their bounds. 1: one is not, or the machine cannot be
+    checked.
     """
     from pkm_twin import load
     from pkm_twin.apps.certify import ENGINES, certificate_of
@@ -535,7 +544,7 @@ def certify(
             table.add_row(item.engine, item.what, *values, verdict)
         table_console().print(table)
         for name, reason in result.missing.items():
-            typer.echo(f"{name} was not asked: {reason}")
+            typer.echo(f"{name} was not used: {reason}")
         typer.echo("good" if result.good else "bad")
     if not result.good:
         raise typer.Exit(REFUSED)
@@ -592,7 +601,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _tell(text: str) -> None:
-    """One line on stderr, whatever names and values are in it."""
+    """Print one line on stderr, with unprintable characters escaped."""
     print(f"pkm-twin: {one_line(text, 2000)}", file=sys.stderr)
 
 

@@ -84,14 +84,16 @@ def check_motion_times(path: Path, time: Array, q: Array, qd: Array | None) -> N
                 "times in milliseconds",
             )  # fmt: skip
     if step > LONGEST_STEP:
-        warn(path, f"time: steps of {step:g} s; the model takes seconds, does it say milliseconds?")
+        warn(path, f"time: steps of {step:g} s; expected seconds; are these milliseconds?")
 
 
 def _lines(text: TextIO, path: Path) -> Iterator[str]:
     """The lines of a file, none so long that a row takes all the memory."""
     while line := text.readline(MAX_CSV_LINE):
         if len(line) == MAX_CSV_LINE:
-            raise ParameterError(f"{path}: a line", f"{line[:40]}...", f"below {MAX_CSV_LINE} long")
+            raise ParameterError(
+                f"{path}: a line", f"{line[:40]}...", f"at most {MAX_CSV_LINE} characters"
+            )
         yield line
 
 

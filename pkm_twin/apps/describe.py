@@ -129,13 +129,13 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
         ("actuated joints", ", ".join(f"{name} ({unit})" for name, unit in joint_units.items())),
         ("home pose", _pairs(data["home_pose"], data["pose"])),
         ("home joints", _pairs(data["home_joints"], joint_units)),
-        ("distance to singularity at home", f"{data['singularity_at_home']:.3f} (1 is best)"),
+        ("singularity index at home", f"{data['singularity_at_home']:.3f} (1 is best)"),
     ]
     if data["home_choice"]:
         rows.append(("home", data["home_choice"]))
     grouped = grouped_reactions(data["overconstrained"])
     rows += [("overconstrained", text) for text in grouped] or [
-        ("overconstrained", "no: rigid bodies determine every reaction")
+        ("overconstrained", "no: rigid-body equations determine every reaction")
     ]
     found = [Finding(**finding).text for finding in data["plausibility"]]
     rows += [("plausibility", text) for text in found or ["nothing implausible"]]

@@ -20,39 +20,44 @@ Array = NDArray[np.float64]
 def excite(
     robot: RobotName,
     what: Annotated[
-        str, typer.Option(help="of friction, rotor, payload, inertia, commas between")
+        str, typer.Option(help="what a fit shall identify: friction,rotor,payload,inertia or some")
     ] = "friction,rotor,payload,inertia",
     out: Annotated[
-        Path, typer.Option(help="MCAP to write; the same as CSV goes beside it", callback=file_name)
+        Path,
+        typer.Option(help="MCAP to write; the CSV has the same name with .csv", callback=file_name),
     ] = Path("excite.mcap"),
     beside: Annotated[
         Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-        typer.Option(help="a bag whose condition number is told beside", show_default=False),
+        typer.Option(help="also report the condition number of this bag", show_default=False),
     ] = None,
-    duration: Annotated[float, typer.Option(help="s", min=1.0, max=600.0)] = 10.0,
-    harmonics: Annotated[int, typer.Option(help="of each joint", min=3, max=50)] = 6,
-    rate: Annotated[float, typer.Option(help="points a second", min=10.0, max=1000.0)] = 100.0,
+    duration: Annotated[float, typer.Option(help="duration, s", min=1.0, max=600.0)] = 10.0,
+    harmonics: Annotated[int, typer.Option(help="harmonics per joint", min=3, max=50)] = 6,
+    rate: Annotated[float, typer.Option(help="points per second", min=10.0, max=1000.0)] = 100.0,
     share: Annotated[
-        float, typer.Option(help="of all limits that is used", min=0.05, max=1.0)
+        float, typer.Option(help="fraction of all limits to use", min=0.05, max=1.0)
     ] = 0.9,
     acceleration: Annotated[
         Optional[float],  # noqa: UP045
-        typer.Option(help="limit of every joint, rad/s2 or m/s2", show_default=False),
+        typer.Option(
+            help="acceleration limit of every joint, rad/s2 or m/s2; default: none",
+            show_default=False,
+        ),
     ] = None,
     singularity: Annotated[
-        float, typer.Option(help="least singularity measure, 0 to 1", min=0.001, max=0.9)
+        float, typer.Option(help="least singularity index, 0 to 1", min=0.001, max=0.9)
     ] = 0.1,
-    trials: Annotated[int, typer.Option(help="trajectories that are tried", min=10)] = 300,
-    seed: Annotated[int, typer.Option(help="of the trials", min=0)] = 0,
+    trials: Annotated[int, typer.Option(help="number of trajectories to try", min=10)] = 300,
+    seed: Annotated[int, typer.Option(help="seed of the trials", min=0)] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace both files")] = False,
     json_output: Json = False,
 ) -> None:
-    """Design a trajectory that identifies a robot well.
+    """Design a trajectory that excites the parameters to identify.
 
-    A finite Fourier series in every joint, at rest at both ends, D-optimal over the base
-    parameters of what is to be fitted; inside position, velocity and effort limits of the robot's
-    file, its workspace, and clear of singularities. Written as a trajectory_msgs/JointTrajectory
-    on /delta_dynamics/joint_trajectory, and as a CSV as `pkm-twin torques` takes it.
+    Every joint follows a finite Fourier series that starts and ends at rest. The trajectory is
+    D-optimal for the base parameters of what is to be fitted. It stays inside the robot file's
+    position, velocity and effort limits and inside the workspace, away from singularities. The
+    command writes a trajectory_msgs/JointTrajectory on /delta_dynamics/joint_trajectory, and a CSV
+    for `pkm-twin torques`.
     """
     from delta_dynamics.excitation import Bounds, Judge
     from delta_dynamics.excitation import excite as design
@@ -100,8 +105,8 @@ def excite(
         return
     typer.echo(f"condition number {best.condition:.4g} over {len(judge.columns)} base parameters")
     if other is not None:
-        told = f"{other:.4g}" if np.isfinite(other) else "infinite, some of them do not show"
-        typer.echo(f"beside it {beside}: {told}")
+        told = f"{other:.4g}" if np.isfinite(other) else "infinite, it does not excite all of them"
+        typer.echo(f"condition number of {beside}: {told}")
     typer.echo(f"{out}, {table}: {len(time)} points, {duration:g} s")
 
 

@@ -15,25 +15,25 @@ from pkm_twin.console import refuse_existing
 from pkm_twin.files import replace_file
 from pkm_twin.machine.robot import Robot
 
-app = typer.Typer(help="Write a robot as files of other software.", no_args_is_help=True)
+app = typer.Typer(help="Export a robot to other software.", no_args_is_help=True)
 
 SHARE = 0.5
-"""Of the effort that the weight leaves at home: what a planner may accelerate with."""
+"""Fraction of the effort left at home after gravity that a planner may use to accelerate."""
 
 
 @app.command()
 def moveit(
     robot: RobotName,
-    out: Annotated[Path, typer.Option(help="folder of the package, made anew")],
+    out: Annotated[Path, typer.Option(help="folder of the new package")],
     kinematics_plugin: Annotated[
-        str, typer.Option(help="inverse kinematics of the actuated joints", metavar="NAME")
+        str, typer.Option(help="MoveIt's plugin for the inverse kinematics", metavar="NAME")
     ] = "",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
 ) -> None:
     """Write a MoveIt configuration: URDF, SRDF, limits, controllers, kinematics and a launch file.
 
-    Plans go to delta_dynamics, which fills them with effort for the controller. Goals in joint
-    space need nothing else; goals of the platform's pose need a kinematics plugin.
+    MoveIt sends its plans to delta_dynamics, which adds efforts for the controller. Goals in joint
+    space work as they are; goals of the platform's pose need a kinematics plugin.
     """
     from pkm_twin import load
     from pkm_twin.export.moveit import moveit_package
@@ -45,14 +45,14 @@ def moveit(
 @app.command()
 def c(
     robot: RobotName,
-    out: Annotated[Path, typer.Option(help="folder of the package, made anew")],
+    out: Annotated[Path, typer.Option(help="folder of the new package")],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
 ) -> None:
     """Write kinematics, dynamics and elasticity as C99 that needs only math.h.
 
-    For controllers in C or C++, PLCs and Simulink: no heap, no recursion, bounded loops, a status
-    from every function. The payload is that of the robot's file; functions that end in _with take
-    another one.
+    The code is for controllers in C or C++, PLCs and Simulink. It uses no heap and no recursion,
+    its loops are bounded, and every function returns a status. Functions use the payload of the
+    robot's file; functions whose names end in _with take the payload as an argument.
     """
     from pkm_twin import load
     from pkm_twin.export.c_package import c_package

@@ -25,7 +25,8 @@ from pkm_twin.machine.schema import parse_yaml
 Array = NDArray[np.float64]
 
 RobotFile = Annotated[
-    str, typer.Argument(help="a robot's name (see `pkm-twin robots`) or a file: the numbers before")
+    str,
+    typer.Argument(help="a robot's name (see `pkm-twin robots`) or file: the values to start from"),
 ]
 NEAR: Final = 0.5
 """Around a pick or release the payload is neither held nor gone, s."""
@@ -40,16 +41,20 @@ def fit(
     ],
     what: Annotated[
         str,
-        typer.Option(help="of friction, rotor, payload, inertia, commas between; or compliance"),
+        typer.Option(
+            help="what to fit: friction,rotor,payload,inertia or some of them; or compliance"
+        ),
     ] = "friction,rotor,payload,inertia",
     out: Annotated[
         Path,
-        typer.Option(help="YAML to write; the report goes beside it as HTML", callback=file_name),
+        typer.Option(
+            help="YAML to write; the report has the same name with .html", callback=file_name
+        ),
     ] = Path("fitted.yaml"),
     report: Annotated[bool, typer.Option(help="write the report with pictures")] = True,
     per_copy: Annotated[
         bool,
-        typer.Option("--per-copy", help="the copies of a limb each by itself, written out"),
+        typer.Option("--per-copy", help="fit each copy of a limb by itself, and write all of them"),
     ] = False,
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
@@ -61,26 +66,28 @@ def fit(
     ] = False,
     json_output: Json = False,
 ) -> None:
-    """Fit friction, rotors, payload and masses of a robot to recorded efforts, or its compliance.
+    """Fit friction, masses or compliance to recordings.
 
-    Positions and efforts are enough: rates are differentiated without delay, and regressor and
-    efforts filtered alike. CSV columns: time (s); JOINT.position and JOINT.effort for every
-    actuated joint; optionally the wrench fx fy fz mx my mz. The last third of each recording is
-    held out and judged.
+    Fits friction, rotors, payload and masses to recorded efforts, or compliance to measured
+    deflections. Positions and efforts are enough: velocities and accelerations are differentiated
+    without delay, and regressor and efforts pass the same filter. CSV columns: time (s);
+    JOINT.position and JOINT.effort for every actuated joint; optionally the wrench fx fy fz mx my
+    mz. The last third of each recording is held out for validation.
 
-    The YAML is the robot's file with new numbers, each with its standard deviation in a comment.
-    What the motion does not show keeps the file's value and is named. A recording that this machine
-    cannot have made is rejected with the reason; --accept fits it all the same and marks the files.
-    A verdict says whether the model explains the recordings, what does not fit and which error is
-    likely; where it does not, standard deviations are widened or withheld.
+    The YAML is the robot's file with the fitted values, each with its standard deviation in a
+    comment. The command lists the parameters that the motion does not excite; they keep the file's
+    value. A recording that this machine cannot have produced is rejected with the reason; --accept
+    fits it nevertheless and marks the files. The verdict reports whether the model explains the
+    recordings, what does not fit and which error is likely. If the model does not explain them,
+    standard deviations are widened or withheld.
 
-    --payload and --load-times tell of a payload that is known, or, with `payload` among what is
-    fitted, when it is held.
+    --payload and --load-times give a known payload. When `payload` is fitted, they give the times
+    at which it is held.
 
     `--what compliance` fits a factor on the compliance of every elastic element (member or joint)
-    to measured loads and deflections: in a bag the wrench and a TransformStamped; CSV columns
-    JOINT.position, fx fy fz mx my mz, and dx dy dz (m) rx ry rz (rad), as many as are measured, all
-    at the platform's reference point in base axes.
+    to measured loads and deflections. A bag needs the wrench and a TransformStamped; a CSV needs
+    the columns JOINT.position, fx fy fz mx my mz, and those of dx dy dz (m) rx ry rz (rad) that
+    were measured, all at the platform's reference point in base axes.
     """
     from pkm_twin.apps.fit_files import fitted_yaml, robot_text, yaml_head
     from pkm_twin.machine.edited import write_edited
@@ -94,7 +101,7 @@ def fit(
     if COMPLIANCE in [word.strip() for word in what.split(",")]:
         if per_copy or payload is not None or load_times is not None:
             raise ParameterError(
-                "what", what, "without --per-copy, --payload and --load-times: of efforts they tell"
+                "what", what, "no --per-copy, --payload or --load-times, which are for efforts"
             )
         _fit_compliance(
             robot, recordings, what, topic, out, page if report else None, json_output,
@@ -109,7 +116,7 @@ def fit(
             machine, recordings, kinds, topic, carried, update, limited=not beyond_limits,
             accept=accept,
         )  # fmt: skip
-    marks = [*(f"accepted all the same: {line}" for line in result.accepted), *beyond]
+    marks = [*(f"accepted by --accept: {line}" for line in result.accepted), *beyond]
     names = [one_line(path.name, 100) for path in recordings]
     fitted = fitted_yaml(text, result, names)
     _check_loads(fitted, out)
@@ -189,7 +196,7 @@ def _fit_compliance(
             update(len(read))
         beyond = _beyond(machine, [(r.name, r.q) for r in read], not beyond_limits)
         result = fit_elements(machine, read, lambda k: update(len(recordings) + k), accept=accept)
-    marks = [*(f"accepted all the same: {line}" for line in result.accepted), *beyond]
+    marks = [*(f"accepted by --accept: {line}" for line in result.accepted), *beyond]
     names = [one_line(path.name, 100) for path in recordings]
     fitted = fitted_yaml(text, result, names)
     _check_loads(fitted, out)
@@ -386,20 +393,21 @@ def _print(result: Any) -> None:
     for n in result.numbers:
         if n.status == "not excited":
             continue
-        note = "only together with others" if n.status == "combination" else ""
+        note = "known only in combination with others" if n.status == "combination" else ""
         table.add_row(n.name, f"{n.before:.6g}", f"{n.after:.6g}", n.spread, n.unit, note)
     console = table_console()
     console.print(table)
     idle = result.of("not excited")
     if idle:
         typer.echo(
-            "the motion tells nothing of, and the file's value stays: "
-            + ", ".join(n.name for n in idle)
+            "not excited by the motion, the file's value stays: " + ", ".join(n.name for n in idle)
         )
     e = result.estimate
     typer.echo(f"condition number {e.condition:.3g} over {e.directions} combinations")
     if e.bound:
-        typer.echo("held by a bound: the data alone want negative friction or no possible body")
+        typer.echo(
+            "at a physical bound: the data alone would give negative friction or an impossible body"
+        )
     for line in verdict_lines(result):
         typer.echo(line)
     for judged, delay in zip(result.judged, result.delays, strict=True):

@@ -32,7 +32,11 @@ img {{ max-width: 100%; }}
 """
 MOST_SAMPLES: Final = 4000
 """Drawn of each recording."""
-WORDS: Final = {"fitted": "", "combination": "only together with others", "not excited": ""}
+WORDS: Final = {
+    "fitted": "",
+    "combination": "known only in combination with others",
+    "not excited": "",
+}
 
 
 def fit_page(result: Fit, recordings: Sequence[str], notes: Sequence[str] = ()) -> str:
@@ -55,9 +59,9 @@ def fit_page(result: Fit, recordings: Sequence[str], notes: Sequence[str] = ()) 
         numbers_table(_shown(result)),
     ]
     parts.append(
-        f"<p>{e.directions} combinations of numbers are told by {result.samples} filtered samples; "
-        f"condition number {e.condition:.3g}. +- is one standard deviation, of the noise, of the "
-        "differentiation and of what the file said before.</p>"
+        f"<p>{result.samples} filtered samples identify {e.directions} combinations of parameters; "
+        f"condition number {e.condition:.3g}. +- is one standard deviation. It includes noise, "
+        "differentiation and the file's prior values.</p>"
     )
     if e.bound:
         parts.append(
@@ -67,7 +71,7 @@ def fit_page(result: Fit, recordings: Sequence[str], notes: Sequence[str] = ()) 
     idle = result.of("not excited")
     if idle:
         names = ", ".join(html.escape(n.name) for n in idle)
-        parts.append(f"<p>The motion tells nothing of, and the file's value stays: {names}.</p>")
+        parts.append(f"<p>Not excited by the motion, the file's value stays: {names}.</p>")
     parts += ["<h2>Numbers, before and now</h2>", picture(changes_figure(_shown(result)))]
     parts += ["<h2>Held out: the last third of each recording</h2>", _residuals(result)]
     parts.append(
@@ -166,7 +170,9 @@ def changes_figure(shown: Sequence[Number]) -> Any:
         ax.plot(n.before / size, place, "x", color="0.4")
     ax.set_yticks(places, [n.name for n in shown], fontsize=8)
     ax.set_xlim(-2, 2)
-    ax.set_xlabel("over the greater of both; cross before, dot now with three deviations")
+    ax.set_xlabel(
+        "relative to the larger value; cross: before, dot: now, bar: 3 standard deviations"
+    )
     ax.grid(alpha=0.3)
     return figure
 
@@ -184,9 +190,15 @@ def _efforts(result: Fit, number: int) -> Any:
             ax.plot(time, (judged.measured - values)[::step, k], color=colour, lw=0.8, label=label)
         band = 2.0 * judged.deviation[::step, k]
         ax.fill_between(
-            time, -band, band, color=COLOURS[0], alpha=0.25, lw=0, label="now, two deviations"
+            time,
+            -band,
+            band,
+            color=COLOURS[0],
+            alpha=0.25,
+            lw=0,
+            label="now, two standard deviations",
         )
-        ax.set_title(f"{judged.name}, {joint}: measured less predicted, held out")
+        ax.set_title(f"{judged.name}, {joint}: measured minus predicted effort, held out")
         ax.set_xlabel("time (s)")
         ax.set_ylabel(f"effort ({result.robot.effort_units[k]})")
         ax.legend(loc="upper right", fontsize=8)

@@ -71,7 +71,7 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> GuardReport:
     a = arrivals
     least = f"at most {1e3 * a.deadline:g} ms"
     duration = (a.last - a.first) / SECOND
-    rate = f", {a.count / duration:.1f} a second" if duration > 0.0 else ""
+    rate = f", {a.count / duration:.1f} per second" if duration > 0.0 else ""
     mean = a.ages / a.count / SECOND if a.count else math.nan
     beyond = f", {a.silences} beyond it" if a.silences else ""
     faults = ", ".join(f"{reason}: {count}" for reason, count in a.faults.items())
@@ -83,7 +83,7 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> GuardReport:
 
     came = Verdict.GOOD if a.count else Verdict.BAD
     items = [
-        Item("messages", f"{a.count}{rate}", "some", came),
+        Item("messages", f"{a.count}{rate}", "1 or more", came),
         item("longest silence", f"{a.longest_silence / 1e6:.1f} ms{beyond}", least, not a.silences),
         item(
             "age on arrival", f"mean {1e3 * mean:.1f}, most {a.oldest / 1e6:.1f} ms", least,
@@ -170,8 +170,8 @@ def _subscribe(node: Any, topic: str, take: Any) -> bool:
     other = {info.topic_type for info in infos} - {TYPE}
     if other:
         raise PkmTwinError(
-            f"{topic} carries {', '.join(sorted(other))}, which has no stamp to judge by; give a "
-            f"topic of {TYPE}, such as delta_dynamics/joint_torques"
+            f"{topic} carries {', '.join(sorted(other))}; expected a topic of {TYPE}, which has "
+            "time stamps, for example delta_dynamics/joint_torques"
         )
     reliable = all(i.qos_profile.reliability == ReliabilityPolicy.RELIABLE for i in infos)
     qos = QoSProfile(
@@ -219,20 +219,24 @@ def guard_check(
         str, typer.Argument(help="topic of stamped torques")
     ] = "delta_dynamics/joint_torques",
     deadline: Annotated[
-        float, typer.Option(help="longest silence and greatest age (s) that the controller bears")
+        float, typer.Option(help="longest gap and greatest age (s) that the controller tolerates")
     ] = 0.1,
-    duration: Annotated[float, typer.Option(help="how long to watch, s; Ctrl-C ends it")] = 10.0,
+    duration: Annotated[
+        float, typer.Option(help="how long to watch, s; Ctrl-C ends earlier")
+    ] = 10.0,
     wait: Annotated[float, typer.Option(help="longest wait (s) for the first message")] = 5.0,
-    sim_time: Annotated[bool, typer.Option("--sim-time", help="stamps are by /clock")] = False,
+    sim_time: Annotated[
+        bool, typer.Option("--sim-time", help="time stamps are in simulated time, /clock")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="machine-readable output")] = False,
 ) -> None:
-    """Report what a controller must notice of a running node's torques.
+    """Monitor the torques of a running node as a controller would.
 
-    Subscribes as a controller would: are the torques fresh when they come, is no silence longer
-    than the deadline, is none lost, is every one finite, with one effort a joint and a stamp after
-    the last, is there one publisher, and does it promise deadline and lifespan? Needs ROS.
+    Checks that torques arrive fresh, that no gap is longer than the deadline, that no message is
+    lost, that every message is finite, has one effort per joint and a later stamp than the one
+    before, and that there is exactly one publisher, which offers deadline and lifespan. Needs ROS.
 
-    Exit code 0: nothing is bad. 1: something is, or no torques came.
+    Exit code 0: nothing is bad. 1: an item is bad, or no torques arrived.
     """
     report = watch(topic, deadline, duration, wait, sim_time)
     if as_json:

@@ -94,5 +94,5 @@ def refuse_beyond(found: list[Beyond], where: str = "") -> None:
     raise ParameterError(
         f"{where}{': ' if where else ''}{first.joint}.{first.quantity}{at}",
         round(first.value, 9),
-        f"{first.low:g} to {first.high:g} {first.unit}{others}; {OPTION} computes it all the same",
+        f"{first.low:g} to {first.high:g} {first.unit}{others}; use {OPTION} to compute anyway",
     )

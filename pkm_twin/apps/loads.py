@@ -70,7 +70,7 @@ class Load:
     def __str__(self) -> str:
         at = "" if self.com is None else " at " + ", ".join(f"{v:g}" for v in self.com) + " m"
         spans = ", ".join(f"{begin:g} to {end:g} s" for begin, end in self.times) or "all the time"
-        told = "as the bag tells" if self.source == "bag" else "as asked for"
+        told = "from the bag" if self.source == "bag" else "as asked for"
         return f"{self.mass:g} kg{at}, {spans}, {told}"
 
 

@@ -19,14 +19,14 @@ MODULES = {
     "machine_sim": "delta_dynamics.sim_node",
 }
 SUMMARIES = {
-    "delta_dynamics": "Trajectories and joint states in, feedforward torques out.",
-    "command_gate": "Stamped torques in, plain commands of an effort controller out.",
-    "stiffness_monitor": "Wrenches in, compliance and the dominant strain-energy element out.",
-    "machine_state": "Joint states in; all joints, the platform's motion and markers out.",
-    "machine_sim": "Efforts or trajectories in, a simulated machine's joint states out.",
+    "delta_dynamics": "Computes feedforward torques from trajectories and joint states.",
+    "command_gate": "Forwards stamped torques to an effort controller, and zeros when they stop.",
+    "stiffness_monitor": "Computes compliance and the dominant element from wrenches and joints.",
+    "machine_state": "Computes all joints, the platform's motion and markers from joint states.",
+    "machine_sim": "Simulates the machine under efforts or trajectories, publishes joint states.",
 }
 TOGETHER = tuple(name for name in MODULES if name != "command_gate")
-COMPOSED = f"Nodes in one process and one executor: {', '.join(TOGETHER)}."
+COMPOSED = f"Runs several nodes in one process and one executor: {', '.join(TOGETHER)}."
 
 
 def delta_dynamics() -> None:
@@ -64,8 +64,9 @@ def composed() -> None:
     answer("composed", COMPOSED, [word for word in words[:end] if word not in names], "NODE")
     if not names or set(names) - set(TOGETHER) or len(set(names)) < len(names):
         print(
-            f"refused to start: composed {' '.join(names)}: expected {', '.join(TOGETHER)}, one or "
-            "more, each once; command_gate has to outlive the others and runs by itself",
+            f"cannot start: composed {' '.join(names)}: expected one or more of "
+            f"{', '.join(TOGETHER)}, each once; command_gate must outlive the others, so it runs "
+            "in its own process",
             file=sys.stderr,
         )
         sys.exit(2)
@@ -87,8 +88,7 @@ def _require_ros(name: str) -> None:
         importlib.import_module("rclpy")
     except ImportError as error:
         print(
-            f"refused to start: {name} needs ROS 2: source its setup, or {install('jazzy')} "
-            f"({error})",
+            f"cannot start: {name} needs ROS 2: source its setup, or {install('jazzy')} ({error})",
             file=sys.stderr,
         )
         sys.exit(1)

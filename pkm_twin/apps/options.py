@@ -11,12 +11,12 @@ import typer
 from pkm_twin.errors import ParameterError
 
 RobotName = Annotated[
-    str, typer.Argument(help="a robot's name (see `pkm-twin robots`) or a YAML file")
+    str, typer.Argument(help="a robot's name (see `pkm-twin robots`), a YAML file or a URDF")
 ]
 Json = Annotated[bool, typer.Option("--json", help="machine-readable output")]
 OptionalRobot = Annotated[
     Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-    typer.Option("--robot", help="name or YAML file; default: the one that the bag names"),
+    typer.Option("--robot", help="a robot's name or file; default: the robot that the bag names"),
 ]
 BagPath = Annotated[
     Path, typer.Argument(help="a bag: an MCAP file or a rosbag2 folder", show_default=False)
@@ -24,33 +24,40 @@ BagPath = Annotated[
 BagTopics = Annotated[
     list[str],
     typer.Option(
-        "--topic", help="joint states or wrenches to read; default: by the robot's joint names"
+        "--topic",
+        help="topic of joint states or wrenches; default: found by the robot's joint names",
     ),
 ]
 Payload = Annotated[
     Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
     typer.Option(
-        help="MASS[,x,y,z] on the platform, kg and m from its reference point; default: what the "
-        "bag tells"
+        help="payload on the platform: MASS[,x,y,z], kg, m from the platform's reference point; "
+        "default: that of the bag or the robot file"
     ),
 ]
 LoadTimes = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
-        help="FROM,TO[,FROM,TO...], s since the beginning, when --payload is held; default: always"
+        help="intervals in which --payload is held: FROM,TO[,FROM,TO...], s from the start; "
+        "default: always"
     ),
 ]
 BeyondLimits = Annotated[
     bool,
-    typer.Option("--beyond-limits", help="compute outside the joints' limits too, and mark it"),
+    typer.Option(
+        "--beyond-limits", help="also compute outside the joint limits, and mark these results"
+    ),
 ]
 Accept = Annotated[
     bool,
-    typer.Option("--accept", help="use data that this machine cannot have made too, and mark it"),
+    typer.Option(
+        "--accept",
+        help="also use data that this machine cannot have produced, and mark the results",
+    ),
 ]
 Platform = Annotated[
     Optional[str],  # noqa: UP045  typer reads it
-    typer.Option(help="of a URDF, the link that carries the tool", show_default=False),
+    typer.Option(help="for a URDF: the link that carries the tool", show_default=False),
 ]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin path``: a motion along way-points, a cycle or a circle, as a trajectory or table."""
+"""``pkm-twin path``: a motion along waypoints, a cycle or a circle, as a trajectory or table."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Array = NDArray[np.float64]
 
 ENDINGS: Final = (".mcap", ".csv")
 OPTIONS: Final = ("blend", "dwell", "arc")
-"""Columns of way-points beside their coordinates."""
+"""Columns of waypoints beside their coordinates."""
 MILLIMETRES: Final = 1e-3
 LEAST_CYCLE: Final = 1.0
 """Millimetres below which a cycle's numbers look like metres."""
 
 
 def read_waypoints(file: Path, robot: Robot, blend: float | None) -> Way:
-    """The path of a CSV of way-points, see :func:`path_command`.
+    """The path of a CSV of waypoints, see :func:`path_command`.
 
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
     """
@@ -111,69 +111,76 @@ def path_command(
     robot: RobotName,
     waypoints: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Argument(help="CSV of way-points; or give --cycle or --circle", show_default=False),
+        typer.Argument(
+            help="CSV of waypoints, unless --cycle or --circle is given", show_default=False
+        ),
     ] = None,
     cycle: Annotated[
         _PerJoint,
         typer.Option(
-            help="pick-and-place cycle there and back, HEIGHT,WIDTH[,LIFT] in mm: 25,305,25",
+            help="pick-and-place cycle there and back: HEIGHT,WIDTH[,LIFT] in mm, as in 25,305,25",
             show_default=False,
         ),
     ] = None,
     circle: Annotated[
         Optional[float],  # noqa: UP045
-        typer.Option(help="circle of this radius, m", show_default=False),
+        typer.Option(help="follow a circle of this radius, m", show_default=False),
     ] = None,
     at: Annotated[
         _PerJoint,
         typer.Option(
-            help="pose in the middle of --cycle (between the two places) or --circle, numbers "
-            "with commas; default: home",
+            help="centre of --cycle (between pick and place) or --circle: the pose's coordinates, "
+            "separated by commas; default: home",
             show_default=False,
         ),
     ] = None,
     direction: Annotated[
-        float, typer.Option(help="of the cycle's way across, degrees from x towards y")
+        float, typer.Option(help="direction of the cycle in the xy plane, degrees from x towards y")
     ] = 0.0,
     blend: Annotated[
         Optional[float],  # noqa: UP045
         typer.Option(
-            help="distance from a corner at which the path leaves the line, m; 0 stops in every "
-            "way-point; default: a smooth curve through way-points, 0.8 of a cycle's rise",
+            help="distance from a corner at which rounding begins, m; 0 stops at every waypoint; "
+            "default: a smooth curve through the waypoints; in a cycle 0.8 of its rise",
             min=0.0,
             show_default=False,
         ),
     ] = None,
-    dwell: Annotated[float, typer.Option(help="rest at both places of a cycle, s", min=0.0)] = 0.0,
+    dwell: Annotated[float, typer.Option(help="dwell at pick and at place, s", min=0.0)] = 0.0,
     fastest: Annotated[
-        bool, typer.Option("--fastest", help="the shortest motion within all limits")
+        bool, typer.Option("--fastest", help="plan the shortest motion within all limits")
     ] = False,
     law: Annotated[
-        str, typer.Option(help="without --fastest: quintic or s-curve, from stop to stop")
+        str,
+        typer.Option(help="motion law without --fastest: quintic or s-curve, from stop to stop"),
     ] = "quintic",
     duration: Annotated[
         Optional[float],  # noqa: UP045
-        typer.Option(help="of the whole, s; default: the shortest", show_default=False),
+        typer.Option(help="duration of the motion, s; default: the shortest", show_default=False),
     ] = None,
     effort: Annotated[
         _PerJoint,
-        typer.Option(help="limit, one number or one a joint, N m or N; default: the file's"),
+        typer.Option(
+            help="effort limit, one for all joints or one per joint, N m or N; default: the file's"
+        ),
     ] = None,
     velocity: Annotated[
-        _PerJoint, typer.Option(help="limit of the joints, rad/s or m/s; default: the file's")
+        _PerJoint,
+        typer.Option(help="velocity limit of the joints, rad/s or m/s; default: the file's"),
     ] = None,
     acceleration: Annotated[
-        _PerJoint, typer.Option(help="limit of the joints, rad/s2 or m/s2; default: none")
+        _PerJoint,
+        typer.Option(help="acceleration limit of the joints, rad/s2 or m/s2; default: none"),
     ] = None,
     jerk: Annotated[
-        _PerJoint, typer.Option(help="limit of the joints, rad/s3 or m/s3; default: none")
+        _PerJoint, typer.Option(help="jerk limit of the joints, rad/s3 or m/s3; default: none")
     ] = None,
     speed: Annotated[
         Optional[float],  # noqa: UP045
-        typer.Option(help="limit of the tool point, m/s; default: none", show_default=False),
+        typer.Option(help="speed limit of the tool point, m/s; default: none", show_default=False),
     ] = None,
     share: Annotated[
-        float, typer.Option(help="part of the file's efforts and velocities that is used")
+        float, typer.Option(help="fraction of the file's effort and velocity limits to use")
     ] = 1.0,
     singularity: Annotated[
         float, typer.Option(help="least singularity index on the path, 0 to 1", min=0.0, max=1.0)
@@ -181,35 +188,36 @@ def path_command(
     payload: Payload = None,
     platform: Platform = None,
     rate: Annotated[
-        float, typer.Option(help="samples a second in the file", min=1.0, max=1e5)
+        float, typer.Option(help="samples per second in the file", min=1.0, max=1e5)
     ] = 1000.0,
     out: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(
-            help="FILE.mcap (a JointTrajectory with efforts) or FILE.csv",
+            help="file to write: FILE.mcap (a JointTrajectory with efforts) or FILE.csv",
             callback=file_name,
             show_default=False,
         ),
     ] = None,
     picture: Annotated[
-        bool, typer.Option(help="draw which limit binds where as a PNG beside the file")
+        bool, typer.Option(help="plot which limit binds where; the PNG has the file's name")
     ] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace both files")] = False,
     as_json: Json = False,
 ) -> None:
-    """Plan a motion along a path, the fastest too.
+    """Plan a motion along a path, also the fastest one.
 
-    WAYPOINTS.csv has a header row and the pose's coordinates (m, rad) or JOINT.position of every
-    joint; the platform goes through the points on a smooth curve without a stop. With a column
-    blend (m), dwell (s) or arc (1: the middle of an arc), or with --blend, it follows straight
-    lines and arcs, and stops where blend is 0. An arc and a tangent line meet without a stop.
+    The CSV of waypoints has a header row and the pose's coordinates (m, rad) or JOINT.position of
+    every joint. The platform passes through the points on a smooth curve without a stop. With a
+    column blend (m), dwell (s) or arc (1: the middle of an arc), or with --blend, it follows
+    straight lines and arcs, and stops where blend is 0. It does not stop between an arc and a
+    tangent line.
 
-    --fastest is the shortest time within effort, velocity, acceleration, jerk and speed limits by
-    the exact inverse dynamics, with payload and friction. Printed are the duration, which limit
-    binds when, and the greatest part of each limit that is used.
+    --fastest finds the shortest time within effort, velocity, acceleration, jerk and speed limits.
+    It uses the exact inverse dynamics with payload and friction. The command prints the duration,
+    which limit binds when, and the largest fraction of each limit that the motion uses.
 
-    The CSV has columns time, JOINT.position, JOINT.velocity, JOINT.acceleration, JOINT.effort, and
-    the pose's coordinates, as `pkm-twin torques` and `pkm-twin size` read them.
+    The CSV that it writes has the columns time, JOINT.position, JOINT.velocity, JOINT.acceleration,
+    JOINT.effort and the pose's coordinates. `pkm-twin torques` and `pkm-twin size` read it.
     """
     from pkm_twin import load
     from pkm_twin.apps.path_report import draw_limits, report, write

@@ -73,7 +73,7 @@ def robot_of(bag: Bag, name: str | Robot | None) -> Robot:
     recorded = bag.report.metadata.get("pkm_twin", {}).get("robot")
     if recorded is None:
         raise BagError(
-            "the bag names no robot; give it with --robot", path=bag.report.path, reason="no robot"
+            "the bag names no robot; use --robot", path=bag.report.path, reason="no robot"
         )
     # Not a path: a bag does not choose which files are opened.
     if recorded not in robot_names():
@@ -161,7 +161,7 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     :raises ParameterError: no robot is given, a column is missing, or a value is no finite number.
     """
     if robot is None:
-        raise ParameterError("robot", None, "--robot: a table names none")
+        raise ParameterError("robot", None, "--robot, because a table names no robot")
     machine = robot if isinstance(robot, Robot) else load(robot)
     columns = read_columns(path)
 

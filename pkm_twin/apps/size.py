@@ -24,17 +24,17 @@ def size(
     drives: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(
-            help="YAML of motors to compare with, or `shipped` for those of config/drives",
+            help="YAML of motors to compare, or `shipped` for the motors in config/drives",
             show_default=False,
         ),
     ] = None,
     motor: Annotated[
-        list[str], typer.Option(help="compare with these of the drives file only")
+        list[str], typer.Option(help="compare only this motor of the drives file; may be repeated")
     ] = [],  # noqa: B006  typer copies it
     over_workspace: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
-            help="instead of a motion: SPEED,ACCELERATION of the tool point (m/s, m/s2), in the "
+            help="in place of a motion: SPEED,ACCELERATION of the tool point (m/s, m/s2), in the "
             "worst direction at the worst pose",
             show_default=False,
         ),
@@ -44,7 +44,7 @@ def size(
         typer.Option(help="least singularity index for --over-workspace, 0 to 1", min=0.0, max=1.0),
     ] = 0.05,
     efforts: Annotated[
-        str, typer.Option(help="file: those of the file where it has them; or model")
+        str, typer.Option(help="efforts to use: those of the motion's file if it has any, or model")
     ] = "file",
     payload: Payload = None,
     load_times: LoadTimes = None,
@@ -53,7 +53,7 @@ def size(
     picture: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(
-            help="PNG of torque against speed of each drive",
+            help="write a PNG of torque against speed for each drive",
             callback=file_name,
             show_default=False,
         ),
@@ -63,12 +63,12 @@ def size(
 ) -> None:
     """Size the drives for a motion.
 
-    For each drive: peak and RMS effort (which heats the motor), speed, power, energy given and
-    regenerated, and the machine's inertia at the joint. Where the robot's file has a section drive
-    (inertia, ratio or lead, efficiency), the same at the motor, and the ratio of the inertias.
+    Prints for each drive: peak and RMS effort (RMS heats the motor), speed, power, energy supplied
+    and regenerated, and the machine's inertia at the joint. If the robot's file has a section drive
+    (inertia, ratio or lead, efficiency), it prints the same at the motor, and the inertia ratio.
 
-    With --drives each motor of the file is compared with each drive: its torque curve, its
-    continuous torque against the RMS torque, its speed; its rotor takes the place of the file's.
+    --drives compares each motor of a file with the needs of each drive: torque curve, continuous
+    torque against RMS torque, and speed. The motor's rotor replaces the one in the robot's file.
 
     The motion is a CSV of `pkm-twin path` or `pkm-twin torques`, a bag of joint states, or a bag
     with a JointTrajectory.

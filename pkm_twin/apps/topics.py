@@ -111,7 +111,9 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = ()) -> Topics:
         kinds[info.type].append(name)
     for kind, names in kinds.items():
         if len(set(names)) > 1:
-            raise _choice_error(bag, f"{' and '.join(names)} are both {kind}; choose one")
+            raise _choice_error(
+                bag, f"{' and '.join(names)} are both {kind}; choose one with --topic"
+            )
     left_out: dict[str, str] = {}
     joints = _choose_joints(bag, robot, kinds[JOINT_STATE], left_out)
     wrench = _choose_wrench(bag, kinds[WRENCH], bool(wanted), left_out)
@@ -167,7 +169,7 @@ def _candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]
         if wanted and name not in wanted:
             left_out[name] = "not chosen"
         elif not wanted and any(part in TWIN_OUTPUTS for part in name.split("/")[-2:]):
-            left_out[name] = "the twin's own"
+            left_out[name] = "published by pkm_twin"
         else:
             fit.append(name)
     return fit
@@ -178,7 +180,7 @@ def _only(bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[str, s
     if len(fit) > 1 and len(preferred) != 1:
         raise _choice_error(bag, f"{what} on {', '.join(fit)}; choose one with --topic")
     chosen = preferred[0] if preferred else fit[0]
-    left_out.update({name: f"{chosen} is taken" for name in fit if name != chosen})
+    left_out.update({name: f"{chosen} is used" for name in fit if name != chosen})
     return chosen
 
 

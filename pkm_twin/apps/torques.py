@@ -41,8 +41,8 @@ BLOCK = 4096
 ENDINGS = (".csv", ".parquet")
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
-MAPPED = "tables have the model's numbers of the joints; joint_map is for messages and bags"
-"""Said of a robot that has a map."""
+MAPPED = "tables use the model's joint values; joint_map applies to messages and bags only"
+"""Printed for a robot that has a map."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,11 @@ def motion_of_bag(
         (
             str(r.topics),
             f"payload: {r.load or 'the robot file alone'}",
-            *([f"left out as a node does: {refused}; first: {r.first_reject}"] if refused else []),
+            *(
+                [f"rejected messages, left out: {refused}; first: {r.first_reject}"]
+                if refused
+                else []
+            ),
             *([] if r.robot.controller.plain else [MAPPED]),
         ),
         at_rest(r, qd)[used],
@@ -143,7 +147,9 @@ def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -
             return None
         missing = [n for n, there in zip(names, present, strict=True) if not there]
         if missing:
-            raise ParameterError(str(path), None, f"a column {missing[0]!r} beside the others")
+            raise ParameterError(
+                str(path), None, f"a column {missing[0]!r} as for the other joints"
+            )
         return np.stack([columns[name] for name in names], -1)
 
     q = stack("position")
@@ -167,7 +173,7 @@ def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -
     still = None if qd is not None else np.abs(rates) <= rate_doubt(time, q, gradient_gain(time))
     notes = [] if carried is None else [f"payload: {carried}"]
     if posed:
-        notes.append(f"joint positions by the pose, {', '.join(machine.pose_names)}")
+        notes.append(f"joint positions computed from the pose, {', '.join(machine.pose_names)}")
     return Motion(
         machine,
         time,

@@ -64,12 +64,12 @@ def atlas(
         str, typer.Argument(help="a robot's name (see `pkm-twin robots`) or a YAML file")
     ],
 ) -> None:
-    """Compute a quantity over a robot's whole workspace: a NetCDF file and its pictures.
+    """Compute a workspace map: a NetCDF file and its pictures.
 
-    Ctrl-C stops it; finished parts stay in FILE.nc.parts, and the same command goes on from there,
-    with the same result. One run at a time works on a file. Machines and memory: docs/scale.md.
+    Ctrl-C stops it. Finished parts stay in FILE.nc.parts, and the same command continues from there
+    with the same result. Only one run at a time can write a file. docs/scale.md has the cost.
 
-    The options of a kind: `pkm-twin atlas ROBOT KIND --help`.
+    For the options of a kind use `pkm-twin atlas ROBOT KIND --help`.
     """
     context.obj = robot
 

@@ -64,12 +64,12 @@ _MESSAGE_COST = 512
 
 
 class DamagedBagError(BagError):
-    """A bag that is damaged or cut; ``salvageable`` messages in it are still whole."""
+    """A damaged or truncated bag; ``salvageable`` is the number of intact messages in it."""
 
     def __init__(
         self, message: str, *, path: Path, reason: str, offset: int | None, salvageable: int
     ) -> None:
-        text = f"{message}; {salvageable} whole messages can be recovered"
+        text = f"{message}; {salvageable} intact messages can be recovered"
         super().__init__(text, path=path, reason=reason, offset=offset)
         self.salvageable = salvageable
 

@@ -333,7 +333,7 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
     reason = reason or damage
     for file in files:
         if target.exists() and file.path.exists() and target.samefile(file.path):
-            raise BagError("the target is the source itself", path=target, reason="exists")
+            raise BagError("target and source are the same file", path=target, reason="exists")
     try:
         with replacing(target) as hidden:
             result = _write_salvage(files, hidden, target)

@@ -55,13 +55,13 @@ def _clamped(value: Any) -> Any:
 def clearance(robot: Robot, pose: ArrayLike) -> Array:
     """Least distance between the surfaces of members of different limbs, shape (...), m.
 
-    Members are round bars between their joints, of the outer diameters in the robot's file:
-    the bars of the 2UPR-RPU, the limbs of the 3-PRRU, arms and rods of a Delta. Zero where two
-    touch; below zero they are in each other, by the axes' distance less the radii. Of platform,
-    base, drives and joints the files tell no shape, so they are not counted.
+    Members are round bars between their joints, with the outer diameters in the robot's file: the
+    bars of the 2UPR-RPU, the limbs of the 3-PRRU, arms and rods of a Delta. The value is the
+    distance of the axes minus the radii: zero if two members touch, negative if they intersect. The
+    files contain no shapes of platform, base, drives and joints, so these are left out.
 
     :param pose: shape (..., m), in the robot's pose coordinates.
-    :raises ParameterError: the file does not tell the members' diameters.
+    :raises ParameterError: the file has no diameters of the members.
     :raises UnreachableError: a pose that is none of the mechanism's, by limb, sample and miss.
     :raises SingularityError: a pose where the mechanism is singular.
     :raises ValueError: a pose that is not finite.

@@ -58,9 +58,9 @@ def singular_home(engine: Engine, rank: int, beside: int) -> ParameterError:
         _owners(engine, extra) if here.shape[1] > there.shape[1] else list(engine.graph.actuated)
     )
     return ParameterError(
-        "joints", f"rank {rank} of the closures at home, {beside} beside it",
-        f"a home that is no singularity: move it, as {', '.join(names[:8])} can move in it without "
-        "the others",
+        "joints", f"rank {rank} of the closures at home, {beside} near it",
+        f"a home that is not a singularity; at this home {', '.join(names[:8])} can move without "
+        "the others, so choose another pose",
     )  # fmt: skip
 
 

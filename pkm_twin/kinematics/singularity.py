@@ -100,7 +100,7 @@ class Placed(Motion):
         columns = difference(self.turn_columns(b), self.turn_columns(a))
 
         def bias() -> Any:
-            raise NotImplementedError("a couple is looked at where it holds")
+            raise NotImplementedError("the acceleration of a couple is not needed")
 
         return Row(
             rod.name, 0.0, {k: c @ normal for k, c in columns.items()}, bias, 1.0, a, b, xb,

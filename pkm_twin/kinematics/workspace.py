@@ -88,13 +88,13 @@ def within_limits(robot: Robot, q: ArrayLike) -> Mask:
 
 
 def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Mask:
-    """Whether poses keep the limits of actuators and passive joints and limbs apart, shape (...).
+    """Whether a pose is inside all joint limits and without limb interference, shape (...).
 
-    Limits that are absent hold everywhere; a pose that is not finite raises.
+    A missing limit is no limit. A pose that is not finite raises an error.
 
     :param pose: shape (..., m), in the robot's pose coordinates, m and rad.
-    :param least_clearance: what :func:`clearance` has to be above, m; -inf lets limbs meet. It
-        bounds no robot whose clearance is not known.
+    :param least_clearance: least value of :func:`clearance`, m; -inf permits limb interference. It
+        has no effect for a robot whose clearance is not known.
     """
     poses = vectors(pose, len(robot.pose_names), "the pose")
     q, inside = try_inverse(robot, poses)

@@ -47,7 +47,9 @@ def robot_path(robot: str | Path) -> Path:
     if text.endswith(".xacro"):
         written = Path(text.removesuffix(".xacro")).with_suffix(".urdf").name
         raise ParameterError(
-            text, "a xacro file", f"a URDF: run `xacro {Path(text).name} > {written}` and give that"
+            text,
+            "a xacro file",
+            f"a URDF: run `xacro {Path(text).name} > {written}` and use that file",
         )
     if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
         return Path(robot)
@@ -59,13 +61,13 @@ def robot_path(robot: str | Path) -> Path:
 def load(robot: str | Path, *, platform: str | None = None) -> Robot:
     """A robot by its name in ``config/``, from a parameter file, or from a URDF with its loops.
 
-    Of a user's file what was done to it, and numbers that are hardly meant, are given as warnings
+    Changes that the import made to a user's file, and implausible numbers in it, give warnings
     (:class:`pkm_twin.errors.RobotWarning`), each once.
 
     :param robot: a name such as ``"delta_cu"``, or a path to a YAML, URDF or MJCF file.
     :param platform: of a URDF the link that carries the tool; default by its name.
     :raises UnknownNameError: no such name; the closest one is named.
-    :raises ParameterError: a file, key, type or value that is refused, by its dotted name.
+    :raises ParameterError: an invalid file, key, type or value, with its dotted name.
     """
     path = robot_path(robot)
     if path.suffix in TREES:
@@ -75,7 +77,7 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
         robot_read = robot_of_data(reading.description, path.stem)
         return _told(path, replace(robot_read, home_choice=reading.home))
     if platform is not None:
-        raise ParameterError("platform", platform, "none: the file names its own platform")
+        raise ParameterError("platform", platform, "none, because the file names its platform")
     return _told(path, robot_of_data(schema.read_yaml(path), path.stem))
 
 

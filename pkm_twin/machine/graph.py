@@ -241,7 +241,7 @@ class Graph:
         if self.platform not in self.bodies:
             raise ParameterError("platform", self.platform, f"one of {', '.join(self.bodies)}")
         if BASE in self.bodies:
-            raise ParameterError(f"bodies.{BASE}", BASE, "a name that is not the ground's")
+            raise ParameterError(f"bodies.{BASE}", BASE, "another name, because base is the ground")
         for joint in self.joints.values():
             self._check_ends(f"joints.{joint.name}", joint.inner, joint.outer)
             self._check_axes(joint)
@@ -275,7 +275,9 @@ class Graph:
                 f"{path}.axes", joint.axes.tolist(), "two axes that are not parallel"
             )
         if joint.actuated and len(joint.freedoms) != 1:
-            raise ParameterError(f"{path}.actuated", joint.kind, "a joint of one freedom")
+            raise ParameterError(
+                f"{path}.actuated", joint.kind, "a joint with one degree of freedom"
+            )
 
     def _check_connection(self) -> None:
         reached, todo = {BASE}, [BASE]

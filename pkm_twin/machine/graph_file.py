@@ -117,7 +117,9 @@ class JointSpec:
     at: Array | None = schema.vector(3, unit="m", default=None)
     axis: Array | None = schema.vector(3, default=None)
     axes: Array | None = schema.matrix(2, 3, default=None)
-    lead: float | None = schema.number(at_least=-10.0, at_most=10.0, unit="m a turn", default=None)
+    lead: float | None = schema.number(
+        at_least=-10.0, at_most=10.0, unit="m per turn", default=None
+    )
     actuated: bool = schema.flag(default=False)
     home: float | None = schema.number(unit="{joint}", default=None)
     limits: LimitSpec | None = schema.section(LimitSpec, default=None)
@@ -142,7 +144,7 @@ class JointSpec:
                 if not float(np.linalg.norm(row)) > 1e-9:
                     raise ParameterError(f"{path}.{key}", row.tolist(), "a vector with a length")
         if kind.threaded() != bool(self.lead):
-            allowed = "m a turn, not zero" if kind.threaded() else f"none for a {self.type} joint"
+            allowed = "m per turn, not zero" if kind.threaded() else f"none for a {self.type} joint"
             raise ParameterError(f"{path}.lead", self.lead, allowed)
         if self.at is None and kind.placed:
             raise ParameterError(f"{path}.at", None, f"the point of a {self.type} joint, m")

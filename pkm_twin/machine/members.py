@@ -84,11 +84,11 @@ def compliances(**options: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Tube:
-    """Schema of a member whose mass is given elsewhere: moduli (Pa), outer diameter (m).
+    """A tube whose mass is given elsewhere: moduli (Pa), outer diameter (m).
 
-    Of ``density`` (kg/m3) and ``inner_diameter`` (m) one is given, and the other follows from
-    the mass. ``shear_factor``: A / A_shear; default Cowper's (1966) of a tube at a Poisson's ratio
-    of 0, 7/6 solid to 2 thin-walled. At 0.3, as of metals, they are 1.13 and 1.88.
+    Give either ``density`` (kg/m3) or ``inner_diameter`` (m); the other follows from the mass.
+    ``shear_factor``: A / A_shear. The default is Cowper's (1966) for a tube at a Poisson's ratio of
+    0, 7/6 solid to 2 thin-walled. At 0.3, as for metals, the factors are 1.13 and 1.88.
     """
 
     youngs_modulus: float = modulus()

@@ -199,7 +199,7 @@ class _Reader:
         if m.jnt_actfrclimited[joint]:
             limits["effort"] = float(np.abs(m.jnt_actfrcrange[joint]).max())
         if m.jnt_stiffness[joint]:
-            warn(self.path, f"the spring of joint {name} is left out")
+            warn(self.path, f"the spring of joint {name} is ignored")
         dof = m.jnt_dofadr[joint]
         return {
             "axes": axis[None],
@@ -232,7 +232,7 @@ class _Reader:
                 continue
             if other >= 0 or self.types[int(self.model.jnt_type[joint])] in ("free", "spherical"):
                 raise ParameterError(
-                    f"equality.{name}", self._name("JOINT", joint), "joints that move by themselves"
+                    f"equality.{name}", self._name("JOINT", joint), "joints without coupling"
                 )
             locks[joint] = float(data[0])
         return locks

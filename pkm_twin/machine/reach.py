@@ -52,7 +52,9 @@ def position_box(graph: Graph, limits: Array | None) -> Array:
     if not np.isfinite(box).all():
         free = [name for name, way in travel.items() if math.isinf(way)]
         named = f"joints.{free[0]}.limits.position" if free else "joints"
-        raise ParameterError(named, None, "limits of the slides: without them poses have no end")
+        raise ParameterError(
+            named, None, "limits of the slides; without them the workspace is unbounded"
+        )
     return box
 
 

@@ -64,7 +64,7 @@ Mask = NDArray[np.bool_]
 R = TypeVar("R", bound="Robot")
 
 SINGULARITY_BOUND: Final = 1e-9
-"""Least singularity measure (0 singular, 1 best) at which a Jacobian is inverted."""
+"""Least singularity index (0 singular, 1 best) at which a Jacobian is inverted."""
 SAME_POSE: Final = 1e-7
 """Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
 assembly is farther away unless a singularity is nearer than that."""
@@ -283,7 +283,9 @@ class Robot:
         if self.drive is None:
             return given
         if given:
-            raise ParameterError("inertia.rotor_inertia", given, "0 beside a section drive")
+            raise ParameterError(
+                "inertia.rotor_inertia", given, "0, because the section drive has the rotor"
+            )
         return self.drive.reflected(slides, "drive")
 
     def shared_parameters(self) -> tuple[Shared, ...]:
@@ -425,9 +427,9 @@ class Robot:
 
     @property
     def element_names(self) -> tuple[str, ...]:
-        """Names that ``element_compliance`` may have, bars first; errors as :meth:`structure`.
+        """Valid names in ``element_compliance``, bars first; errors as :meth:`structure`.
 
-        Energies and factors have an order of their own, which comes with them as ``elements``.
+        Results of energies and factors have their own order, in their attribute ``elements``.
         """
         return self.structure().elements
 
@@ -461,7 +463,7 @@ class Robot:
         return (*self.graph.bodies, *self.graph.rods, "payload")
 
     def inverse(self, pose: ArrayLike) -> Array:
-        """Joint positions q of a pose, shape (..., n); ``forward`` of them is the pose.
+        """Joint positions q (..., n) of poses (..., m); ``forward(q)`` is the pose.
 
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a pose beyond a singularity, or in one.
@@ -472,7 +474,7 @@ class Robot:
         return q
 
     def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
-        """Joint positions (..., n), NaN where a pose is none of the machine's; which are good."""
+        """Joint positions (..., n), NaN for an invalid pose; and which poses are valid, (...)."""
         q, codes = self.judged_inverse(pose, _alone)
         good = np.ones(q.shape[:-1], bool) if codes is None else np.asarray(codes[..., 0] == 0.0)
         return np.where(good[..., None], q, np.nan), good
@@ -633,7 +635,7 @@ class Robot:
         return self.engine.forward
 
     def try_forward(self, q: ArrayLike) -> tuple[Array, Mask]:
-        """Poses (..., m), NaN where there is no assembly; which are good."""
+        """Poses (..., m), NaN where there is no assembly; and which q are valid, (...)."""
         (pose, _, _), status = self.engine.forward(_NONE, q)
         good = np.ones(pose.shape[:-1], bool) if status is None else status[..., 0] == 0.0
         return pose, np.asarray(good)
@@ -653,9 +655,9 @@ class Robot:
         return outputs
 
     def placements(self, q: ArrayLike) -> tuple[dict[str, Array], dict[str, Array]]:
-        """Rotation from home (..., 3, 3), and place of the frame's origin (..., 3), of every body.
+        """Rotation from home (..., 3, 3) and position of the frame's origin (..., 3) of each body.
 
-        A body's origin at home is that of ``engine.tree.at``. Errors as :meth:`forward`.
+        ``engine.tree.at`` has the origins at home. Errors as :meth:`forward`.
         """
         (flat,), status = self.engine.placement(_NONE, q)
         if status is not None:
@@ -675,7 +677,7 @@ class Robot:
         return self.platform(self.inverse(pose))[1]
 
     def home(self) -> Array:
-        """The pose at home, shape (m,): that of the graph, which all vectors of it belong to."""
+        """The home pose (not joint positions), shape (m,): the pose in which the graph is given."""
         return self.engine.home_pose.copy()
 
     def jacobian(self, q: ArrayLike) -> Array:
@@ -719,11 +721,12 @@ class Robot:
         return np.array([self.size if mixed and u == "rad" else 1.0 for u in self.joint_units])
 
     def singularity(self, q: ArrayLike) -> Array:
-        """How far a joint state is from a singularity: 0 in one, 1 at best, shape (...).
+        """The singularity index of joint positions: 0 in a singularity, 1 at best, shape (...).
 
-        Of any kind: the actuators are locked and the platform or another body moves (constraint
-        singularities included), or joints move and the platform does not (the edge of reach); see
-        ``kinematics.singularity``. No unit or scale counts. Errors as :meth:`forward`.
+        It includes singularities of any kind: the platform or another body can move with locked
+        actuators (constraint singularities included), or joints can move without the platform (the
+        edge of the workspace); see ``kinematics.singularity``. It is dimensionless and independent
+        of the machine's scale. Errors as :meth:`forward`.
         """
         one = self.call_one("singularity", self.singularity_kernel, _NONE, q)
         if one is not None:
@@ -744,9 +747,9 @@ class Robot:
         return np.where(good, measure[..., 0], 0.0), np.asarray(good)
 
     def torque_loop(self, samples: int = 1) -> TorqueLoop:
-        """Inverse dynamics for a control loop, on arrays that stay where they are.
+        """Inverse dynamics for a control loop, with preallocated arrays.
 
-        Write ``q, qd, qdd, wrench``, call, read ``tau`` and the status that the call returns; see
+        Write ``q, qd, qdd, wrench``, call it, and read ``tau`` and the returned status; see
         :class:`delta_dynamics.loop.TorqueLoop`.
         """
         made: TorqueLoop = import_module("delta_dynamics.loop").TorqueLoop(self, samples)
@@ -754,7 +757,7 @@ class Robot:
 
     @cached_property
     def passive_joints(self) -> tuple[str, ...]:
-        """Names of the passive joints' numbers, one a revolute or prismatic axis."""
+        """Names of the passive joints' values, one per revolute or prismatic axis."""
         return passive_names(self.engine)
 
     def passive(self, q: ArrayLike) -> Array:
@@ -775,13 +778,13 @@ class Robot:
         return flat
 
     def grid(self) -> PoseGrid:
-        """How atlases lay out this machine's poses; without an axis of its own, as a box."""
+        """The grid of poses of a workspace map; a box for a machine without an axis."""
         return PoseGrid("box", self.pose_names)
 
     def search_box(self) -> Array:
-        """Bounds outside of which no pose of the workspace lies, shape (m, 2), m and rad.
+        """A box that contains all poses of the workspace, shape (m, 2), m and rad.
 
-        :raises ParameterError: what is missing that would bound the workspace.
+        :raises ParameterError: a limit that would bound the workspace is missing.
         """
         place = position_box(self.graph, self.limits.position)
         rows = []
@@ -796,10 +799,10 @@ class Robot:
     def changed(self: R, **sections: Mapping[str, object] | object) -> R:
         """A copy with new values, e.g. ``payload={"mass": 0.2}, geometry={"arm_length": 0.3}``.
 
-        All values are checked as in a file; one bad value rejects all. A section of geometry,
-        masses or members makes the machine of a new file: its home is chosen again.
+        All values are checked as in a file; one invalid value rejects all. A change of geometry,
+        masses or members is like a new file: the home is chosen again.
 
-        :raises ParameterError: a value out of range, or a machine that cannot be.
+        :raises ParameterError: a value out of range, or an impossible machine.
         """
         if not set(sections) <= set(self.changeable):
             known = self.parameter_sections()
@@ -819,7 +822,7 @@ class Robot:
         return made
 
     def refuse_joints(self, status: Array, q: ArrayLike, inputs: Sequence[ArrayLike] = ()) -> None:
-        """Raise the typed error of the first refused sample, if there is one.
+        """Raise the typed error of the first rejected sample, if there is one.
 
         :param status: of a kernel, shape (..., 2).
         :param inputs: everything that the kernel was given.

@@ -67,7 +67,7 @@ class _StrictLoader(yaml.SafeLoader):
             raise yaml.YAMLError(f"{node.value}: write a decimal number, or text in quotes")
         value: int = super().construct_yaml_int(node)
         if value.bit_length() > 1023:
-            raise yaml.YAMLError("an integer beyond all floats")
+            raise yaml.YAMLError("an integer too large for a float")
         return value
 
     def construct_yaml_float(self, node: Any) -> float:
@@ -531,7 +531,7 @@ def _number(
     try:
         result = float(value)
     except OverflowError:
-        raise ParameterError(field, "an integer beyond all floats", bound) from None
+        raise ParameterError(field, "an integer too large for a float", bound) from None
     if math.isfinite(result) and abs(result) > MAX_SIZE:
         bound += f", at most {MAX_SIZE:g} in size"
     finite = abs(result) <= MAX_SIZE or (infinite and result == math.inf)

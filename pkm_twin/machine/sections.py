@@ -76,23 +76,26 @@ def check_angles(angle: float, path: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class DriveSpec:
-    """A drive: inertia of the rotor (kg m2) behind a gear of ``ratio`` turns a turn, or of a screw
-    or belt of ``lead`` metres a turn; reflected to the joint it is ``rotor_inertia``.
+    """A drive: the inertia of the rotor (kg m2), and a gear with ``ratio`` (motor turns per turn of
+    the joint), or a screw or belt with ``lead`` (m per turn of the motor). The inertia reflected to
+    the joint is ``rotor_inertia``.
 
-    ``efficiency``: of the gear or screw, for the sizing of motors; the dynamics read none of it.
+    ``efficiency``: of the gear or screw, for sizing motors; the dynamics do not use it.
     """
 
     inertia: float = schema.number(at_least=0.0, unit="kg m2")
     ratio: float | None = schema.number(
-        at_least=1e-6, at_most=1e6, unit="turns a turn", default=None
+        at_least=1e-6, at_most=1e6, unit="turns per turn", default=None
     )
-    lead: float | None = schema.number(at_least=1e-6, at_most=1e6, unit="m a turn", default=None)
+    lead: float | None = schema.number(at_least=1e-6, at_most=1e6, unit="m per turn", default=None)
     efficiency: float = schema.number(above=0.0, at_most=1.0, default=1.0)
 
     def verify(self, path: str) -> None:
         """One of the two."""
         if (self.ratio is None) == (self.lead is None):
-            raise ParameterError(path, None, "one of ratio (turns a turn) and lead (m a turn)")
+            raise ParameterError(
+                path, None, "either `ratio` (turns per turn) or `lead` (m per turn)"
+            )
 
     @property
     def turns(self) -> float:
@@ -103,7 +106,7 @@ class DriveSpec:
     def reflected(self, slides: bool, path: str) -> float:
         """Kg m2 of a joint that turns, kg of one that slides."""
         if slides != (self.lead is not None):
-            what = "lead, m a turn" if slides else "ratio, turns a turn"
+            what = "lead, m per turn" if slides else "ratio, turns per turn"
             raise ParameterError(path, None, f"{what}, for this type of joint")
         return self.inertia * self.turns**2
 

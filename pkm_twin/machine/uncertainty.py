@@ -35,7 +35,7 @@ class UncertaintyEntry:
     def verify(self, path: str) -> None:
         """One of both."""
         if (self.deviation is None) == (self.relative is None):
-            raise ParameterError(path, None, "either deviation or relative")
+            raise ParameterError(path, None, "either `deviation` or `relative`")
 
 
 @dataclass(frozen=True, eq=False)

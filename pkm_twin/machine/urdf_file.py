@@ -121,7 +121,7 @@ def read(path: Path, robot: ET.Element) -> Urdf:
         raise ParameterError(
             str(path),
             f"no loop closure, and passive joints: {', '.join(idle)}",
-            "<constraint> or <loop> elements, or closed_loop in a YAML file beside it",
+            "<constraint> or <loop> elements, or closed_loop in a YAML file next to it",
         )
     name = robot.get("name") or path.stem
     initial = _initial(robot, actuated)
@@ -142,7 +142,7 @@ def _link(element: ET.Element, name: str) -> Link:
         raise ParameterError(f"{where}.mass", value, "zero or more, kg")
     inertia = urdf_xml.single(inertial, "inertia", where)
     if inertia is None:
-        raise ParameterError(f"{where}.inertia", None, "an <inertia> beside the mass, kg m2")
+        raise ParameterError(f"{where}.inertia", None, "an <inertia> for the mass, kg m2")
     xx, xy, xz, yy, yz, zz = (
         urdf_xml.number(
             inertia.get(key, "0" if key[1] != key[2] else None), f"{where}.inertia.{key}"
@@ -162,7 +162,7 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     if kind not in JOINTS:
         raise UnknownNameError(f"{where}.type", kind, JOINTS)
     if element.find("mimic") is not None:
-        raise ParameterError(f"{where}.mimic", "<mimic>", "joints that move by themselves")
+        raise ParameterError(f"{where}.mimic", "<mimic>", "joints without coupling")
     parent, child = (
         urdf_xml.reference(urdf_xml.single(element, end, where), f"{where}.{end}", links)
         for end in ("parent", "child")
@@ -221,13 +221,13 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
             raise ParameterError(
                 f"joint.{joint.name}.child",
                 joint.child,
-                f"a tree of links: {joint.child!r} hangs on {parents[joint.child].name!r} already; "
-                "a loop is closed by a <constraint> element",
+                f"a tree of links: {joint.child!r} already has the parent joint "
+                f"{parents[joint.child].name!r}; close the loop with a <constraint> element",
             )
         parents[joint.child] = joint
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
-        raise ParameterError("robot", roots, "one root link: exactly one that is no child")
+        raise ParameterError("robot", roots, "exactly one root link (a link that is not a child)")
     known = {roots[0]}
     for link in links:
         # Up to what is known to hang on the root: every link is passed once.
@@ -236,7 +236,7 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
             if link in way:
                 circle = sorted(way)
                 raise ParameterError(
-                    f"joint.{parents[link].name}", circle, "a tree: these go in a circle"
+                    f"joint.{parents[link].name}", circle, "a tree; these links form a circle"
                 )
             way[link] = None
             link = parents[link].parent
@@ -265,7 +265,7 @@ def _retyped(joints: dict[str, Joint], beside: dict[str, Any]) -> dict[str, Join
     """Joints that the YAML file calls spherical, universal or fixed."""
     names, kinds = beside.get("joint_name", []), beside.get("joint_type", [])
     if len(names) != len(kinds):
-        raise ParameterError("joint_type", kinds, f"one a name of joint_name: {len(names)}")
+        raise ParameterError("joint_type", kinds, f"{len(names)}, one per name in joint_name")
     unit = dict(zip("XYZ", np.eye(3), strict=True))
     universal = {f"UJOINT_{a}{b}": (a, b) for a in "XYZ" for b in "XYZ" if a != b}
     joints = dict(joints)
@@ -317,7 +317,7 @@ def _actuated(
         raise ParameterError(
             str(path),
             "no actuated joint",
-            "command interfaces in a <ros2_control> element, or name_mot in a YAML file beside it",
+            "command interfaces in a <ros2_control> element, or name_mot in a YAML file next to it",
         )
     if len(set(names)) != len(names):
         raise ParameterError(source, names, "each joint once")
@@ -377,7 +377,7 @@ def _warn_of_units(
     if size > LARGE:
         warn(
             path,
-            f"{where}: an offset of {size:g} m; a URDF is in metres, does it say millimetres?",
+            f"{where}: an offset of {size:g} m; a URDF uses metres; are these millimetres?",
         )
     for top in robot:
         angles = [word for e in top.iter() for word in e.get("rpy", "").split()]
@@ -385,6 +385,6 @@ def _warn_of_units(
         if largest > 2.0 * math.pi + 1e-6:
             warn(
                 path,
-                f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF is in radians, does it "
-                "say degrees?",
+                f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF uses radians; "
+                "are these degrees?",
             )

@@ -136,7 +136,7 @@ def _pairs(
     pairs = beside.get("closed_loop", [])
     kinds = beside.get("type", ["6d"] * len(pairs))
     if len(kinds) != len(pairs):
-        raise ParameterError("type", kinds, f"one a pair of closed_loop: {len(pairs)}")
+        raise ParameterError("type", kinds, f"{len(pairs)}, one per pair in closed_loop")
     closures = []
     for i, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
         if not isinstance(pair, list) or len(pair) != 2:

@@ -112,7 +112,7 @@ def name(element: ET.Element, taken: Container[str]) -> str:
     if not own:
         raise ParameterError(kind, own, f"every <{kind}> with a name")
     if own in taken:
-        raise ParameterError(f"{kind}.{own}", own, "a name that stands once")
+        raise ParameterError(f"{kind}.{own}", own, "a unique name")
     return own
 
 

@@ -113,7 +113,7 @@ def _built(robot: Robot, data: dict[str, Any], spread: Mapping[str, float]) -> R
             raise ParameterError(
                 "spread.lengths",
                 spread["lengths"],
-                f"0 for this robot: it closes no more ({error})",
+                f"0 for this robot, because its loops do not close ({error})",
             ) from error
         raise
     return made

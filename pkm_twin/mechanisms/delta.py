@@ -84,7 +84,10 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class Inertia:
-    """Masses (kg) and inertias (kg m2); arm_inertia about the arm's com, across; thin rods."""
+    """Masses (kg) and inertias (kg m2).
+
+    ``arm_inertia``: about the arm's centre of mass, across the arm. Forearms are thin rods.
+    """
 
     platform_mass: float = mass()
     arm_mass: float = mass()
@@ -98,15 +101,16 @@ class Inertia:
 
 @dataclass(frozen=True, eq=False)
 class Members:
-    """Arms and forearms as tubes, whose masses stand in the inertia section.
+    """Arms and forearms as tubes; their masses are in the section inertia.
 
-    For elasticity, and by the outer diameters for limb interference; dynamics read none of it.
+    Used for elasticity, and the outer diameters for limb interference; the dynamics do not use it.
 
-    ``forearm``: each of a parallelogram's two rods, ``parallelogram_width`` apart (m), half of
-    the forearm's mass each. ``rcu_forearm``: the one rod of an rcu limb, for modes of a robot that
-    has one. ``platform_inertia``: about the platform's origin, kg m2; default a thin disc of the
-    platform's radius. ``drive_compliance``: of a locked drive, rad/(N m); ``elbow_compliance`` and
-    ``platform_joint_compliance``: of each rod's end in all directions that it holds, m/N.
+    ``forearm``: each of a parallelogram's two rods, ``parallelogram_width`` apart (m), each with
+    half of the forearm's mass. ``rcu_forearm``: the one rod of an rcu limb, for modes of a robot
+    with such a limb. ``platform_inertia``: about the platform's reference point, kg m2; default a
+    thin disc of the platform's radius. ``drive_compliance``: of a locked drive, rad/(N m).
+    ``elbow_compliance`` and ``platform_joint_compliance``: of each rod's end in all directions that
+    the joint constrains, m/N.
     """
 
     arm: Tube = schema.section(Tube)
@@ -197,7 +201,9 @@ class Delta(Robot):
         if platform is None:
             g = self.geometry
             raise ParameterError(
-                "geometry.forearm_length", g.forearm_length, "one with which limbs can be assembled"
+                "geometry.forearm_length",
+                g.forearm_length,
+                "a length with which the limbs can be assembled",
             )
         return q, platform
 

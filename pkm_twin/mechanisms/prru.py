@@ -78,7 +78,7 @@ PLATFORM: Final = "platform"
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Lengths (m), limb azimuths phi (rad), and where the sliders stand."""
+    """Lengths (m), limb azimuths phi (rad), and the position of the sliders (above or below)."""
 
     base_radius: float = length()
     platform_radius: float = length()
@@ -104,9 +104,9 @@ class Inertia:
 
     ``link_com``: both links' centre of mass as a fraction of l from the slider joint.
     ``lower_link_inertia``, ``upper_link_inertia``: about that centre, [across, along the limb];
-    default a thin rod of length l. ``platform_com`` and ``platform_inertia`` (about the com)
-    in platform axes; default a thin disc of the platform's radius. ``rotor_inertia``: of the
-    drives, reflected to the sliders, kg, inertia without weight.
+    the default is a thin rod of length l. ``platform_com`` and ``platform_inertia`` (about the
+    centre of mass) are in platform axes; the default is a thin disc of the platform's radius.
+    ``rotor_inertia``: of the drives, reflected to the sliders, kg, without weight.
     """
 
     slider_mass: float = mass()
@@ -296,7 +296,9 @@ class Prru(Robot):
         g, travel = self.geometry, self.limits.position
         if travel is None:
             raise ParameterError(
-                "limits.position", None, "limits of the sliders: without them z has no end"
+                "limits.position",
+                None,
+                "limits of the sliders; without them the workspace is unbounded",
             )
         reach, right = g.limb_length + g.platform_radius, np.pi / 2
         z = float(travel.min()) - reach, float(travel.max()) + reach

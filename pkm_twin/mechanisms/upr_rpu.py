@@ -90,8 +90,8 @@ class Geometry:
 class Members:
     """Round bars: moduli (Pa), diameters (m), and the shear factor A / A_shear.
 
-    Its default 1 is the paper's; Cowper's (1966) of a round bar is 7/6 at a Poisson's ratio of 0
-    and 1.13 at 0.3.
+    The default 1 is that of the paper. Cowper's factor (1966) of a round bar is 7/6 at a Poisson's
+    ratio of 0 and 1.13 at 0.3.
     """
 
     youngs_modulus: float = modulus()
@@ -110,8 +110,9 @@ class Members:
 class JointsCompliance:
     """Compliance of each joint in its own axes u, v, w: three m/N, three rad/(N m).
 
-    R of UPR: v its axis, w from A to B. U of UPR and of RPU: u, v its axes. R of RPU: u its
-    axis, w from A to B. Entries about an axis of the joint are free (.inf); 0 is rigid.
+    R of UPR: v is its axis, w points from A to B. U of UPR and of RPU: u and v are its axes. R of
+    RPU: u is its axis, w points from A to B. Entries about an axis of the joint are free (.inf); 0
+    is rigid.
     """
 
     upr_revolute: Array = compliances()
@@ -134,14 +135,14 @@ class JointsCompliance:
 
 @dataclass(frozen=True, eq=False)
 class Inertia:
-    """Density of the bars (kg/m3), and the platform with what it carries.
+    """Density of the bars (kg/m3), and the platform's mass.
 
-    As rigid bodies a limb is two equal round bars, each half as long as the limb at home, which is
-    the middle of ``limits.limb_length``: the lower from B, the upper from A; they meet at home. For
-    modes it is one bar from B to A.
-    ``rotor_inertia``: of the drives, reflected to the limbs, kg, inertia without weight.
-    ``platform_com`` (m) and ``platform_inertia`` (about the com, kg m2) in platform axes; default
-    a thin disc of the platform's radius about its origin.
+    As rigid bodies, a limb is two equal round bars, each half as long as the limb at home, whose
+    length is the middle of ``limits.limb_length``. The lower bar starts at B, the upper one at A;
+    they meet at home. For modes a limb is one bar from B to A.
+    ``rotor_inertia``: of the drives, reflected to the limbs, kg, without weight.
+    ``platform_com`` (m) and ``platform_inertia`` (about the centre of mass, kg m2) are in platform
+    axes; the default is a thin disc of the platform's radius about the reference point.
     """
 
     density: float = schema.number(above=0.0, at_most=1e5, unit="kg/m3")
@@ -155,7 +156,7 @@ class Inertia:
 class Limits:
     """Limb lengths [min, max], one pair or three (m); bound of every passive joint's angle (rad).
 
-    Absent is None: no limit.
+    The default is no limit.
     """
 
     limb_length: Array | None = schema.interval(above=0.0, count=3, unit="m", default=None)
@@ -405,7 +406,9 @@ class UprRpu(Robot):
         lengths = self.limits.limb_length
         if lengths is None:
             raise ParameterError(
-                "limits.limb_length", None, "limits of the limbs: without them z has no end"
+                "limits.limb_length",
+                None,
+                "limits of the limbs; without them the workspace is unbounded",
             )
         right = math.pi / 2
         return np.array([(-float(lengths[:2].max()), 0.0), (-right, right), (-right, right)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Paths, their time laws, the fastest motion along them, and the sizing of drives."""
+"""Paths, motion laws, the fastest motion along a path, and the sizing of drives."""
 
 from pkm_twin.paths.constraints import Limits
 from pkm_twin.paths.fastest import fastest, timed

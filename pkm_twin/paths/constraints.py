@@ -32,7 +32,7 @@ NOTHING: Final = 1e-12
 
 @dataclass(frozen=True)
 class Limits:
-    """What a motion must keep; infinite where there is no limit.
+    """Limits of a motion; infinite means no limit.
 
     ``effort``, ``velocity``, ``acceleration``, ``jerk``: of the actuated joints, shape (n,).
     ``speed``: of the platform's reference point, m/s.

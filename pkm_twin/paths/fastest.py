@@ -63,21 +63,21 @@ def fastest(
 
     :param robot: with the payload that it carries, ``robot.changed(payload=...)``.
     :param path: of ``paths.through``, ``lines``, ``cycle`` or ``circle``; or poses (k, m), through
-        which the path goes smoothly without a stop.
+        which the path passes smoothly without a stop.
     :param effort: greatest efforts, (n,) or one for all, N m or N; default the robot file's.
-    :param velocity: of the joints, likewise, rad/s or m/s.
+    :param velocity: largest velocities of the joints, rad/s or m/s; default the robot file's.
     :param acceleration: of the joints, rad/s2 or m/s2; default no limit.
     :param jerk: of the joints, rad/s3 or m/s3; default no limit.
     :param speed: of the platform's reference point, m/s; default no limit.
-    :param share: part of the robot file's efforts and velocities that is used.
+    :param share: fraction of the robot file's efforts and velocities to use.
     :param singularity: least singularity index on the path, 0 to 1.
-    :param wrench: what the surroundings apply to the platform all the time, (6,), base axes.
+    :param wrench: constant external wrench on the platform, (6,), base axes.
     :param points: of the path, about; with a limit of jerk at most :data:`JERK_POINTS`.
     :returns: the motion: ``.times``, ``.q``, ``.qd``, ``.qdd``, ``.effort`` and ``.pose`` at its
         points, the same of ``.uniform(rate)`` and ``.sample(times)``; ``.bounds``, which limit
         binds when; ``.duration``, s.
-    :raises ParameterError: by the place: a pose out of reach, beyond a joint's limit, close to a
-        singularity, or where a drive cannot hold the machine; or no limit bounds the speed.
+    :raises ParameterError: with the position: a pose out of reach, beyond a joint's limit or close
+        to a singularity, or a drive that cannot hold the machine; or no limit bounds the speed.
     """
     made = path if isinstance(path, Path) else through(robot, path)
     limits = Limits.of(
@@ -109,7 +109,7 @@ def timed(
     points: int = POINTS,
     **bounds: Any,
 ) -> TimedPath:
-    """A motion along a path by a law, as short as the limits let it be or of a given duration.
+    """A motion along a path by a law, with a given duration or the shortest within the limits.
 
     :param law: ``fastest``, ``quintic`` or ``s-curve``, each from stop to stop.
     :param duration: of the whole, rests included, s; all stretches are slowed down alike.

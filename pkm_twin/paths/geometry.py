@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Space = Literal["pose", "joint"]
 
 SHORTEST: Final = 1e-9
-"""Distance below which two way-points are one, m."""
+"""Distance below which two waypoints are one, m."""
 SHARPEST: Final = -0.985
 """Cosine of the turn from which on a corner is a reversal (170 degrees) and cannot be rounded."""
 TANGENT: Final = 1e-6
@@ -78,22 +78,22 @@ def _points(robot: Robot, points: ArrayLike, space: Space) -> tuple[Array, Array
     names = robot.pose_names if space == "pose" else robot.joint_names
     if values.ndim != 2 or values.shape[1] != len(names) or len(values) < 2:
         raise ParameterError(
-            "way-points", f"shape {values.shape}", f"2 or more rows of {', '.join(names)}"
+            "waypoints", f"shape {values.shape}", f"2 or more rows of {', '.join(names)}"
         )
     if not np.isfinite(values).all():
         row = int(np.argwhere(~np.isfinite(values))[0, 0])
-        raise ParameterError(f"way-point {row}", values[row].tolist(), "finite numbers")
+        raise ParameterError(f"waypoint {row}", values[row].tolist(), "finite numbers")
     steps = np.linalg.norm(np.diff(values, axis=0) * scales_of(robot, space), axis=1)
     if not (steps > SHORTEST).any():
-        raise ParameterError("way-points", "all the same", "different way-points")
+        raise ParameterError("waypoints", "all equal", "two or more different waypoints")
     return values, np.concatenate([[True], steps > SHORTEST])
 
 
 def through(robot: Robot, points: ArrayLike, *, space: Space = "pose") -> Path:
-    """A smooth curve through way-points without a stop: a cubic spline over the chords' lengths.
+    """A smooth curve through waypoints without a stop: a cubic spline over the chords' lengths.
 
     :param points: shape (k, m), coordinates of the pose, or joint positions (k, n).
-    :raises ParameterError: fewer than two different way-points, or no numbers.
+    :raises ParameterError: fewer than two different waypoints, or values that are not finite.
     """
     values, new = _points(robot, points, space)
     values = values[new]
@@ -115,16 +115,16 @@ def lines(
     arc: ArrayLike = False,
     space: Space = "pose",
 ) -> Path:
-    """Straight lines and arcs between way-points, corners rounded or passed with a stop.
+    """Straight lines and arcs between waypoints, corners rounded or passed with a stop.
 
     :param points: shape (k, m), coordinates of the pose, or joint positions (k, n).
-    :param blend: by way-point (k,) or one for all: distance from the corner at which the path
+    :param blend: by waypoint (k,) or one for all: distance from the corner at which the path
         leaves the line, m (angles by the platform's radius); at most half of the shorter
         neighbouring line. 0 is a stop. It must be 0 where an arc begins or ends.
-    :param dwell: rest in each way-point, s, shape (k,) or one for all; above 0 it is a stop.
-    :param arc: which way-points (k,) are points in the middle of an arc, from the way-point before
+    :param dwell: rest in each waypoint, s, shape (k,) or one for all; above 0 it is a stop.
+    :param arc: which waypoints (k,) are points in the middle of an arc, from the waypoint before
         to the one behind. An arc and a tangent line meet without a stop.
-    :raises ParameterError: by the way-point.
+    :raises ParameterError: with the waypoint.
     """
     values, new = _points(robot, points, space)
     count = len(values)
@@ -134,8 +134,8 @@ def lines(
         bad = ~(np.isfinite(numbers) & (numbers >= 0.0))
         if bad.any():
             row = int(bad.argmax())
-            raise ParameterError(f"way-point {row}: {name}", numbers[row], "0 or more")
-    # A way-point that is repeated only adds its rest.
+            raise ParameterError(f"waypoint {row}: {name}", numbers[row], "0 or more")
+    # A waypoint that is repeated only adds its rest.
     for k in np.flatnonzero(np.logical_not(new)):
         dwells[k] += dwells[k - 1]
         keep = int(np.flatnonzero(new[:k])[-1])
@@ -146,7 +146,7 @@ def lines(
 
 
 class _Lines:
-    """Lines and arcs between way-points that differ."""
+    """Lines and arcs between waypoints that differ."""
 
     def __init__(
         self, robot: Robot, space: Space, points: Array, blends: Array, dwells: Array,
@@ -184,18 +184,18 @@ class _Lines:
         return Path(self.space, tuple(stretches), float(self.dwells[0]), "lines")
 
     def _moves(self) -> Sequence[tuple[Piece, int]]:
-        """Each line or arc, and the way-point that it ends in."""
+        """Each line or arc, and the waypoint that it ends in."""
         result: list[tuple[Piece, int]] = []
         k, last = 0, len(self.points) - 1
         if self.arcs[0] or self.arcs[last]:
             raise ParameterError(
-                "way-points: arc", "the first or last", "way-points between two others"
+                "waypoints: arc", "the first or last", "waypoints between two others"
             )
         while k < last:
             if self.arcs[k + 1]:
                 if self.arcs[k + 2]:
                     raise ParameterError(
-                        f"way-point {k + 2}: arc", 1, "an arc's end: one point in its middle only"
+                        f"waypoint {k + 2}: arc", 1, "an arc's end: one point in its middle only"
                     )
                 result.append((self._arc(k), k + 2))
                 k += 2
@@ -213,7 +213,7 @@ class _Lines:
             return 0.0
         if not (isinstance(piece, Line) and isinstance(following, Line)):
             raise ParameterError(
-                f"way-point {k}: blend", wanted, "0 where an arc begins or ends (make it tangent)"
+                f"waypoint {k}: blend", wanted, "0 where an arc begins or ends (make it tangent)"
             )
         turn = float(np.sum(piece.slope * following.slope * self.scales**2))
         if turn <= SHARPEST or turn >= 1.0 - TANGENT**2:
@@ -221,14 +221,14 @@ class _Lines:
         return min(wanted, 0.5 * piece.length, 0.5 * following.length)
 
     def _arc(self, k: int) -> Arc:
-        """The arc from way-point k through the next one to the one behind."""
+        """The arc from waypoint k through the next one to the one behind."""
         names = self.robot.pose_names if self.space == "pose" else ()
         places = [i for i, name in enumerate(names) if name in ("x", "y", "z")]
         if len(places) < 2:
             raise ParameterError(
-                f"way-point {k + 1}: arc", 1, "poses with two or more of x, y, z among them"
+                f"waypoint {k + 1}: arc", 1, "poses with two or more of x, y, z among them"
             )
-        return arc_through(*self.points[k : k + 3], places=places, where=f"way-point {k + 1}")
+        return arc_through(*self.points[k : k + 3], places=places, where=f"waypoint {k + 1}")
 
 
 def _end(piece: Piece) -> Array:
@@ -251,7 +251,7 @@ def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0
     :param centre: the pose in the middle, shape (m,).
     :param radius: m.
     :param turns: how often; negative turns the other way.
-    :raises ParameterError: a pose without two of x, y, z, or a radius that is none.
+    :raises ParameterError: a pose without two of x, y, z, or an invalid radius.
     """
     middle = np.asarray(centre, float)
     places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")][:2]
@@ -288,7 +288,7 @@ def cycle(
     :param blend: rounding of the upper corners, m; default 0.8 of the smaller rise.
     :param dwell: rest in both places, s.
     :param back: whether the path goes back to the first place.
-    :raises ParameterError: a robot that cannot move up and across, or no way.
+    :raises ParameterError: a robot that cannot move up and across, or lengths of zero.
     """
     fall = height if lift is None else lift
     for name, value in (("height", height), ("width", width), ("lift", fall)):

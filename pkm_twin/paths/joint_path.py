@@ -23,7 +23,7 @@ Index = NDArray[np.int64]
 LEAST_POINTS: Final = 16
 """Intervals of the shortest piece."""
 PER_KNOT: Final = 1
-"""Least intervals between two way-points of a smooth curve."""
+"""Least intervals between two waypoints of a smooth curve."""
 GRADE: Final = 1.5
 """Power of the distance from a stop by which points are set: speeds go by its root."""
 ROUNDING: Final = 1e-9

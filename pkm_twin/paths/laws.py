@@ -111,7 +111,7 @@ class LawRun:
 def shortest(
     robot: Robot, part: JointPath, law: Law, limits: Limits, wrench: Array | None
 ) -> LawRun:
-    """A stretch by a law, as short as the limits let it be."""
+    """A stretch by a law, the shortest within the limits."""
     run = LawRun(part, law, 1.0)
     interval, share, v, u = run.at(run.times)
     q, first, second = part.between(interval, share)

@@ -35,7 +35,7 @@ BRIEF: Final = 0.01
 
 @dataclass(frozen=True)
 class Bound:
-    """A part of the motion in which one limit binds: times (s), its name and its used part.
+    """An interval in which one limit binds: times (s), the limit's name and its used fraction.
 
     ``what`` is empty where the machine rests or no limit binds.
     """
@@ -121,7 +121,7 @@ class Run:
 class TimedPath:
     """A motion along a path: runs from rest to rest, with the rests before and between (s).
 
-    ``limits``: what it was to keep. ``singularity``: least singularity index on the path.
+    ``limits``: those of the plan. ``singularity``: least singularity index on the path.
     ``limited`` (stretches): how the limits bind. ``law``: how its speed was chosen.
     """
 

@@ -176,10 +176,10 @@ def size_drives(
     effort: Array,
     motors: Sequence[Motor] = (),
 ) -> list[DriveDuty]:
-    """What each drive gives over a motion.
+    """What each drive must supply for a motion.
 
     :param time: rising times (k,), s; q, qd, qdd and effort, shape (k, n).
-    :param motors: that may be taken; each replaces the rotor of the robot's file.
+    :param motors: candidates; each replaces the rotor of the robot's file.
     :raises ParameterError: fewer than two samples; or motors for a joint without a ``drive``.
     """
     if len(time) < LEAST:

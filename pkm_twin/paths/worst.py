@@ -100,9 +100,9 @@ def worst_over_workspace(
     singularity: float = SINGULARITY,
     rays: int = RAYS,
 ) -> Worst:
-    """The greatest efforts and speeds of the drives, tool point in the worst directions.
+    """The largest efforts and speeds of the drives, for the worst directions of the tool point.
 
-    Speed and acceleration are those of the position in the pose; its angles stand still. The
+    Speed and acceleration are those of the position; the orientation stays constant. The
     worst acceleration is exact; of the speed :data:`DIRECTIONS` are tried at all poses, and
     :data:`MORE_DIRECTIONS` at the worst.
 

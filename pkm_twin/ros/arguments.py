@@ -10,8 +10,8 @@ USAGE = """usage: {words} [--help] [--version] [--ros-args -p PARAMETER:=VALUE -
 
 {summary}
 
-Runs until SIGINT or SIGTERM. Its parameters: `ros2 param describe /{node} PARAMETER` while it runs,
-or docs/nodes.md, section {node}."""
+Runs until SIGINT or SIGTERM. For its parameters see docs/nodes.md, section {node}, or use
+`ros2 param describe /{node} PARAMETER` while it runs."""
 
 
 def answer(name: str, summary: str, arguments: Sequence[str], others: str = "") -> None:
@@ -32,8 +32,7 @@ def answer(name: str, summary: str, arguments: Sequence[str], others: str = "") 
         print(_version())
         raise SystemExit(0)
     print(
-        f"refused to start: {own[0]!r} is no argument of a node; parameters stand behind --ros-args"
-        " as -p NAME:=VALUE",
+        f"cannot start: unknown argument {own[0]!r}; give parameters as --ros-args -p NAME:=VALUE",
         file=sys.stderr,
     )
     raise SystemExit(2)

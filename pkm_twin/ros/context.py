@@ -72,7 +72,7 @@ def own_node(
             )  # fmt: skip
         except InvalidNamespaceException as error:
             first = str(error).splitlines()[0]
-            raise PkmTwinError(f"--namespace {namespace!r} is no namespace: {first}") from None
+            raise PkmTwinError(f"--namespace {namespace!r} is invalid: {first}") from None
         yield node
     finally:
         if node is not None:

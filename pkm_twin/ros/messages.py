@@ -246,7 +246,7 @@ class JointReader:
         q = self._take("position", message.position, count, index, self._position)
         if q is None:
             what = "all positions are nan" if len(message.position) else "no positions"
-            raise MessageError("empty", f"{what}; {count} names are given")
+            raise MessageError("empty", f"{what} for {count} names")
         return stamp, index, q
 
     def efforts(self, message: Any, now: int, rules: StampRules) -> EffortSample:
@@ -256,7 +256,7 @@ class JointReader:
         count = len(message.name)
         effort = self._take("effort", message.effort, count, index, self._effort)
         if effort is None:
-            raise MessageError("empty", f"no efforts; {count} names are given")
+            raise MessageError("empty", f"no efforts for {count} names")
         given = np.array([message.effort[i] for i in index], np.float64)
         return EffortSample(stamp, effort, ControllerNumbers(given))
 
@@ -351,7 +351,7 @@ class JointReader:
                 given = ", ".join(map(shown, key[:8])) + (", ..." if len(key) > 8 else "")
                 raise MessageError("missing joint", f"joint {joint!r} is missing; given: {given}")
             if count > 1:
-                raise MessageError("duplicated joint", f"joint {joint!r} stands {count} times")
+                raise MessageError("duplicated joint", f"joint {joint!r} occurs {count} times")
         index = [key.index(joint) for joint in self._names]
         # Few and short: what strangers send is not kept.
         if len(self._known) < 16 and sum(map(len, key)) < 4096:

@@ -119,7 +119,7 @@ class TwinNode(ParameterNode):
         self.seldom = SeldomGroup()
         super().__init__(name)
         self._autostart = self.declare(
-            "autostart", True, "configure and activate at the start", read_only=True
+            "autostart", True, "configure and activate the node at start", read_only=True
         )
         self.executor_kind: str = self.declare(
             "executor",
@@ -129,7 +129,7 @@ class TwinNode(ParameterNode):
             read_only=True,
         )
         self._queue_depth = self.declare(
-            "queue_depth", 1000, "messages that wait for the node, a topic",
+            "queue_depth", 1000, "messages of a topic that can wait for the node",
             low=1, high=100_000, read_only=True,
         )  # fmt: skip
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", output_qos())
@@ -344,7 +344,9 @@ class TwinNode(ParameterNode):
                 if self.executor_kind != "events":
                     self.destroy_subscription(subscription)
                 subscription = subscribe()
-                self.log_throttled("qos", f"{topic}: best effort from here on, as its publisher")
+                self.log_throttled(
+                    "qos", f"{topic}: best effort from now on, as its publisher offers it"
+                )
 
         subscription = subscribe()
 
@@ -404,7 +406,7 @@ class TwinNode(ParameterNode):
         :raises MessageError: too much waits already.
         """
         if len(self._tasks) >= MAX_TASKS:
-            raise MessageError("busy", f"{MAX_TASKS} wait to be answered already")
+            raise MessageError("busy", f"{MAX_TASKS} requests are waiting already")
         self._tasks.append((where, task))
 
     def turned(self) -> None:
@@ -455,7 +457,7 @@ class TwinNode(ParameterNode):
                 callback(message)
                 return
             self._seen["clock messages refused"] += 1
-            self.log_throttled("clock", f"/clock: refused, {sec} s and {nanosec} ns is no time")
+            self.log_throttled("clock", f"/clock: rejected, invalid time: {sec} s and {nanosec} ns")
 
         return checked
 
@@ -475,7 +477,7 @@ class TwinNode(ParameterNode):
             except Exception as error:
                 self._seen["requests refused"] += 1
                 text = _cut(f"{type(error).__name__}: {error}")
-                self.log_throttled("request", f"{kind.__name__}: refused, {text}")
+                self.log_throttled("request", f"{kind.__name__}: rejected, {text}")
             response = kind.Response()
             refusal = SetParametersResult(successful=False, reason=text)
             if kind is SetParameters:
@@ -504,7 +506,7 @@ class TwinNode(ParameterNode):
     def _on_reset(self, request: Any, response: Any) -> Any:
         ended = self.reset_stop()
         response.success = True
-        response.message = f"ended: {ended}" if ended else "no stop was latched"
+        response.message = f"reset: {ended}" if ended else "no stop was latched"
         return response
 
     def _jumped(self, jump: Any) -> None:
@@ -523,7 +525,9 @@ class TwinNode(ParameterNode):
         policy: str = qos_policy_name_from_kind(event.last_policy_kind).lower()
         self._incompatible += event.total_count_change
         self._unfit[topic] = policy
-        self.log_throttled(f"qos {topic}", f"{topic}: incompatible QoS of another node: {policy}")
+        self.log_throttled(
+            f"qos {topic}", f"{topic}: another node has an incompatible QoS: {policy}"
+        )
         return policy
 
     def _is_unfit(self, topic: str) -> bool:
@@ -544,7 +548,7 @@ class TwinNode(ParameterNode):
             found.append((ERROR, f"a callback raised an exception: {self._last_kind}"))
         self._unfit = {topic: p for topic, p in self._unfit.items() if self._is_unfit(topic)}
         found += [
-            (WARN, f"incompatible QoS of another node on {topic}: {policy}")
+            (WARN, f"another node on {topic} has an incompatible QoS: {policy}")
             for topic, policy in self._unfit.items()
         ]
         if self.get_parameter("use_sim_time").value:
@@ -566,7 +570,9 @@ class TwinNode(ParameterNode):
         before, self._reported = self._reported, (taken, lost, overruns, clocks)
         taken, lost, overruns, clocks = (a - b for a, b in zip(self._reported, before, strict=True))
         if clocks:
-            found.append((WARN, f"{clocks} messages of /clock were no time in the last second"))
+            found.append(
+                (WARN, f"{clocks} messages of /clock had an invalid time in the last second")
+            )
         if lost:
             found.append((WARN, f"{lost} messages lost in the last second"))
         # A single late one on a machine that also does other things is no trouble.

@@ -63,7 +63,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
     Signals are not the middleware's, which would close the topics at once: a signal ends the
     spinning at its next event, and :meth:`TwinNode.farewell` is called while the topics are there.
 
-    :returns: 0 after a signal, 1 where a node refuses its configuration.
+    :returns: 0 after a signal, 1 if a node rejects its configuration.
     """
     nodes: list[TwinNode] = []
     executor: _Executor | None = None
@@ -98,7 +98,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
         # The middleware's own refusals (arguments, types, QoS overrides) have many lines.
         lines = error.lines if isinstance(error, UnknownParametersError) else [str(error)]
         for line in lines:
-            print(f"refused to start: {' '.join(line.split())}", file=sys.stderr)
+            print(f"cannot start: {' '.join(line.split())}", file=sys.stderr)
         return 1
     finally:
         ignore_signals()

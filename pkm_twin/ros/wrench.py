@@ -38,16 +38,17 @@ def declare_wrench(node: TwinNode, read_only: bool = False, **others: Any) -> Wr
     for name, value in (("wrench_frame", frame), ("base_frame", base)):
         if not value:
             raise ParameterError(name, value, "a frame's name")
-    place = "where the wrench is measured, from the platform's reference point, platform axes"
+    place = "position of the sensor from the platform's reference point, platform axes"
     return WrenchSettings(
         wrench_frame=frame,
         accept_empty_frame=node.declare(
-            "accept_empty_frame", default.accept_empty_frame, "an empty frame means wrench_frame",
+            "accept_empty_frame", default.accept_empty_frame, "accept an empty frame id as "
+            "wrench_frame",
             read_only=read_only,
         ),
         sensor_xyz=triple(node, "sensor.xyz", place, "m", read_only),
         sensor_rpy=triple(
-            node, "sensor.rpy", "roll, pitch and yaw of the sensor's axes in the platform's", "rad",
+            node, "sensor.rpy", "roll, pitch and yaw of the sensor relative to the platform", "rad",
             read_only,
         ),
         **others,
@@ -60,7 +61,7 @@ def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | N
     :raises ParameterError: transforms are asked for and tf2_ros is not installed.
     """
     wanted = node.declare(
-        "use_tf", False, "take the sensor's place from /tf instead of sensor.xyz and sensor.rpy",
+        "use_tf", False, "take the sensor's pose from /tf in place of sensor.xyz and sensor.rpy",
         read_only=True,
     )  # fmt: skip
     if not wanted:

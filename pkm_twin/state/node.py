@@ -49,21 +49,35 @@ class MachineStateNode(health.TwinNode):
 
     def __init__(self) -> None:
         super().__init__("machine_state", executor="events")
-        robot = load(self.declare("mechanism", "delta_cu", "robot: name or path", read_only=True))
+        robot = load(
+            self.declare(
+                "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
+            )
+        )
         settings = self._declare_settings()
         self._frames = {
-            "platform": self._declare_frame("platform_frame", PLATFORM, "on the reference point"),
+            "platform": self._declare_frame(
+                "platform_frame", PLATFORM, "of the platform, at its reference point"
+            ),
             "tool": self._declare_frame("tool_frame", "tool0", "of the tool"),
         }
         self._tool = Mount.of(
-            triple(self, "tool.xyz", "the tool from the platform's reference point", "m"),
-            triple(self, "tool.rpy", "roll, pitch and yaw of the tool in the platform", "rad"),
+            triple(
+                self,
+                "tool.xyz",
+                "position of the tool from the platform's reference point, platform axes",
+                "m",
+            ),
+            triple(
+                self, "tool.rpy", "roll, pitch and yaw of the tool relative to the platform", "rad"
+            ),
         )
         mounts = declare_mounts(self, self._frames["platform"])
         self._core = MachineState(robot, settings, mounts)
         self._core.pace = Pace(
             self.declare(
-                "rate", 100.0, "of ~/joint_states, ~/pose and ~/twist at most, 0: every sample",
+                "rate", 100.0, "largest rate of ~/joint_states, ~/pose and ~/twist; 0: every "
+                "sample",
                 unit="Hz", low=0.0, high=1e4, read_only=True,
             )
         )  # fmt: skip
@@ -77,8 +91,9 @@ class MachineStateNode(health.TwinNode):
         self._description = self.create_guarded_publisher(String, "robot_description", latched=True)
         # Hardware only where it is asked for: a controller_manager beside would load and move it.
         hardware = self.declare(
-            "hardware_plugin", "", "of the ros2_control element in robot_description; empty: no "
-            "such element", read_only=True,
+            "hardware_plugin", "", "hardware plugin in the ros2_control element of "
+            "robot_description; "
+            "empty: no such element", read_only=True,
         )  # fmt: skip
         self._urdf = robot_urdf(robot, hardware)
         self._transforms = self._create_transforms()
@@ -138,7 +153,7 @@ class MachineStateNode(health.TwinNode):
         return level, message, values
 
     def _declare_frame(self, name: str, default: str, text: str) -> str:
-        frame: str = self.declare(name, default, f"frame {text}", read_only=True)
+        frame: str = self.declare(name, default, f"frame id {text}", read_only=True)
         if not frame:
             raise ParameterError(name, frame, "a frame's name")
         return frame
@@ -147,17 +162,19 @@ class MachineStateNode(health.TwinNode):
         d = WrenchSettings()
         return declare_wrench(
             self,
-            base_frame=self._declare_frame("base_frame", d.base_frame, "that is fixed"),
+            base_frame=self._declare_frame("base_frame", d.base_frame, "of the base"),
             max_state_age=self.declare(
-                "max_state_age", d.max_state_age, "from a joint state to the nearest wrench",
+                "max_state_age", d.max_state_age, "largest time between a joint state and the "
+                "nearest wrench",
                 **SECONDS,
             ),
             future_tolerance=self.declare(
-                "future_tolerance", d.future_tolerance, "how far stamps may be ahead of the clock",
+                "future_tolerance", d.future_tolerance, "how far time stamps may be ahead of the "
+                "clock",
                 **SECONDS,
             ),
             accept_zero_stamp=self.declare(
-                "accept_zero_stamp", d.accept_zero_stamp, "take a zero stamp for arrival time"
+                "accept_zero_stamp", d.accept_zero_stamp, "accept a zero stamp, as the arrival time"
             ),
         )  # fmt: skip
 
@@ -166,10 +183,12 @@ class MachineStateNode(health.TwinNode):
         large: dict[str, Any] = {"low": 0.0, "high": 1e9, "read_only": True}
         return Scales(
             self.declare(
-                "deflection_scale", d.deflection, "how many times deflections are enlarged", **large
+                "deflection_scale", d.deflection, "factor by which deflections are "
+                "enlarged", **large
             ),
-            self.declare("force_scale", d.force, "length of a force", unit="m/N", **large),
-            self.declare("moment_scale", d.moment, "length of a moment", unit="m/(N m)", **large),
+            self.declare("force_scale", d.force, "length of force arrows", unit="m/N", **large),
+            self.declare("moment_scale", d.moment, "length of moment "
+            "arrows", unit="m/(N m)", **large),
             self.declare(
                 "ellipsoid_force", d.ellipsoid_force,
                 "force whose deflections the compliance ellipsoid shows", unit="N", **large,
@@ -181,13 +200,14 @@ class MachineStateNode(health.TwinNode):
         wanted = self.declare(
             "publish_tf",
             "all",
-            "base to platform and platform to tool, the tool alone (robot_state_publisher has the "
-            "platform), or none",
+            "transforms to publish: all (base to platform, platform to tool), tool (if "
+            "robot_state_publisher publishes the platform) or none",
             choices=("all", "tool", "none"),
             read_only=True,
         )
         rate = self.declare(
-            "tf_rate", 100.0, "of base to platform at most", unit="Hz", low=0.1, high=1e4,
+            "tf_rate", 100.0, "largest rate of the transform from base to "
+            "platform", unit="Hz", low=0.1, high=1e4,
             read_only=True,
         )  # fmt: skip
         self._transforms_period = round(SECOND / rate)
@@ -198,12 +218,15 @@ class MachineStateNode(health.TwinNode):
                 self, self._core.settings.base_frame, self._frames, self._tool, wanted == "all"
             )
         except ImportError as error:
-            self.get_logger().warning(f"no transforms are published without tf2_msgs ({error})")
+            self.get_logger().warning(
+                f"tf2_msgs is missing, so no transforms are published ({error})"
+            )
             return None
 
     def _create_markers(self) -> None:
         rate = self.declare(
-            "markers_rate", 20.0, "of ~/markers at most, 0: none", unit="Hz", low=0.0, high=1000.0,
+            "markers_rate", 20.0, "largest rate of ~/markers; 0: "
+            "none", unit="Hz", low=0.0, high=1000.0,
             read_only=True,
         )  # fmt: skip
         if rate > 0.0:

@@ -90,8 +90,8 @@ class Continuity:
         if not measure >= self.stop:
             raise MessageError(
                 "singular",
-                f"too close to a singularity or the edge of reach: measure {measure:.3g}, "
-                f"singularity_stop is {self.stop:g}",
+                f"too close to a singularity or the edge of the workspace: index {measure:.3g}, "
+                f"allowed {self.stop:g} or more (singularity_stop)",
             )
         self._before, self._last = last, state
         return bool(measure < self.warn)
@@ -113,6 +113,6 @@ class Continuity:
         if not worst <= self._largest:
             raise MessageError(
                 "jump",
-                f"{self.robot.pose_names[beyond.index(worst)]} of the platform jumped while the "
-                "joints did not: another assembly mode",
+                f"{self.robot.pose_names[beyond.index(worst)]} of the platform jumped but the "
+                "joints did not: the assembly mode changed",
             )

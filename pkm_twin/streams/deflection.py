@@ -49,7 +49,7 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
         if not math.isfinite(value):
             raise MessageError("not finite", f"{label} is {value}")
         if 0.0 < abs(value) < TINY:
-            raise MessageError("bounds", f"{label} is {value:g}, below every measurement")
+            raise MessageError("bounds", f"{label} is {value:g}, too small for a measurement")
     far = max(abs(value) for value in values[:3])
     if far > MAX_SHIFT:
         raise MessageError("bounds", f"translation is {far:g} m, allowed up to {MAX_SHIFT:g}")

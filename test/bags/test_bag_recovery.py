@@ -151,7 +151,7 @@ def test_refusals(bag: Path, tmp_path: Path) -> None:
         recover(bag, taken)
     assert caught.value.reason == "exists" and taken.read_bytes() == b"precious"
     (tmp_path / "own.mcap").write_bytes(bag.read_bytes())
-    with pytest.raises(BagError, match="source itself"):
+    with pytest.raises(BagError, match="the same file"):
         recover(tmp_path / "own.mcap", tmp_path / "own.mcap", overwrite=True)
     (tmp_path / "text.mcap").write_text("no bag at all")
     with pytest.raises(BagError, match="not an MCAP"):

@@ -155,16 +155,18 @@ def table(rows, unit):
 def main(target):
     stream, long = measure()
     lines = [
-        "# Where a sample's time goes",
+        "# Latency",
         "",
-        "Written by `python -m test.benchmarks.latency`: CPU time of one thread of the node "
-        "`delta_dynamics` with `delta_cu`, medians, no subscriber. What the middleware takes on "
-        "the way is in [the round trip](benchmarks.md).",
+        "Written by `python -m test.benchmarks.latency`: processor time of one thread of the node "
+        "`delta_dynamics` with `delta_cu`, medians, no subscriber. [The round trip](benchmarks.md) "
+        "includes the time of the middleware.",
         "",
-        "A state is read from its bytes and answered in bytes, past rclpy's conversion, which is a "
-        "large part of what a bare echo takes. Pose, rates, jump and singularity are one compiled "
-        "program, the fit over the window is another, the torques are the third; the rest is "
-        "Python. At 1 kHz the caches are cold, and a call takes about twice as long as here.",
+        "The node decodes a joint state from its bytes and encodes the answer to bytes, without "
+        "rclpy's conversion, which takes a large part of the time of a bare echo. Three compiled "
+        "programs do the computation: pose, rates, jump and singularity index; the fit over the "
+        "window; and the torques. The rest is Python. At 1 kHz the caches are cold, and a call "
+        "takes "
+        "about twice as long as here.",
         "",
         "## A joint state",
         "",
@@ -172,7 +174,7 @@ def main(target):
         "",
         f"## A trajectory of {POINTS} points",
         "",
-        "Worked on in slices between the stream's samples.",
+        "Computed in slices between the samples of the stream.",
         "",
         *table(long, "ms"),
     ]

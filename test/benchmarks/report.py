@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 TARGETS = """
-Targets: one torque sample at most 2 us, 0.15 us a sample in a batch, one platform response at most
-30 us, 6 us a sample in a batch; of the round trip p50 at most 1.10 of the echo's, p99 and
-processor time at most 1.2, and p50 with `events` below the single-threaded echo's; a minute
-without a lost message; 2 s to the first answer.
+Targets: one torque sample at most 2 us, 0.15 us per sample in a batch; one platform response at
+most 30 us, 6 us per sample in a batch; round trip p50 at most 1.10 of the echo's, p99 and processor
+time at most 1.2, and p50 with `events` below the single-threaded echo's; a minute without a lost
+message; 2 s to the first answer.
 """
 BOUNDS = (1.10, 1.2, 1.2)
 """Most that p50, p99 and processor time may be of the echo's."""
@@ -24,10 +24,10 @@ def main(source, target):
         "",
         f"Made by `make bench` on {data['datetime'][:10]}: {cpu.get('brand_raw', 'unknown CPU')}, "
         f"{cpu['count']} cores shared with other work, Python "
-        f"{data['machine_info']['python_version']}, one thread. The median of each; machines and "
-        "their load differ, so read the ratios. All through the public Python API.",
+        f"{data['machine_info']['python_version']}, one thread. Times are medians; they depend on "
+        "the computer and its load, so compare the ratios. All calls use the public Python API.",
         "",
-        "| what | samples a call | us a call | us a sample |",
+        "| what | samples per call | us per call | us per sample |",
         "|---|---:|---:|---:|",
     ]
     told = {}
@@ -63,12 +63,12 @@ def round_trip(trip):
     priority = "at real-time priority" if trip["real_time"] else "at normal priority"
     lines = [
         "",
-        "Round trip over DDS at 1 kHz, `joint_states` to `~/joint_torques`, beside a node that "
-        f"sends the same message back: {trip['slices']} slices of each in turn, medians, "
-        f"{priority}; processor time is that of all threads of the process. Ratios are to the echo "
-        "with the same executor, slice by slice.",
+        "Round trip over DDS at 1 kHz, `joint_states` to `~/joint_torques`, compared with a node "
+        f"that sends the same message back (echo): {trip['slices']} slices of each in turn, "
+        f"medians, {priority}. Processor time is that of all threads of the process. Ratios are "
+        "relative to the echo with the same executor, slice by slice.",
         "",
-        "| node | p50 (us) | p99 (us) | CPU a message (us) | p50, p99, CPU to the echo |",
+        "| node | p50 (us) | p99 (us) | CPU per message (us) | p50, p99, CPU over the echo's |",
         "|---|---:|---:|---:|---|",
     ]
     missed = []

@@ -102,16 +102,16 @@ def _head(command: str, seed: int) -> str:
     versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     if CCX is not None:
         versions += f", CalculiX {calculix_version()}"
-    return f"""# Certificate of dynamics and static stiffness
+    return f"""# Cross-checks of dynamics and static stiffness
 
-The twin's torques, reactions, energies and free motion, beside three other routes to the same
-numbers, and the 2UPR-RPU's platform compliance beside finite elements. This page is written by a
-program; every number in the tables comes from its run of {today}. Make it again with
+This page compares the torques, reactions, energies and free motion of pkm_twin with three
+independent methods, and the 2UPR-RPU's platform compliance with finite elements. A program writes
+the page; every number in the tables comes from its run of {today}. Write it again with
 
     make certificate
 
-which runs `{command}`; it takes some minutes and fails where a bound is
-exceeded. The random numbers start from {seed}. Made with Python {platform.python_version()},
+which runs `{command}`. It takes some minutes and fails if a bound is
+exceeded. The seed of the random numbers is {seed}. Written with Python {platform.python_version()},
 {versions}.
 """
 
@@ -135,25 +135,27 @@ def _torques(figures: dict[str, Figures], judge: Judge) -> str:
 
 Each machine has random dimensions, limb azimuths up to {AZIMUTH_ERROR} rad off, masses and
 inertias, a payload with its own centre of mass and full inertia matrix, gravity in any direction,
-friction; each state random positions, rates, accelerations and a wrench on the platform. The R-C-U
-is on any of the limbs; the 3-PRRU's sliders are above or below, and {THIN:.0%} of its machines have
-rods without inertia about themselves for links. States whose Jacobian, by the twin, is worse
-conditioned than 1 : {1 / LEAST_MEASURE:.0f} are not drawn.
+and friction. Each state has random positions, rates, accelerations and a wrench on the platform.
+The R-C-U limb is any of the limbs. The 3-PRRU's sliders are above or below, and the links of
+{THIN:.0%} of its machines are rods without inertia about their axes. States whose Jacobian, as
+computed by pkm_twin, has a condition number above {1 / LEAST_MEASURE:.0f} are left out.
 
 - **Pinocchio**: an open tree of bodies and loop constraints; tree motion by Newton's method and
   the constraints' Jacobian, efforts from recursive Newton-Euler sweeps and the multipliers.
-- **MuJoCo**: another tree, an MJCF made of the same parameter mapping; loops closed by Newton's
+- **MuJoCo**: another tree, an MJCF made from the same parameter mapping; loops closed by Newton's
   method on MuJoCo's kinematics, rates and accelerations by its Jacobians and their derivatives,
   `mj_inverse` on the tree, projected on the actuators. Rods have {SPECK:.0e} kg m2 about
-  themselves, because MuJoCo wants more than nothing.
+  their axes, because MuJoCo requires a positive inertia.
 - **Lagrange**: kinetic and potential energy as functions of points and their velocities, all
-  derivatives by central differences in {DIGITS} digits, the loops closed by Newton's method in as
-  many. What is left is the twin's rounding.
+  derivatives by central differences in {DIGITS} digits, the loops closed by Newton's method in the
+  same precision. The remaining difference is the rounding of pkm_twin.
 
-A difference is the greatest one of the three efforts over the greatest effort of the other route.
-The last column is the greatest difference of the platform's place by forward kinematics.
+A difference is the largest difference of the three efforts, divided by the largest effort of the
+other method. The last column is the largest difference of the platform's position by forward
+kinematics.
 
-| robot | route | machines | states | worst | median | bound | place, m (bound {PLACE_BOUND:.0e}) |
+| robot | method | machines | states | worst | median | bound \
+| position, m (bound {PLACE_BOUND:.0e}) |
 |---|---|---|---|---|---|---|---|
 {table}
 """
@@ -176,18 +178,18 @@ def _balances(figures: dict[str, Figures], judge: Judge) -> str:
     table = "\n".join(rows)
     return f"""## Balances
 
-Over the same states; the last two where the Lagrange route was taken.
+Computed for the same states; the last two for the states of the Lagrange method.
 
-- Bodies: force and moment balance of every body with the joints' reactions, the worst imbalance
-  over the greatest load.
-- Efforts: the actuators' efforts that come out of these balances, against those by virtual work.
-- Power: the twin's efforts and platform twist against the rate of the Lagrange route's energy,
-  over the sum of the powers' amounts.
-- Energy: the twin's kinetic and potential energy against the Lagrange route's.
+- Bodies: force and moment balance of every body with the joints' reactions; the worst imbalance,
+  divided by the largest load.
+- Efforts: the actuators' efforts from these balances, compared with those by virtual work.
+- Power: the efforts and platform twist of pkm_twin, compared with the rate of the Lagrange method's
+  energy; the difference, divided by the sum of the absolute powers.
+- Energy: kinetic and potential energy of pkm_twin, compared with the Lagrange method.
 
-The first two weigh reactions against the twin's own inertia forces. A couple that does no work in
-any motion of the machine, such as the gyroscopic one of a 3-PRRU's upper link, is in the reactions
-but not in torques or energies: `test/validation/test_reactions_pinocchio.py` judges it.
+The first two compare reactions with pkm_twin's own inertia forces. A couple that does no work in
+any motion of the machine, such as the gyroscopic one of a 3-PRRU's upper link, occurs in the
+reactions but not in torques or energies; `test/validation/test_reactions_pinocchio.py` checks it.
 
 | balance | robot | states | worst | median | bound |
 |---|---|---|---|---|---|
@@ -217,26 +219,27 @@ def _swings(swings: list[Swing], judge: Judge) -> str:
     table = "\n".join(rows)
     return f"""## Free swing of {DURATION:.0f} s
 
-The shipped parameter files, without friction. The actuators hold constant efforts, those that
-balance the weight at a stable equilibrium. Both Deltas: arms at {DELTA_REST} rad, let go at rest
-{_list(DELTA_DEVIATION)} rad beside that. (Without efforts a Delta of these dimensions swings about
-stretched limbs, and most starts reach the edge of its workspace.) The sliders of the 3-PRRU are
-vertical, so without efforts it would fall: it hangs from its sliders (`branch: above`) with a
-tool of {TOOL["mass"]:.0f} kg, {-TOOL["com"][2]} m below the platform, which makes the tilt stable,
-and begins with slider rates of {_list(PRRU_RATES)} m/s; their mean is zero because its height
-is free.
+The robots are the shipped parameter files without friction. The actuators apply constant efforts
+that balance the weight at a stable equilibrium. Both Deltas have arms at {DELTA_REST} rad and
+start at rest {_list(DELTA_DEVIATION)} rad away from there. (Without efforts a Delta of these
+dimensions swings about stretched limbs, and most starts reach the edge of its workspace.) The
+sliders of the 3-PRRU are vertical, so without efforts it would fall. It hangs from its sliders
+(`branch: above`) with a tool of {TOOL["mass"]:.0f} kg, {-TOOL["com"][2]} m below the platform,
+which makes the tilt stable. It starts with slider rates of {_list(PRRU_RATES)} m/s; their mean is
+zero because its height is free.
 
-The twin's `forward_dynamics` and Pinocchio's are both integrated by DOP853 with tolerances of
-{TOLERANCE:.0e}, Pinocchio's whole tree without closing the loops again; the engine's own step is
-RK4 at {1e3 * STEP:.0f} ms with the loops closed after each step. Energy: the Lagrange route's
-function at {SAMPLES} instants, less the constant efforts' work; its greatest change over the
-greatest kinetic energy. Closure: the limbs' lengths and planes between actuators and platform; the
-twin's loops are solved anew for each state. Travel of one actuator and differences from the twin
-at the end in rad, rad/s (Delta) and m, m/s (3-PRRU). Bounds: energy {SWING_BOUNDS["drift"]:.0e},
-closure {SWING_BOUNDS["closure"]:.0e} m, end states {SWING_BOUNDS["DOP853"]:.0e} with DOP853 and
-{SWING_BOUNDS["its own step"]:.0e} with the step.
+DOP853 integrates `forward_dynamics` of pkm_twin and of Pinocchio with tolerances of
+{TOLERANCE:.0e}, Pinocchio's whole tree without closing the loops again. Pinocchio's own step is
+RK4 at {1e3 * STEP:.0f} ms with the loops closed after each step. Energy: the Lagrange method's
+function at {SAMPLES} instants minus the work of the constant efforts; its largest change, divided
+by the largest kinetic energy. Closure: the limbs' lengths and planes between actuators and
+platform; pkm_twin solves its loops for each state. Travel of one actuator, and differences from
+pkm_twin at the end, in rad, rad/s (Delta) and m, m/s (3-PRRU). Bounds: energy
+{SWING_BOUNDS["drift"]:.0e}, closure {SWING_BOUNDS["closure"]:.0e} m, end states
+{SWING_BOUNDS["DOP853"]:.0e} with DOP853 and {SWING_BOUNDS["its own step"]:.0e} with the step.
 
-| robot | engine | travel | kinetic energy, J | energy drift | closure, m | q apart | q' apart |
+| robot | engine | travel | kinetic energy, J | energy drift | closure, m \
+| difference of q | of q' |
 |---|---|---|---|---|---|---|---|
 {table}
 """
@@ -264,24 +267,25 @@ def _compliance(links: dict[str, Links], judge: Judge) -> str:
     spans = _span(np.concatenate([found.shipped.diagonal for found in links.values()]))
     return f"""{title}
 
-The shipped parameters with joints that are rigid where they are not free, drives locked. CalculiX
-has the three bars as solid bricks (C3D20R; {FINE} of them a bar, section x length), with no beam
-theory and no shear factor. Its joints hold the mean displacement and mean turn of a bar's end
-section, which may warp and contract, by equations between displacements; the platform is rigid.
+The robot has the shipped parameters, locked drives, and joints that are rigid in all directions in
+which they are not free. The CalculiX model has solid bricks for the three bars (C3D20R; {FINE} per
+bar, section x length), no beam theory and no shear factor. Its joints constrain the mean
+displacement and mean rotation of a bar's end section, which can warp and contract, by equations
+between displacements; the platform is rigid.
 
-Differences are relative: of all 36 entries, over sqrt(C_ii C_jj); of the diagonal's, each over
-itself; of the six deflections under the load of the paper's table 1, {_wrench(LOAD)}
-in N and N m, each over itself however small. Bound {BOUND:.0e}, for the mesh a quarter of that.
-Mesh: {MESH} bricks a bar against {FINE}.
+Differences are relative: those of all 36 entries to sqrt(C_ii C_jj), those of the diagonal entries
+each to its own value, and those of the six deflections under the load of the paper's table 1,
+{_wrench(LOAD)} in N and N m, each to its own value, however small. The bound is {BOUND:.0e}, for
+the mesh a quarter of it. Mesh: {MESH} bricks per bar compared with {FINE}.
 
 | pose | z (m), beta, gamma (deg) | entries | diagonal | deflections | Cowper | rigid ends | mesh |
 |---|---|---|---|---|---|---|---|
 {table}
 
-The twin's diagonal is off by {spans}, negative is stiffer. Its shear factor is
-{robot.members.shear_factor:g}, as the paper's; *Cowper* is the worst of entries and diagonal with
-{round_bar(robot):.3f}, a round bar's (Cowper 1966). *Rigid ends*: the twin's diagonal against
-solids whose end sections are rigid and so hinder contraction.
+The diagonal of pkm_twin differs by {spans}; negative is stiffer. Its shear factor is
+{robot.members.shear_factor:g}, as in the paper. *Cowper* is the worst difference of entries and
+diagonal with {round_bar(robot):.3f}, the factor of a round bar (Cowper 1966). *Rigid ends* compares
+the diagonal with solids whose end sections are rigid and therefore cannot contract.
 """
 
 
@@ -301,32 +305,35 @@ def _paper_rows(rows: PaperRows, links: dict[str, Links], judge: Judge) -> str:
     beams = ""
     if links:
         apart = max(_worst(found.shipped.diagonal) for found in links.values())
-        beams = f"Beam theory is not, either: solid bars are within {_percent(apart)} (above)."
+        beams = (
+            "Beam theory does not explain it either: solid bars are within "
+            f"{_percent(apart)} (above)."
+        )
     # Where joints hardly matter.
     bent = (0, 5)
     joints = _worst(rows.rigid[:, bent] / rows.twin[:, bent] - 1)
     softer = _filled(f"""
         The finite elements are softer in {int((known > 0).sum())} of the {known.size} components
-        that are printed with three digits, by {_span(known)}. The worst difference over the
+        that are printed with three digits, by {_span(known)}. The worst difference relative to the
         finite elements is {worst}; the paper states {PAPER_BOUND:g}.
     """)
     cause = _filled(f"""
-        One scale on the joints' printed compliances is not the difference: of all factors from
-        {FACTORS[0]:g} to {FACTORS[-1]:g} the best, {rows.joints[0]:.2f}, leaves
-        {_percent(rows.joints[1])}. With joints that are rigid the twin's dx and rz change by
-        {_percent(joints)} or less, where the finite elements are softer by
-        {_span(rows.excess[:, bent])}. {beams} One factor on the compliance of all bars,
-        {rows.bars[0]:.2f}, would leave {_percent(rows.bars[1])}. What remains are bars that are
-        softer than round ones from joint to joint, single joints several times softer than printed,
-        or an elastic platform; the paper shows neither mesh nor contacts, so which of them it is
-        cannot be told.
+        A common factor on the joints' printed compliances does not explain the difference: of all
+        factors from {FACTORS[0]:g} to {FACTORS[-1]:g} the best one, {rows.joints[0]:.2f}, leaves
+        {_percent(rows.joints[1])}. With rigid joints dx and rz of pkm_twin change by
+        {_percent(joints)} or less, but the finite elements are softer by
+        {_span(rows.excess[:, bent])}. {beams} A common factor on the compliance of all bars,
+        {rows.bars[0]:.2f}, would leave {_percent(rows.bars[1])}. Possible causes are bars that are
+        softer than round ones between the joints, single joints several times softer than printed,
+        or an elastic platform. The paper shows neither mesh nor contacts, so the cause cannot be
+        determined.
     """)
     return f"""## The paper's finite elements
 
-Table 1 of the 2UPR-RPU paper, with the shipped joint compliances, beside the twin; the per cents
-are the paper's finite elements over the twin, less 1.
+Table 1 of the 2UPR-RPU paper compared with pkm_twin, with the shipped joint compliances. The
+percentages are the relative differences of the paper's finite elements from pkm_twin.
 
-| | twin, 1 | finite elements, 1 | over the twin | twin, 2 | finite elements, 2 | over the twin |
+| | pkm_twin, 1 | finite elements, 1 | difference | pkm_twin, 2 | finite elements, 2 | difference |
 |---|---|---|---|---|---|---|
 {table}
 

@@ -4,6 +4,7 @@
 import json
 import os
 import random
+import re
 
 import numpy as np
 import pytest
@@ -322,7 +323,7 @@ class TestRecover:
         cut.write_bytes(whole[: len(whole) * 3 // 4])
         refused = process("check", cut)
         assert refused.code == 3
-        promised = int(refused.one_line_error().split(" whole messages")[0].split()[-1])
+        promised = int(re.search(r"(\d+) intact messages", refused.one_line_error())[1])
         done = process("recover", cut, saved, "--json")
         assert (done.code, done.err) == (3, "")
         facts = json.loads(done.out)
@@ -516,7 +517,7 @@ class TestTopics:
         assert info.type == WRENCH
         data = json.loads(twin("check", path, "--json").out)
         assert data["topics"]["wrench"] == "/wrench"
-        assert data["topics"]["left_out"] == {own: "the twin's own"}
+        assert set(data["topics"]["left_out"]) == {own}
 
 
 class TestPayload:

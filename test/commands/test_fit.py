@@ -209,7 +209,7 @@ def test_numbers_that_are_no_recording_of_this_machine(
         data = json.loads(done.out)
         (reason,) = data["accepted"]
         for marked in (Path("fitted.yaml"), Path("fitted.html")):
-            assert "accepted all the same" in marked.read_text()
+            assert "accepted by --accept" in marked.read_text()
         assert "units?" in reason and data["verdict"]["model"] != "explains"
         assert {p["standard_deviation"] for p in data["parameters"]} == {None}
     if column == "position":

@@ -116,7 +116,7 @@ def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "compliance,friction")
     assert "compliance alone" in done.one_line_error()
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "compliance", "--payload", "1")
-    assert "without --per-copy, --payload" in done.one_line_error()
+    assert "no --per-copy, --payload" in done.one_line_error()
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "complience")
     assert "did you mean 'compliance'" in done.one_line_error()
     assert not list(tmp_path.glob("*.yaml"))

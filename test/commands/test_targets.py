@@ -177,7 +177,7 @@ def test_what_is_read_is_not_replaced(capsys, tmp_path, deflections):
     same = tmp_path / "same.yaml"
     shutil.copy(deflections, same)
     done = command(capsys, "calibrate", "upr_rpu", same, "--out", same, "--overwrite")
-    assert "the source itself" in done.one_line_error()
+    assert "the same file" in done.one_line_error()
     assert same.read_bytes() == deflections.read_bytes()
 
 

@@ -16,12 +16,12 @@ from pkm_twin.machine.sections import Payload, friction_of, limits_of
 from pkm_twin.machine.uncertainty import UncertaintyEntry
 from pkm_twin.mechanisms import delta, prru, upr_rpu
 
-HEAD = """# Parameters
+HEAD = """# Robot files
 
-Every key of a robot's YAML with its unit, what is allowed, and its default. SI units, angles in
-rad, z up. A key that is not listed, a value of another type and one out of its bound are refused by
-name. Of two units the first is that of joints that turn, the second that of joints that slide;
-`pkm-twin info ROBOT` prints a robot's values with the units of its own joints.
+Every key of a robot's YAML with its unit, its valid values and its default. SI units, angles in
+rad, z up. An unknown key, a value of another type and a value out of its bounds are rejected, with
+the name of the key. Of two units, the first is for joints that rotate and the second for joints
+that slide; `pkm-twin info ROBOT` prints a robot's values with the units of its joints.
 
 Written by `make pages`.
 """
@@ -34,45 +34,47 @@ UNITS = {
 }
 MACHINE = """## `mechanism: machine`
 
-Any machine as a graph of bodies, joints and rods, every vector in base axes at the home pose; by
-example in [new_machine.md](new_machine.md). `friction` and `limits` stand at the joints.
+Any machine as a graph of bodies, joints and rods, with every vector in base axes at the home pose.
+[new_machine.md](new_machine.md) has an example. `friction` and `limits` are keys of the joints.
 
 | key | unit | allowed | default |
 |---|---|---|---|
 | `mechanism` |  | machine | required |
 | `platform` |  | a body's name: it carries the tool | platform |
 | `origin` | m | 3 numbers: the platform's reference point at home | the platform's com |
-| `pose` |  | of x, y, z, roll, pitch, yaw as many as the mobility | the first that will do |
+| `pose` |  | as many of x, y, z, roll, pitch, yaw as the mobility | the first valid choice |
 | `bodies`, `joints`, `rods` |  | mappings of names to entries | none |
 | `joint_map` |  | a mapping of names to entries | none |
 | `uncertainty` |  | a mapping of paths to entries | none |
 | `element_compliance` |  | a mapping of names to numbers, at least 1e-06, at most 1e+06 | none |
 | `limbs` |  | one section or a list: `azimuths` (rad), `bodies`, `joints`, `rods` | none |
 
-What stands in `limbs` is given for azimuth 0, copied and turned about base z by each azimuth, its
-names with _1, _2 and so on; bodies of the section itself are the copy's, others are not."""
+The entries of `limbs` are given for azimuth 0. They are copied and rotated about base z by each
+azimuth; the names get _1, _2 and so on. A copy uses its own copy of the bodies in the section;
+other bodies are shared."""
 
 
-FRICTION = "At the actuated joints, against the rate: viscous by its amount, Coulomb by its sign."
-LIMITS = "What nodes and commands refuse or warn of; without them there is no limit."
-UNCERTAINTY = """How sure a number is, by its dotted path in this file (`inertia.arm_mass`),
-or all numbers below a name together (`joints_compliance`): each an independent cause, from which
-`torque_deviation` and `compliance_deviation` follow. Either `deviation`, the standard deviation in
-the number's own unit, or `relative`, that of a common factor."""
+FRICTION = """Friction of the actuated joints, opposite to the rate: viscous friction is
+proportional to the rate, Coulomb friction depends on its sign. `offset` is a constant effort."""
+LIMITS = "Nodes and commands reject values beyond these limits, or warn. The default is no limit."
+UNCERTAINTY = """The uncertainty of a number, by its dotted path in this file (`inertia.arm_mass`),
+or of all numbers below a name together (`joints_compliance`). Each entry is an independent cause;
+`torque_deviation` and `compliance_deviation` propagate them. Give either `deviation`, the standard
+deviation in the number's own unit, or `relative`, that of a common factor."""
 
-JOINT_MAP = """Converts between the controller's names and numbers of a joint and the model's:
+JOINT_MAP = """Converts between the controller's names and values of a joint and those of the model:
 controller = offset + sign * ratio * model for positions, without the offset for velocities and
 accelerations, divided by sign * ratio for efforts, so that power is the same on both sides.
 
-Messages and bags carry the controller's names and numbers, and so does the table of poses that
-`calibrate` reads. Everything else has the model's: the Python API, parameters of nodes
-(`effort_limits`, `friction.*`, `start`), the tables of `torques` and `fit`, the exported code, and
-`machine_state`'s `~/joint_states`, whose joints are those of the URDF."""
+Messages, bags and the table of poses for `calibrate` contain the controller's names and values.
+Everything else uses those of the model: the Python API, parameters of nodes (`effort_limits`,
+`friction.*`, `start`), the tables of `torques` and `fit`, the exported code, and `machine_state`'s
+`~/joint_states`, whose joints are those of the URDF."""
 ELEMENTS = """### `element_compliance`
 
-Factors on the compliance of elastic elements by their names (those of `strain_energy`: members
-and joints), 1 where left out: `{3U: 3.0}` makes a joint three times softer than the other
-sections say. Above 0, at most 1e6. `fit --what compliance` writes it."""
+Factors on the compliance of elastic elements, by the names that `strain_energy` uses (members and
+joints); the default is 1. `{3U: 3.0}` makes a joint three times softer than in the other sections.
+Above 0, at most 1e6. `fit --what compliance` writes this section."""
 GRAVITY = """### `gravity`
 
 Acceleration of free fall in base axes, m/s2; default [0, 0, -9.81]."""

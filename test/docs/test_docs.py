@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import subprocess
@@ -11,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from pkm_twin import errors as module
 from pkm_twin import robot_names
-from test.docs import architecture, engine, parameters
+from test.docs import architecture, engine, errors, parameters
 from test.support.command import typed_line
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -66,6 +68,16 @@ def test_a_new_machine_from_an_empty_file_to_torques(tmp_path, twin, monkeypatch
 def test_the_parameters_page_is_that_of_the_schemas():
     """Else `make pages` writes it anew."""
     assert (DOCS / "parameters.md").read_text(encoding="utf-8") == parameters.page()
+
+
+def test_the_errors_page_has_every_error_and_reason():
+    """Else `make pages` writes it."""
+    assert (DOCS / "errors.md").read_text(encoding="utf-8") == errors.page()
+    own = {kind for kind in vars(module).values() if inspect.isclass(kind)}
+    assert {k for k in own if issubclass(k, module.PkmTwinError)} - {module.PkmTwinError} <= set(
+        errors.ERRORS
+    )
+    assert set(errors.REASONS) == errors.reasons()
 
 
 def test_the_sizes_of_the_engine_are_todays():

@@ -24,10 +24,10 @@ RESULTS = Path("out/faults.json")
 PASS = "pass"
 INTRODUCTION = """Printed by `make faults`: {passed} of {total} rows passed.
 
-**R** the message is refused whole, nothing is published from it, it is counted and told in
-`/diagnostics`. **S** as R, and the stream stops until good samples come. **F** the node refuses to
-start, the file to load, with the name of the field. **X** the command ends with this exit code and
-one line. The tests of a row are in `test/faults/catalogue.yaml`.
+**R**: the message is rejected whole and counted; nothing is published from it, and `/diagnostics`
+reports it. **S**: as R, and the stream stops until accepted samples arrive. **F**: the node does
+not start, or the file does not load; the error names the field. **X**: the command ends with this
+exit code and prints one line. `test/faults/catalogue.yaml` lists the tests of each row.
 """
 
 

@@ -28,28 +28,31 @@ KINDS: tuple[type[Kind], ...] = (
 )  # fmt: skip
 NODES = "nodes.json"
 """What test_fuzz.py leaves there."""
-INTRODUCTION = """## At random
+INTRODUCTION = """## Fuzzing
 
-Printed by `make fuzz`: {total:,} examples, 500 from a seed, the seeds from the one in the table,
-and before them the corpus of what once fell (`test/fuzz/corpus`). A kind holds when nothing but
-the package's own errors comes back, each of them one short line; nothing is read that was not
-written; a torque, a forwarded command or a deflection comes of a sound message only, by rules that
-`test/fuzz/messages.py` has of its own, and is that of the model. Times are those of a machine that
-did other work too. To be many, command lines share a process, which one in {each:,} has to itself,
-and most changed parameter files are taken as what YAML makes of them; of a machine whose geometry
-is new all is checked that loading checks, and one in {compiled} is compiled and asked for its
-efforts, too.
+Printed by `make fuzz`: {total:,} random examples, 500 per seed, with seeds from the one in the
+table on, after the corpus of inputs that failed in the past (`test/fuzz/corpus`). A kind passes if
+
+- only the package's own errors occur, each of them one short line;
+- nothing is read that was not written;
+- a torque, a forwarded command or a deflection is published only for a valid message (by the
+  independent rules of `test/fuzz/messages.py`), and equals that of the model.
+
+The computer also did other work, which affects the times. For speed, command lines share a
+process; one in {each:,} has its own. Most changed parameter files are passed as parsed YAML. A
+machine with a new geometry passes all checks of loading; one in {compiled} is also compiled and
+asked for its efforts.
 """
 HEAD = (
-    "| kind | seed | examples | taken | refused, most often for | median | 99.9 % | slowest (ms) "
-    "| memory grown (MiB) | failed |\n" + "|---" * 10 + "|"
+    "| kind | seed | examples | accepted | rejected, most often for | median | 99.9 % "
+    "| slowest (ms) | memory grown (MiB) | failed |\n" + "|---" * 10 + "|"
 )
 NODES_TEXT = """
 
 Real nodes over DDS, seed {seed}, {seconds:.0f} s:
 {sent}. All nodes alive, no exception;
-{torques:,} torques came back, each finite and with the stamp of a sound message; {requests:,}
-requests and {clocks:,} clocks were refused and counted.
+{torques:,} torques were received, each finite and with the stamp of a valid message; {requests:,}
+requests and {clocks:,} clocks were rejected and counted.
 """
 
 

@@ -475,5 +475,5 @@ def test_a_member_on_nothing_is_refused():
     bar = Member(
         "bar", "bar", TUBE, np.zeros(3), np.ones(3), Support("j", "arm", np.eye(3)), None
     )  # fmt: skip
-    with pytest.raises(ValueError, match="arm hangs nowhere"):
+    with pytest.raises(ValueError, match="arm"):
         assemble(frame_of(np.zeros(3), (bar,), ()), 2)

@@ -289,24 +289,26 @@ def write(folder, summary, watched, ages):
 
 TEXT = """## Long run
 
-Printed by `make soak MINUTES={minutes:g}`: two `delta_dynamics`, one of them fed a looping bag by
-the player, `stiffness_monitor` and `command_gate`, at 1 kHz as far as the machine let the sender
-({sent:,} joint states, one in a hundred bad, and a fifth as many wrenches). Meanwhile
-{parameters:,} requests for parameters, good and bad, {trajectory:,} trajectories of 500 points,
-{suspend:,} suspensions of {suspension:g} s (SIGSTOP, SIGCONT) of a node, and {kill:,} kills of the
-player. The first fifth is warm-up. `stale_after` and the gate's `deadline` were {stale:g} s.
+Printed by `make soak MINUTES={minutes:g}`: two `delta_dynamics` (the player replays a looping bag
+to one of them), `stiffness_monitor` and `command_gate`, at 1 kHz or as fast as the computer
+allowed ({sent:,} joint states, one in a hundred invalid, and a fifth as many wrenches). Meanwhile
+there were {parameters:,} valid and invalid requests for parameters, {trajectory:,} trajectories of
+500 points, {suspend:,} suspensions of a node for {suspension:g} s (SIGSTOP, SIGCONT), and {kill:,}
+kills of the player. The first fifth is warm-up. `stale_after` and the gate's `deadline` were
+{stale:g} s.
 
 ![Memory, descriptors, threads and ages of a long run](soak.png)
 
 {nodes}
 
-Ages from a state's stamp to the answer's publication, on a machine whose two cores did much other
-work: what is left waiting in a queue is answered up to its age's bound, and no later.
+Ages from a joint state's stamp to the publication of the answer, on a computer whose two cores did
+much other work. Messages that wait in a queue are answered up to the bound of their age, not later.
 
 {ages}
 
-Age is looked at just before a torque is published. Only a process that the machine holds up between
-the two sends an older one, and the topic's deadline then tells.
+The node checks the age just before it publishes a torque. It sends an older torque only if the
+computer delays the process between the check and the publication; the topic's deadline then reports
+it.
 """
 
 

@@ -128,7 +128,7 @@ def test_what_the_twin_refuses_never_reaches_the_controller(client, controller):
     status, result = client.ended()
     assert status == GoalStatus.STATUS_ABORTED
     assert result.error_code == FollowJointTrajectory.Result.INVALID_GOAL
-    assert "the twin refused the trajectory, unknown joint" in result.error_string
+    assert "rejected the trajectory, unknown joint" in result.error_string
     assert len(controller.goals) == before
 
 
@@ -165,4 +165,4 @@ def test_a_controller_that_is_not_there_is_named(peer, launch):
     client.send(trajectory())
     status, result = client.ended()
     assert status == GoalStatus.STATUS_ABORTED
-    assert result.error_string == "no controller serves /nobody/follow_joint_trajectory"
+    assert result.error_string == "no action server at /nobody/follow_joint_trajectory"

@@ -200,7 +200,7 @@ def test_a_goal_whose_controller_was_killed_is_aborted_within_two_seconds(action
     action.node.look(action.code.GONE)
     (result,) = goal.ends
     assert goal.how == ABORTED
-    assert result.error_string == "/controller has gone with the goal"
+    assert "/controller" in result.error_string
     # What comes after the end ends nothing again.
     if not answered:
         action.controller.answers[0].tell(handle)
@@ -234,7 +234,8 @@ def test_goals_wait_for_the_controller_to_be_found_in_their_order_and_not_for_ev
     assert cancelled.how == CANCELED and not late.ends
     action.now += 0.2
     action.node.look(1)
-    assert late.how == ABORTED and late.ends[0].error_string == "no controller serves /controller"
+    assert late.how == ABORTED
+    assert late.ends[0].error_string == "no action server at /controller"
 
 
 def test_a_cancelled_goal_is_replaced_by_the_weight_of_the_place_before_it_ends(action):
@@ -319,7 +320,7 @@ def test_goals_end_and_the_machine_is_held_when_the_node_ends(action):
     moving = action.accept(Goal(1))
     handle = action.controller.take()
     action.served.farewell()
-    assert moving.how == ABORTED and moving.ends[0].error_string == "the twin has ended"
+    assert moving.how == ABORTED and "shutting down" in moving.ends[0].error_string
     assert len(action.holds) == 1
     assert action.served.parting
     action.controller.take()

@@ -39,10 +39,9 @@ def test_help_and_version_end_at_once(node, before):
 def test_an_argument_that_is_none_is_refused(node):
     done = run(node, "mechanism:=delta")
     assert done.returncode == 2
-    assert done.stderr.splitlines() == [
-        "refused to start: 'mechanism:=delta' is no argument of a node; parameters stand behind "
-        "--ros-args as -p NAME:=VALUE"
-    ]
+    (line,) = done.stderr.splitlines()
+    assert "'mechanism:=delta'" in line
+    assert "--ros-args -p NAME:=VALUE" in line
 
 
 @pytest.mark.parametrize("node", NODES)
@@ -50,6 +49,4 @@ def test_without_ros_one_line_says_what_is_missing(node):
     done = run(node, before=WITHOUT)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith(
-        f"refused to start: {node} needs ROS 2: source its setup, or pip install"
-    )
+    assert line.startswith(f"cannot start: {node} needs ROS 2: source its setup, or pip install")

@@ -192,9 +192,9 @@ def test_gravity_is_that_of_the_measured_state(heard, launch):
 def test_a_publisher_that_promises_no_deadline_is_told_of(heard, launch):
     gated = Gated(heard, launch, "demanding")
     heard.talk(JointState, "/demanding/torques")
-    also = "incompatible QoS of another node on delta_dynamics/joint_torques: deadline"
+    also = "another node on delta_dynamics/joint_torques has an incompatible QoS: deadline"
     array = gated.diagnostics(lambda a: also in values_of(a)["also"])
-    assert "/peer promises torques with deadline none" in array.status[0].message
+    assert "/peer offers torques with deadline none" in array.status[0].message
     assert all(command == ZEROS for command in gated.commands)
     gated.process.stop()
 
@@ -213,7 +213,7 @@ def test_a_publisher_that_promises_no_deadline_is_told_of(heard, launch):
 )
 def test_a_bad_configuration_is_refused_in_one_line(refused, parameters, named):
     line = one_line_refusal(refused(GATE, *parameters))
-    assert line.startswith("refused to start: ")
+    assert line.startswith("cannot start: ")
     assert named in line
 
 

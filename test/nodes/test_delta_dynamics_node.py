@@ -384,7 +384,7 @@ class TestParameters:
     )
     def test_a_bad_configuration_is_refused_in_one_line(self, refused, parameters, named):
         line = one_line_refusal(refused(MODULE, *parameters))
-        assert line.startswith("refused to start: ")
+        assert line.startswith("cannot start: ")
         assert named in line
 
 

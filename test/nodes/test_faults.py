@@ -452,7 +452,7 @@ class TestNeighbours:
         node = strict.peer.node
         worst = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         publisher = node.create_publisher(JointState, "/strict/states", worst)
-        line = "incompatible QoS of another node on joint_states: reliability"
+        line = "another node on joint_states has an incompatible QoS: reliability"
         self.told(strict, lambda text: line in text)
         node.destroy_publisher(publisher)
         self.told(strict, lambda text: line not in text)
@@ -464,7 +464,7 @@ class TestNeighbours:
         listener = node.create_subscription(
             JointState, "/quick/joint_torques", lambda message: None, hasty
         )
-        line = "incompatible QoS of another node on ~/joint_torques: deadline"
+        line = "another node on ~/joint_torques has an incompatible QoS: deadline"
         self.told(quick, lambda text: line in text)
         node.destroy_subscription(listener)
         self.told(quick, lambda text: line not in text)

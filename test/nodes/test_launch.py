@@ -362,7 +362,7 @@ class TestRunning:
 
             last = answer()
             # The node may see the controller later than this process does.
-            while last.result.error_string.startswith("no controller serves"):
+            while last.result.error_string.startswith("no action server"):
                 last = answer()
             assert last.status == GoalStatus.STATUS_SUCCEEDED, last.result.error_string
             rows = [(p.positions, p.velocities, p.accelerations) for p in sent.points]

@@ -35,10 +35,10 @@ def viser():
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (("--host", "0.0.0.0"), "--host: '0.0.0.0'; expected 127.0.0.1; any other"),
+        (("--host", "0.0.0.0"), "--host: '0.0.0.0'; expected 127.0.0.1, or "),
         (("--host", "0.0.0.0", "--token", "short"), "--token: '5 characters'"),
         (("--port", "70000"), "--port: 70000; expected 0 to 65535"),
-        (("--host", "no.such.host.invalid", "--token", TOKEN), "is no address here"),
+        (("--host", "no.such.host.invalid", "--token", TOKEN), "is not an address"),
         (("--bag", "nothing.mcap", "--port", "0"), "nothing.mcap"),
     ],
 )

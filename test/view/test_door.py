@@ -82,9 +82,11 @@ def test_the_token_is_asked_for_once_and_kept_in_a_cookie():
 def test_a_port_in_use_is_told():
     with listen("127.0.0.1", 0) as first:
         port = first.getsockname()[1]
-        with pytest.raises(PkmTwinError, match=f"127.0.0.1 port {port}: .*in use; --port"):
+        with pytest.raises(
+            PkmTwinError, match=f"127.0.0.1 port {port}: .*in use; choose another --port"
+        ):
             listen("127.0.0.1", port)
-    with pytest.raises(PkmTwinError, match="no address"):
+    with pytest.raises(PkmTwinError, match="is not an address"):
         listen("no.such.host.invalid", 0)
     with pytest.raises(ParameterError, match="65535"):
         listen("127.0.0.1", 70000)

@@ -20,47 +20,47 @@ def view(
     platform: Platform = None,
     bag: Annotated[
         Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-        typer.Option(help="show this recording on a time line", show_default=False),
+        typer.Option(help="replay this recording on a timeline", show_default=False),
     ] = None,
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
     load_times: LoadTimes = None,
     live: Annotated[bool, typer.Option("--live", help="follow running nodes; needs ROS")] = False,
     namespace: Annotated[
-        str, typer.Option(help="with --live: the robot's namespace", show_default=False)
+        str, typer.Option(help="the robot's namespace, with --live", show_default=False)
     ] = "",
     host: Annotated[
-        str, typer.Option(help="address to listen on; any but the loopback needs --token")
+        str, typer.Option(help="address to listen on; every address except loopback needs --token")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="port to listen on; 0 is any free one")] = 8080,
+    port: Annotated[int, typer.Option(help="port to listen on; 0: any free port")] = 8080,
     token: Annotated[
         str,
         typer.Option(
             envvar="PKM_TWIN_TOKEN",
-            help="what visitors must know, at least 16 characters; better by the environment "
-            "variable than on the command line, which others see",
+            help="access token, at least 16 characters; prefer the environment variable, because "
+            "other users can see the command line",
             show_default=False,
         ),
     ] = "",
 ) -> None:
-    """Show a robot in the browser, to be moved and loaded by sliders.
+    """Show a robot in the browser, with sliders for pose and load.
 
-    Joints and pose inside their limits, distance to singularities, clearance of limbs, deflection
-    and strain energy under a wrench; with --bag a recording's time line with the twin's torques,
-    with --live what running nodes say. Nothing is fetched from any other host.
+    The page shows joint positions and their limits, the singularity index, the clearance between
+    limbs, and deflection and strain energy under a wrench. With --bag it replays a recording with
+    the model's torques; with --live it follows running nodes. It loads nothing from other hosts.
 
-    Serves until Ctrl-C, on this machine alone unless --host and --token say otherwise.
+    Runs until Ctrl-C, and is reachable from this machine only, unless --host and --token are given.
     """
     from pkm_twin.apps.view.door import Door, listen
     from pkm_twin.atlas.extras import require
 
     carried = load_of(payload, load_times)
     if bag is None and (topic or carried is not None):
-        raise typer.BadParameter("--topic, --payload and --load-times are of a recording: --bag")
+        raise typer.BadParameter("--topic, --payload and --load-times need --bag")
     if bag is not None and live:
-        raise typer.BadParameter("--bag and --live: one of them")
+        raise typer.BadParameter("give --bag or --live, not both")
     if namespace and not live:
-        raise typer.BadParameter("--namespace is of running nodes: --live")
+        raise typer.BadParameter("--namespace needs --live")
     require("viser", "view")
     door = Door(host, token)
     from pkm_twin import load

@@ -24,7 +24,7 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from pkm_twin.errors import ParameterError, PkmTwinError, install
 
-UNKNOWN: Final = f"this version of viser is not known here: {install('view')}"
+UNKNOWN: Final = f"unsupported version of viser: {install('view')}"
 LEAST_TOKEN: Final = 16
 """Characters of a token: fewer could be guessed."""
 POLICY: Final = (
@@ -68,7 +68,7 @@ class Door:
     def __post_init__(self) -> None:
         if not self.token and not is_loopback(self.host):
             raise ParameterError(
-                "--host", self.host, "127.0.0.1; any other address with a --token to ask for"
+                "--host", self.host, "127.0.0.1, or another address together with --token"
             )
         plain = self.token.isascii() and self.token.isprintable() and " " not in self.token
         if self.token and not (plain and len(self.token) >= LEAST_TOKEN):
@@ -83,10 +83,10 @@ class Door:
         """
         host = headers.get("host", "")
         if is_loopback(self.host) and not is_loopback(_name(host)):
-            return Refusal(HTTPStatus.FORBIDDEN, "this page is for its own machine alone")
+            return Refusal(HTTPStatus.FORBIDDEN, "this page is available on its own computer only")
         origin = headers.get("origin")
         if origin is not None and origin.partition("://")[2].lower() != host.lower():
-            return Refusal(HTTPStatus.FORBIDDEN, "not for the pages of other sites")
+            return Refusal(HTTPStatus.FORBIDDEN, "pages of other sites have no access")
         if not self.token:
             return None
         if self._has_pass(headers.get("cookie", ""), port) or self._bears(headers):
@@ -102,7 +102,7 @@ class Door:
             return Refusal(HTTPStatus.SEE_OTHER, "", (("Location", to), ("Set-Cookie", cookie)))
         return Refusal(
             HTTPStatus.UNAUTHORIZED,
-            "a token is asked for: /?token=TOKEN, or the header Authorization: Bearer TOKEN",
+            "access needs a token: /?token=TOKEN, or the header Authorization: Bearer TOKEN",
             (("WWW-Authenticate", "Bearer"),),
         )
 
@@ -131,7 +131,9 @@ def listen(host: str, port: int) -> socket.socket:
         )[0]
         result = socket.socket(family, kind)
     except OSError as error:
-        raise PkmTwinError(f"--host {host!r} is no address here: {error.strerror}") from None
+        raise PkmTwinError(
+            f"--host {host!r} is not an address of this computer: {error.strerror}"
+        ) from None
     try:
         result.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         result.bind(address)
@@ -139,7 +141,7 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         result.close()
         raise PkmTwinError(
-            f"cannot listen on {host} port {port}: {error.strerror}; --port has another"
+            f"cannot listen on {host} port {port}: {error.strerror}; choose another --port"
         ) from None
     return result
 

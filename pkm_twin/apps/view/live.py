@@ -120,7 +120,7 @@ class Live:
         factors = keys[: keys.index("total_energy")]
         shares = {key: values[key] for key in factors}
         if any(share is None for share in shares.values()):
-            raise MessageError("not finite", "a factor is no number")
+            raise MessageError("not finite", "a factor is NaN or infinite")
         self._shares = {key: float(share) for key, share in shares.items() if share is not None}
         self._dominant = str(status.message)
 

@@ -196,7 +196,7 @@ class Model:
             return _refused(state, str(error))
         if asked is not None:
             if (np.abs(pose - asked) > SAME * (1.0 + np.abs(asked))).any():
-                return _refused(state, "pose is reached in another assembly than the home pose's")
+                return _refused(state, "the pose is in another assembly mode than home")
             pose = asked
         angle = self._angle_beyond(pose)
         return _refused(state, angle) if angle else replace(state, q=q, pose=pose, refusal="")

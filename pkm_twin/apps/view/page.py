@@ -129,7 +129,7 @@ class Page:
             reason = f"{type(error).__name__}: {one_line(str(error))}"
             if reason not in self._failures:
                 self._failures.add(reason)
-                _LOG.warning("view: a change was not made: %s", reason)
+                _LOG.warning("view: a change was rejected: %s", reason)
 
     def become(self, state: State) -> None:
         """Show another state; one with a refusal leaves the sliders where they were put."""
@@ -154,7 +154,7 @@ class Page:
                 self.ask(gui.add_button("No wrench").on_click, "unload", self._unload)
             r = model.enlargement
             self._enlarge = gui.add_slider(
-                "deflection drawn, times", r.low, r.high, r.step, r.high / 2
+                "deflection magnified, times", r.low, r.high, r.step, r.high / 2
             )
             self.ask(self._enlarge.on_update, "enlarge", self._show)
             self._loads = gui.add_html("")

@@ -37,10 +37,10 @@ class BagPanel:
         with panel.add_tab("Bag"):
             self._time = gui.add_slider("time, s", 0.0, max(timeline.end, 0.01), 0.001, 0.0)
             self._play = gui.add_button("Play")
-            self._speed = gui.add_dropdown("speed, times", SPEEDS, initial_value="1")
+            self._speed = gui.add_dropdown("speed factor", SPEEDS, initial_value="1")
             self._instant = gui.add_html("")
             at, twin, residual = timeline.curves()
-            named = (("torque of the twin", twin), ("residual: measured less twin", residual))
+            named = (("effort of the model", twin), ("residual: measured minus model", residual))
             self._charts = [
                 (_chart(page, title, at, values, mark=True), at, values)
                 for title, values in named

@@ -38,9 +38,9 @@ def status(model: Model, state: State, numbers: Numbers) -> str:
     """Singularity measure, clearance, joints with their efforts at rest, and a refusal in words."""
     gap = None if numbers.clearance is None else 1e3 * numbers.clearance
     rows = [
-        _judged("singularity", "singularity measure", numbers.singularity, "",
+        _judged("singularity", "singularity index", numbers.singularity, "",
                 numbers.singularity_grade, "1 best, 0 singular"),
-        _judged("clearance", "clearance of limbs", gap, "mm", numbers.clearance_grade,
+        _judged("clearance", "clearance between limbs", gap, "mm", numbers.clearance_grade,
                 numbers.why.get("clearance", "")),
     ]  # fmt: skip
     said = (
@@ -123,7 +123,7 @@ def bars(shares: Mapping[str, float]) -> str:
 
 def instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
     """The bag at one time: measured effort, the twin's, and the residual of every joint."""
-    rows = [_head("joint", "measured", "twin", "residual")]
+    rows = [_head("joint", "measured", "model", "residual")]
     columns = (("measured", at.measured), ("twin", at.twin), ("residual", at.residual))
     for k, name in enumerate(robot.joint_names):
         unit = robot.effort_units[k]
@@ -152,7 +152,7 @@ def heard(robot: Robot, live: Heard, waiting: str) -> str:
         text += f'<div id="waiting">waiting for {escape(waiting)}</div>'
     if live.refused:
         text += (
-            f'<div style="color:{GRADES["bad"]}">{live.refused} messages refused, the last: '
+            f'<div style="color:{GRADES["bad"]}">{live.refused} messages rejected, the last: '
             f"{escape(live.reason)}</div>"
         )
     if live.dominant:
@@ -165,7 +165,7 @@ def _judged(key: str, what: str, value: float | None, unit: str, grade: Grade, h
     words = {"good": "", "warn": " low", "bad": " too low"}[grade]
     cell = _value(key, value, unit, GRADES[grade], bold=True)
     if value is None:
-        words = " not known"
+        words = " unknown"
     note = f'<span style="color:{GRADES[grade]}">{words}</span>' if words else ""
     return _row(f'<span title="{escape(hint)}">{what}</span>', cell + note)
 

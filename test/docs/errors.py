@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/errors.md from the classes: ``python -m test.docs.errors docs/errors.md``."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import sys
+from pathlib import Path
+
+from pkm_twin import errors, robot_names
+from pkm_twin.bags.reader import DamagedBagError
+
+ROOT = Path(__file__).parents[2]
+HEAD = """# Errors
+
+All errors are subclasses of `PkmTwinError`. An error is one line: what is wrong, where, and what is
+expected. Commands print it on stderr and end with exit code 1, or 2 for wrong usage of an option.
+Nodes reject the message, count it by its reason and report it in `/diagnostics`
+([faults](faults.md)).
+
+Written by `make pages`.
+
+| error | also a | meaning | example | what to do |
+|---|---|---|---|---|
+"""
+ERRORS = {
+    errors.ParameterError: (
+        errors.ParameterError("geometry.arm_length", -0.2, "a number, at least 1e-06"),
+        "correct the value; [robot files](parameters.md) lists all keys with their bounds",
+    ),
+    errors.FileError: (
+        errors.FileError("poses.csv", FileNotFoundError(), "a CSV file"),
+        "check the path and the format",
+    ),
+    errors.UnknownNameError: (
+        errors.UnknownNameError("robot", "delt", robot_names()),
+        "use the suggested name; `pkm-twin robots` lists the robots",
+    ),
+    errors.MobilityError: (
+        errors.MobilityError(2, 1, ["elbow_2's axis is 1e-05 rad from parallel to motor_1's axis"]),
+        "correct the named joint, or the number of `actuated` joints "
+        "([new machine](new_machine.md#what-to-check-first))",
+    ),
+    errors.UnreachableError: (
+        errors.UnreachableError("pose", "limb 2", (3,), 0.0125),
+        "choose a pose inside the workspace (`pkm-twin atlas ROBOT workspace`)",
+    ),
+    errors.SingularityError: (
+        errors.SingularityError("joint state", (), 2e-9, 1e-6),
+        "keep `robot.singularity(q)` above 0.05 or more "
+        "([singularity index](engine.md#singularities-kinematicssingularity))",
+    ),
+    errors.SearchError: (
+        errors.SearchError("the least over all directions", 100000, 100000),
+        "use a machine with fewer actuated joints, or another pose",
+    ),
+    errors.MessageError: (
+        errors.MessageError("not finite", "position of arm_1 is nan"),
+        "see the reasons below",
+    ),
+    errors.BagError: (
+        errors.BagError("no topic /wrench", path="run.mcap", reason="no_topic"),
+        "choose topics with `--topic`; the attribute `reason` is a stable code",
+    ),
+    DamagedBagError: (
+        DamagedBagError(
+            "the file ends in a chunk",
+            path=Path("run.mcap"),
+            reason="truncated",
+            offset=1_000_000,
+            salvageable=1200,
+        ),
+        "save the intact messages with `pkm-twin recover` ([recordings](recordings.md))",
+    ),
+}
+"""An example of each class, and what a user can do."""
+REASONS = {
+    "bounds": ("a value or a size is beyond the bounds of any real machine", "check the units"),
+    "busy": ("too many requests are waiting", "send trajectories more slowly"),
+    "cdr": ("the bytes are not a message of this type", "use the same message definitions"),
+    "duplicated joint": ("a joint occurs twice", "send each joint once"),
+    "effort limit": ("an effort is beyond `effort_limits`", "slow the motion, or `limit_policy`"),
+    "empty": ("no joints, points, positions or efforts", "fill the arrays"),
+    "frame": ("another frame than `wrench_frame`", "set `wrench_frame`, `accept_empty_frame`"),
+    "future stamp": ("the stamp is ahead of the clock", "synchronise the clocks"),
+    "jump": ("a joint or the platform moved faster than it can", "check encoders and stamps"),
+    "late answer": ("the computation took longer than `stale_after`", "reduce the load"),
+    "length": ("an array has another length than the names", "send one value per joint"),
+    "limit": ("a position or velocity is beyond the robot's limits", "check `limits`"),
+    "missing joint": ("an actuated joint is missing", "check the names, or use `joint_map`"),
+    "no pose": ("no joint state within `max_state_age` of the wrench", "check `joint_states`"),
+    "no velocities": ("derivatives are missing", "set `acceleration` to `differentiate`"),
+    "no wrench": ("no fresh wrench", "check the topic `wrench` and its stamps"),
+    "non-finite result": ("the model gave NaN or infinity", "check the input and the robot file"),
+    "not finite": ("NaN or infinity in the message", "check the sensor"),
+    "over": ("the trajectory has already ended", "use `use_sim_time` for a replayed bag"),
+    "pose": ("joint positions of a deflection are not usable", "check `joint_states`"),
+    "singular": ("too close to a singularity", "plan away from it, see `singularity_stop`"),
+    "stale stamp": ("the stamp is too old", "use `use_sim_time` for a replayed bag"),
+    "stamp order": ("the stamp is not later than the last one", "send samples in order"),
+    "time": ("times do not increase, or are invalid", "correct `time_from_start` or the stamp"),
+    "too short": ("too few points to differentiate", "send at least 3 points"),
+    "transform": ("no transform for the sensor", "publish it, or use `sensor.xyz`, `sensor.rpy`"),
+    "uneven stamps": ("stamps are too uneven to differentiate", "check the sender's timing"),
+    "unknown joint": ("a trajectory has a joint that the robot lacks", "see `extra_joints`"),
+    "unreachable": ("the joint positions cannot be assembled", "check the robot file and offsets"),
+    "zero stamp": ("the stamp is zero", "stamp the message, or set `accept_zero_stamp`"),
+}
+"""Reason of a rejected message to its meaning and to what a user can do."""
+
+
+def reasons() -> set[str]:
+    """The reasons that the sources give; "limit" is "bounds" of a robot with limits."""
+    found = {"limit"}
+    for folder in ("pkm_twin", "delta_dynamics", "stiffness_monitor"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if not isinstance(node, ast.Call) or ast.unparse(node.func) != "MessageError":
+                    continue
+                if isinstance(node.args[0], ast.Constant):
+                    found.add(node.args[0].value)
+    return found
+
+
+def page() -> str:
+    """The whole page."""
+    lines = []
+    for kind, (example, hint) in ERRORS.items():
+        bases = ", ".join(f"`{base.__name__}`" for base in kind.__bases__)
+        meaning = inspect.cleandoc(kind.__doc__ or "").replace("``", "`").replace("\n\n", " ")
+        cells = [f"`{kind.__name__}`", bases, " ".join(meaning.split()), f"`{example}`", hint]
+        lines.append("| " + " | ".join(cells) + " |")
+    text = (
+        "\n\n## Reasons of rejected messages\n\n| reason | meaning | what to do |\n|---|---|---|\n"
+    )
+    rows = [f"| {reason} | {what} | {hint} |" for reason, (what, hint) in sorted(REASONS.items())]
+    return HEAD + "\n".join(lines) + text + "\n".join(rows) + "\n"
+
+
+if __name__ == "__main__":
+    Path(sys.argv[1]).write_text(page(), encoding="utf-8")
