@@ -44,6 +44,7 @@ setup(
     package_data={
         "pkm_twin": ["py.typed"],
         "pkm_twin.config": ["*.yaml", "drives/*.yaml"],
+        "pkm_twin.export": ["fmu_sources/*.c"],
         "delta_dynamics": ["py.typed"],
         "stiffness_monitor": ["py.typed"],
     },
@@ -89,6 +90,7 @@ setup(
             "colcon-ros",
             "cvxpy>=1.4",
             "dask[distributed]",
+            "fmpy",
             "h5netcdf",
             "h5py",
             "hypothesis",

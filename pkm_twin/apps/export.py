@@ -12,6 +12,7 @@ import typer
 
 from pkm_twin.apps.options import RobotName
 from pkm_twin.console import refuse_existing
+from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import replace_file
 from pkm_twin.machine.robot import Robot
 
@@ -58,6 +59,35 @@ def c(
     from pkm_twin.export.c_package import c_package
 
     _write(out, c_package(load(robot)), overwrite)
+
+
+@app.command()
+def fmu(
+    robot: RobotName,
+    out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.fmu")],
+    fmi: Annotated[int, typer.Option(help="version of FMI, 2 or 3")] = 3,
+    kind: Annotated[
+        str, typer.Option(help="dynamics: motion under efforts; torques: efforts of a motion")
+    ] = "dynamics",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
+) -> None:
+    """Write a Functional Mock-up Unit, for model exchange and co-simulation.
+
+    Its sources are inside; where this machine has a C compiler, a binary for it, too.
+    """
+    from pkm_twin import load
+    from pkm_twin.export import fmu as units
+
+    if fmi not in units.VERSIONS:
+        raise ParameterError("--fmi", fmi, "2 or 3")
+    if kind not in units.KINDS:
+        raise UnknownNameError("--kind", kind, units.KINDS)
+    refuse_existing(out, overwrite)
+    compiler = units.found_compiler()
+    if compiler is None:
+        typer.echo("warning: no C compiler found: the FMU has sources and no binary", err=True)
+    replace_file(out, units.Fmu(load(robot), fmi, kind).archive(compiler))
+    typer.echo(out)
 
 
 def _write(out: Path, files: Mapping[str, str], overwrite: bool) -> None:
