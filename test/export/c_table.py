@@ -132,7 +132,7 @@ def row(name):
 if __name__ == "__main__":
     page = Path(sys.argv[1])
     lines = page.read_text(encoding="utf-8").splitlines()
-    kept = [line for line in lines if not line.startswith("| `")]
-    at = next(k for k, line in enumerate(kept) if line.startswith("|---"))
-    rows = [row(name) for name in robot_names()]
-    page.write_text("\n".join([*kept[: at + 1], *rows, *kept[at + 1 :], ""]), encoding="utf-8")
+    at = next(k for k, line in enumerate(lines) if line.startswith("| robot | source")) + 2
+    end = next(k for k in range(at, len(lines)) if not lines[k].startswith("| `"))
+    lines[at:end] = [row(name) for name in robot_names()]
+    page.write_text("\n".join([*lines, ""]), encoding="utf-8")
