@@ -90,6 +90,40 @@ def fmu(
     typer.echo(out)
 
 
+@app.command()
+def mjcf(
+    robot: RobotName,
+    out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.xml")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
+) -> None:
+    """Write an MJCF for MuJoCo: bodies, loops as constraints, motors, a keyframe at home."""
+    from delta_dynamics import inverse_dynamics
+    from pkm_twin import load
+    from pkm_twin.machine.robot_urdf import robot_mjcf
+
+    loaded = load(robot)
+    home = loaded.massive().graph.home
+    efforts = inverse_dynamics(loaded, home, 0.0 * home, 0.0 * home) - loaded.friction.offset
+    refuse_existing(out, overwrite)
+    replace_file(out, robot_mjcf(loaded, list(efforts)).encode())
+    typer.echo(out)
+
+
+@app.command()
+def sdf(
+    robot: RobotName,
+    out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.sdf")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
+) -> None:
+    """Write an SDF model: links, and joints that close the loops, too."""
+    from pkm_twin import load
+    from pkm_twin.machine.robot_urdf import robot_sdf
+
+    refuse_existing(out, overwrite)
+    replace_file(out, robot_sdf(load(robot)).encode())
+    typer.echo(out)
+
+
 def _write(out: Path, files: Mapping[str, str], overwrite: bool) -> None:
     """Write the files of a package; all or, where one may not be replaced, none."""
     for name in files:
