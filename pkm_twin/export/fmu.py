@@ -278,8 +278,7 @@ class Fmu:
             code = [name for name in names if name.endswith(".c")]
             command = [
                 compiler, "-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden",
-                "-ffp-contract=off", f"-DFMI{self.version}_OVERRIDE_FUNCTION_PREFIX", *code, "-o",
-                "model.so", "-lm",
+                "-ffp-contract=off", *code, "-o", "model.so", "-lm",
             ]  # fmt: skip
             done = subprocess.run(  # noqa: S603  a compiler of this machine, without a shell
                 command, cwd=folder, capture_output=True, text=True, check=False

@@ -245,12 +245,12 @@ def interface(version: int) -> str:
     shared = source("shared").replace("LOGGER\n", source(f"logger{version}") + "\n", 1)
     shared = shared.replace("CALL_LOGGER", _CALL[version])
     macro = f"""\
-/* An importer that compiles a library sets FMI{version}_OVERRIDE_FUNCTION_PREFIX; sources that are
-   linked with others have the model's name in front. */
-#if defined(FMI{version}_OVERRIDE_FUNCTION_PREFIX)
-#define FMI(name) JOINED(fmi{version}, name)
+/* Sources that are linked with others are compiled with FMI{version}_FUNCTION_PREFIX=@_; a library
+   has the standard's names. */
+#if defined(FMI{version}_FUNCTION_PREFIX) && !defined(FMI{version}_OVERRIDE_FUNCTION_PREFIX)
+#define FMI(name) JOINED(FMI{version}_FUNCTION_PREFIX, fmi{version}##name)
 #else
-#define FMI(name) JOINED(@_fmi{version}, name)
+#define FMI(name) fmi{version}##name
 #endif
 """
     written = [_function(name, *entry) for name, entry in functions.items()]

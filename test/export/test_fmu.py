@@ -21,6 +21,7 @@ from test.machine.random_machines import variant
 from test.support.robots import loaded, partly_long, random_motion
 
 fmpy = pytest.importorskip("fmpy")
+from fmpy.build import build_platform_binary  # noqa: E402
 from fmpy.validation import validate_fmu  # noqa: E402
 
 pytestmark = pytest.mark.skipif(found_compiler() is None, reason="there is no C compiler")
@@ -223,6 +224,17 @@ def test_a_saved_state_goes_on_as_before(version, unit, tmp_path):
     assert read(at) == after
     slave.terminate()
     slave.freeInstance()
+
+
+@pytest.mark.long
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="there is no CMake")
+@pytest.mark.parametrize(("version", "kind"), KINDS_OF)
+def test_an_importer_compiles_the_sources(version, kind, tmp_path):
+    path = tmp_path / "robot.fmu"
+    path.write_bytes(Fmu(robot_of("rubbed"), version, kind).archive())
+    fmpy.extract(str(path), str(tmp_path / "out"))
+    build_platform_binary(tmp_path / "out")
+    assert fmpy.simulate_fmu(str(tmp_path / "out"), stop_time=0.01)["status"][-1] == 0
 
 
 def test_the_command_writes_a_unit_that_has_its_units(tmp_path):
