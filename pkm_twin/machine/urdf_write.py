@@ -182,8 +182,7 @@ def _inertial(link: ET.Element, body: UrdfBody, place: Array) -> None:
     upper = body.inertia[np.triu_indices(3)]
     # Rounding that turned axes leave behind says nothing.
     upper = np.where(np.abs(upper) > 1e-14 * float(np.abs(upper).max()), upper, 0.0)
-    # To 15 digits: a bar's moment about itself is a difference of larger ones.
-    values = {key: f"{value:.15g}" for key, value in zip(keys, upper, strict=True)}
+    values = {key: f"{value:.12g}" for key, value in zip(keys, upper, strict=True)}
     ET.SubElement(inertial, "inertia", values)
 
 
@@ -299,5 +298,11 @@ def _start(home: float, drive: UrdfDrive) -> float:
 
 
 def number_text(values: Iterable[float], least: float = 1e-13) -> str:
-    """Numbers to 14 digits, so that the last bits of another machine's arithmetic do not show."""
-    return " ".join(f"{value:.14g}" if abs(value) > least else "0" for value in values)
+    """Numbers to 14 digits, so that the last bits of another machine's arithmetic do not show.
+
+    Vectors to 14 decimals too: a short component may be a difference of longer ones.
+    """
+    row = [float(value) for value in values]
+    if len(row) > 1:
+        row = [round(value, 14) for value in row]
+    return " ".join(f"{value:.14g}" if abs(value) > least else "0" for value in row)

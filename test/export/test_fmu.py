@@ -84,8 +84,9 @@ def simulated(path, kind, span, start, **more):
     )
 
 
-@pytest.mark.parametrize(("version", "kind"), KINDS_OF)
-def test_fmpy_finds_nothing_wrong_and_every_run_writes_the_same(version, kind, tmp_path):
+@pytest.mark.parametrize("unit", partly_long(KINDS_OF, *KINDS_OF[1:3]), ids=str)
+def test_fmpy_finds_nothing_wrong_and_every_run_writes_the_same(unit, tmp_path):
+    version, kind = unit
     robot = robot_of("rubbed")
     path = tmp_path / "robot.fmu"
     path.write_bytes(Fmu(robot, version, kind).archive())
