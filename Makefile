@@ -69,6 +69,7 @@ bench: $(VENV)/bench.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest test/benchmarks -m benchmark_run --benchmark-disable-gc --benchmark-json=out/benchmarks.json
 	$(BIN)/python -m test.benchmarks.report out/benchmarks.json docs/benchmarks.md
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.latency docs/latency.md
+	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.pinocchio_c docs/export_c.md
 
 certificate: $(VENV)/certificate.stamp
 	$(BIN)/python -m test.certificate

@@ -44,7 +44,11 @@ setup(
     package_data={
         "pkm_twin": ["py.typed"],
         "pkm_twin.config": ["*.yaml", "drives/*.yaml"],
-        "pkm_twin.export": ["ros2_control_package/*.*", "ros2_control_package/*/*.*"],
+        "pkm_twin.export": [
+            "fmu_sources/*.c",
+            "ros2_control_package/*.*",
+            "ros2_control_package/*/*.*",
+        ],
         "delta_dynamics": ["py.typed"],
         "stiffness_monitor": ["py.typed"],
     },
@@ -91,6 +95,7 @@ setup(
             "colcon-ros",
             "cvxpy>=1.4",
             "dask[distributed]",
+            "fmpy",
             "h5netcdf",
             "h5py",
             "hypothesis",

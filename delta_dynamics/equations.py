@@ -63,9 +63,9 @@ class Equations:
         :raises ValueError: a value that is not finite.
         """
         robot = self.robot
-        flat = robot.call_one("motion", lambda: _kernel(robot), robot.inertial, q, qd)
+        flat = robot.call_one("motion", lambda: motion_kernel(robot), robot.inertial, q, qd)
         if flat is None:
-            (flat,), status = _kernel(robot)(robot.inertial, q, qd)
+            (flat,), status = motion_kernel(robot)(robot.inertial, q, qd)
             if status is not None:
                 robot.refuse_joints(status, q, (q, qd))
         mass, bias, energies, twists, rows, drift = self._parts
@@ -84,7 +84,8 @@ class Equations:
         )
 
 
-def _kernel(robot: Robot) -> Kernel:
+def motion_kernel(robot: Robot) -> Kernel:
+    """The program of :class:`Terms`: q and qd to all of them but these two, row by row."""
     return robot.massive().kernel("motion", _motion)
 
 

@@ -329,7 +329,9 @@ class Resistance:
         )
         fall = span * slopes(here.qd, seconds)
         last = span * slopes(end.qd, self.seconds(end, self.accelerate(law, end)[0]))
-        times = np.where((np.abs(after) <= size) & (after <= before), span, math.inf)
+        # Joints without stops are infinitely far from them.
+        ends = np.isfinite(after) & (np.abs(after) <= size) & (after <= before)
+        times = np.where(ends, span, math.inf)
         for i in suspects[times[suspects] > span]:
             times[i] = span * first_fall(before[i], fall[i], after[i], last[i], size[i])
         first = min(span, float(times.min()))

@@ -12,6 +12,7 @@ import typer
 
 from pkm_twin.apps.options import RobotName
 from pkm_twin.console import refuse_existing
+from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import replace_file
 from pkm_twin.machine.robot import Robot
 
@@ -78,6 +79,69 @@ def ros2_control(
     from pkm_twin.export.ros2_control import ros2_control_package
 
     _write(out, ros2_control_package(load(robot), bandwidth), overwrite)
+
+
+@app.command()
+def fmu(
+    robot: RobotName,
+    out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.fmu")],
+    fmi: Annotated[int, typer.Option(help="version of FMI, 2 or 3")] = 3,
+    kind: Annotated[
+        str, typer.Option(help="dynamics: motion under efforts; torques: efforts of a motion")
+    ] = "dynamics",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
+) -> None:
+    """Write a Functional Mock-up Unit, for model exchange and co-simulation.
+
+    Its sources are inside; where this machine has a C compiler, a binary for it, too.
+    """
+    from pkm_twin import load
+    from pkm_twin.export import fmu as units
+
+    if fmi not in units.VERSIONS:
+        raise ParameterError("--fmi", fmi, "2 or 3")
+    if kind not in units.KINDS:
+        raise UnknownNameError("--kind", kind, units.KINDS)
+    refuse_existing(out, overwrite)
+    compiler = units.found_compiler()
+    if compiler is None:
+        typer.echo("warning: no C compiler found: the FMU has sources and no binary", err=True)
+    replace_file(out, units.Fmu(load(robot), fmi, kind).archive(compiler))
+    typer.echo(out)
+
+
+@app.command()
+def mjcf(
+    robot: RobotName,
+    out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.xml")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
+) -> None:
+    """Write an MJCF for MuJoCo: bodies, loops as constraints, motors, a keyframe at home."""
+    from delta_dynamics import inverse_dynamics
+    from pkm_twin import load
+    from pkm_twin.machine.robot_urdf import robot_mjcf
+
+    loaded = load(robot)
+    home = loaded.massive().graph.home
+    efforts = inverse_dynamics(loaded, home, 0.0 * home, 0.0 * home) - loaded.friction.offset
+    refuse_existing(out, overwrite)
+    replace_file(out, robot_mjcf(loaded, list(efforts)).encode())
+    typer.echo(out)
+
+
+@app.command()
+def sdf(
+    robot: RobotName,
+    out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.sdf")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
+) -> None:
+    """Write an SDF model: links, and joints that close the loops, too."""
+    from pkm_twin import load
+    from pkm_twin.machine.robot_urdf import robot_sdf
+
+    refuse_existing(out, overwrite)
+    replace_file(out, robot_sdf(load(robot)).encode())
+    typer.echo(out)
 
 
 def _write(out: Path, files: Mapping[str, str], overwrite: bool) -> None:

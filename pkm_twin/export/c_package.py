@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from delta_dynamics.equations import motion_kernel
 from delta_dynamics.virtual_work import accelerations, inverse_dynamics, masses_kernel, torques
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression
 from pkm_twin.codegen.kernels import Kernel
@@ -55,7 +56,7 @@ def c_package(robot: Robot) -> dict[str, str]:
     A robot without masses has no functions of dynamics, one without elastic members none of
     elasticity.
     """
-    made = _Package(robot)
+    made = Package(robot)
     return {
         f"{made.prefix}.h": made.header(),
         f"{made.prefix}.c": made.source(),
@@ -65,14 +66,22 @@ def c_package(robot: Robot) -> dict[str, str]:
     }
 
 
-class _Package:
-    def __init__(self, robot: Robot) -> None:
-        self.robot = robot
+class Package:
+    """A robot's header, source and the files beside them.
+
+    :param names: of the functions, without ``terms`` all of them by default. ``terms``: those of
+        :class:`delta_dynamics.equations.Terms`, side by side.
+    """
+
+    def __init__(self, robot: Robot, names: Collection[str] = ()) -> None:
+        self.robot, self._names = robot, names
         self.prefix = f"pkm_{identifier(robot.name)}"
         self.macro = self.prefix.upper()
         self.n, self.m = robot.joints_count, len(robot.pose_names)
         self.massive = _has(robot.massive)
-        self.elastic: Elastic | None = elastic_of(robot) if _has(robot.structure) else None
+        elastic = self._wants("compliance") or self._wants("strain_energy")
+        has = elastic and _has(robot.structure)
+        self.elastic: Elastic | None = elastic_of(robot) if has else None
         self.fold = Folding()
         self.payload = self.fold.tape.inputs(PARAMETERS, 13)
         forward = self._read(robot.engine.forward)
@@ -105,61 +114,88 @@ class _Package:
         result: list[Routine] = []
 
         def add(
-            name: str, summary: str, inputs: Mapping[str, int], *gates: Expression, **outputs: Any
+            name: str,
+            summary: str,
+            inputs: Mapping[str, int],
+            kernel: Callable[[], Kernel],
+            own: Sequence[Any] | Array = (),
+            **outputs: str,
         ) -> None:
-            result.append(Routine(name, inputs, outputs, gates, SOLVER, summary))
+            if self._wants(name):
+                rows = self._rows(kernel(), own)
+                made = {key: rows[row] for key, row in outputs.items()}
+                result.append(Routine(name, inputs, made, (), SOLVER, summary))
 
+        engine, p = robot.engine, self._inertial() if self.massive else ()
         if self.massive:
-            p = self._inertial()
-            (tau,) = self._rows(torques(robot), p).values()
             add(
                 "torques", "Actuator efforts tau (N m or N) for a motion.",
-                rates | {"qdd": n} | wrench, tau=tau,
+                rates | {"qdd": n} | wrench, lambda: torques(robot), p, tau="efforts",
             )  # fmt: skip
-        forward = self._rows(robot.engine.forward)
-        add("forward", "Pose of joint positions.", q, pose=forward["pose"])
+        add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
         add(
             "platform",
             "Position (m) of the platform's reference point in base axes, and the platform's "
             "rotation from home, row by row.",
-            q, position=forward["position"], rotation=forward["rotation"],
+            q, lambda: engine.forward, position="position", rotation="rotation",
         )  # fmt: skip
         if self.massive:
-            (masses,) = self._rows(masses_kernel(robot), p).values()
-            add("mass_matrix", "Mass matrix of the actuated joints, row by row.", q, m=masses)
-            (qdd,) = self._rows(accelerations(robot), p).values()
+            add(
+                "mass_matrix", "Mass matrix of the actuated joints, row by row.",
+                q, lambda: masses_kernel(robot), p, m="matrix",
+            )  # fmt: skip
             add(
                 "accelerations", "Joint accelerations that efforts tau cause.",
-                rates | {"tau": n} | wrench, qdd=qdd,
+                rates | {"tau": n} | wrench, lambda: accelerations(robot), p, qdd="accelerations",
             )  # fmt: skip
-        jacobians = self._rows(robot.engine.jacobian)
-        add("jacobian", "Pose rates per joint rate, row by row.", q, j=jacobians["rates"])
+        if "terms" in self._names:
+            add(
+                "terms", "Terms of the equations of motion: mass matrix, bias, energies, twists of "
+                "the platform, rates and drift of passive joints with friction.",
+                rates, lambda: motion_kernel(robot), p, terms="terms",
+            )  # fmt: skip
+        add(
+            "jacobian",
+            "Pose rates per joint rate, row by row.",
+            q,
+            lambda: engine.jacobian,
+            j="rates",
+        )
         add(
             "platform_jacobian",
             "Velocity of the platform's reference point and angular velocity, base axes, per "
             "joint rate, row by row.",
-            q, j=jacobians["twist"],
+            q, lambda: engine.jacobian, j="twist",
         )  # fmt: skip
-        (index,) = self._rows(robot.singularity_kernel()).values()
-        add("singularity", "Singularity index: 0 in a singularity, 1 at best.", q, index=index)
+        add(
+            "singularity", "Singularity index: 0 in a singularity, 1 at best.",
+            q, robot.singularity_kernel, index="measure",
+        )  # fmt: skip
         if self.elastic is not None:
-            self._add_elastic(self.elastic, add)
+            self._add_elastic(self.elastic, result)
         return result
 
-    def _add_elastic(self, elastic: Elastic, add: Callable[..., None]) -> None:
+    def _wants(self, name: str) -> bool:
+        return not self._names or name in self._names
+
+    def _add_elastic(self, elastic: Elastic, result: list[Routine]) -> None:
         (row,) = self._rows(elastic.response).values()
         k = len(elastic.names)
         mechanism = self.fold.tape.lift(HELD - row[-1])
-        add(
-            "compliance",
-            "Compliance of the platform at its reference point, joints locked: x y z rx ry rz, "
-            "base axes, row by row.",
-            {"q": self.n}, mechanism, c=row[2 * k + 7 : 2 * k + 43],
+        made = (
+            Routine(
+                "compliance", {"q": self.n}, {"c": row[2 * k + 7 : 2 * k + 43]}, [mechanism],
+                SOLVER,
+                "Compliance of the platform at its reference point, joints locked: x y z rx ry rz, "
+                "base axes, row by row.",
+            ),
+            Routine(
+                "strain_energy", {"q": self.n, "wrench": 6}, {"energies": row[k : 2 * k]},
+                [mechanism], SOLVER,
+                f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
+            ),
         )  # fmt: skip
-        add(
-            "strain_energy", f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
-            {"q": self.n, "wrench": 6}, mechanism, energies=row[k : 2 * k],
-        )  # fmt: skip
+        result += [routine for routine in made if self._wants(routine.name)]
 
     def _inertial(self) -> Array:
         """Run-time inputs of the dynamics, by the payload's numbers."""
@@ -174,7 +210,7 @@ class _Package:
     # The source.
 
     def _write(self) -> None:
-        unit, robot = self.unit, self.robot
+        unit = self.unit
         own = self.fold(self.parameters, {PARAMETERS: self._payload()})
         unit.add(table("@_own", [e.a for e in own]))
         unit.solver(SOLVER, self.equations)
@@ -183,6 +219,12 @@ class _Package:
         for routine in self.routines:
             unit.routine(routine)
             unit.own(routine)
+        if self._wants("inverse"):
+            self._write_inverse()
+
+    def _write_inverse(self) -> None:
+        """Joints of a pose may belong to another assembly: ``forward`` decides."""
+        unit, robot, n, m = self.unit, self.robot, self.n, self.m
         kernel = robot.inverse_kernel
         given = self._read(kernel)[1]
         outputs, gates, solver = self._rows(kernel), [], ""
@@ -199,34 +241,6 @@ class _Package:
             "inverse", {"pose": self.m}, {"q": outputs["q"]}, (), solver, summary
         )
         self.candidate = candidate
-        self._write_inverse()
-        unit.own(self.inverse)
-
-    def _write_parameters(self) -> None:
-        unit, size = self.unit, len(self.parameters)
-        call = unit.function("prepare", self.parameters, {})
-        unit.add(f"""\
-int @_parameters(double mass, const double *com, const double *inertia, double *out)
-{{
-    double p[13], r[{size}];
-    int i, status;
-    p[0] = mass;
-    for (i = 0; i < 3; i++) {{
-        p[1 + i] = com[i];
-    }}
-    for (i = 0; i < 9; i++) {{
-        p[4 + i] = inertia[i];
-    }}
-    {call % "r"};
-    status = ((mass >= 0.0) && (@_finite(p, 13) != 0) && (@_finite(r, {size}) != 0)) ? 0 : 2;
-    @_give(status, r, out, {size});
-    return status;
-}}
-""")
-
-    def _write_inverse(self) -> None:
-        """Joints of a pose may belong to another assembly: ``forward`` decides."""
-        robot, n, m = self.robot, self.n, self.m
         turns = [1.0 if turn else 0.0 for turn in robot._turn_mask]
         test = "            double apart = there[i] - pose[i];\n"
         if any(turns):
@@ -254,8 +268,32 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
     return status;
 }}
 """)
+        unit.own(self.inverse)
+
+    def _write_parameters(self) -> None:
+        unit, size = self.unit, len(self.parameters)
+        call = unit.function("prepare", self.parameters, {})
+        unit.add(f"""\
+int @_parameters(double mass, const double *com, const double *inertia, double *out)
+{{
+    double p[13], r[{size}];
+    int i, status;
+    p[0] = mass;
+    for (i = 0; i < 3; i++) {{
+        p[1 + i] = com[i];
+    }}
+    for (i = 0; i < 9; i++) {{
+        p[4 + i] = inertia[i];
+    }}
+    {call % "r"};
+    status = ((mass >= 0.0) && (@_finite(p, 13) != 0) && (@_finite(r, {size}) != 0)) ? 0 : 2;
+    @_give(status, r, out, {size});
+    return status;
+}}
+""")
 
     def source(self) -> str:
+        """All functions."""
         return (
             f"/* SPDX-License-Identifier: Apache-2.0 */\n/* {self._title} */\n"
             f'#include "{self.prefix}.h"\n\n{HEAD}\n{self.unit.text()}'
@@ -269,6 +307,8 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
     @property
     def public(self) -> list[Routine]:
         """All functions, the inverse behind the forward."""
+        if not self._wants("inverse"):
+            return self.routines
         at = [r.name for r in self.routines].index("forward") + 1
         return [*self.routines[:at], self.inverse, *self.routines[at:]]
 

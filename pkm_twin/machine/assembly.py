@@ -145,7 +145,7 @@ class Assembly:
             rows.append((_between(first, second), across @ turn))
         elif closure.type == "universal":
             normal = np.cross(second, first)
-            rows.append((np.array([first @ second]), (normal @ turn)[None]))
+            rows.append((np.array([first @ second - closure.cosine]), (normal @ turn)[None]))
         return np.concatenate([r for r, _ in rows]), np.vstack([j for _, j in rows])
 
     def residuals(self, rates: bool = True) -> tuple[Array, Array]:

@@ -135,8 +135,9 @@ class _Reader:
             self.links,
             self.joints,
             tuple(self._closures()),
-            self._actuated(locks),
+            actuated := self._actuated(locks),
             self.model.opt.gravity.tolist(),
+            {name: self._start(self.model.joint(name).id) for name in actuated},
         )
 
     def _name(self, kind: str, index: int) -> str:
@@ -172,16 +173,12 @@ class _Reader:
             at = np.zeros(3) if kind == "free" else m.jnt_pos[joint].copy()
             origin, link = place @ Pose(position=at - back), f"{own}_link"
             place, back = Pose(), at
-            if kind in ("revolute", "prismatic") and abs(m.qpos0[m.jnt_qposadr[joint]]) > 0.0:
-                raise ParameterError(
-                    f"joint.{own}.ref", m.qpos0[m.jnt_qposadr[joint]], "zero, as in a URDF"
-                )
+            if kind in ("revolute", "prismatic"):
+                # The file's frames are those at ``ref``; a joint's origin is where its value is 0.
+                origin @= _moved(kind, axis, -self._start(joint))
             self._link(link)
             if joint in locks:
-                held = Pose(about(axis, locks[joint]))
-                if kind == "prismatic":
-                    held = Pose(position=axis * locks[joint])
-                self._joint(own, "fixed", parent, link, origin @ held)
+                self._joint(own, "fixed", parent, link, origin @ _moved(kind, axis, locks[joint]))
             elif kind in ("free", "spherical"):
                 self._joint(own, kind, parent, link, origin)
             else:
@@ -208,6 +205,10 @@ class _Reader:
             "coulomb": float(m.dof_frictionloss[dof]),
             "rotor_inertia": float(m.dof_armature[dof]),
         }
+
+    def _start(self, joint: int) -> float:
+        """Value of a hinge or a slide as the file draws it."""
+        return float(self.model.qpos0[self.model.jnt_qposadr[joint]])
 
     def _equalities(self) -> list[tuple[str, int, Array, tuple[int, int], bool]]:
         m = self.model
@@ -280,6 +281,11 @@ class _Reader:
                 str(self.path), "no actuator", "an <actuator> of each driven joint"
             )
         return tuple(names)
+
+
+def _moved(kind: str, axis: Array, value: float) -> Pose:
+    """A slide or a hinge at a value."""
+    return Pose(position=axis * value) if kind == "prismatic" else Pose(about(axis, value))
 
 
 def _rotation(quaternion: Array) -> Array:

@@ -1,24 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot as a URDF, and as a ``mechanism: machine`` description.
+"""A robot as a URDF, MJCF, SDF, and as a ``mechanism: machine`` description.
 
 May import: numpy, this package, the names of passive joints.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.errors import warn
 from pkm_twin.kinematics.passive import single_joints
 from pkm_twin.machine import schema
 from pkm_twin.machine.entries import has_entry
 from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.graph_description import graph_description
+from pkm_twin.machine.mjcf_write import write_mjcf
 from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.sdf_write import write_sdf
 from pkm_twin.machine.urdf_tree import urdf_tree
-from pkm_twin.machine.urdf_write import MOCK, UrdfBody, UrdfDrive, write_urdf
+from pkm_twin.machine.urdf_write import MOCK, UrdfBody, UrdfDrive, UrdfTree, write_urdf
 
 Array = NDArray[np.float64]
 
@@ -27,16 +31,52 @@ def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
     """The robot as a URDF that parsers of trees read, see docs/urdf.md.
 
     Its joints are ``robot.joint_names`` and ``robot.passive_joints``; with their values the link
-    ``platform`` stands where ``robot.platform`` says, and the masses sum to the robot's. A URDF
-    has no place for rotors and offsets, nor for friction in the joints that it cuts: they are left
-    out.
+    ``platform`` stands where ``robot.platform`` says, and the masses sum to the robot's. Rotors and
+    constant friction of the drives are parameters of ros2_control's joints, friction in the joints
+    that it cuts stands in ``<constraint>``; rotors in passive joints are left out.
 
     :param hardware: ros2_control's plugin, by default mock hardware; empty: no ``<ros2_control>``
         element, as for a description that a controller_manager must not make hardware of.
     :param prefix: of the names of all links and joints.
     """
+    return write_urdf(robot_tree(robot), hardware, prefix)
+
+
+def robot_mjcf(robot: Robot, efforts: Sequence[float] | None = None) -> str:
+    """The robot as an MJCF file, see docs/simulators.md.
+
+    Its joints are ``robot.joint_names`` and ``robot.passive_joints``, and those that close loops.
+
+    :param efforts: of the actuators in the keyframe ``home``, shape (n,), N m or N.
+    """
+    tree = robot_tree(robot)
+    for name in tree.actuated:
+        if robot.friction.offset[tree.actuated.index(name)]:
+            warn(name, "MJCF has no constant friction of a drive: it is left out")
+    return write_mjcf(tree, robot.gravity, efforts)
+
+
+def robot_sdf(robot: Robot) -> str:
+    """The robot as an SDF model, see docs/simulators.md; gravity is the world's."""
+    tree = robot_tree(robot)
+    left_out = [
+        f"{what} of {joint.name}"
+        for joint in tree.joints
+        for what, value in (
+            ("the rotor inertia", joint.drive.rotor_inertia),
+            ("the constant friction", joint.drive.offset),
+        )
+        if value
+    ]
+    if left_out:
+        warn(tree.name, f"SDF has no place for {', '.join(left_out)}")
+    return write_sdf(tree)
+
+
+def robot_tree(robot: Robot) -> UrdfTree:
+    """The robot's bodies, single joints and closures with all that description formats tell."""
     engine, load = robot.engine, robot.payload
-    tree = urdf_tree(
+    return urdf_tree(
         robot.graph,
         single_joints(engine),
         engine.tree.cut,
@@ -44,7 +84,6 @@ def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
         drives=_drives(robot),
         payload=UrdfBody("payload", load.mass, load.com, load.inertia),
     )
-    return write_urdf(tree, hardware, prefix)
 
 
 def robot_description(robot: Robot) -> dict[str, Any]:
@@ -119,5 +158,7 @@ def _drives(robot: Robot) -> dict[str, UrdfDrive]:
             one(limits.effort, k),
             float(friction.viscous[k]),
             float(friction.coulomb[k]),
+            robot.graph.joints[name].rotor_inertia,
+            float(friction.offset[k]),
         )
     return drives

@@ -330,7 +330,7 @@ def inertia(*, positive: bool, default: Any = dataclasses.MISSING) -> Any:
         if float(np.abs(matrix - matrix.T).max()) > 1e-9 * scale:
             raise ParameterError(field, value, "a symmetric matrix")
         a, b, c = np.linalg.eigvalsh(matrix)
-        if a < -1e-12 * scale or (positive and not a > 1e-12 * scale):
+        if a < -1e-9 * scale or (positive and not a > 1e-12 * scale):
             bound = "above zero" if positive else "zero or more"
             raise ParameterError(field, value, f"principal moments {bound}; the least is {a:.6g}")
         if c > (a + b) * (1 + 1e-9):

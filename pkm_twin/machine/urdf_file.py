@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -60,6 +60,7 @@ class Joint:
     viscous: float
     coulomb: float
     rotor_inertia: float = 0.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +125,15 @@ def read(path: Path, robot: ET.Element) -> Urdf:
             "<constraint> or <loop> elements, or closed_loop in a YAML file next to it",
         )
     name = robot.get("name") or path.stem
-    initial = _initial(robot, actuated)
+    initial = _parameters(robot, actuated, "initial_value")
+    rotors = _parameters(robot, actuated, "rotor_inertia")
+    offsets = _parameters(robot, actuated, "friction_offset")
+    for joint in [joints[key] for key in (*rotors, *offsets)]:
+        joints[joint.name] = replace(
+            joint,
+            rotor_inertia=rotors.get(joint.name, 0.0),
+            offset=offsets.get(joint.name, 0.0),
+        )
     return Urdf(
         name, root, links, joints, tuple(closures.values()), actuated, initial=initial,
         accuracy=_accuracy(robot),
@@ -174,13 +183,7 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     limit = urdf_xml.single(element, "limit", where)
     if limit is not None and kind in ("revolute", "continuous", "prismatic"):
         limits = _limits(limit, where, kind)
-    viscous = coulomb = 0.0
-    for tag in ("dynamics", "joint_properties"):
-        dynamics = urdf_xml.single(element, tag, where)
-        if dynamics is not None:
-            viscous = urdf_xml.positive(dynamics.get("damping", "0"), f"{where}.{tag}.damping")
-            coulomb = urdf_xml.positive(dynamics.get("friction", "0"), f"{where}.{tag}.friction")
-            break
+    viscous, coulomb = urdf_xml.friction(element, where)
     kind = "revolute" if kind == "continuous" else kind
     return Joint(
         name, kind, parent, child, origin, np.reshape(axes, (-1, 3)), limits, viscous, coulomb
@@ -331,16 +334,18 @@ def _actuated(
     return tuple(names)
 
 
-def _initial(robot: ET.Element, actuated: tuple[str, ...]) -> dict[str, float]:
-    """The actuated joints' ``initial_value`` in a ``<ros2_control>`` element."""
+def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str) -> dict[str, float]:
+    """A parameter of the actuated joints, or of their position, in ``<ros2_control>`` elements."""
     found: dict[str, float] = {}
     for joint in robot.findall("ros2_control/joint"):
         name = joint.get("name", "")
-        for state in joint.findall("state_interface"):
-            for param in state.findall("param") if state.get("name") == "position" else ():
-                if param.get("name") == "initial_value" and name in actuated:
-                    where = f"ros2_control.{name}.initial_value"
-                    found[name] = urdf_xml.number((param.text or "").strip(), where)
+        states = [s for s in joint.findall("state_interface") if s.get("name") == "position"]
+        for param in [one for part in (joint, *states) for one in part.findall("param")]:
+            if param.get("name") == key and name in actuated:
+                where = f"ros2_control.{name}.{key}"
+                found[name] = urdf_xml.number((param.text or "").strip(), where)
+                if key == "rotor_inertia" and found[name] < 0.0:
+                    raise ParameterError(where, found[name], "zero or more")
     return found
 
 

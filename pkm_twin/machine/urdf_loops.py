@@ -10,10 +10,11 @@ May import: numpy, the standard library, the XML's parts.
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections import ChainMap
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -43,6 +44,7 @@ PARTS: Final = (
     "child",
     "child_origin",
     "child_axis",
+    "dynamics",
 )
 LOOPS: Final = {
     name: CONSTRAINTS[name]
@@ -54,13 +56,20 @@ BESIDE: Final = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """A joint that closes a loop: a frame on either link, an axis in either frame (or none)."""
+    """A joint that closes a loop: a frame on either link, an axis in either frame (or none).
+
+    ``viscous``, ``coulomb``: friction of a joint of one freedom. ``cosine``: of the angle between
+    the axes of a universal joint.
+    """
 
     name: str
     type: str
     links: tuple[str, str]
     frames: tuple[Pose, Pose]
     axes: tuple[Array, Array] | None
+    viscous: float = 0.0
+    coulomb: float = 0.0
+    cosine: float = 0.0
 
 
 def closures(
@@ -106,7 +115,11 @@ def _constraint(element: ET.Element, name: str, links: Collection[str]) -> Closu
     # The child's axis is the parent's where the two frames meet, unless it is given.
     alone = kind != "universal" and element.find("child_axis") is None
     child = parent if alone else urdf_xml.axis(element, "child_axis", where)
-    return _closure(name, CONSTRAINTS[kind], ends, frames, (parent, child))
+    viscous, coulomb = urdf_xml.friction(element, where)
+    closure = _closure(name, CONSTRAINTS[kind], ends, frames, (parent, child))
+    angle = urdf_xml.number(element.get("angle", repr(math.pi / 2)), f"{where}.angle")
+    cosine = math.cos(angle) if "angle" in element.attrib and kind == "universal" else 0.0
+    return replace(closure, viscous=viscous, coulomb=coulomb, cosine=cosine)
 
 
 def _loop(element: ET.Element, name: str, links: Collection[str]) -> Closure:

@@ -227,11 +227,21 @@ def _joint(
             data["home"] = value
     if actuated and joint.limits:
         data["limits"] = joint.limits
-    if "axis" in data and (joint.viscous > 0.0 or joint.coulomb > 0.0):
-        data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
-    if actuated and joint.rotor_inertia > 0.0:
+    data |= _friction(joint, data)
+    if actuated and joint.offset:
+        data["friction"] = {"viscous": 0.0, "coulomb": 0.0, **data.get("friction", {})}
+        data["friction"]["offset"] = joint.offset
+    if "axis" in data and joint.rotor_inertia > 0.0:
         data["rotor_inertia"] = joint.rotor_inertia
     return data
+
+
+def _friction(part: Joint | Closure, data: dict[str, Any]) -> dict[str, Any]:
+    """The entry of a joint of one freedom that has friction."""
+    single = data["type"] in ("revolute", "prismatic")
+    if single and (part.viscous > 0.0 or part.coulomb > 0.0):
+        return {"friction": {"viscous": part.viscous, "coulomb": part.coulomb}}
+    return {}
 
 
 def _closure(closure: Closure, bodies: dict[str, str], place: Pose, view: Pose) -> dict[str, Any]:
@@ -246,7 +256,7 @@ def _closure(closure: Closure, bodies: dict[str, str], place: Pose, view: Pose) 
             data["axes"] = [first, first]
         else:
             data["axis"] = first
-    return data
+    return data | _friction(closure, data)
 
 
 def _masses(

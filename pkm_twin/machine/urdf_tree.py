@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.kinematics.passive import Axis
-from pkm_twin.machine.graph import BASE, Graph
+from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.outline import bars
 from pkm_twin.machine.urdf_write import (
     GROUND,
@@ -58,8 +58,7 @@ def urdf_tree(
         joint = graph.joints.get(axis.joint) if axis.name == axis.joint else None
         drive = UrdfDrive()
         if joint is not None:
-            drive = UrdfDrive(None, None, None, joint.viscous, joint.coulomb)
-            drive = (drives or {}).get(joint.name, drive)
+            drive = (drives or {}).get(joint.name, _resistance(joint))
         singles.append(
             UrdfJoint(
                 axis.name,
@@ -82,7 +81,11 @@ def urdf_tree(
     for source in cut:
         joint = graph.joints[source]
         ends = links[joint.inner], links[joint.outer]
-        closures.append(UrdfClosure(source, joint.kind, *ends, joint.at, joint.axes))
+        closures.append(
+            UrdfClosure(
+                source, joint.kind, *ends, joint.at, joint.axes, joint.home, _resistance(joint)
+            )
+        )
     for rod in graph.rods.values():
         ends = links[rod.name], links[rod.outer]
         nothing = np.zeros((0, 3))
@@ -96,6 +99,17 @@ def urdf_tree(
         graph.actuated,
         links[graph.platform],
         graph.origin,
+        tuple(
+            (f"{name}_slide", name, joint.pitch)
+            for name, joint in graph.joints.items()
+            if joint.type.threaded()
+        ),
+    )
+
+
+def _resistance(joint: Joint) -> UrdfDrive:
+    return UrdfDrive(
+        damping=joint.viscous, friction=joint.coulomb, rotor_inertia=joint.rotor_inertia
     )
 
 

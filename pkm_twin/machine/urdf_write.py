@@ -3,8 +3,9 @@
 
 All is given at home, in base axes: every link's frame stands on its joint, parallel to the base
 at home, and a joint at home has the value ``home``. Loops that the tree cuts are ``<constraint>``
-elements (urdfdom pull request 264), which parsers of trees pass over; ``cylindrical_joint`` and
-``translation_joint`` are additions to that proposal.
+elements (urdfdom pull request 264), which parsers of trees pass over; ``cylindrical_joint``,
+``translation_joint``, ``<dynamics>`` and ``angle`` (between a universal joint's axes, rad, where it
+is not a right one) are additions to that proposal.
 
 May import: numpy, the standard library, the rotations, the bounds of what is read.
 """
@@ -57,13 +58,18 @@ class UrdfBody:
 
 @dataclass(frozen=True, eq=False)
 class UrdfDrive:
-    """Limits of a joint, None where there is none, and its friction per rate and dry."""
+    """Limits of a joint, None where there is none, and its friction per rate and dry.
+
+    ``rotor_inertia``: kg m2 or kg, at the joint; ``offset``: constant friction.
+    """
 
     position: tuple[float, float] | None = None
     velocity: float | None = None
     effort: float | None = None
     damping: float = 0.0
     friction: float = 0.0
+    rotor_inertia: float = 0.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +91,10 @@ class UrdfJoint:
 
 @dataclass(frozen=True, eq=False)
 class UrdfClosure:
-    """A joint between two links that the tree leaves out; ``axes``: (count, 3), base axes."""
+    """A joint between two links that the tree leaves out; ``axes``: (count, 3), base axes.
+
+    A joint of one freedom has its value at home, and what resists it.
+    """
 
     name: str
     type: str
@@ -93,6 +102,8 @@ class UrdfClosure:
     child: str
     point: Array
     axes: Array
+    home: float = 0.0
+    drive: UrdfDrive = field(default_factory=UrdfDrive)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +121,8 @@ class UrdfTree:
     """A machine as a tree of links; joints from the ground outwards, each child once.
 
     ``actuated``: joints, in the robot's order. ``platform``: the body that carries the tool;
-    ``origin``: its reference point at home, (3,).
+    ``origin``: its reference point at home, (3,). ``screws``: slide, turn and pitch (m a rad) of
+    joints of which the slide follows the turn.
     """
 
     name: str
@@ -121,6 +133,7 @@ class UrdfTree:
     actuated: tuple[str, ...]
     platform: str
     origin: Array
+    screws: tuple[tuple[str, str, float], ...] = ()
 
 
 def write_urdf(tree: UrdfTree, hardware: str = MOCK, prefix: str = "") -> str:
@@ -163,13 +176,13 @@ def write_urdf(tree: UrdfTree, hardware: str = MOCK, prefix: str = "") -> str:
 def _inertial(link: ET.Element, body: UrdfBody, place: Array) -> None:
     # Also where there is no mass: some simulators take a kilogram for what is not said.
     inertial = ET.SubElement(link, "inertial")
-    ET.SubElement(inertial, "origin", xyz=_text(body.com - place), rpy="0 0 0")
+    ET.SubElement(inertial, "origin", xyz=number_text(body.com - place), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=f"{body.mass:.15g}")
     keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     upper = body.inertia[np.triu_indices(3)]
     # Rounding that turned axes leave behind says nothing.
     upper = np.where(np.abs(upper) > 1e-14 * float(np.abs(upper).max()), upper, 0.0)
-    values = {key: _text([value], 0.0) for key, value in zip(keys, upper, strict=True)}
+    values = {key: f"{value:.12g}" for key, value in zip(keys, upper, strict=True)}
     ET.SubElement(inertial, "inertia", values)
 
 
@@ -178,25 +191,30 @@ def _visuals(link: ET.Element, place: Array, capsules: Iterable[UrdfCapsule]) ->
     for capsule in capsules:
         along = capsule.end - capsule.start
         length = float(np.linalg.norm(along))
-        radius = _text([capsule.radius])
+        radius = number_text([capsule.radius])
         shapes = [("sphere", capsule.start, "0 0 0"), ("sphere", capsule.end, "0 0 0")]
         if length > 0.0:
-            # Snapped, so that an angle does not hang on the sign of what is nearly zero.
-            x, y, z = np.round(along / length, 12) + 0.0
-            turned = _text([0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)])
-            shapes.insert(0, ("cylinder", (capsule.start + capsule.end) / 2, turned))
+            centre = (capsule.start + capsule.end) / 2
+            shapes.insert(0, ("cylinder", centre, rpy_along(along / length)))
         for shape, centre, rpy in shapes:
             if shape == "sphere" and any(np.array_equal(centre, other) for other in round_ends):
                 continue
             if shape == "sphere":
                 round_ends.append(centre)
             visual = ET.SubElement(link, "visual")
-            ET.SubElement(visual, "origin", xyz=_text(centre - place), rpy=rpy)
+            ET.SubElement(visual, "origin", xyz=number_text(centre - place), rpy=rpy)
             geometry = ET.SubElement(visual, "geometry")
             size = {"radius": radius}
             if shape == "cylinder":
-                size["length"] = _text([length])
+                size["length"] = number_text([length])
             ET.SubElement(geometry, shape, size)
+
+
+def rpy_along(direction: Array) -> str:
+    """Roll, pitch and yaw of axes whose z is a unit vector."""
+    # Snapped, so that an angle does not hang on the sign of what is nearly zero.
+    x, y, z = np.round(direction, 12) + 0.0
+    return number_text([0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)])
 
 
 def _joint(robot: ET.Element, joint: UrdfJoint, places: dict[str, Array]) -> None:
@@ -207,37 +225,45 @@ def _joint(robot: ET.Element, joint: UrdfJoint, places: dict[str, Array]) -> Non
         xyz = xyz - joint.axis * joint.home
     elif joint.type == "revolute":
         rpy = rotations.to_rpy(rotations.about(joint.axis, -joint.home))
-    ET.SubElement(element, "origin", xyz=_text(xyz), rpy=_text(rpy))
+    ET.SubElement(element, "origin", xyz=number_text(xyz), rpy=number_text(rpy))
     ET.SubElement(element, "parent", link=joint.parent)
     ET.SubElement(element, "child", link=joint.child)
     if joint.type == "fixed":
         return
-    ET.SubElement(element, "axis", xyz=_text(joint.axis))
+    ET.SubElement(element, "axis", xyz=number_text(joint.axis))
     free, drive = UNLIMITED[joint.type], joint.drive
     low, high = drive.position or (-free, free)
     ET.SubElement(
         element,
         "limit",
-        lower=_text([low]),
-        upper=_text([high]),
-        velocity=_text([UNLIMITED["velocity"] if drive.velocity is None else drive.velocity]),
-        effort=_text([UNLIMITED["effort"] if drive.effort is None else drive.effort]),
+        lower=number_text([low]),
+        upper=number_text([high]),
+        velocity=number_text([UNLIMITED["velocity"] if drive.velocity is None else drive.velocity]),
+        effort=number_text([UNLIMITED["effort"] if drive.effort is None else drive.effort]),
     )
+    _dynamics(element, drive)
+
+
+def _dynamics(element: ET.Element, drive: UrdfDrive) -> None:
     if drive.damping or drive.friction:
-        ET.SubElement(
-            element, "dynamics", damping=_text([drive.damping]), friction=_text([drive.friction])
-        )
+        damping, friction = number_text([drive.damping]), number_text([drive.friction])
+        ET.SubElement(element, "dynamics", damping=damping, friction=friction)
 
 
 def _closure(robot: ET.Element, closure: UrdfClosure, places: dict[str, Array]) -> None:
     element = ET.SubElement(robot, "constraint", name=closure.name, type=CLOSURES[closure.type])
     for i, (end, link) in enumerate((("parent", closure.parent), ("child", closure.child))):
         ET.SubElement(element, end, link=link)
-        at = _text(closure.point - places[link])
+        at = number_text(closure.point - places[link])
         ET.SubElement(element, f"{end}_origin", xyz=at, rpy="0 0 0")
         if len(closure.axes):
             axis = closure.axes[min(i, len(closure.axes) - 1)]
-            ET.SubElement(element, f"{end}_axis", xyz=_text(axis))
+            ET.SubElement(element, f"{end}_axis", xyz=number_text(axis))
+    _dynamics(element, closure.drive)
+    if len(closure.axes) == 2:
+        cosine = float(np.clip(closure.axes[0] @ closure.axes[1], -1.0, 1.0))
+        if abs(cosine) > 1e-12:
+            element.set("angle", number_text([math.acos(cosine)]))
 
 
 def _control(robot: ET.Element, tree: UrdfTree, plugin: str) -> None:
@@ -251,9 +277,16 @@ def _control(robot: ET.Element, tree: UrdfTree, plugin: str) -> None:
             ET.SubElement(element, "command_interface", name=interface)
         position = ET.SubElement(element, "state_interface", name="position")
         start = _start(joints[name].home, joints[name].drive)
-        ET.SubElement(position, "param", name="initial_value").text = _text([start])
+        ET.SubElement(position, "param", name="initial_value").text = number_text([start])
         for interface in ("velocity", "effort"):
             ET.SubElement(element, "state_interface", name=interface)
+        drive = joints[name].drive
+        for key, value in (
+            ("rotor_inertia", drive.rotor_inertia),
+            ("friction_offset", drive.offset),
+        ):
+            if value:
+                ET.SubElement(element, "param", name=key).text = number_text([value])
 
 
 def _start(home: float, drive: UrdfDrive) -> float:
@@ -264,6 +297,12 @@ def _start(home: float, drive: UrdfDrive) -> float:
     return (limits[0] + limits[1]) / 2
 
 
-def _text(values: Iterable[float], least: float = 1e-12) -> str:
-    """Numbers to 12 digits, so that the last bits of another machine's arithmetic do not show."""
-    return " ".join(f"{value:.12g}" if abs(value) > least else "0" for value in values)
+def number_text(values: Iterable[float], least: float = 1e-13) -> str:
+    """Numbers to 14 digits, so that the last bits of another machine's arithmetic do not show.
+
+    Vectors to 14 decimals too: a short component may be a difference of longer ones.
+    """
+    row = [float(value) for value in values]
+    if len(row) > 1:
+        row = [round(value, 14) for value in row]
+    return " ".join(f"{value:.14g}" if abs(value) > least else "0" for value in row)

@@ -217,3 +217,15 @@ def number(text: str | None, where: str) -> float:
     if not math.isfinite(value) or abs(value) > schema.MAX_SIZE:
         raise ParameterError(where, text, "a finite number")
     return value
+
+
+def friction(element: ET.Element, where: str) -> tuple[float, float]:
+    """Viscous and dry friction of a joint or closure, zero where it states none."""
+    for tag in ("dynamics", "joint_properties"):
+        dynamics = single(element, tag, where)
+        if dynamics is not None:
+            return (
+                positive(dynamics.get("damping", "0"), f"{where}.{tag}.damping"),
+                positive(dynamics.get("friction", "0"), f"{where}.{tag}.friction"),
+            )
+    return 0.0, 0.0

@@ -11,6 +11,8 @@ Targets: one torque sample at most 2 us, 0.15 us per sample in a batch; one plat
 most 30 us, 6 us per sample in a batch; round trip p50 at most 1.10 of the echo's, p99 and processor
 time at most 1.2, and p50 with `events` below the single-threaded echo's; a minute without a lost
 message; 2 s to the first answer.
+
+The exported C, alone and next to Pinocchio in C++: [export_c.md](export_c.md).
 """
 BOUNDS = (1.10, 1.2, 1.2)
 """Most that p50, p99 and processor time may be of the echo's."""

@@ -65,6 +65,14 @@ def test_a_new_machine_from_an_empty_file_to_torques(tmp_path, twin, monkeypatch
         assert (tmp_path / made).stat().st_size
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("page", ["export_fmu.md", "simulators.md"])
+def test_the_blocks_of_a_page_run(page, tmp_path, twin, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    printed = [run(language, block, tmp_path, twin) for language, block, _ in blocks(page)]
+    assert len(printed) == 2 and all(printed)
+
+
 def test_the_parameters_page_is_that_of_the_schemas():
     """Else `make pages` writes it anew."""
     assert (DOCS / "parameters.md").read_text(encoding="utf-8") == parameters.page()

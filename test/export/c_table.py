@@ -131,9 +131,8 @@ def row(name):
 
 if __name__ == "__main__":
     page = Path(sys.argv[1])
-    # The last table of the page.
-    head, rule, rest = page.read_text(encoding="utf-8").rpartition("|---|---:")
-    ends, *old = rest.split("\n")
-    kept = [line for line in old if not line.startswith("| `")]
-    rows = [row(name) for name in robot_names()]
-    page.write_text("\n".join([head + rule + ends, *rows, *kept]), encoding="utf-8")
+    lines = page.read_text(encoding="utf-8").splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith("| robot | source")) + 2
+    end = next(k for k in range(at, len(lines)) if not lines[k].startswith("| `"))
+    lines[at:end] = [row(name) for name in robot_names()]
+    page.write_text("\n".join([*lines, ""]), encoding="utf-8")

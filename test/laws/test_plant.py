@@ -167,6 +167,22 @@ def test_stops_hold_and_let_go():
     assert (plant.qd < 0.0).all()
 
 
+def test_a_machine_without_stops_is_one_with_far_ones():
+    data = variant("four_bar", np.random.default_rng(1)) | {"mechanism": "machine"}
+    found = []
+    for limits in (None, {"position": [-1e3, 1e3]}):
+        for joint in data["joints"].values():
+            if joint.get("actuated"):
+                joint.pop("limits", None)
+                joint |= {} if limits is None else {"limits": limits}
+        plant = Plant(robot_of_data(data, "four_bar"), [data["joints"]["motor"]["home"]])
+        plant.qd = np.array([0.5])
+        for _ in range(200):
+            plant.advance(np.zeros(1), NO_WRENCH, STEP)
+        found.append([*plant.q, *plant.qd])
+    np.testing.assert_allclose(*found, 1e-9, 1e-12)
+
+
 @pytest.mark.parametrize("n", range(1, 7))
 def test_forces_of_friction_and_stops_obey_coulomb(n, rng):
     for k in range(60):

@@ -177,7 +177,6 @@ def test_a_weld_and_a_lock_hold(tmp_path):
 REFUSED = {
     "joint": (CONNECT + '<joint joint1="m1" joint2="m2"/>', "", "", "equality.*'m1'"),
     "tendon": (CONNECT, 'joint="m1" gear', 'site="tool" gear', "actuator.a1"),
-    "reference": (CONNECT, 'axis="0 0 2"', 'axis="0 0 2" ref="10"', "joint.m1.ref"),
     "no motor": (
         CONNECT,
         '<motor name="a2" joint="m2"/><motor name="a1" joint="m1" gear="3"/>',

@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot as a Functional Mock-up Unit, FMI 2.0 or 3.0: model exchange and co-simulation.
+
+May import: pkm_twin's core, delta_dynamics, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import platform
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from delta_dynamics.virtual_work import MASSLESS
+from pkm_twin.errors import ParameterError
+from pkm_twin.export.c_lines import table
+from pkm_twin.export.c_package import Package
+from pkm_twin.export.fmu_interface import interface, source
+from pkm_twin.export.fmu_xml import Description, Variable, build_of, quoted, text_of
+from pkm_twin.machine.inertia import loaded_joints
+from pkm_twin.machine.robot import Robot
+
+VERSIONS: Final = (2, 3)
+KINDS: Final = ("dynamics", "torques")
+INTERNAL: Final = 1e-4
+"""Step of the integrator in co-simulation, s, where the importer sets no other."""
+MODEL: Final = "fmu.c"
+CONSTANTS: Final = f"""\
+#define LEAST {MASSLESS!r}
+/* Of the plant: a rate that is none, forces and motions that are equal, rows that depend. */
+#define STILL 1e-12
+#define TOLERANCE 1e-9
+#define REGULAR 1e-11
+#define DEPENDENT 1e-14
+/* Rate, rad/s or m/s, that a sliding joint may have in the other direction before it stops. */
+#define CREEP 1e-10
+/* Changes of stick and slip in an internal step whose times are found, and how exactly. */
+#define CHANGES 20
+#define INSTANT 1e-8
+"""
+COMPILERS: Final = ("cc", "gcc", "clang")
+_FOLDERS: Final = {
+    ("x86_64", 2): "linux64", ("x86_64", 3): "x86_64-linux",
+    ("aarch64", 2): "aarch64-linux", ("aarch64", 3): "aarch64-linux",
+}  # fmt: skip
+_ZIPPED: Final = (1980, 1, 1, 0, 0, 0)
+
+
+class Fmu:
+    """The files of an FMU; ``identifier`` is the name of its functions and binaries.
+
+    ``kind``: dynamics (states q and qd, inputs tau and wrench) or torques (inputs q, qd, qdd and
+    wrench). ``version`` of FMI: 2 or 3.
+
+    :raises ParameterError: a robot whose file gives no masses.
+    """
+
+    def __init__(self, robot: Robot, version: int = 3, kind: str = "dynamics") -> None:
+        robot.massive()
+        self.robot, self.version, self.kind = robot, version, kind
+        self.dynamic = kind == "dynamics"
+        self.n = robot.joints_count
+        names = ("terms", "forward") if self.dynamic else ("torques", "forward", "singularity")
+        self._package = Package(robot, names)
+        self.identifier = self._package.prefix
+        passive = loaded_joints(robot.graph)
+        dry = [*robot.friction.coulomb, *(joint.coulomb for joint in passive)]
+        self._rows = [k for k, force in enumerate(dry) if force > 0.0] if self.dynamic else []
+        self._dry = [float(dry[k]) for k in self._rows]
+        self._row_names = [*robot.joint_names, *(joint.name for joint in passive)]
+        self._passive = [float(joint.viscous) for joint in passive]
+        self._starts: dict[str, int] = {}
+        self.variables = self._variables()
+        self.files = self._files()
+
+    # Variables.
+
+    def _variables(self) -> list[Variable]:
+        robot, n = self.robot, self.n
+        found: list[Variable] = []
+
+        def add(group: str, rows: Sequence[Variable]) -> list[int]:
+            self._starts[group] = len(found)
+            found.extend(rows)
+            return list(range(len(found) - len(rows), len(found)))
+
+        names = [quoted(name) for name in robot.joint_names]
+        units = robot.joint_units
+        efforts = ["N.m" if unit == "rad" else "N" for unit in units]
+
+        def joints(
+            what: str, text: str, kind: str, ends: str = "", start: Sequence[float] | None = None
+        ) -> list[Variable]:
+            own = efforts if what == "tau" else [unit + ends for unit in units]
+            begin = [None] * n if start is None else [float(x) for x in start]
+            return [
+                Variable(f"{what}.{name}", kind, unit, f"{text} of {joint}", value)
+                for name, joint, unit, value in zip(
+                    names, robot.joint_names, own, begin, strict=True
+                )
+            ]
+
+        still = [0.0] * n
+        home, moves = robot.graph.home, "s" if self.dynamic else "i"
+        add("TIME", [Variable("time", "t", "s", "Time")])
+        q = add("Q", joints("q", "position", moves, start=home.tolist()))
+        qd = add("QD", joints("qd", "velocity", moves, "/s", still))
+        if self.dynamic:
+            # A state that can be seen is an output that depends on itself.
+            for k in (*q, *qd):
+                found[k] = replace(found[k], needs=[k])
+            add("DQ", [
+                replace(v, name=f"der({found[k].name})", derivative=k, needs=[j])
+                for k, j, v in zip(q, qd, joints("qd", "velocity", "d", "/s"), strict=True)
+            ])  # fmt: skip
+            accelerations = add("DQD", [
+                replace(v, name=f"der({found[k].name})", derivative=k)
+                for k, v in zip(qd, joints("qdd", "acceleration", "d", "/s2"), strict=True)
+            ])  # fmt: skip
+            moved = add("TAU", joints("tau", "effort", "i", start=still))
+        else:
+            moved = add("QDD", joints("qdd", "acceleration", "i", "/s2", still))
+        wrench = add("WRENCH", [
+            Variable(
+                f"wrench.{axis}", "i", unit, "what the surroundings apply to the platform at its "
+                "reference point, base axes", 0.0,
+            )
+            for unit, axes in (("N", ("fx", "fy", "fz")), ("N.m", ("mx", "my", "mz")))
+            for axis in axes
+        ])  # fmt: skip
+        every = [*q, *qd, *moved, *wrench]
+        add("PAYLOAD", self._payload())
+        if self.dynamic:
+            for k in accelerations:
+                found[k] = replace(found[k], needs=every)
+            add("STEP", [
+                Variable("step", "p", "s", "longest internal step of co-simulation", INTERNAL)
+            ])  # fmt: skip
+        else:
+            efforts_at = joints("tau", "effort that the motion needs", "o")
+            add("TAU", [replace(v, needs=every) for v in efforts_at])
+        add("POSE", [
+            Variable(f"pose.{name}", "o", unit, "pose of the platform", needs=q)
+            for name, unit in zip(map(quoted, robot.pose_names), robot.pose_units, strict=True)
+        ])  # fmt: skip
+        if not self.dynamic:
+            add("SINGULARITY", [
+                Variable("singularity", "o", "", "0 in a singularity, 1 at best", needs=q)
+            ])  # fmt: skip
+        text = "0 valid, 1 no assembly or a singularity, 2 not finite"
+        add("STATUS", [Variable("status", "o", "", text, needs=every, whole=True)])
+        add("INDICATORS", [
+            Variable(
+                f"stick_slip.{quoted(self._row_names[row])}", "d", "",
+                "falls through zero where the joint begins to stick or to slide", needs=every,
+            )
+            for row in self._rows
+        ])  # fmt: skip
+        return found
+
+    def _payload(self) -> list[Variable]:
+        load = self.robot.payload
+        rows = [Variable("payload.mass", "p", "kg", "mass of the payload", float(load.mass))]
+        place = "from the platform's reference point, axes fixed to the platform, base's at home"
+        for axis, value in zip("xyz", load.com, strict=True):
+            text = f"centre of mass {place}"
+            rows.append(Variable(f"payload.com.{axis}", "p", "m", text, float(value)))
+        for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+            name, value = f"payload.inertia.{'xyz'[i]}{'xyz'[k]}", float(load.inertia[i][k])
+            text = "entry of the inertia matrix about the centre of mass"
+            rows.append(Variable(name, "p", "kg.m2", text, value))
+        return rows
+
+    # Files.
+
+    def _model(self) -> str:
+        """The wrapper's text; in place of its token stands ``TOKEN``."""
+        robot, size = self.robot, len(self.variables)
+        defined = {
+            "N": self.n, "COUNT": size, "DRY": len(self._rows), "PASSIVE": len(self._passive),
+            "STATES": 2 * self.n if self.dynamic else 0, "STATUS_AT": self._starts["STATUS"],
+            **self._starts,
+        }  # fmt: skip
+        lines = [f"#define {name} {value}" for name, value in defined.items()]
+        lines.append(f"#define PARAMETERS {self._package.macro}_PARAMETERS")
+        tables = {"START": [v.start or 0.0 for v in self.variables]}
+        if self.dynamic:
+            lines.append(CONSTANTS)
+            tables["OFFSET"] = robot.friction.offset.tolist()
+            tables["VISCOUS"] = robot.friction.viscous.tolist()
+            tables["PASSIVE_VISCOUS"] = self._passive
+            tables["FRICTION"] = self._dry
+        kinds = "".join(v.kind for v in self.variables)
+        constants = [table(name, values) for name, values in tables.items() if values]
+        constants.append(f'static const char KIND[] = "{kinds}";\n')
+        if self._rows:
+            rows = ", ".join(map(str, self._rows))
+            constants.append(f"static const int ROW[DRY] = {{{rows}}};\n")
+        model = ["torques"]
+        if self.dynamic:
+            friction = ["dry", "rates", "settle"] if self._rows else ["rates", "smooth"]
+            model = ["dynamics", *friction, "steps"]
+        title = f"/* {self.identifier}: written by pkm-twin export fmu. */\n"
+        parts = [
+            f"/* SPDX-License-Identifier: Apache-2.0 */\n{title}", source("head"),
+            "\n".join(lines) + "\n",
+            *constants, *map(source, ["model", *model]), interface(self.version),
+        ]  # fmt: skip
+        return "\n".join(parts).replace("@", self.identifier)
+
+    def _files(self) -> dict[str, str]:
+        prefix = self.identifier
+        sources = {
+            f"{prefix}.h": self._package.header(),
+            f"{prefix}.c": self._package.source(),
+            MODEL: self._model(),
+        }
+        described = Description(
+            self.robot.name or prefix, prefix, "", self._text, self.variables,
+            [k for k, v in enumerate(self.variables) if v.name.startswith("stick_slip.")],
+            bool(self._rows), [name for name in sources if name.endswith(".c")],
+        )  # fmt: skip
+        first = text_of(described, self.version)
+        digest = hashlib.sha256("".join([first, *sources.values()]).encode()).hexdigest()
+        token = "-".join(digest[a:b] for a, b in ((0, 8), (8, 12), (12, 16), (16, 20), (20, 32)))
+        token = f"{{{token}}}"
+        described = replace(described, token=token)
+        sources[MODEL] = sources[MODEL].replace(
+            "#define COUNT", f'#define TOKEN "{token}"\n#define COUNT', 1
+        )
+        if self.version == 3:
+            sources["buildDescription.xml"] = build_of(described)
+        return {
+            "modelDescription.xml": text_of(described, self.version),
+            **{f"sources/{name}": text for name, text in sources.items()},
+        }
+
+    @property
+    def _text(self) -> str:
+        name = self.robot.name or self.identifier
+        if self.dynamic:
+            return f"Motion of {name} under joint efforts and a wrench on its platform"
+        return f"Joint efforts that a motion of {name} needs"
+
+    def archive(self, compiler: str | None = None) -> bytes:
+        """The FMU; with a binary for this machine where a compiler is given.
+
+        :raises ParameterError: the compiler does not accept the sources, with what it printed.
+        """
+        files: dict[str, bytes] = {name: text.encode() for name, text in self.files.items()}
+        folder = _FOLDERS.get((platform.machine(), self.version))
+        if compiler is not None and folder is not None and platform.system() == "Linux":
+            name = f"binaries/{folder}/{self.identifier}.so"
+            files[name] = self._binary(compiler)
+        made = io.BytesIO()
+        with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in files.items():
+                entry = zipfile.ZipInfo(name, _ZIPPED)
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                entry.external_attr = 0o644 << 16
+                archive.writestr(entry, content)
+        return made.getvalue()
+
+    def _binary(self, compiler: str) -> bytes:
+        with tempfile.TemporaryDirectory() as folder:
+            names = []
+            for name, text in self.files.items():
+                if name.startswith("sources/"):
+                    names.append(name.removeprefix("sources/"))
+                    (Path(folder) / names[-1]).write_text(text, encoding="utf-8")
+            code = [name for name in names if name.endswith(".c")]
+            command = [
+                compiler, "-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden",
+                "-ffp-contract=off", *code, "-o", "model.so", "-lm",
+            ]  # fmt: skip
+            done = subprocess.run(  # noqa: S603  a compiler of this machine, without a shell
+                command, cwd=folder, capture_output=True, text=True, check=False
+            )
+            if done.returncode:
+                raise ParameterError(compiler, done.stderr.strip(), "a C99 compiler")
+            return (Path(folder) / "model.so").read_bytes()
+
+
+def found_compiler() -> str | None:
+    """The first C compiler of this machine."""
+    return next((path for name in COMPILERS if (path := shutil.which(name))), None)

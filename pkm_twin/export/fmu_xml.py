@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The variables of an FMU and its modelDescription.xml, of FMI 2.0 and 3.0, byte for byte the same.
+
+May import: the standard library.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+TOOL: Final = "pkm_twin"
+UNITS: Final[dict[str, dict[str, int]]] = {
+    "s": {"s": 1}, "m": {"m": 1}, "rad": {"rad": 1}, "m/s": {"m": 1, "s": -1},
+    "rad/s": {"rad": 1, "s": -1}, "m/s2": {"m": 1, "s": -2}, "rad/s2": {"rad": 1, "s": -2},
+    "kg": {"kg": 1}, "kg.m2": {"kg": 1, "m": 2}, "N": {"kg": 1, "m": 1, "s": -2},
+    "N.m": {"kg": 1, "m": 2, "s": -2},
+}  # fmt: skip
+"""Units by their base units' exponents."""
+PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable; its value reference is its place.
+
+    ``kind``: t time, i input, p parameter, s state, d derivative or event indicator, o output.
+    ``start``: of what has one. ``derivative``: place of the state that it is the derivative of.
+    ``needs``: places of the inputs and states that it depends on.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    description: str
+    start: float | None = None
+    derivative: int | None = None
+    needs: Sequence[int] = ()
+    whole: bool = False
+
+    @property
+    def causality(self) -> str:
+        """As FMI has it; a state can be seen as an output."""
+        words = {"t": "independent", "i": "input", "p": "parameter", "d": "local"}
+        return words.get(self.kind, "output")
+
+    @property
+    def variability(self) -> str:
+        """As FMI has it."""
+        if self.whole:
+            return "discrete"
+        return "tunable" if self.kind == "p" else "continuous"
+
+    @property
+    def initial(self) -> str:
+        """As FMI has it; of inputs and time nothing."""
+        return {"p": "exact", "s": "exact", "d": "calculated", "o": "calculated"}.get(self.kind, "")
+
+
+@dataclass(frozen=True)
+class Description:
+    """What both versions of modelDescription.xml tell.
+
+    ``indicators``: places of the event indicators. ``resets``: whether events change rates.
+    """
+
+    name: str
+    identifier: str
+    token: str
+    text: str
+    variables: Sequence[Variable]
+    indicators: Sequence[int]
+    resets: bool
+    sources: Sequence[str]
+
+    def states(self) -> list[int]:
+        """Places of the continuous states."""
+        return [k for k, v in enumerate(self.variables) if v.kind == "s"]
+
+    def unknowns(self, kinds: str) -> list[tuple[int, Variable]]:
+        """Outputs (``so``), derivatives (``d``)."""
+        return [
+            (k, v)
+            for k, v in enumerate(self.variables)
+            if v.kind in kinds and k not in self.indicators
+        ]
+
+
+def quoted(name: str) -> str:
+    """A name as a part of a structured one."""
+    if PLAIN.fullmatch(name):
+        return name
+    safe = "".join(c if c.isascii() and c.isprintable() else "_" for c in name)
+    safe = safe.replace("\\", "\\\\").replace("'", "\\'").replace('"', '\\"')
+    return f"'{safe}'"
+
+
+def text_of(d: Description, version: int) -> str:
+    """The file of a version of FMI, 2 or 3."""
+    top = _second(d) if version == 2 else _third(d)
+    ET.indent(top)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(top, encoding="unicode") + "\n"
+
+
+def build_of(d: Description) -> str:
+    """``sources/buildDescription.xml`` of FMI 3.0."""
+    top = ET.Element("fmiBuildDescription", fmiVersion="3.0")
+    build = ET.SubElement(top, "BuildConfiguration", modelIdentifier=d.identifier)
+    files = ET.SubElement(build, "SourceFileSet", language="C99")
+    for name in d.sources:
+        ET.SubElement(files, "SourceFile", name=name)
+    ET.SubElement(build, "Library", name="m")
+    ET.indent(top)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(top, encoding="unicode") + "\n"
+
+
+def _units(top: ET.Element, d: Description) -> None:
+    units = ET.SubElement(top, "UnitDefinitions")
+    for name in sorted({v.unit for v in d.variables if v.unit}):
+        unit = ET.SubElement(units, "Unit", name=name)
+        ET.SubElement(unit, "BaseUnit", {key: str(k) for key, k in UNITS[name].items()})
+
+
+def _attributes(d: Description, v: Variable) -> dict[str, str]:
+    """Start, unit and what makes a state one."""
+    found = {"start": repr(v.start)} if v.start is not None else {}
+    if v.unit:
+        found["unit"] = v.unit
+    if v.kind == "s" and d.resets:
+        found["reinit"] = "true"
+    return found
+
+
+def _second(d: Description) -> ET.Element:
+    top = ET.Element(
+        "fmiModelDescription", fmiVersion="2.0", modelName=d.name, guid=d.token,
+        description=d.text, generationTool=TOOL, variableNamingConvention="structured",
+        numberOfEventIndicators=str(len(d.indicators)),
+    )  # fmt: skip
+    for kind, more in (
+        ("ModelExchange", {"completedIntegratorStepNotNeeded": "true"}),
+        ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
+    ):
+        more |= {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
+        element = ET.SubElement(top, kind, {"modelIdentifier": d.identifier, **more})
+        files = ET.SubElement(element, "SourceFiles")
+        for name in d.sources:
+            ET.SubElement(files, "File", name=name)
+    _units(top, d)
+    ET.SubElement(top, "DefaultExperiment", startTime="0", stopTime="1", stepSize="0.001")
+    variables = ET.SubElement(top, "ModelVariables")
+    for k, v in enumerate(d.variables):
+        entry = {
+            "name": v.name, "valueReference": str(k), "description": v.description,
+            "causality": v.causality, "variability": v.variability, "initial": v.initial,
+        }  # fmt: skip
+        scalar = ET.SubElement(variables, "ScalarVariable", {a: b for a, b in entry.items() if b})
+        more = _attributes(d, v)
+        if v.derivative is not None:
+            more["derivative"] = str(v.derivative + 1)
+        ET.SubElement(scalar, "Integer" if v.whole else "Real", more)
+    structure = ET.SubElement(top, "ModelStructure")
+
+    def unknowns(tag: str, entries: Iterable[tuple[int, Variable]]) -> None:
+        rows = list(entries)
+        if rows:
+            part = ET.SubElement(structure, tag)
+            for k, v in rows:
+                needs = " ".join(str(i + 1) for i in v.needs)
+                ET.SubElement(part, "Unknown", index=str(k + 1), dependencies=needs)
+
+    unknowns("Outputs", d.unknowns("so"))
+    unknowns("Derivatives", d.unknowns("d"))
+    unknowns("InitialUnknowns", d.unknowns("od"))
+    return top
+
+
+def _third(d: Description) -> ET.Element:
+    top = ET.Element(
+        "fmiModelDescription", fmiVersion="3.0", modelName=d.name, instantiationToken=d.token,
+        description=d.text, generationTool=TOOL, variableNamingConvention="structured",
+    )  # fmt: skip
+    for kind, more in (
+        ("ModelExchange", {"needsCompletedIntegratorStep": "false"}),
+        ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
+    ):
+        more |= {"canGetAndSetFMUState": "true", "canSerializeFMUState": "true"}
+        ET.SubElement(top, kind, {"modelIdentifier": d.identifier, **more})
+    _units(top, d)
+    ET.SubElement(top, "DefaultExperiment", startTime="0", stopTime="1", stepSize="0.001")
+    variables = ET.SubElement(top, "ModelVariables")
+    for k, v in enumerate(d.variables):
+        entry = {
+            "name": v.name, "valueReference": str(k), "description": v.description,
+            "causality": v.causality, "variability": v.variability, "initial": v.initial,
+            **_attributes(d, v),
+        }  # fmt: skip
+        if v.derivative is not None:
+            entry["derivative"] = str(v.derivative)
+        kind = "Int32" if v.whole else "Float64"
+        ET.SubElement(variables, kind, {a: b for a, b in entry.items() if b})
+    structure = ET.SubElement(top, "ModelStructure")
+    for tag, kinds in (
+        ("Output", "so"), ("ContinuousStateDerivative", "d"), ("InitialUnknown", "od"),
+    ):  # fmt: skip
+        for k, v in d.unknowns(kinds):
+            needs = " ".join(map(str, v.needs))
+            ET.SubElement(structure, tag, valueReference=str(k), dependencies=needs)
+    for k in d.indicators:
+        needs = " ".join(map(str, d.variables[k].needs))
+        ET.SubElement(structure, "EventIndicator", valueReference=str(k), dependencies=needs)
+    return top

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pinocchio in C++ and the exported C on the same machine, in one program, into docs/export_c.md.
+
+``python -m test.benchmarks.pinocchio_c docs/export_c.md``: needs g++, Eigen's headers and the wheel
+of Pinocchio, whose headers are compiled with the same flags as the exported C.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pinocchio
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import load
+from pkm_twin.export.c_package import c_package
+from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.joints import across
+from pkm_twin.machine.robot_urdf import robot_description, robot_tree
+from pkm_twin.machine.simulated import hang
+from pkm_twin.machine.tree import axes_with_z
+from pkm_twin.machine.urdf_write import GROUND
+from test.support.robots import joint_range
+
+ROBOTS = "delta", "delta_cu", "linear_delta", "prru", "rps3", "stewart"
+SAMPLES = 1000
+FLAGS = "-O3", "-march=native", "-DNDEBUG", "-w"
+DEFINED = (
+    "-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_LIMIT_VECTOR_SIZE=30",
+    "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS", "-DBOOST_FUSION_INVOKE_MAX_ARITY=12",
+)  # fmt: skip
+"""As Pinocchio's own build has it."""
+HERE = Path(__file__).parent
+HEAD = "| robot | joints of the tree |"
+
+
+def frame(turned, at):
+    return np.block([[turned, np.reshape(at, (3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def flat(*parts):
+    return " ".join(repr(float(x)) for part in parts for x in np.ravel(part))
+
+
+def description(robot):
+    """The tree in numbers, as the program reads it; lines."""
+    tree = robot_tree(robot)
+    places = {GROUND: (0, np.eye(4))}
+    joints, inertias, numbers, home = [], [], {}, []
+    for link in hang(tree):
+        index, above = places[link.parent]
+        for joint in link.joints:
+            here = frame(axes_with_z(joint.axis, across(joint.axis)[0]), joint.point)
+            zero = here.copy()
+            c, s = np.cos(joint.home), np.sin(joint.home)
+            if joint.type == "revolute":
+                zero[:3, :3] = here[:3, :3] @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+            else:
+                zero[:3, 3] -= joint.home * joint.axis
+            at = np.linalg.inv(above) @ zero
+            kind = "R" if joint.type == "revolute" else "P"
+            joints.append(f"{index} {kind} {flat(at[:3, :3], at[:3, 3])}")
+            index, above = len(joints), here
+            numbers[joint.name] = index - 1
+            home.append(joint.home)
+        places[link.name] = index, above
+        if link.body.mass and index:
+            turned = above[:3, :3]
+            com = turned.T @ (link.body.com - above[:3, 3])
+            about = turned.T @ link.body.inertia @ turned
+            inertias.append(f"{index} {flat([link.body.mass], com, about)}")
+    points, angles = [], []
+    for closure in tree.closures:
+        ends = [places[closure.parent], places[closure.child]]
+        local = [(np.linalg.inv(above) @ [*closure.point, 1.0])[:3] for _, above in ends]
+        points += [f"{index} {flat(at)}" for (index, _), at in zip(ends, local, strict=True)]
+        pairs = []
+        if closure.type == "universal":
+            pairs = [closure.axes]
+        elif closure.type == "revolute":
+            pairs = [(e, closure.axes[0]) for e in across(closure.axes[0])]
+        elif closure.type != "spherical":
+            raise ValueError(closure.type)
+        for first, second in pairs:
+            sides = [
+                f"{index} {flat(above[:3, :3].T @ axis)}"
+                for (index, above), axis in zip(ends, (first, second), strict=True)
+            ]
+            angles.append(f"{' '.join(sides)} {float(first @ second)!r}")
+    rows = [str(len(joints)), *joints, str(len(inertias)), *inertias, flat(robot.gravity)]
+    rows += [str(len(points) // 2), *points, str(len(angles)), *angles]
+    rows += [str(robot.joints_count), *(str(numbers[name]) for name in tree.actuated)]
+    return [*rows, flat(home)]
+
+
+def path(robot):
+    """A smooth motion through the middle of the joints' ranges, a sample a millisecond."""
+    middle, half = joint_range(robot)
+    rate = 2.0 * np.pi * np.arange(1, len(middle) + 1)
+    angle = rate * (1e-3 * np.arange(SAMPLES)[:, None]) + np.arange(len(middle))
+    reach = 0.3 * half
+    return (
+        middle + reach * np.sin(angle),
+        reach * rate * np.cos(angle),
+        -reach * rate**2 * np.sin(angle),
+    )
+
+
+def smooth(name):
+    """A robot without friction, which Pinocchio's rnea leaves out."""
+    robot = load(name)
+    if robot.mechanism == "machine":
+        data = robot_description(robot)
+        for joint in data["joints"].values():
+            joint.pop("friction", None)
+        return robot_of_data(data, name)
+    n = robot.joints_count
+    return robot.changed(friction={"viscous": [0.0] * n, "coulomb": [0.0] * n, "offset": [0.0] * n})
+
+
+def measured(name, folder, program):
+    """Of one robot what the program prints, as numbers."""
+    robot = smooth(name)
+    rows = description(robot)
+    q, qd, qdd = path(robot)
+    tau = inverse_dynamics(robot, q, qd, qdd)
+    rotors = [robot.graph.joints[joint].rotor_inertia for joint in robot.graph.actuated]
+    rows.append(str(SAMPLES))
+    for sample in zip(q, qd, qdd, tau - rotors * qdd, tau, strict=True):
+        rows.append(flat(*sample))
+    (folder / "machine.txt").write_text("\n".join(rows))
+    for file, text in c_package(robot).items():
+        (folder / file).write_text(text)
+    prefix = f"pkm_{name}"
+    command = ["gcc", "-std=c99", *FLAGS, "-fPIC", "-shared", f"{prefix}.c", "-o", "pkm.so", "-lm"]
+    subprocess.run(command, cwd=folder, check=True)
+    done = subprocess.run(
+        [str(program), "machine.txt", "./pkm.so", prefix],
+        cwd=folder, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    return [float(word) for word in done.stdout.split()]
+
+
+def compiled(folder):
+    """The program, with Pinocchio's headers alone: its library is built without these flags."""
+    include = Path(pinocchio.__file__).parents[4] / "include"
+    program = folder / "compare"
+    command = [
+        "g++", "-std=c++17", *FLAGS, *DEFINED, f"-I{include}", "-I/usr/include/eigen3",
+        str(HERE / "pinocchio.cpp"), "-o", str(program), "-ldl",
+    ]  # fmt: skip
+    subprocess.run(command, check=True)
+    return program
+
+
+def row(name, folder, program):
+    nv, miss, turns, closed, bare, c, accelerations, _ = measured(name, folder, program)
+    assert miss < 1e-8, (name, miss)
+    cells = [
+        f"`{name}`",
+        f"{nv:.0f}",
+        f"{miss:.0e}",
+        f"{turns:.1f}",
+        f"{closed:,.0f}",
+        f"{bare:,.0f}",
+    ]
+    cells += [f"{c:,.0f}", f"{accelerations:,.0f}"]
+    return "| " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    page = Path(sys.argv[1])
+    lines = page.read_text(encoding="utf-8").splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith(HEAD)) + 2
+    end = at
+    while end < len(lines) and lines[end].startswith("| `"):
+        end += 1
+    with tempfile.TemporaryDirectory() as made:
+        there = Path(made)
+        built = compiled(there)
+        lines[at:end] = [row(name, there, built) for name in sys.argv[2:] or ROBOTS]
+    page.write_text("\n".join([*lines, ""]), encoding="utf-8")
