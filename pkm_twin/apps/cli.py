@@ -14,7 +14,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from pkm_twin.apps import export
+from pkm_twin.apps import export, maps  # noqa: F401  maps adds its commands to atlas
 from pkm_twin.apps.calibrate import calibrate_command
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit

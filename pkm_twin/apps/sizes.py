@@ -47,6 +47,13 @@ def loaded(name: str, platform: str | None) -> Robot:
     return load(name, platform=platform) if platform else load(name)
 
 
+def motion_of(path: Path, robot: Robot, topics: Sequence[str], carried: Load | None) -> Motion:
+    """A recording or a path; errors as :func:`read_motion`."""
+    if is_bag(path):
+        return motion_of_bag(path, robot, topics, carried)
+    return motion_of_csv(path, robot, carried)
+
+
 def read_motion(
     path: Path, robot: Robot, topics: Sequence[str], carried: Load | None, efforts: str
 ) -> Taken:
@@ -56,11 +63,10 @@ def read_motion(
     :raises BagError: a bag without joint states or a trajectory.
     """
     given: Array | None = None
+    motion = motion_of(path, robot, topics, carried)
     if is_bag(path):
-        motion = motion_of_bag(path, robot, topics, carried)
         given = motion.measured if motion.planned is None else motion.planned
     else:
-        motion = motion_of_csv(path, robot, carried)
         columns = read_columns(path)
         names = [f"{joint}.effort" for joint in robot.joint_names]
         if all(name in columns for name in names):

@@ -183,7 +183,7 @@ def strain_energy_sweep(
     :raises ParameterError: a robot whose elastic elements are not :data:`ELEMENTS`, a wrench that
         is none, or a robot that has no regular workspace.
     """
-    if robot.element_names != ELEMENTS:
+    if not has_paper_elements(robot):
         raise ParameterError(
             "mechanism", robot.mechanism, "elastic limbs of R joint, bar and U joint (upr_rpu)"
         )
@@ -205,6 +205,11 @@ def strain_energy_sweep(
     # Each height has its axis, so the count is not quite linear in the step.
     tilt_step = float(heights[1].sum()) / max(rungs - len(heights[0]) / 2, 1.0)
     return _sweep(robot, load, heights, tilt_step, azimuths)
+
+
+def has_paper_elements(robot: Robot) -> bool:
+    """Whether a robot's elastic elements are :data:`ELEMENTS`."""
+    return robot.mechanism == "upr_rpu" and robot.element_names == ELEMENTS
 
 
 def checked_wrench(wrench: ArrayLike | str) -> tuple[float, ...]:
