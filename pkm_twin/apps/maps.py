@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -145,7 +145,11 @@ class PathMap:
 
         robot, names = self.robot, self.quantity.elements(self.robot)
         header = ["time", *robot.pose_names, "counts"]
-        columns: list[list[Any]] = [self.time.tolist(), *pose.T.tolist(), inside.astype(int).tolist()]
+        columns: list[list[Any]] = [
+            self.time.tolist(),
+            *pose.T.tolist(),
+            inside.astype(int).tolist(),
+        ]
         for case, one in zip(self.cases, found, strict=True):
             before = "" if len(self.cases) == 1 else f"{case.name}."
             header += [f"{before}{w}" for w in ("value", "x", "y", "z", "element")]
@@ -193,11 +197,15 @@ def _made(
     """The map of a command line, over the workspace or along a path."""
     from pkm_twin.apps.options import load_of
     from pkm_twin.atlas.maps.sweep import QUANTITIES, check, map_sweep
+    from pkm_twin.atlas.strain_energy.sweep import has_paper_elements, strain_energy_sweep
 
     carried = load_of(payload, None)
     if carried is not None:
         machine = carried.on(machine)
     cases = _cases(wrench)
+    plain = (payload, along, least_singularity, least_clearance) == (None, None, _SINGULARITY, 0.0)
+    if name == "strain-energy" and plain and len(cases) < 2 and has_paper_elements(machine):
+        return strain_energy_sweep(machine, cases[0].wrench or "P1" if cases else "P1", points)
     if along is None:
         return map_sweep(
             machine, name, points, cases=cases, least_singularity=least_singularity,
@@ -214,107 +222,46 @@ def _made(
     )  # fmt: skip
 
 
-@kind
-def compliance(
-    machine: Robot,
-    points: int | None,
-    wrench: Wrench = [],  # noqa: B006  typer copies it
-    payload: LoadOf = None,
-    along: Along = None,
-    least_singularity: Singularity = _SINGULARITY,
-    least_clearance: Clearance = 0.0,
-) -> Sweep | Alone:
-    """Where it is softest: greatest compliance and its direction, or deflection under loads."""
-    return _made(
-        "compliance", machine, points, wrench, payload, along, least_singularity, least_clearance
-    )
+def _offer(name: str, doc: str, *, loads: bool = True) -> None:
+    """Make a map a command; with load cases, or without."""
+
+    def loaded(
+        machine: Robot,
+        points: int | None,
+        wrench: Wrench = [],  # noqa: B006  typer copies it
+        payload: LoadOf = None,
+        along: Along = None,
+        least_singularity: Singularity = _SINGULARITY,
+        least_clearance: Clearance = 0.0,
+    ) -> Sweep | Alone:
+        bounds = least_singularity, least_clearance
+        return _made(name, machine, points, wrench, payload, along, *bounds)
+
+    def unloaded(
+        machine: Robot,
+        points: int | None,
+        payload: LoadOf = None,
+        along: Along = None,
+        least_singularity: Singularity = _SINGULARITY,
+        least_clearance: Clearance = 0.0,
+    ) -> Sweep | Alone:
+        return _made(name, machine, points, (), payload, along, least_singularity, least_clearance)
+
+    made: Callable[..., Sweep | Alone] = loaded if loads else unloaded
+    made.__name__, made.__doc__ = name, doc
+    kind(made)
 
 
-@kind
-def payload(
-    machine: Robot,
-    points: int | None,
-    wrench: Wrench = [],  # noqa: B006  typer copies it
-    payload: LoadOf = None,
-    along: Along = None,
-    least_singularity: Singularity = _SINGULARITY,
-    least_clearance: Clearance = 0.0,
-) -> Sweep | Alone:
-    """How much it carries: the largest mass that the drives hold at rest, weight included."""
-    return _made(
-        "payload", machine, points, wrench, payload, along, least_singularity, least_clearance
-    )
-
-
-@kind
-def acceleration(
-    machine: Robot,
-    points: int | None,
-    wrench: Wrench = [],  # noqa: B006  typer copies it
-    payload: LoadOf = None,
-    along: Along = None,
-    least_singularity: Singularity = _SINGULARITY,
-    least_clearance: Clearance = 0.0,
-) -> Sweep | Alone:
-    """How hard it accelerates: from rest, in the worst direction, within the efforts."""
-    return _made(
-        "acceleration", machine, points, wrench, payload, along, least_singularity, least_clearance
-    )
-
-
-@kind
-def frequency(
-    machine: Robot,
-    points: int | None,
-    payload: LoadOf = None,
-    along: Along = None,
-    least_singularity: Singularity = _SINGULARITY,
-    least_clearance: Clearance = 0.0,
-) -> Sweep | Alone:
-    """Where it rings lowest: first natural frequency, actuators locked."""
-    return _made(
-        "frequency", machine, points, (), payload, along, least_singularity, least_clearance
-    )
-
-
-@kind
-def pose_error(
-    machine: Robot,
-    points: int | None,
-    payload: LoadOf = None,
-    along: Along = None,
-    least_singularity: Singularity = _SINGULARITY,
-    least_clearance: Clearance = 0.0,
-) -> Sweep | Alone:
-    """Where it is least accurate: position's standard deviation by `uncertainty`."""
-    return _made(
-        "pose-error", machine, points, (), payload, along, least_singularity, least_clearance
-    )
-
-
-@kind
-def strain_energy(
-    machine: Robot,
-    points: int | None,
-    wrench: Wrench = [],  # noqa: B006
-    payload: LoadOf = None,
-    along: Along = None,
-    least_singularity: Singularity = _SINGULARITY,
-    least_clearance: Clearance = 0.0,
-) -> Sweep | Alone:
+_offer("compliance", "Where it is softest: compliance, its direction, or deflections under loads.")
+_offer("payload", "How much it carries: the largest mass that the drives hold at rest.")
+_offer("acceleration", "How hard it accelerates: from rest, in the worst direction.")
+_offer("frequency", "Where it rings lowest: first frequency, actuators locked.", loads=False)
+_offer("pose-error", "Where it is least accurate, by the file's `uncertainty`.", loads=False)
+_offer(
+    "strain-energy",
     """Which part gives: strain energy of loads, and the elements' parts of it.
 
-    Of upr_rpu, with one wrench and no other option, over its regular workspace, and next to the
+    Of upr_rpu, with one wrench at most and no other option, over its regular workspace, next to the
     2UPR-RPU paper's table 2.
-    """
-    from pkm_twin.atlas.strain_energy.sweep import has_paper_elements, strain_energy_sweep
-
-    plain = payload is None and along is None and least_clearance == 0.0
-    if plain and least_singularity == _SINGULARITY and has_paper_elements(machine):
-        cases = _cases(wrench)
-        if len(cases) < 2:
-            return strain_energy_sweep(machine, cases[0].wrench if cases else "P1", points)
-    return _made(
-        "strain-energy", machine, points, wrench, payload, along, least_singularity,
-        least_clearance,
-    )  # fmt: skip
+    """,
+)

@@ -239,9 +239,7 @@ def modes(machine: Robot, points: int | None) -> Sweep:
     return modes_sweep(machine, points)
 
 
-def _present(
-    file: Path, picture: bool, html: bool, as_json: bool, out: Path | None = None
-) -> None:
+def _present(file: Path, picture: bool, html: bool, as_json: bool, out: Path | None = None) -> None:
     from pkm_twin.atlas import kinds
     from pkm_twin.atlas.maps.figures import answers, sentence
     from pkm_twin.atlas.store import open_atlas, reading

@@ -61,7 +61,7 @@ def planes(
     fields = [name for name in fields if name in atlas]
     result = []
     home = dict(zip(atlas.coordinate.values, atlas.home.values.tolist(), strict=True))
-    dims = atlas[fields[0]].dims
+    dims = tuple(map(str, atlas[fields[0]].dims))
     if dims == SLICED:
         for k in range(atlas.sizes["slice"]):
             part = atlas.isel(slice=k)
@@ -146,7 +146,7 @@ def page(title: str, atlas: Dataset, labels: Mapping[str, Label], inside: Any = 
     labels = {name: label for name, label in labels.items() if name in atlas}
     first = atlas[next(iter(labels))]
     if first.ndim == 3 and first.dims != SLICED:
-        return _page_of_slices(title, atlas, labels, first.dims, inside)
+        return _page_of_slices(title, atlas, labels, tuple(map(str, first.dims)), inside)
     return _page_of_planes(title, atlas, labels)
 
 

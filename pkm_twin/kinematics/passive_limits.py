@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether passive joints stay within their ranges: how far ball joints swivel, and turns and slides.
+"""Whether passive joints stay within their ranges: swivels of ball joints, turns and slides.
 
 May import: numpy, pkm_twin's machine, the standard library.
 """
@@ -22,8 +22,9 @@ class PassiveLimit:
     """The range of one passive joint, from ``low`` to ``high``, rad or m; vectors at home.
 
     ``kind`` "swivel": the angle between two directions that are both along ``axis`` at home, one
-    fixed in the inner body and one in the outer. "rod": the same of the way from ``at`` on the inner
-    body to ``far`` on the outer one. "turn": about the axis. "slide": of the point ``at`` along it.
+    fixed in the inner body and one in the outer. "rod": the same of the way from ``at`` on the
+    inner body to ``far`` on the outer one. "turn": about the axis. "slide": of the point ``at``
+    along it.
     ``home``: the joint's value at home.
     """
 

@@ -109,7 +109,7 @@ def keeps_limits(
     least_clearance: float = 0.0,
     known: Mask | bool = True,
 ) -> Mask:
-    """Whether joint positions keep the limits of actuators and passive joints and limbs apart, (...).
+    """Whether joint positions keep all limits, and limbs apart, shape (...); see `reachable`.
 
     :param q: shape (..., n); ``pose``: theirs, shape (..., m).
     :param least_clearance: as in :func:`reachable`.

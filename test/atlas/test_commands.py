@@ -113,7 +113,7 @@ def test_interrupted_and_resumed(call, small_atlases, tmp_path):
     ("words", "code", "text"),
     [
         (["atlas", "five_bar", "isotropy"], 1, "three pose coordinates"),
-        (["atlas", "delta", "strain-energy"], 1, "elastic"),
+        (["atlas", "delta", "pose-error"], 1, "uncertainty"),
         (["atlas", "delta", "weather"], 1, "workspace"),
         (["atlas", "upr_rpu", "strain-energy", "--wrench", "1,2"], 2, "six numbers"),
         (["atlas", "delta", "modess"], 1, "did you mean 'modes'"),

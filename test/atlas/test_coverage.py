@@ -11,9 +11,9 @@ import pytest
 from pkm_twin import robot_names
 from pkm_twin.atlas import kinds, workspace
 from pkm_twin.atlas.grids import height_range, largest_distance
+from pkm_twin.atlas.planes import planes
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
-from pkm_twin.atlas.planes import planes
 from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import reachable, singularity_at, try_forward

@@ -67,9 +67,7 @@ def acceleration(robot: Robot, q: Array, wrench: Array | None) -> Found:
     row = np.take_along_axis(each, joint[..., None, None], -2)[..., 0, :] @ axes
     sign = np.where(np.take_along_axis(held, joint[..., None], -1) < 0.0, -1.0, 1.0)
     length = np.linalg.norm(row, axis=-1, keepdims=True)
-    return Found(
-        np.maximum(value, 0.0), sign * row / np.where(length > 0.0, length, 1.0), joint
-    )
+    return Found(np.maximum(value, 0.0), sign * row / np.where(length > 0.0, length, 1.0), joint)
 
 
 def _acceleration_unit(robot: Robot, case: Case) -> str:

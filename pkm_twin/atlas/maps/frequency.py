@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
 from pkm_twin.atlas.maps.quantity import Array, Found, Quantity, no_wrench, size_and_direction
 from pkm_twin.machine.robot import Robot
 from stiffness_monitor.modes import modes
@@ -36,7 +34,7 @@ FREQUENCY: Final = Quantity(
     largest=False,
     points=1000,
     chunk=256,
-    samples=128,
-    population=16,
-    rounds=20,
+    samples=256,
+    population=24,
+    rounds=40,
 )

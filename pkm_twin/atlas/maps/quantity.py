@@ -48,9 +48,10 @@ class Quantity:
     """One kind of map.
 
     ``question``: what its picture answers. ``evaluate``: of a robot, joint positions (k, n) and a
-    wrench. ``elements``: names that it blames. ``unit``: of a robot and a case. ``largest``: whether
-    the largest value is the worst. ``default``: the case without one given. ``points``: of the grid;
-    ``chunk``: poses computed at once; ``samples`` and ``rounds``: of the search for the worst pose.
+    wrench. ``elements``: names that it blames. ``unit``: of a robot and a case. ``largest``: is the
+    largest value the worst? ``default``: the case without one given. ``points``: of the grid;
+    ``chunk``: poses computed at once; ``samples``, ``population`` and ``rounds``: of the search
+    for the worst pose.
     """
 
     name: str

@@ -74,7 +74,9 @@ class MapSweep(PoseSweep):
             "direction": Field(
                 (*by_case, "axis"), {**turn, "long_name": "direction of the value, base axes"}
             ),
-            "dominant": Field(by_case, {**least, "long_name": f"index of the {what.element}"}, "i2"),
+            "dominant": Field(
+                by_case, {**least, "long_name": f"index of the {what.element}"}, "i2"
+            ),
         }
         if what.has_shares:
             about = {**SHARE, "long_name": "part of each element"}
@@ -84,13 +86,8 @@ class MapSweep(PoseSweep):
     @property
     def coordinates(self) -> dict[str, Variable]:
         """The grid's, the cases with their units, axes and elements."""
-        units = [self.quantity.unit(self.robot, case) for case in self.cases]
-        return super().coordinates | {
-            "case": texts("case", [case.name for case in self.cases]),
-            "case_unit": texts("case", units),
-            "axis": texts("axis", "xyz"),
-            "element": texts("element", self.elements),
-        }
+        elements = texts("element", self.elements)
+        return super().coordinates | worst_coordinates(self) | {"element": elements}
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -154,27 +151,40 @@ class MapSweep(PoseSweep):
         for k, case in enumerate(self.cases):
             starts = np.concatenate([starts[k] for starts, _ in parts])
             worst.append(worst_of(self, case, starts[np.isfinite(starts[:, 0])]))
-        pose = np.array([w.pose for w in worst])
-        elements = np.array([w.found.element[0] for w in worst])
-        values = np.array([w.found.value[0] for w in worst])
-        directions = np.array([w.found.direction[0] for w in worst])
-        what = "of the whole workspace"
-        about = {"valid_min": 0, "valid_max": len(self.elements) - 1}
+        about = {**SHARE, "long_name": "part of the grid that counts"}
         return {
-            "valid": Variable(
-                (), np.array(counted / every), {**SHARE, "long_name": "part of the grid that counts"}
-            ),
-            "worst_value": Variable(("case",), values, {"long_name": f"worst value {what}"}),
-            "worst_pose": Variable(
-                ("case", "coordinate"), pose, {"long_name": f"pose of the worst value {what}"}
-            ),
-            "worst_direction": Variable(
-                ("case", "axis"), directions, {"long_name": "direction of the worst value"}
-            ),
-            "worst_element": Variable(
-                ("case",), elements, {**about, "long_name": f"its {self.quantity.element}"}
-            ),
+            "valid": Variable((), np.array(counted / every), about),
+            **worst_variables(self, worst),
         }
+
+
+def worst_coordinates(sweep: MapSweep) -> dict[str, Variable]:
+    """Coordinates that :func:`worst_variables` have, but for the elements."""
+    units = [sweep.quantity.unit(sweep.robot, case) for case in sweep.cases]
+    return {
+        "case": texts("case", [case.name for case in sweep.cases]),
+        "case_unit": texts("case", units),
+        "axis": texts("axis", "xyz"),
+        "coordinate": texts("coordinate", sweep.robot.pose_names),
+    }
+
+
+def worst_variables(sweep: MapSweep, worst: Sequence[Worst]) -> dict[str, Variable]:
+    """The worst of each case: value, pose, direction, and index of the element."""
+    each = [w.found for w in worst]
+    result: dict[str, Variable] = {}
+
+    def stored(name: str, dims: tuple[str, ...], values: Any, what: str, **more: int) -> None:
+        about = {"long_name": what, **more}
+        result[f"worst_{name}"] = Variable(("case", *dims), np.array(values), about)
+
+    stored("value", (), [f.value[0] for f in each], "worst value of the whole workspace")
+    stored("pose", ("coordinate",), [w.pose for w in worst], "pose of the worst value, m and rad")
+    stored("direction", ("axis",), [f.direction[0] for f in each], "its direction, base axes")
+    most = len(sweep.elements) - 1
+    names = f"index of its {sweep.quantity.element}"
+    stored("element", (), [f.element[0] for f in each], names, valid_min=0, valid_max=most)
+    return result
 
 
 def counts(
@@ -207,8 +217,16 @@ def found_of(quantity: Quantity, robot: Robot, q: Array, case: Case) -> Found:
             nan = np.full(1, np.nan)
             shares = np.full((1, size), np.nan) if quantity.has_shares else None
             return Found(nan, np.full((1, 3), np.nan), np.full(1, -1), shares)
-    halves = [found_of(quantity, robot, part, case) for part in np.array_split(q, 2)]
-    return Found(*(None if a is None else np.concatenate([a, b]) for a, b in zip(*halves)))  # type: ignore[arg-type]
+    one, other = (found_of(quantity, robot, part, case) for part in np.array_split(q, 2))
+    shares = None
+    if one.shares is not None and other.shares is not None:
+        shares = np.concatenate([one.shares, other.shares])
+    return Found(
+        np.concatenate([one.value, other.value]),
+        np.concatenate([one.direction, other.direction]),
+        np.concatenate([one.element, other.element]),
+        shares,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,8 +248,7 @@ def worst_of(sweep: MapSweep, case: Case, starts: Array) -> Worst:
     limits = robot.limits.position
     by_joints = limits is not None and bool(np.isfinite(limits).all())
     rng = np.random.default_rng(0)
-    if by_joints:
-        assert limits is not None
+    if limits is not None and by_joints:
         low, high = limits.T
         low, high = low + INSIDE * (high - low), high - INSIDE * (high - low)
         first = robot.inverse(starts) if len(starts) else np.empty((0, len(low)))
