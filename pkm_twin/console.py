@@ -24,7 +24,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.files import decimal, require_replaceable
 
 
@@ -118,6 +118,11 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
         require_replaceable(path)
     except OSError as error:
         raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def tell(text: str) -> None:
+    """One line on stderr, whatever names and values are in it."""
+    print(f"pkm-twin: {one_line(text, 2000)}", file=sys.stderr)
 
 
 def system_error(error: OSError) -> str:

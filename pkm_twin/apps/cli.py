@@ -16,6 +16,7 @@ from rich.text import Text
 
 from pkm_twin.apps import export, maps  # noqa: F401  maps adds its commands to atlas
 from pkm_twin.apps.calibrate import calibrate_command
+from pkm_twin.apps.check_command import check
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
@@ -25,7 +26,6 @@ from pkm_twin.apps.options import (
     BeyondLimits,
     Json,
     LoadTimes,
-    OptionalRobot,
     Payload,
     Platform,
     RobotName,
@@ -33,6 +33,7 @@ from pkm_twin.apps.options import (
 )
 from pkm_twin.apps.path import path_command
 from pkm_twin.apps.size import size
+from pkm_twin.apps.trend import trend
 from pkm_twin.apps.view.command import view
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
@@ -45,8 +46,9 @@ from pkm_twin.console import (
     silence_output,
     system_error,
     table_console,
+    tell,
 )
-from pkm_twin.errors import ParameterError, PkmTwinError, one_line, plain_warnings
+from pkm_twin.errors import ParameterError, PkmTwinError, plain_warnings
 from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
@@ -400,65 +402,6 @@ def compliance(
 
 
 @app.command()
-def check(
-    bag: BagPath,
-    robot: OptionalRobot = None,
-    residual: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            help="allowed RMS of the torque residual, part of the peak: 0.05 is 5 %",
-        ),
-    ] = 0.05,
-    topic: BagTopics = [],  # noqa: B006  typer copies it
-    payload: Payload = None,
-    load_times: LoadTimes = None,
-    as_json: Json = False,
-) -> None:
-    """Judge a recorded bag against the twin.
-
-    Are the file's bytes whole, would a node take every joint state and wrench, are there gaps, are
-    limits kept, is it far from singularities, and are the measured efforts what the model says? An
-    item without evidence (no CRCs, no efforts, a robot without masses) is unknown, not good; it
-    does not make the bag bad. Which topics and which payload were taken is printed first.
-
-    Exit code 0: nothing is bad. 1: something is, or it is no bag. 3: the file is damaged, but part
-    of it can be saved with `pkm-twin recover`.
-    """
-    from pkm_twin.apps.check import Bounds, check_bag
-    from pkm_twin.apps.verdict import Verdict, items_table
-    from pkm_twin.bags.reader import DamagedBagError
-
-    carried = load_of(payload, load_times)
-    try:
-        with progress("reading", None) as update:
-            report = check_bag(
-                bag, robot, Bounds(residual=residual), update, topics=topic, carried=carried
-            )
-    except PkmTwinError as error:
-        salvageable = error.salvageable if isinstance(error, DamagedBagError) else 0
-        if as_json:
-            facts = {"bag": str(bag), "good": False, "error": str(error)}
-            print_json({**facts, "salvageable": salvageable})
-        _tell(str(error))
-        raise typer.Exit(SALVAGED if salvageable else REFUSED) from None
-    if as_json:
-        print_json(report.as_json())
-    else:
-        typer.echo(f"{report.topics}")
-        typer.echo(f"payload: {report.load or 'the robot file alone'}")
-        if not report.unsure:
-            typer.echo("uncertainty: the robot file gives none, so the model has no band")
-        table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
-        bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
-        text = f"bad: {', '.join(bad)}" if bad else "good"
-        typer.echo(text + (f"; not judged: {', '.join(unknown)}" if unknown else ""))
-    if not report.good:
-        raise typer.Exit(REFUSED)
-
-
-@app.command()
 def recover(
     bag: BagPath,
     out: Annotated[Path, typer.Argument(help="the new bag", callback=file_name)],
@@ -544,6 +487,8 @@ app.command("calibrate")(calibrate_command)
 app.command("path")(path_command)
 app.command()(size)
 app.command()(guard_check)
+app.command()(check)
+app.command()(trend)
 app.command()(view)
 app.command()(fit)
 app.command()(excite)
@@ -588,13 +533,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _end(f"{'' if error.filename else 'cannot write the output: '}{system_error(error)}")
 
 
-def _tell(text: str) -> None:
-    """One line on stderr, whatever names and values are in it."""
-    print(f"pkm-twin: {one_line(text, 2000)}", file=sys.stderr)
-
-
 def _end(text: str) -> NoReturn:
-    _tell(text)
+    tell(text)
     sys.exit(REFUSED)
 
 
