@@ -20,6 +20,7 @@ from pkm_twin.apps.check_command import check
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
+from pkm_twin.apps.joint_loads import loads
 from pkm_twin.apps.options import (
     BagPath,
     BagTopics,
@@ -486,6 +487,7 @@ app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
 app.command("path")(path_command)
 app.command()(size)
+app.command()(loads)
 app.command()(guard_check)
 app.command()(check)
 app.command()(trend)
