@@ -25,7 +25,7 @@ from rich.progress import (
 )
 
 from pkm_twin.errors import PkmTwinError, one_line
-from pkm_twin.files import decimal, require_replaceable
+from pkm_twin.files import STANDARD, decimal, require_replaceable
 
 
 @contextmanager
@@ -108,6 +108,8 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
 
     :raises PkmTwinError: such a target.
     """
+    if str(path) == STANDARD:
+        return
     if source is not None and path.exists() and source.exists() and path.samefile(source):
         raise PkmTwinError(f"{path}: the target is the source itself")
     if os.path.lexists(path) and not overwrite:

@@ -130,7 +130,7 @@ def check(
         typer.Option(
             min=0.0,
             max=1.0,
-            help="allowed RMS of the torque residual, part of the peak: 0.05 is 5 %",
+            help="largest RMS torque residual that is good, as a fraction of the peak: 0.05 is 5 %",
         ),
     ] = 0.05,
     topic: BagTopics = [],  # noqa: B006  typer copies it
@@ -151,15 +151,16 @@ def check(
     jobs: Annotated[int, typer.Option(help="processes for a folder of bags", min=1)] = 1,
     as_json: Json = False,
 ) -> None:
-    """Judge a recorded bag, or all bags of a folder, against the twin.
+    """Compare a recording, or all recordings of a folder, with the model.
 
-    Are the file's bytes whole, would a node take every joint state and wrench, are there gaps, are
-    limits kept, is it far from singularities, and are the measured efforts what the model says? An
-    item without evidence (no CRCs, no efforts, a robot without masses) is unknown, not good; it
-    does not make the bag bad. Which topics and which payload were taken is printed first.
+    Checks that the file is complete, that a node would accept every joint state and wrench, that
+    there are no gaps, that joints stay inside their limits and away from singularities, and that
+    the measured efforts agree with the model. An item without data (no CRCs, no efforts, a robot
+    without masses) is unknown, which is neither good nor bad. The first lines report which topics
+    and which payload were used.
 
-    Exit code 0: nothing is bad. 1: something is, or it is no bag. 3: the file is damaged, but part
-    of it can be saved with `pkm-twin recover`.
+    Exit code 0: nothing is bad. 1: an item is bad, or the file is not a bag. 3: the file is
+    damaged, but `pkm-twin recover` can save part of it.
     """
     from pkm_twin.apps.verdict import Verdict, items_table
     from pkm_twin.bags.reader import DamagedBagError
@@ -186,7 +187,7 @@ def check(
         typer.echo(f"{report.topics}")
         typer.echo(f"payload: {report.load or 'the robot file alone'}")
         if not report.unsure:
-            typer.echo("uncertainty: the robot file gives none, so the model has no band")
+            typer.echo("uncertainty: none in the robot file, so the model has no uncertainty band")
         table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
         bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
         text = f"bad: {', '.join(bad)}" if bad else "good"

@@ -34,6 +34,7 @@ from pkm_twin.apps.options import (
 )
 from pkm_twin.apps.path import path_command
 from pkm_twin.apps.size import size
+from pkm_twin.apps.tables import tables
 from pkm_twin.apps.trend import trend
 from pkm_twin.apps.view.command import view
 from pkm_twin.atlas import commands as atlases
@@ -50,7 +51,7 @@ from pkm_twin.console import (
     tell,
 )
 from pkm_twin.errors import ParameterError, PkmTwinError, plain_warnings
-from pkm_twin.files import open_standard_streams
+from pkm_twin.files import STANDARD, open_standard_streams
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
 app = typer.Typer(
@@ -233,6 +234,7 @@ def convert(robot: RobotName, platform: Platform = None) -> None:
 
 
 @app.command()
+@tables
 def torques(
     robot: RobotName,
     motion: Annotated[
@@ -271,7 +273,8 @@ def torques(
     from pkm_twin.bags.storage import is_bag
 
     check_target(out)
-    drawing = out.with_suffix(".png")
+    drawing, piped = out.with_suffix(".png"), str(out) == STANDARD
+    picture = picture and not piped
     for target in (out, drawing) if picture else (out,):
         refuse_existing(target, overwrite, motion)
     carried = load_of(payload, load_times)
@@ -288,13 +291,13 @@ def torques(
         columns = table(data, update)
     try:
         write_table(columns, out)
-        typer.echo(f"{out}: {len(data.time)} rows, {len(columns)} columns")
+        typer.echo(f"{out}: {len(data.time)} rows, {len(columns)} columns", err=piped)
         if picture:
             typer.echo(f"{plots.save(plots.torques(data, columns), drawing)}")
     except OSError as error:
         raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
     for note in (*data.notes, *(f"beyond limits: {item}" for item in found)):
-        typer.echo(note)
+        typer.echo(note, err=piped)
 
 
 # A negative number is no option.
@@ -485,14 +488,14 @@ def certify(
 app.add_typer(atlases.app, name="atlas")
 app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
-app.command("path")(path_command)
-app.command()(size)
-app.command()(loads)
+app.command("path")(tables(path_command))
+app.command()(tables(size))
+app.command()(tables(loads))
 app.command()(guard_check)
-app.command()(check)
+app.command()(tables(check))
 app.command()(trend)
 app.command()(view)
-app.command()(fit)
+app.command()(tables(fit))
 app.command()(excite)
 app.command()(atlases.show)
 

@@ -23,7 +23,7 @@ from pkm_twin.apps.options import BagTopics, Json, LoadTimes, Payload, Platform,
 from pkm_twin.apps.torques import Motion
 from pkm_twin.console import file_name, print_json, refuse_existing
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.files import replace_file
+from pkm_twin.files import STANDARD, replace_file
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.robot import Robot
@@ -359,4 +359,4 @@ def loads(
     if as_json:
         print_json(data)
     else:
-        typer.echo(text)
+        typer.echo(text, err=STANDARD in (str(out), str(spectrum)))

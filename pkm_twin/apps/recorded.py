@@ -166,7 +166,7 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     if robot is None:
         raise ParameterError("robot", None, "--robot: a table names none")
     machine = robot if isinstance(robot, Robot) else load(robot)
-    columns = read_columns(path)
+    columns = read_columns(path, machine)
 
     def stack(what: str) -> Array | None:
         names = [f"{joint}.{what}" for joint in machine.joint_names]
