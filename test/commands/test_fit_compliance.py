@@ -119,7 +119,7 @@ def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
     assert "without --per-copy, --payload" in done.one_line_error()
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "complience")
     assert "did you mean 'compliance'" in done.one_line_error()
-    assert not list(tmp_path.glob("*.yaml"))
+    assert [path.name for path in tmp_path.glob("*.yaml")] == ["rigid.yaml"]
 
 
 def changed(path, source, **columns):
