@@ -138,9 +138,10 @@ def test_refusals_are_one_line(words, code, text, call, tmp_path):
 
 def test_each_kind_says_its_own_options(call):
     shared = {"--points", "--out", "--workers", "--scheduler", "--html", "--overwrite"}
+    bounds = {"--least-singularity", "--least-clearance"}
     own = {
-        "workspace": {"--least-singularity", "--least-clearance"},
-        "strain-energy": {"--wrench"},
+        "workspace": bounds,
+        "strain-energy": {"--wrench", "--payload", "--along", *bounds},
         "isotropy": {"--height", "--energy", "--beyond-limits"},
         "modes": set(),
     }

@@ -51,6 +51,6 @@ POSE_ERROR: Final = Quantity(
     points=20_000,
     chunk=4096,
     samples=1024,
-    population=48,
-    rounds=40,
+    population=64,
+    rounds=100,
 )

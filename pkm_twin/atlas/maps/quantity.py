@@ -66,9 +66,9 @@ class Quantity:
     has_shares: bool = False
     points: int = 50_000
     chunk: int = 16384
-    samples: int = 4096
-    population: int = 96
-    rounds: int = 80
+    samples: int = 8192
+    population: int = 256
+    rounds: int = 200
     attrs: Mapping[str, Any] = field(default_factory=lambda: {"valid_min": 0.0})
 
 

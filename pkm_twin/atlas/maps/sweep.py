@@ -3,8 +3,8 @@
 
 Poses count where actuators and passive joints keep their limits, limbs stay apart, and the
 singularity index is not below a bound. The worst pose is that of the whole workspace, between the
-grid's poses and off its planes too: a search (differential evolution) begins at the worst of the
-grid and of joint states all over the limits.
+grid's poses and off its planes too: a search begins at the worst of the grid and of joint states
+all over the limits.
 
 May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
 """
@@ -289,24 +289,30 @@ def evolved(
     quantity: Quantity,
     rng: np.random.Generator,
 ) -> tuple[Array, float]:
-    """The place (n,) of the highest score in a box, and it, by differential evolution.
+    """The place (n,) of the highest score in a box, and it, from the best of the places tried.
 
-    Storn and Price 1997, current to best, from the best of the places tried.
+    Each place of a population climbs for itself, so that many hills are climbed: by steps along one
+    coordinate or all, whose size follows their success, and by differences of two others
+    (differential evolution, Storn and Price 1997); some go towards the best.
     """
     scores = np.concatenate([score(part) for part in np.array_split(tried, 1 + len(tried) // 4096)])
     order = np.argsort(-scores, kind="stable")[: quantity.population]
     x, f = tried[order], scores[order]
     count, n = x.shape
+    step = np.full(count, 0.1)
     for _ in range(quantity.rounds):
-        leader = x[f.argmax()]
-        a, b = x[rng.integers(0, count, count)], x[rng.integers(0, count, count)]
-        weight = rng.uniform(0.4, 0.9, (count, 1))
-        way = np.where(rng.random((count, 1)) < 0.5, leader - x, 0.0)
-        moved = x + weight * way + weight * (a - b)
-        kept = (rng.random((count, n)) < 0.2) & (np.arange(n) != rng.integers(0, n, (count, 1)))
-        moved = np.clip(np.where(kept, x, moved), low, high)
+        a, b = (x[rng.integers(0, count, count)] for _ in range(2))
+        alone = np.equal.outer(rng.integers(0, n, count), np.arange(n))
+        along = alone | (rng.random((count, 1)) < 0.5)
+        near = along * rng.normal(size=(count, n)) * step[:, None] * (high - low)
+        pull = np.where(rng.random((count, 1)) < 0.1, x[f.argmax()] - x, 0.0)
+        crossed = rng.random((count, n)) < 0.8
+        far = rng.uniform(0.4, 0.9, (count, 1)) * (a - b + pull) * crossed
+        local = np.asarray(rng.random(count) < 0.7)
+        moved = np.clip(x + np.where(local[:, None], near, far), low, high)
         reached = score(moved)
         better = reached > f
+        step = np.clip(np.where(local, step * np.where(better, 1.5, 0.9), step), 1e-6, 0.3)
         x, f = np.where(better[:, None], moved, x), np.where(better, reached, f)
     return x[f.argmax()], float(f.max())
 
