@@ -20,6 +20,7 @@ setup(
         "pkm_twin.apps.view",
         "pkm_twin.atlas",
         "pkm_twin.atlas.isotropy",
+        "pkm_twin.atlas.maps",
         "pkm_twin.atlas.modes",
         "pkm_twin.atlas.strain_energy",
         "pkm_twin.atlas.workspace",

@@ -4,6 +4,7 @@
 from delta_dynamics.base_parameters import BaseParameters, base_parameters
 from delta_dynamics.contact import Contact, ContactMonitor
 from delta_dynamics.derivatives import TorqueDerivatives, torque_derivatives, torque_gradient
+from delta_dynamics.elastic_reactions import elastic_reactions
 from delta_dynamics.isotropy import (
     Extremes,
     JointMotion,
@@ -51,6 +52,7 @@ __all__ = [
     "TorqueDerivatives",
     "base_parameters",
     "dynamics_terms",
+    "elastic_reactions",
     "energy",
     "energy_matrices",
     "energy_transfer",

@@ -113,12 +113,56 @@ def reactions(
     :raises ParameterError: a robot without masses.
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
-    full = least_norm_reactions(robot, q, qd, qdd, wrench)
+    return known_alone(least_norm_reactions(robot, q, qd, qdd, wrench))
+
+
+def known_alone(full: Reactions) -> Reactions:
+    """The same with NaN for what is indeterminate."""
     return replace(
         full,
         wrenches=_read_only(np.where(full.determinate, full.wrenches, np.nan)),
         values=_read_only(np.where(full.determinate_components, full.values, np.nan)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """Balances of all bodies in every sample, and all that solves them.
+
+    ``value``: the least-norm solution (..., unknowns). ``null``: columns that may be added to it,
+    of no unit, shape (..., unknowns, unknowns), zero beyond their number; ``unit`` (..., unknowns)
+    makes them forces (N) and moments (N m). ``spread``: wrenches of the joints about their points
+    by the unknowns, shape (..., joints, 6, unknowns). ``size``: of the machine, m, (...).
+    """
+
+    joints: tuple[_Joint, ...]
+    components: tuple[str, ...]
+    points: Array
+    spread: Array
+    value: Array
+    null: Array
+    unit: Array
+    size: Array
+    residual: Array
+
+    def reactions(self, value: Array, null: Array) -> Reactions:
+        """Of a solution, and what may still be added to it."""
+        # Moments and forces of the null space in one unit again, so that one bound holds.
+        reach = np.einsum("...jik,...kn->...jin", self.spread, null * self.unit[..., None])
+        reach[..., 3:, :] /= self.size[..., None, None, None]
+        joints = self.joints
+        return Reactions(
+            names=tuple(joint.name for joint in joints),
+            bodies=tuple((joint.inner, joint.outer) for joint in joints),
+            points=_read_only(self.points),
+            wrenches=_read_only(np.einsum("...jik,...k->...ji", self.spread, value)),
+            determinate=_small(reach),
+            components=self.components,
+            values=_read_only(value),
+            determinate_components=_small(null),
+            actuated=tuple(joint.actuated for joint in joints if joint.actuated is not None),
+            residual=_read_only(self.residual),
+        )
 
 
 def least_norm_reactions(
@@ -130,6 +174,14 @@ def least_norm_reactions(
     the mechanism's size (root mean square distance of the joints from their centre). In a real
     machine elasticity and tolerances determine these components; this is one of many solutions.
     """
+    found = balance(robot, q, qd, qdd, wrench)
+    return found.reactions(found.value, found.null)
+
+
+def balance(
+    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
+) -> Balance:
+    """The balances of a motion, solved; arguments and errors as :func:`reactions`."""
     engine = robot.massive()
     load = np.zeros(6) if wrench is None else vectors(wrench, 6, "the wrench")
     (bodies, rods, places, platform), status = engine.kernel("loads", _loads)(
@@ -161,20 +213,8 @@ def least_norm_reactions(
     finite(value, "the motion or the wrench")
 
     spread = np.stack([_columns(joint, names, batch) for joint in joints], -3)
-    # Moments and forces of the null space in one unit again, so that one bound holds.
-    reach = np.einsum("...jik,...kn->...jin", spread, null * _unit(moment, size)[..., None])
-    reach[..., 3:, :] /= size[..., None, None, None]
-    return Reactions(
-        names=tuple(joint.name for joint in joints),
-        bodies=tuple((joint.inner, joint.outer) for joint in joints),
-        points=_read_only(points),
-        wrenches=_read_only(np.einsum("...jik,...k->...ji", spread, value)),
-        determinate=_small(reach),
-        components=names,
-        values=_read_only(value),
-        determinate_components=_small(null),
-        actuated=tuple(joint.actuated for joint in joints if joint.actuated is not None),
-        residual=_read_only(residual),
+    return Balance(
+        tuple(joints), names, points, spread, value, null, _unit(moment, size), size, residual
     )
 
 

@@ -24,8 +24,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from pkm_twin.errors import PkmTwinError
-from pkm_twin.files import decimal, require_replaceable
+from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.files import STANDARD, decimal, require_replaceable
 
 
 @contextmanager
@@ -108,6 +108,8 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
 
     :raises PkmTwinError: such a target.
     """
+    if str(path) == STANDARD:
+        return
     if source is not None and path.exists() and source.exists() and path.samefile(source):
         raise PkmTwinError(f"{path}: target and source are the same file")
     if os.path.lexists(path) and not overwrite:
@@ -118,6 +120,11 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
         require_replaceable(path)
     except OSError as error:
         raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def tell(text: str) -> None:
+    """One line on stderr, whatever names and values are in it."""
+    print(f"pkm-twin: {one_line(text, 2000)}", file=sys.stderr)
 
 
 def system_error(error: OSError) -> str:

@@ -15,8 +15,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import BinaryIO, Final
 
+STANDARD: Final = "-"
+"""Name of standard input and output."""
 _KINDS: Final = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a FIFO"),
@@ -76,10 +79,19 @@ def require_replaceable(path: Path) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """A name of this process's own beside ``path``, which takes its place at a good end.
 
+    Of :data:`STANDARD` what is there at the end goes to stdout.
+
     The name is short, whatever the target's is: one that the file system takes is not refused.
 
     :raises OSError: the target is no regular file, or cannot be written.
     """
+    if os.fspath(path) == STANDARD:
+        with TemporaryDirectory() as folder:
+            hidden = Path(folder) / "out"
+            yield hidden
+            sys.stdout.buffer.write(hidden.read_bytes())
+            sys.stdout.buffer.flush()
+        return
     require_replaceable(path)
     hidden = path.with_name(f".{os.getpid()}.{next(_numbers)}.tmp")
     try:

@@ -131,8 +131,13 @@ def check_bag(
     :param carried: the payload, by default the one that the bag tells of.
     :raises BagError: the file is damaged or cannot be judged at all.
     """
+    return judged(read_recording(path, robot, progress, topics=topics, carried=carried), bounds)
+
+
+def judged(recording: Recording, bounds: Bounds | None = None) -> CheckReport:
+    """Judge a recording against the twin."""
     bounds = bounds or Bounds()
-    recording = read_recording(path, robot, progress, topics=topics, carried=carried)
+    path = recording.source
     items = [*_file(recording, bounds), *_timing(recording, bounds), *_limits(recording)]
     items.append(_singularity(recording, bounds))
     judged, bands = _residuals(recording, bounds)
@@ -232,7 +237,7 @@ def _residuals(r: Recording, bounds: Bounds) -> tuple[list[Item], dict[str, Mode
         return [Item(what, reason, bound, Verdict.UNKNOWN)], {}
     models = (inverse_dynamics, _held, torque_deviation)[: 3 if r.robot.uncertainty else 2]
     try:
-        (expected, held, *spread), used, still = _modelled(r, *models)
+        (expected, held, *spread), used, still, _ = modelled(r, *models)
     except (UnreachableError, SingularityError):
         raise
     except ValueError as error:  # numbers within bounds whose result is not finite
@@ -309,7 +314,7 @@ def _judged(r: Recording, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def predicted(r: Recording) -> tuple[Array, NDArray[np.bool_]]:
     """Efforts that the twin expects (samples, n), zero where its window is not full; and where."""
-    (efforts,), used, _ = _modelled(r, inverse_dynamics)
+    (efforts,), used, _, _ = modelled(r, inverse_dynamics)
     return efforts, used
 
 
@@ -328,11 +333,12 @@ def at_rest(r: Recording, qd: Array) -> NDArray[np.bool_]:
     return np.asarray(np.abs(qd) <= rate_doubt(r.time, r.q, gain, _WINDOW // 2))
 
 
-def _modelled(
+def modelled(
     r: Recording, *models: Callable[..., Array]
-) -> tuple[list[Array], NDArray[np.bool_], NDArray[np.bool_]]:
-    """What functions of robot, motion and wrench say, shape (samples, n) each; where; what rests.
+) -> tuple[list[Array], NDArray[np.bool_], NDArray[np.bool_], Array]:
+    """What functions of robot, motion and wrench say, shape (samples, n) each.
 
+    And which samples these are, (samples,), which joints rest, and their rates, (samples, n).
     Where a joint stands still dry friction has no direction, and the model none of it.
     """
     qd, qdd, used = motion(r)
@@ -344,7 +350,7 @@ def _modelled(
         rows = np.arange(part.start, part.stop)[used[part]]
         for found, model in zip(values, models, strict=True):
             found[rows] = model(robot, r.q[rows], qd[rows], qdd[rows], wrench[rows])
-    return values, used, still
+    return values, used, still, qd
 
 
 def motion(r: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -14,18 +14,19 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from pkm_twin.apps import export
+from pkm_twin.apps import export, maps  # noqa: F401  maps adds its commands to atlas
 from pkm_twin.apps.calibrate import calibrate_command
+from pkm_twin.apps.check_command import check
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
+from pkm_twin.apps.joint_loads import loads
 from pkm_twin.apps.options import (
     BagPath,
     BagTopics,
     BeyondLimits,
     Json,
     LoadTimes,
-    OptionalRobot,
     Payload,
     Platform,
     RobotName,
@@ -33,6 +34,8 @@ from pkm_twin.apps.options import (
 )
 from pkm_twin.apps.path import path_command
 from pkm_twin.apps.size import size
+from pkm_twin.apps.tables import tables
+from pkm_twin.apps.trend import trend
 from pkm_twin.apps.view.command import view
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
@@ -45,9 +48,10 @@ from pkm_twin.console import (
     silence_output,
     system_error,
     table_console,
+    tell,
 )
-from pkm_twin.errors import ParameterError, PkmTwinError, one_line, plain_warnings
-from pkm_twin.files import open_standard_streams
+from pkm_twin.errors import ParameterError, PkmTwinError, plain_warnings
+from pkm_twin.files import STANDARD, open_standard_streams
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
 app = typer.Typer(
@@ -233,6 +237,7 @@ def convert(robot: RobotName, platform: Platform = None) -> None:
 
 
 @app.command()
+@tables
 def torques(
     robot: RobotName,
     motion: Annotated[
@@ -274,7 +279,8 @@ def torques(
     from pkm_twin.bags.storage import is_bag
 
     check_target(out)
-    drawing = out.with_suffix(".png")
+    drawing, piped = out.with_suffix(".png"), str(out) == STANDARD
+    picture = picture and not piped
     for target in (out, drawing) if picture else (out,):
         refuse_existing(target, overwrite, motion)
     carried = load_of(payload, load_times)
@@ -291,13 +297,13 @@ def torques(
         columns = table(data, update)
     try:
         write_table(columns, out)
-        typer.echo(f"{out}: {len(data.time)} rows, {len(columns)} columns")
+        typer.echo(f"{out}: {len(data.time)} rows, {len(columns)} columns", err=piped)
         if picture:
             typer.echo(f"{plots.save(plots.torques(data, columns), drawing)}")
     except OSError as error:
         raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
     for note in (*data.notes, *(f"beyond limits: {item}" for item in found)):
-        typer.echo(note)
+        typer.echo(note, err=piped)
 
 
 # A negative number is no option.
@@ -410,66 +416,6 @@ def compliance(
 
 
 @app.command()
-def check(
-    bag: BagPath,
-    robot: OptionalRobot = None,
-    residual: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            help="largest RMS torque residual that is good, as a fraction of the peak: 0.05 is 5 %",
-        ),
-    ] = 0.05,
-    topic: BagTopics = [],  # noqa: B006  typer copies it
-    payload: Payload = None,
-    load_times: LoadTimes = None,
-    as_json: Json = False,
-) -> None:
-    """Compare a recording with the model.
-
-    Checks that the file is complete, that a node would accept every joint state and wrench, that
-    there are no gaps, that joints stay inside their limits and away from singularities, and that
-    the measured efforts agree with the model. An item without data (no CRCs, no efforts, a robot
-    without masses) is unknown, which is neither good nor bad. The first lines report which topics
-    and which payload were used.
-
-    Exit code 0: nothing is bad. 1: an item is bad, or the file is not a bag. 3: the file is
-    damaged, but `pkm-twin recover` can save part of it.
-    """
-    from pkm_twin.apps.check import Bounds, check_bag
-    from pkm_twin.apps.verdict import Verdict, items_table
-    from pkm_twin.bags.reader import DamagedBagError
-
-    carried = load_of(payload, load_times)
-    try:
-        with progress("reading", None) as update:
-            report = check_bag(
-                bag, robot, Bounds(residual=residual), update, topics=topic, carried=carried
-            )
-    except PkmTwinError as error:
-        salvageable = error.salvageable if isinstance(error, DamagedBagError) else 0
-        if as_json:
-            facts = {"bag": str(bag), "good": False, "error": str(error)}
-            print_json({**facts, "salvageable": salvageable})
-        _tell(str(error))
-        raise typer.Exit(SALVAGED if salvageable else REFUSED) from None
-    if as_json:
-        print_json(report.as_json())
-    else:
-        typer.echo(f"{report.topics}")
-        typer.echo(f"payload: {report.load or 'the robot file alone'}")
-        if not report.unsure:
-            typer.echo("uncertainty: none in the robot file, so the model has no uncertainty band")
-        table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
-        bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
-        text = f"bad: {', '.join(bad)}" if bad else "good"
-        typer.echo(text + (f"; not judged: {', '.join(unknown)}" if unknown else ""))
-    if not report.good:
-        raise typer.Exit(REFUSED)
-
-
-@app.command()
 def recover(
     bag: BagPath,
     out: Annotated[Path, typer.Argument(help="the new bag", callback=file_name)],
@@ -553,11 +499,14 @@ def certify(
 app.add_typer(atlases.app, name="atlas")
 app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
-app.command("path")(path_command)
-app.command()(size)
+app.command("path")(tables(path_command))
+app.command()(tables(size))
+app.command()(tables(loads))
 app.command()(guard_check)
+app.command()(tables(check))
+app.command()(trend)
 app.command()(view)
-app.command()(fit)
+app.command()(tables(fit))
 app.command()(excite)
 app.command()(atlases.show)
 
@@ -600,13 +549,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _end(f"{'' if error.filename else 'cannot write the output: '}{system_error(error)}")
 
 
-def _tell(text: str) -> None:
-    """Print one line on stderr, with unprintable characters escaped."""
-    print(f"pkm-twin: {one_line(text, 2000)}", file=sys.stderr)
-
-
 def _end(text: str) -> NoReturn:
-    _tell(text)
+    tell(text)
     sys.exit(REFUSED)
 
 

@@ -8,6 +8,7 @@ import csv
 import io
 import math
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
@@ -15,8 +16,10 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.apps.tables import cells, in_si
 from pkm_twin.errors import FileError, ParameterError, warn
-from pkm_twin.files import decimal, open_regular
+from pkm_twin.files import STANDARD, decimal, open_regular
+from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 MAX_CSV_BYTES = 1024**3
@@ -31,19 +34,24 @@ MAX_CSV_LINE = 1024**2
 """Longest line of it, characters."""
 
 
-def read_columns(path: Path) -> dict[str, Array]:
-    """Columns of a CSV with a header row, by name, shape (rows,) each.
+def read_columns(path: Path, robot: Robot | None = None) -> dict[str, Array]:
+    """Columns of a CSV with a header row, by name, shape (rows,) each, in SI units.
+
+    :param path: ``-`` is stdin. ``robot``: whose joints and pose the columns may be of.
 
     :raises ParameterError: not readable, too large, or a value is no finite number.
     """
     try:
+        if str(path) == STANDARD:
+            with io.TextIOWrapper(sys.stdin.buffer, encoding="utf-8-sig", newline="") as text:
+                return in_si(_parse_columns(path, _rows(text, path)), robot)
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > MAX_CSV_BYTES:
                 raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_CSV_BYTES}")
             # Spreadsheets put a byte order mark before the header row.
             with io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text:
-                return _parse_columns(path, csv.reader(_lines(text, path)))
+                return in_si(_parse_columns(path, _rows(text, path)), robot)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(path, error, "a CSV file") from None
 
@@ -85,6 +93,10 @@ def check_motion_times(path: Path, time: Array, q: Array, qd: Array | None) -> N
             )  # fmt: skip
     if step > LONGEST_STEP:
         warn(path, f"time: steps of {step:g} s; expected seconds; are these milliseconds?")
+
+
+def _rows(text: TextIO, path: Path) -> Iterator[list[str]]:
+    return cells(_lines(text, path), lambda found: warn(path, found))
 
 
 def _lines(text: TextIO, path: Path) -> Iterator[str]:

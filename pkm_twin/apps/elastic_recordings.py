@@ -61,7 +61,7 @@ def read_deflected(path: Path, robot: Robot, topics: Sequence[str] = ()) -> Defl
 
 
 def _of_table(path: Path, robot: Robot) -> Deflected:
-    columns = read_columns(path)
+    columns = read_columns(path, robot)
     names = [f"{joint}.position" for joint in robot.joint_names]
     for name in names:
         if name not in columns:

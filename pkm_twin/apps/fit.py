@@ -306,7 +306,7 @@ def _of_csv(path: Path, machine: Any) -> Any:
     from pkm_twin.apps.columns import read_columns, times_of
     from pkm_twin.apps.recorded import WRENCH_AXES
 
-    columns = read_columns(path)
+    columns = read_columns(path, machine)
     for what in ("position", "effort"):
         missing = [j for j in machine.joint_names if f"{j}.{what}" not in columns]
         if missing and what == "effort" and len(missing) == len(machine.joint_names):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pkm_twin.apps.options import Json, Payload, Platform, RobotName, load_of
 from pkm_twin.console import file_name, numbers, parse_numbers, print_json, refuse_existing
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.files import STANDARD
 from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.geometry import Path as Way
 from pkm_twin.paths.geometry import Space
@@ -36,7 +37,7 @@ def read_waypoints(file: Path, robot: Robot, blend: float | None) -> Way:
     from pkm_twin.apps.columns import read_columns
     from pkm_twin.paths import lines, through
 
-    columns = read_columns(file)
+    columns = read_columns(file, robot)
     joints = [f"{name}.position" for name in robot.joint_names]
     others = {f"{j}.{w}" for j in robot.joint_names for w in ("velocity", "acceleration", "effort")}
     by_joints = any(name in columns for name in joints)
@@ -223,9 +224,10 @@ def path_command(
     from pkm_twin.apps.path_report import draw_limits, report, write
     from pkm_twin.paths import timed
 
-    drawing = None if out is None or not picture else out.with_suffix(".png")
+    piped = str(out) == STANDARD
+    drawing = None if out is None or not picture or piped else out.with_suffix(".png")
     if out is not None:
-        if out.suffix not in ENDINGS:
+        if out.suffix not in ENDINGS and not piped:
             raise ParameterError("out", str(out), f"a name that ends in {' or '.join(ENDINGS)}")
         for target in (out, drawing):
             if target is not None:
@@ -257,7 +259,7 @@ def path_command(
     if as_json:
         print_json(data)
     else:
-        typer.echo(text)
+        typer.echo(text, err=piped)
 
 
 def _limit(name: str, text: str, machine: Robot) -> list[float]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.apps.loads import Load
+from pkm_twin.files import STANDARD
 from pkm_twin.paths import Samples, TimedPath
 
 Array = NDArray[np.float64]
@@ -36,7 +37,7 @@ def write(
     motion: TimedPath, samples: Samples, carried: Load | None, out: Path, overwrite: bool
 ) -> None:
     """The motion as a CSV or as a bag with one JointTrajectory."""
-    if out.suffix == ".csv":
+    if out.suffix == ".csv" or str(out) == STANDARD:
         from pkm_twin.apps.torques import write_table
 
         write_table(columns_of(motion, samples), out)

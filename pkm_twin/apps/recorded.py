@@ -51,6 +51,8 @@ class Recording:
     wrench: Array | None
     rejected: Counter[str]
     first_reject: str
+    source: str = ""
+    """The file, as it was named."""
     qdd: Array | None = None
     """Accelerations of a table that has them, shape (samples, n)."""
 
@@ -149,6 +151,7 @@ def read_recording(
         wrench=_fixed(machine, stamps, samples, wrenches),
         rejected=rejected,
         first_reject=first,
+        source=str(path),
     )
 
 
@@ -163,7 +166,7 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     if robot is None:
         raise ParameterError("robot", None, "--robot, because a table names no robot")
     machine = robot if isinstance(robot, Robot) else load(robot)
-    columns = read_columns(path)
+    columns = read_columns(path, machine)
 
     def stack(what: str) -> Array | None:
         names = [f"{joint}.{what}" for joint in machine.joint_names]
@@ -185,7 +188,7 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
         robot=machine, bag=None, topics=Topics("columns of the table"), load=carried,
         stamps=np.round(time * 1e9).astype(np.int64), time=time, q=q, qd=qd,
         effort=stack("effort") if measured is None else measured, wrench=wrench,
-        rejected=Counter(), first_reject="", qdd=stack("acceleration"),
+        rejected=Counter(), first_reject="", source=str(path), qdd=stack("acceleration"),
     )  # fmt: skip
 
 

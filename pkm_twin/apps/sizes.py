@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
-from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.loads import Load, by_load
 from pkm_twin.apps.torques import Motion, motion_of_bag, motion_of_csv
 from pkm_twin.bags.storage import is_bag
@@ -47,6 +46,13 @@ def loaded(name: str, platform: str | None) -> Robot:
     return load(name, platform=platform) if platform else load(name)
 
 
+def motion_of(path: Path, robot: Robot, topics: Sequence[str], carried: Load | None) -> Motion:
+    """A recording or a path; errors as :func:`read_motion`."""
+    if is_bag(path):
+        return motion_of_bag(path, robot, topics, carried)
+    return motion_of_csv(path, robot, carried)
+
+
 def read_motion(
     path: Path, robot: Robot, topics: Sequence[str], carried: Load | None, efforts: str
 ) -> Taken:
@@ -55,16 +61,8 @@ def read_motion(
     :raises ParameterError: a table that is no motion.
     :raises BagError: a bag without joint states or a trajectory.
     """
-    given: Array | None = None
-    if is_bag(path):
-        motion = motion_of_bag(path, robot, topics, carried)
-        given = motion.measured if motion.planned is None else motion.planned
-    else:
-        motion = motion_of_csv(path, robot, carried)
-        columns = read_columns(path)
-        names = [f"{joint}.effort" for joint in robot.joint_names]
-        if all(name in columns for name in names):
-            given = np.stack([columns[name] for name in names], -1)
+    motion = motion_of(path, robot, topics, carried)
+    given = motion.measured if motion.planned is None else motion.planned
     if given is not None and efforts == "file":
         return Taken(motion, given, "the file's")
     effort = np.empty_like(motion.q)

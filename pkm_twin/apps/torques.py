@@ -31,7 +31,7 @@ from pkm_twin.errors import (
     UnknownNameError,
     UnreachableError,
 )
-from pkm_twin.files import replacing
+from pkm_twin.files import STANDARD, replacing
 from pkm_twin.machine.robot import Robot
 from pkm_twin.streams.rest import gradient_gain, rate_doubt
 
@@ -132,7 +132,7 @@ def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -
     :raises ParameterError: a column is missing or misspelt, or a value is no finite number.
     """
     machine = robot if isinstance(robot, Robot) else load(robot)
-    columns = read_columns(path)
+    columns = read_columns(path, machine)
     known = [f"{joint}.{what}" for joint in machine.joint_names for what in INPUTS]
     for name in columns:
         joint, dot, what = name.rpartition(".")
@@ -171,6 +171,10 @@ def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -
     rates = _differentiated(q, time) if qd is None else qd
     wrench = [columns.get(name, np.zeros(len(time))) for name in WRENCH_AXES]
     still = None if qd is not None else np.abs(rates) <= rate_doubt(time, q, gradient_gain(time))
+    names = [f"{joint}.effort" for joint in machine.joint_names]
+    efforts = None
+    if all(name in columns for name in names):
+        efforts = np.stack([columns[name] for name in names], -1)
     notes = [] if carried is None else [f"payload: {carried}"]
     if posed:
         notes.append(f"joint positions computed from the pose, {', '.join(machine.pose_names)}")
@@ -184,6 +188,7 @@ def motion_of_csv(path: Path, robot: str | Robot, carried: Load | None = None) -
         load=carried,
         notes=tuple(notes if machine.controller.plain else [*notes, MAPPED]),
         still=still,
+        planned=efforts,
     )
 
 
@@ -257,7 +262,7 @@ def check_target(path: Path) -> None:
 
     :raises ParameterError: the ending is none of :data:`ENDINGS`, or pyarrow is missing for it.
     """
-    if path.suffix not in ENDINGS:
+    if path.suffix not in ENDINGS and str(path) != STANDARD:
         raise ParameterError("out", str(path), f"a name that ends in {' or '.join(ENDINGS)}")
     if path.suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
         raise ParameterError("out", str(path), "CSV; Parquet needs the Python package pyarrow")
@@ -272,7 +277,7 @@ def write_table(columns: dict[str, Array], path: Path) -> None:
     """
     check_target(path)
     with replacing(path) as hidden:
-        (_write_csv if path.suffix == ".csv" else _write_parquet)(columns, hidden)
+        (_write_parquet if path.suffix == ".parquet" else _write_csv)(columns, hidden)
 
 
 def _write_csv(columns: dict[str, Array], path: Path) -> None:

@@ -7,14 +7,14 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Optional, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Optional, Protocol, get_type_hints
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from typer.core import TyperGroup
 
-from pkm_twin.console import file_name, numbers, progress
+from pkm_twin.console import file_name, print_json, progress
 from pkm_twin.errors import UnknownNameError
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
 from pkm_twin.threads import one_blas_thread
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from pkm_twin.atlas.sweep import Sweep
     from pkm_twin.machine.robot import Robot
 
-WRENCH: Final = "P1, P2, P3 or six numbers with commas between"
 MOST: Final = 10**11
 """Samples beyond which a number is a slip."""
 
@@ -36,6 +35,7 @@ _Text = Optional[str]  # noqa: UP045
 _File = Optional[Path]  # noqa: UP045
 
 Html = Annotated[bool, typer.Option("--html", help="also one page to turn and zoom, no network")]
+Json = Annotated[bool, typer.Option("--json", help="machine-readable output")]
 
 
 class _Kinds(TyperGroup):
@@ -83,12 +83,20 @@ def show(
         ),
     ] = None,
     html: Html = False,
+    as_json: Json = False,
 ) -> None:
     """Draw a stored atlas again: PNGs, and with --html a page to turn and zoom."""
-    _present(file, True, html, out)
+    _present(file, True, html, as_json, out)
 
 
-def _kind(sweep: Callable[..., Sweep]) -> Callable[..., Sweep]:
+class Alone(Protocol):
+    """What a kind does in place of a sweep."""
+
+    def present(self, out: Path | None, picture: bool, overwrite: bool, as_json: bool) -> None:
+        """Compute, write and print it."""
+
+
+def kind(sweep: Callable[..., Sweep | Alone]) -> Callable[..., Sweep | Alone]:
     """Make a function of a robot, a number of points and a kind's own options a command.
 
     Its name is the kind; the options of :func:`_compute` come with all kinds.
@@ -113,7 +121,7 @@ def _kind(sweep: Callable[..., Sweep]) -> Callable[..., Sweep]:
 def _parameters(function: Callable[..., Any], *without: str) -> dict[str, inspect.Parameter]:
     """Parameters of a function as keywords, their annotations evaluated."""
     # What only the checker imports is no option's type.
-    names = {**globals(), "Sweep": Any, "Robot": Any}
+    names = {**globals(), **vars(inspect.getmodule(function)), "Sweep": Any, "Robot": Any}
     hints = get_type_hints(function, names, include_extras=True)
     return {
         key: parameter.replace(annotation=hints[key], kind=inspect.Parameter.KEYWORD_ONLY)
@@ -124,7 +132,7 @@ def _parameters(function: Callable[..., Any], *without: str) -> dict[str, inspec
 
 def _compute(
     kind: str,
-    sweep: Callable[[Robot, int | None], Sweep],
+    sweep: Callable[[Robot, int | None], Sweep | Alone],
     *,
     context: typer.Context,
     points: Annotated[
@@ -145,15 +153,20 @@ def _compute(
     picture: Annotated[bool, typer.Option(help="also PNGs beside the file")] = True,
     html: Html = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the target")] = False,
+    as_json: Json = False,
 ) -> None:
     """Compute one kind of atlas of the context's robot, and draw it."""
     from pkm_twin import load
     from pkm_twin.atlas.run import run
+    from pkm_twin.atlas.sweep import Sweep
 
     machine = load(context.obj)
     target = out or Path(f"{machine.name}_{kind}.nc")
     work = sweep(machine, points)
     one_blas_thread()
+    if not isinstance(work, Sweep):
+        work.present(out, picture, overwrite, as_json)
+        return
     with (
         first_signal(KeyboardInterrupt),
         progress(f"{kind} of {machine.name}", work.points) as update,
@@ -174,10 +187,10 @@ def _compute(
                 err=True,
             )
             raise typer.Exit(INTERRUPTED) from None
-    _present(target, picture, html)
+    _present(target, picture, html, as_json)
 
 
-@_kind
+@kind
 def workspace(
     machine: Robot,
     points: int | None,
@@ -196,22 +209,7 @@ def workspace(
     )
 
 
-@_kind
-def strain_energy(
-    machine: Robot,
-    points: int | None,
-    wrench: Annotated[
-        str, typer.Option(help="P1, P2, P3 of the paper or six numbers, N and N m")
-    ] = "P1",
-) -> Sweep:
-    """Where a wrench stores its energy (upr_rpu)."""
-    from pkm_twin.atlas.strain_energy.sweep import WRENCHES, strain_energy_sweep
-
-    load = wrench if wrench in WRENCHES else numbers(wrench, 6, WRENCH)
-    return strain_energy_sweep(machine, load, points)
-
-
-@_kind
+@kind
 def isotropy(
     machine: Robot,
     points: int | None,
@@ -233,7 +231,7 @@ def isotropy(
     )
 
 
-@_kind
+@kind
 def modes(machine: Robot, points: int | None) -> Sweep:
     """The six lowest natural frequencies and their shapes."""
     from pkm_twin.atlas.modes.sweep import modes_sweep
@@ -241,23 +239,31 @@ def modes(machine: Robot, points: int | None) -> Sweep:
     return modes_sweep(machine, points)
 
 
-def _present(file: Path, picture: bool, html: bool, out: Path | None = None) -> None:
+def _present(file: Path, picture: bool, html: bool, as_json: bool, out: Path | None = None) -> None:
     from pkm_twin.atlas import kinds
+    from pkm_twin.atlas.maps.figures import answers, sentence
     from pkm_twin.atlas.store import open_atlas, reading
 
     with open_atlas(file) as data:
         with reading(file):
             about = f"{file}: {data.attrs['title']}, {dict(data.sizes)}"
-            table = _factors(data) if data.attrs["kind"] == "strain-energy" else None
+            worst = answers(data) if "worst_value" in data else []
+            table = _factors(data) if "global_factor" in data else None
+        target = out or file
+        drawn = kinds.save_all(data, target) if picture else []
+        if html:
+            drawn.append(kinds.write_page(data, target.with_suffix(".html")))
+        if as_json:
+            told = {"robot": data.attrs["robot"], "kind": data.attrs["kind"], "file": str(file)}
+            sizes = {str(name): size for name, size in data.sizes.items()}
+            files = [str(path) for path in drawn]
+            print_json(told | {"sizes": sizes, "worst": worst, "pictures": files})
+            return
         typer.echo(about)
         if table is not None:
             Console().print(table)
-        target = out or file
-        if picture:
-            for path in kinds.save_all(data, target):
-                typer.echo(str(path))
-        if html:
-            typer.echo(str(kinds.write_page(data, target.with_suffix(".html"))))
+        for line in [*map(sentence, worst), *map(str, drawn)]:
+            typer.echo(line)
 
 
 def _factors(data: Dataset) -> Table:

@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from pkm_twin.atlas import isotropy, modes, pages, plots, strain_energy, workspace
+from pkm_twin.atlas.maps import figures as maps
 from pkm_twin.atlas.store import reading, writing
 from pkm_twin.atlas.sweep import Kind
 from pkm_twin.errors import UnknownNameError
@@ -30,6 +31,8 @@ def kind_of(atlas: Dataset) -> Kind:
     :raises UnknownNameError: a kind that this version does not know.
     """
     name = str(atlas.attrs["kind"])
+    if "map" in atlas.attrs:
+        return maps.KIND
     if name not in KINDS:
         raise UnknownNameError("map", name, tuple(KINDS))
     return KINDS[name]

@@ -22,7 +22,7 @@ from typing import IO, Any, Final
 from pkm_twin.bags.format import ZSTD_MAGIC, Budget, FormatError, RecordReader
 from pkm_twin.bags.plain_yaml import load_plain
 from pkm_twin.errors import BagError
-from pkm_twin.files import open_regular
+from pkm_twin.files import STANDARD, open_regular
 
 METADATA_FILE: Final = "metadata.yaml"
 MAX_METADATA_BYTES: Final = 4 * 1024**2
@@ -133,6 +133,8 @@ def is_bag(path: Path) -> bool:
 
     :raises OSError: the file is there, but cannot be opened or is no regular one.
     """
+    if str(path) == STANDARD:
+        return False
     suffixes = {suffix.lower() for suffix in path.suffixes}
     if os.path.isdir(path) or suffixes & {".mcap", ".db3"}:
         return True

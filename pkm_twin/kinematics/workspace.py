@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
+from pkm_twin.kinematics.passive_limits import within_passive_limits
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -98,11 +99,29 @@ def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Ma
     """
     poses = vectors(pose, len(robot.pose_names), "the pose")
     q, inside = try_inverse(robot, poses)
-    inside &= within_limits(robot, q)
+    return inside & keeps_limits(robot, q, poses, least_clearance, inside)
+
+
+def keeps_limits(
+    robot: Robot,
+    q: Array,
+    pose: Array,
+    least_clearance: float = 0.0,
+    known: Mask | bool = True,
+) -> Mask:
+    """Whether joint positions keep all limits, and limbs apart, shape (...); see `reachable`.
+
+    :param q: shape (..., n); ``pose``: theirs, shape (..., m).
+    :param least_clearance: as in :func:`reachable`.
+    :param known: where there is an assembly; elsewhere the result is False.
+    """
+    inside = np.array(within_limits(robot, q) & known)
     bound = getattr(robot.limits, "joint_angle", None)
     if bound is not None and has_joint_angles(robot):
         # NaN is not below.
-        inside &= joint_angle_at(robot, poses) <= bound
+        inside &= joint_angle_at(robot, pose) <= bound
+    if robot.passive_limits:
+        inside[inside] = within_passive_limits(robot, q[inside])
     if has_clearance(robot) and least_clearance > -math.inf:
         # The dearest test, so only where all others hold.
         inside[inside] = joint_clearance(robot, q[inside], refuse=False) > least_clearance

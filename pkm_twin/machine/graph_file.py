@@ -91,11 +91,26 @@ class FrictionSpec:
 
 @dataclass(frozen=True, eq=False)
 class LimitSpec:
-    """Limits of one actuated joint: position [min, max], rate, effort."""
+    """Limits of one joint: position [min, max], rate, effort; or how far it swivels.
+
+    ``swivel``: of a spherical or universal joint, the largest angle between two directions that
+    are both along ``axis`` (base axes) at home, one fixed in the inner body, one in the outer.
+    ``axis``: default the direction of the member that the joint holds; of a universal joint the
+    normal of its axes.
+    """
 
     position: Array | None = schema.interval(unit="{joint}", default=None)
     velocity: float | None = schema.number(above=0.0, unit="{joint}/s", default=None)
     effort: float | None = schema.number(above=0.0, unit="{effort}", default=None)
+    swivel: float | None = schema.number(above=0.0, at_most=np.pi, unit="rad", default=None)
+    axis: Array | None = schema.vector(3, default=None)
+
+    def verify(self, path: str) -> None:
+        """An axis has a length, and is a swivel's."""
+        if self.axis is not None and self.swivel is None:
+            raise ParameterError(f"{path}.axis", self.axis.tolist(), "none without swivel")
+        if self.axis is not None and not float(np.linalg.norm(self.axis)) > 1e-9:
+            raise ParameterError(f"{path}.axis", self.axis.tolist(), "a vector with a length")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +121,8 @@ class JointSpec:
     ``home`` at home (0 where left out). ``axes``: of a universal joint, the first fixed in the
     inner body, the second in the outer one. ``lead``: how far a ``helical`` joint goes along its
     axis in a turn, m; its number is the turn, and a left-handed thread has a lead below zero. A
-    ``translation`` is three slides along base axes. ``limits`` are those of actuated joints.
+    ``translation`` is three slides along base axes. ``limits``: of a passive joint its ``position``
+    and ``swivel`` bound the workspace; the others are those of actuated joints.
     ``rotor_inertia``: of the drive, reflected to the joint, inertia without weight; or ``drive``,
     which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a screw's or belt's
     ``lead`` (joints that slide). ``compliance``: in the joint's own axes.
@@ -157,8 +173,17 @@ class JointSpec:
             )
         if self.rotor_inertia and self.drive is not None:
             raise ParameterError(f"{path}.drive", "given", "either drive or rotor_inertia")
+        swivels = self.limits is not None and self.limits.swivel is not None
+        if swivels and self.type not in ("spherical", "universal"):
+            raise ParameterError(
+                f"{path}.limits.swivel", self.type, "a spherical or universal joint"
+            )
+        if swivels and any(
+            getattr(self.limits, key) is not None for key in ("position", "velocity", "effort")
+        ):
+            raise ParameterError(f"{path}.limits", self.type, "swivel alone")
         for key in ("limits", "friction", "rotor_inertia", "drive", "home"):
-            if getattr(self, key) and len(freedoms) != 1:
+            if getattr(self, key) and len(freedoms) != 1 and not (key == "limits" and swivels):
                 raise ParameterError(f"{path}.{key}", self.type, "a joint of one freedom")
         if len(freedoms) == 1 and freedoms[0].turns:
             check_angles(self.home or 0.0, f"{path}.home")
@@ -194,13 +219,17 @@ class JointSpec:
 
 @dataclass(frozen=True, eq=False)
 class RodSpec:
-    """A thin even straight bar with a ball joint at each end: points (m), mass (kg)."""
+    """A thin even straight bar with a ball joint at each end: points (m), mass (kg).
+
+    ``swivel``: how far it may lean from its direction at home, against each body, rad.
+    """
 
     between: tuple[str, ...] = schema.names(2)
     ends: Array = schema.matrix(2, 3, unit="m")
     mass: float = mass(default=0.0)
     section: Tube | None = schema.section(Tube, default=None)
     radius: float | None = length(default=None)
+    swivel: float | None = schema.number(above=0.0, at_most=np.pi, unit="rad", default=None)
 
 
 @dataclass(frozen=True)
@@ -329,6 +358,9 @@ def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
             )
     else:
         new["between"] = tuple(f"{b}_{number}" if b in own else b for b in entry.between)
+        limits = getattr(entry, "limits", None)
+        if limits is not None and limits.axis is not None:
+            new["limits"] = dataclasses.replace(limits, axis=array(rotation @ limits.axis))
     return dataclasses.replace(entry, **new)
 
 

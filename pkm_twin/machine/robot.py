@@ -58,6 +58,7 @@ from pkm_twin.machine.uncertainty import (
 
 if TYPE_CHECKING:
     from delta_dynamics.loop import TorqueLoop
+    from pkm_twin.kinematics.passive_limits import PassiveLimit
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -215,6 +216,15 @@ class Robot:
         """Angles that ``limits.joint_angle`` bounds, shape (..., k), rad; None where it is none."""
         del pose
         return None
+
+    @property
+    def passive_limits(self) -> tuple[PassiveLimit, ...]:
+        """Ranges of passive joints that bound the workspace; none: the file states none."""
+        return ()
+
+    def passive_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """What its file tells of these at joints and rods: plain data, by kind and name."""
+        return {}
 
     def structure(self) -> Structure:
         """Elastic beams and joints.

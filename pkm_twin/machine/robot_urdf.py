@@ -96,6 +96,9 @@ def robot_description(robot: Robot) -> dict[str, Any]:
     for kind, entries in elastic.items():
         for name, entry in entries.items():
             data[kind][name] |= entry
+    for kind, entries in robot.passive_entries().items():
+        for name, entry in entries.items():
+            data[kind][name] |= entry
     if elastic and robot.element_compliance:
         data["element_compliance"] = dict(robot.element_compliance)
     data["gravity"] = robot.gravity.tolist()

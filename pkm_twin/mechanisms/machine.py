@@ -22,6 +22,7 @@ from pkm_twin.codegen.expressions import norm, plain
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.kinematics.engine import choose_coordinates
 from pkm_twin.kinematics.motion import matrices, numbers
+from pkm_twin.kinematics.passive_limits import PassiveLimit
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.entries import check_number, full_keys, given, number_in, placed
@@ -36,6 +37,7 @@ from pkm_twin.machine.graph_drives import driven, drives_of
 from pkm_twin.machine.graph_file import (
     KINDS,
     PER_COPY,
+    LimitSpec,
     Source,
     graph_of_entries,
     number_of_entry,
@@ -43,6 +45,7 @@ from pkm_twin.machine.graph_file import (
     written_out,
 )
 from pkm_twin.machine.joint_map import JointMapEntry
+from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.robot_urdf import robot_description
@@ -135,6 +138,7 @@ class Machine(Robot):
         _ = robot.controller
         robot.engine.check()
         robot.check_masses()
+        _ = robot.passive_limits
         check_uncertainty(robot)
         robot.check_elements()
         return robot
@@ -423,6 +427,66 @@ class Machine(Robot):
                 if value is not None:
                     told[kind].setdefault(name, {})[word] = value
         return {kind: entries for kind, entries in told.items() if entries}
+
+    @cached_property
+    def passive_limits(self) -> tuple[PassiveLimit, ...]:
+        """Positions and swivels of joints that are not actuated, and of rods at both ends.
+
+        :raises ParameterError: a swivel without an axis.
+        """
+        found = []
+        for name, joint in self.graph.joints.items():
+            limits = self.specs["joints"][name].limits
+            ends = joint.inner, joint.outer, joint.at
+            if limits is None or joint.actuated:
+                continue
+            if limits.swivel is not None:
+                axis = unit(self._swivel_axis(name, limits))
+                found.append(PassiveLimit(name, "swivel", *ends, axis, 0.0, limits.swivel))
+            elif limits.position is not None:
+                kind = "slide" if joint.slides else "turn"
+                low, high = limits.position.tolist()
+                found.append(PassiveLimit(name, kind, *ends, joint.axes[0], low, high, joint.home))
+        for name, rod in self.specs["rods"].items():
+            if rod.swivel is not None:
+                for k, way in ((0, 1), (1, 0)):
+                    axis = unit(rod.ends[way] - rod.ends[k])
+                    body, other = rod.between[k], rod.between[way]
+                    found.append(
+                        PassiveLimit(
+                            name, "rod", body, other, rod.ends[k], axis, 0.0, rod.swivel,
+                            far=rod.ends[way],
+                        )
+                    )  # fmt: skip
+        return tuple(found)
+
+    def _swivel_axis(self, name: str, limits: LimitSpec) -> Array:
+        """The direction that a ball joint swivels from."""
+        joint = self.graph.joints[name]
+        if limits.axis is not None:
+            return limits.axis
+        if joint.kind == "universal":
+            return np.cross(*joint.axes)
+        for body in (joint.inner, joint.outer):
+            member = None if body == BASE else self.specs["bodies"][body].member
+            if member is not None and body != self.graph.platform:
+                return np.asarray(member.end - member.start, np.float64)
+        raise ParameterError(
+            f"joints.{name}.limits.axis", None, "the direction that it swivels from, base axes"
+        )
+
+    def passive_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """Limits of passive joints, swivels of rods."""
+        told: dict[str, dict[str, dict[str, Any]]] = {"joints": {}, "rods": {}}
+        for limit in self.passive_limits:
+            if limit.kind == "rod":
+                told["rods"][limit.joint] = {"swivel": limit.high}
+            elif limit.kind == "swivel":
+                entry = {"swivel": limit.high, "axis": limit.axis.tolist()}
+                told["joints"][limit.joint] = {"limits": entry}
+            else:
+                told["joints"][limit.joint] = {"limits": {"position": [limit.low, limit.high]}}
+        return told
 
     def structure(self) -> Structure:
         """Bars with sections, and the compliance of joints.

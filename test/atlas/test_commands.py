@@ -113,7 +113,7 @@ def test_interrupted_and_resumed(call, small_atlases, tmp_path):
     ("words", "code", "text"),
     [
         (["atlas", "five_bar", "isotropy"], 1, "three pose coordinates"),
-        (["atlas", "delta", "strain-energy"], 1, "elastic"),
+        (["atlas", "delta", "pose-error"], 1, "uncertainty"),
         (["atlas", "delta", "weather"], 1, "workspace"),
         (["atlas", "upr_rpu", "strain-energy", "--wrench", "1,2"], 2, "six numbers"),
         (["atlas", "delta", "modess"], 1, "did you mean 'modes'"),
@@ -138,9 +138,10 @@ def test_refusals_are_one_line(words, code, text, call, tmp_path):
 
 def test_each_kind_says_its_own_options(call):
     shared = {"--points", "--out", "--workers", "--scheduler", "--html", "--overwrite"}
+    bounds = {"--least-singularity", "--least-clearance"}
     own = {
-        "workspace": {"--least-singularity", "--least-clearance"},
-        "strain-energy": {"--wrench"},
+        "workspace": bounds,
+        "strain-energy": {"--wrench", "--payload", "--along", *bounds},
         "isotropy": {"--height", "--energy", "--beyond-limits"},
         "modes": set(),
     }

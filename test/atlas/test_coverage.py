@@ -11,9 +11,9 @@ import pytest
 from pkm_twin import robot_names
 from pkm_twin.atlas import kinds, workspace
 from pkm_twin.atlas.grids import height_range, largest_distance
+from pkm_twin.atlas.planes import planes
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
-from pkm_twin.atlas.workspace.stored import planes
 from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.workspace import reachable, singularity_at, try_forward
@@ -107,7 +107,7 @@ def test_an_atlas_without_an_axis(name, tmp_path):
         data.load()
         assert data.attrs["layout"] == "box"
         assert "circle" not in data
-        shown = planes(data)
+        shown = planes(data, ("singularity", "clearance", "joint_angle"))
         assert len(shown) == max(1, size * (size - 1) // 2)
         for figure in kinds.draw(data).values():
             assert sum(bool(ax.get_xlabel()) for ax in figure.axes) >= len(shown)

@@ -11,7 +11,7 @@ from stiffness_monitor import compliance
 from test.bags.test_recordings import FOLDER
 from test.laws.deflections import SENSORS, noisy, twin_recording
 from test.support.command import command
-from test.support.robots import load
+from test.support.robots import load, rigid
 
 SOFT = FOLDER / "upr_rpu_soft_joint.mcap"
 COLLISION = FOLDER / "delta_cu_collision.mcap"
@@ -105,7 +105,7 @@ def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
         (("upr_rpu", without_wrench), "no wrench in the bag"),
         (("upr_rpu", SOFT, "--topic", "/wrnch"), "is not in the bag"),
         (("delta_cu", COLLISION), "no deflection in the bag"),
-        (("stewart", plain), "nothing is elastic"),
+        ((rigid("stewart", tmp_path / "rigid.yaml"), plain), "nothing is elastic"),
         (("upr_rpu", table(tmp_path / "a.csv", wrench=(), rows=slice(60))), "no wrench"),
         (("upr_rpu", table(tmp_path / "b.csv", deflection=(), rows=slice(60))), "no deflection"),
         (("upr_rpu", table(tmp_path / "c.csv", rows=slice(0, 9))), "too short to fit"),
@@ -119,7 +119,7 @@ def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
     assert "no --per-copy, --payload" in done.one_line_error()
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "complience")
     assert "did you mean 'compliance'" in done.one_line_error()
-    assert not list(tmp_path.glob("*.yaml"))
+    assert [path.name for path in tmp_path.glob("*.yaml")] == ["rigid.yaml"]
 
 
 def changed(path, source, **columns):

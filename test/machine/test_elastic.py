@@ -8,14 +8,14 @@ import yaml
 from pkm_twin.apps.certificate.description import expand
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics.clearance import clearance
-from pkm_twin.machine.catalogue import config_folder, robot_of_data
+from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.entries import with_entries
 from stiffness_monitor import compliance, platform_response, strain_energy
 from stiffness_monitor.beams import assemble
 from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.structure import structural_model
 from test.machine.random_machines import plain
-from test.support.robots import load
+from test.support.robots import load, rigid
 
 POSES = [[0.02, 0.03, -0.33], [-0.05, 0.0, -0.36]]
 
@@ -108,7 +108,7 @@ def test_the_graph_form_of_a_delta_is_as_stiff(delta_in_the_graph_form):
 @pytest.mark.parametrize("name", ["stewart", "rps3"])
 def test_springs_in_the_drives_alone_give_the_jacobians_compliance(name, tmp_path):
     """Rigid bodies on elastic drives: C = J c J', whatever closes the loops."""
-    data = yaml.safe_load((config_folder() / f"{name}.yaml").read_text(encoding="utf-8"))
+    data = yaml.safe_load(rigid(name, tmp_path / "rigid.yaml").read_text(encoding="utf-8"))
     along = 1e-6
     sections = [data, *(data["limbs"] if isinstance(data["limbs"], list) else [data["limbs"]])]
     for section in sections:
@@ -129,9 +129,10 @@ def test_springs_in_the_drives_alone_give_the_jacobians_compliance(name, tmp_pat
         compliance(robot, pose)
 
 
-def test_a_rigid_machine_says_what_is_missing():
+def test_a_rigid_machine_says_what_is_missing(tmp_path):
+    robot = load(rigid("stewart", tmp_path / "rigid.yaml"))
     with pytest.raises(ParameterError, match="nothing is elastic") as caught:
-        compliance(load("stewart"), load("stewart").home())
+        compliance(robot, robot.home())
     assert caught.value.field == "bodies"
 
 

@@ -15,7 +15,7 @@ from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.compliance import member_deflections
 from test.nodes.harness import SECOND, Maker, Plain
-from test.support.robots import ELASTIC, load
+from test.support.robots import load, some_elastic
 
 MAKE = Maker(Plain())
 NOW = 1_000 * SECOND
@@ -53,7 +53,7 @@ def loaded(robot, state, wrench=WRENCH):
     )
 
 
-each_elastic = pytest.mark.parametrize("robot", ELASTIC, indirect=True)
+each_elastic = pytest.mark.parametrize("robot", some_elastic, indirect=True)
 
 
 class TestState:

@@ -69,7 +69,9 @@ ELASTIC = [name for name, robot in SHIPPED.items() if has(robot, "structure")]
 
 every_robot = pytest.mark.parametrize("name", robot_names())
 massive = pytest.mark.parametrize("name", MASSIVE)
-elastic = pytest.mark.parametrize("name", ELASTIC)
+some_elastic = partly_long(ELASTIC, "delta", "delta_cu", "prru", "upr_rpu")
+"""All elastic robots, by default those whose mechanism has a file of its own."""
+elastic = pytest.mark.parametrize("name", some_elastic)
 some_robots = pytest.mark.parametrize(
     "name", partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu")
 )
@@ -80,6 +82,21 @@ def parameters_of(name: str) -> dict[str, Any]:
     """The plain parameter mapping of a shipped robot."""
     data: dict[str, Any] = yaml.safe_load((config_folder() / f"{name}.yaml").read_text())
     return data
+
+
+def rigid(name: str, path: Path) -> Path:
+    """A shipped robot without members, sections and compliances, written there."""
+
+    def stripped(entry: Any) -> Any:
+        if isinstance(entry, dict):
+            left = {key: stripped(value) for key, value in entry.items()}
+            return {
+                key: left[key] for key in left if key not in ("member", "section", "compliance")
+            }
+        return [stripped(value) for value in entry] if isinstance(entry, list) else entry
+
+    path.write_text(yaml.safe_dump(stripped(parameters_of(name))))
+    return path
 
 
 def massless(path: Path) -> Path:

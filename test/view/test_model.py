@@ -14,7 +14,7 @@ from pkm_twin.apps.view.model import Model, _round, _step
 from pkm_twin.apps.view.scene import SCALE, Scene, plate, round_mesh, share_colours
 from pkm_twin.kinematics.clearance import clearance, has_clearance
 from stiffness_monitor import compliance
-from test.support.robots import has, load
+from test.support.robots import has, load, rigid
 
 URDF = Path(__file__).resolve().parents[1] / "machine/five_bar.urdf"
 NAMES = [*robot_names(), URDF.name]
@@ -145,8 +145,9 @@ def test_numbers_are_the_cores(name, rng):
             assert html.count(f'id="{key}"') == 1
 
 
-def test_what_is_not_known_is_said():
-    numbers = model_of("stewart").numbers(model_of("stewart").start)
+def test_what_is_not_known_is_said(tmp_path):
+    model = model_of(rigid("stewart", tmp_path / "rigid.yaml"))
+    numbers = model.numbers(model.start)
     assert numbers.energy is None
     assert "member" in numbers.why["energy"]
     assert "diameters" in numbers.why["clearance"]

@@ -19,6 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.atlas.grids import circles, cylinder, height_range, ladder, nice, turns
+from pkm_twin.atlas.maps.quantity import Case
+from pkm_twin.atlas.maps.sweep import (
+    MapSweep,
+    map_sweep,
+    worst_coordinates,
+    worst_of,
+    worst_variables,
+)
 from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.robot import Robot
@@ -106,7 +114,13 @@ class StrainEnergySweep(Sweep):
             "radius": Variable(
                 ("z",), self.radii, {"units": "rad", "long_name": "largest circle of tilts"}
             ),
+            **worst_coordinates(self.whole),
         }
+
+    @property
+    def whole(self) -> MapSweep:
+        """The map of the same over the whole workspace, whose worst pose is stored."""
+        return map_sweep(self.robot, self.kind, cases=[Case("wrench", self.wrench)])
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -167,7 +181,8 @@ class StrainEnergySweep(Sweep):
             values = np.array([math.fsum(row) for row in sums]) / count
             attrs = {**SHARE, "long_name": f"global strain-energy factor, {what}"}
             result[name] = Variable(("element",), values, attrs)
-        return result
+        whole = self.whole
+        return result | worst_variables(whole, [worst_of(whole, whole.cases[0], np.empty((0, 3)))])
 
 
 def strain_energy_sweep(
@@ -183,7 +198,7 @@ def strain_energy_sweep(
     :raises ParameterError: a robot whose elastic elements are not :data:`ELEMENTS`, a wrench that
         is none, or a robot that has no regular workspace.
     """
-    if robot.element_names != ELEMENTS:
+    if not has_paper_elements(robot):
         raise ParameterError(
             "mechanism", robot.mechanism, "elastic limbs of R joint, bar and U joint (upr_rpu)"
         )
@@ -205,6 +220,11 @@ def strain_energy_sweep(
     # Each height has its axis, so the count is not quite linear in the step.
     tilt_step = float(heights[1].sum()) / max(rungs - len(heights[0]) / 2, 1.0)
     return _sweep(robot, load, heights, tilt_step, azimuths)
+
+
+def has_paper_elements(robot: Robot) -> bool:
+    """Whether a robot's elastic elements are :data:`ELEMENTS`."""
+    return robot.mechanism == "upr_rpu" and robot.element_names == ELEMENTS
 
 
 def checked_wrench(wrench: ArrayLike | str) -> tuple[float, ...]:

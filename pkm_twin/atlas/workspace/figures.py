@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.atlas import figures, plots
-from pkm_twin.atlas.workspace.stored import Plane, planes
+from pkm_twin.atlas import figures, planes, plots
+from pkm_twin.atlas.workspace.page import LABELS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -218,49 +218,19 @@ def _workspace(atlas: Dataset) -> Figure:
     return _upright(atlas) if "circle" in atlas else _sections(atlas)
 
 
-def plane(shown: Plane, greatest: float, ax: Axes | None = None) -> Axes:
-    """Distance to a singularity over two pose coordinates, or over the only one.
-
-    :param greatest: value of the last colour.
-    """
-    ax = figures.axes_or_new(ax)
-    first, second = shown.ticks
-    values = shown.fields["singularity"]
-    ax.set_title(shown.where, fontsize=9)
-    ax.set_xlabel(f"{shown.names[0]} ({shown.units[0]})")
-    if len(second) == 1:
-        ax.plot(first, values[:, 0], color=plots.COLOURS[0])
-        ax.set_ylabel("distance to a singularity (1)")
-        ax.set_ylim(0.0, 1.05 * greatest)
-        ax.grid(alpha=0.3)
-        return ax
-    ax.set_ylabel(f"{shown.names[1]} ({shown.units[1]})")
-    mesh = ax.pcolormesh(
-        first,
-        second,
-        np.ma.masked_invalid(values.T),
-        shading="nearest",
-        cmap=figures.MAP,
-        vmin=0.0,
-        vmax=greatest,
-    )
-    figures.bar(ax, mesh, "distance to a singularity (1)")
-    return ax
-
-
 def _sections(atlas: Dataset) -> Figure:
     """Every pair of coordinates through the home pose."""
-    shown = planes(atlas)
+    shown = planes.planes(atlas, list(LABELS))
     columns = min(len(shown), 5 if len(shown) > 4 else 3)
     rows = math.ceil(len(shown) / columns)
     figure, axes = figures.subplots(
         rows, columns, figsize=(5.2 * columns, 4.2 * rows), layout="constrained", squeeze=False
     )
-    greatest = float(atlas.singularity.max())
+    greatest = float(atlas.singularity.max()) or 1.0
     for ax in axes.ravel()[len(shown) :]:
         ax.set_visible(False)
     for one, ax in zip(shown, axes.ravel(), strict=False):
-        plane(one, greatest if greatest > 0.0 else 1.0, ax)
+        planes.draw(one, "singularity", LABELS["singularity"], 0.0, greatest, ax)
     size = ""
     if "volume" in atlas:
         size = f" {float(atlas.volume):.4g} {atlas.volume.attrs['units']}"

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin check``: recordings against the twin, one or a folder of them."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Optional
+
+import typer
+
+from pkm_twin.apps.options import BagTopics, Json, LoadTimes, OptionalRobot, Payload, load_of
+from pkm_twin.console import print_json, progress, table_console, tell
+from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.threads import one_blas_thread_for_children
+
+if TYPE_CHECKING:
+    from pkm_twin.apps.check import CheckReport
+    from pkm_twin.apps.loads import Load
+
+REFUSED, SALVAGED = 1, 3
+METADATA: Final = "metadata.yaml"
+"""What makes a folder a rosbag2 bag."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is judged beside the recording itself, and where it is kept."""
+
+    robot: str | None
+    residual: float
+    topics: tuple[str, ...]
+    carried: Load | None
+    history: Path | None
+    machine: str | None
+
+
+def bags_of(folder: Path) -> list[Path]:
+    """Recordings in a folder and below: MCAP files and rosbag2 folders, by name."""
+    whole = {path.parent for path in folder.rglob(METADATA)}
+    files = [p for p in folder.rglob("*.mcap") if not whole & set(p.parents)]
+    return sorted([*whole, *files])
+
+
+def is_collection(path: Path) -> bool:
+    """Whether a path is a folder of recordings, not a rosbag2 bag itself."""
+    if not path.is_dir() or (path / METADATA).exists():
+        return False
+    # A bag whose metadata is lost has its files side by side.
+    return bool(bags_of(path)) and not any(path.glob("*.db3"))
+
+
+def check_one(path: Path, request: Request, update: Any = None) -> CheckReport:
+    """Judge a recording, and append it to the history; errors as ``check_bag``."""
+    from pkm_twin.apps.check import Bounds, judged
+    from pkm_twin.apps.recorded import read_recording
+
+    recording = read_recording(
+        path, request.robot, update, topics=request.topics, carried=request.carried
+    )
+    report = judged(recording, Bounds(residual=request.residual))
+    if request.history is not None:
+        from pkm_twin.apps.history import append, measure, recorded_at
+
+        name = recording.robot.name
+        when = recorded_at(recording, path)
+        machine = request.machine or name
+        append(request.history, machine, name, path, when, report.good, measure(recording))
+    return report
+
+
+def _facts(path: Path, request: Request) -> dict[str, Any]:
+    """One recording of many, as plain data; a damaged one too."""
+    try:
+        return check_one(path, request).as_json()
+    except (PkmTwinError, OSError) as error:
+        return {"bag": str(path), "good": False, "error": one_line(str(error))}
+
+
+def _judged_all(
+    paths: Sequence[Path], request: Request, jobs: int
+) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Verdicts as they come."""
+    if jobs == 1:
+        yield from ((path, _facts(path, request)) for path in paths)
+        return
+    context = multiprocessing.get_context("spawn")
+    with one_blas_thread_for_children(), ProcessPoolExecutor(jobs, mp_context=context) as pool:
+        flying = {pool.submit(_facts, path, request): path for path in paths}
+        for future in as_completed(flying):
+            yield flying[future], future.result()
+
+
+def _check_folder(folder: Path, request: Request, jobs: int, as_json: bool) -> bool:
+    """Judge all recordings of a folder on so many processes; whether all are good."""
+    paths = bags_of(folder)
+    found: dict[Path, dict[str, Any]] = {}
+    with progress("checking", len(paths)) as update:
+        for path, facts in _judged_all(paths, request, min(jobs, len(paths))):
+            found[path] = facts
+            update(len(found))
+    results = [found[path] for path in paths]
+    good = all(result["good"] for result in results)
+    if as_json:
+        print_json({"folder": str(folder), "good": good, "recordings": results})
+        return good
+    for result in results:
+        bad = [item["what"] for item in result.get("items", ()) if item["verdict"] == "bad"]
+        why = result.get("error") or ("bad: " + ", ".join(bad) if bad else "good")
+        typer.echo(f"{result['bag']}: {why}")
+    count = sum(not result["good"] for result in results)
+    typer.echo(f"{len(results)} recordings, {count} bad" if count else f"{len(results)} good")
+    return good
+
+
+def check(
+    bag: Annotated[
+        Path,
+        typer.Argument(
+            help="a bag: an MCAP file or a rosbag2 folder; a CSV; or a folder of bags",
+            show_default=False,
+        ),
+    ],
+    robot: OptionalRobot = None,
+    residual: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="largest RMS torque residual that is good, as a fraction of the peak: 0.05 is 5 %",
+        ),
+    ] = 0.05,
+    topic: BagTopics = [],  # noqa: B006  typer copies it
+    payload: Payload = None,
+    load_times: LoadTimes = None,
+    history: Annotated[
+        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        typer.Option(
+            help="also append residual, friction, payload and stiffness to this file, for "
+            "`pkm-twin trend`",
+            show_default=False,
+        ),
+    ] = None,
+    machine: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="name in the history; default: the robot's", show_default=False),
+    ] = None,
+    jobs: Annotated[int, typer.Option(help="processes for a folder of bags", min=1)] = 1,
+    as_json: Json = False,
+) -> None:
+    """Compare a recording with the model, or all recordings of a folder.
+
+    Checks that the file is complete, that a node would accept every joint state and wrench, that
+    there are no gaps, that joints stay inside their limits and away from singularities, and that
+    the measured efforts agree with the model. An item without data (no CRCs, no efforts, a robot
+    without masses) is unknown, which is neither good nor bad. The first lines report which topics
+    and which payload were used.
+
+    Exit code 0: nothing is bad. 1: an item is bad, or the file is not a bag. 3: the file is
+    damaged, but `pkm-twin recover` can save part of it.
+    """
+    from pkm_twin.apps.verdict import Verdict, items_table
+    from pkm_twin.bags.reader import DamagedBagError
+
+    carried = load_of(payload, load_times)
+    request = Request(robot, residual, tuple(topic), carried, history, machine)
+    if is_collection(bag):
+        if not _check_folder(bag, request, jobs, as_json):
+            raise typer.Exit(REFUSED)
+        return
+    try:
+        with progress("reading", None) as update:
+            report = check_one(bag, request, update)
+    except PkmTwinError as error:
+        salvageable = error.salvageable if isinstance(error, DamagedBagError) else 0
+        if as_json:
+            facts = {"bag": str(bag), "good": False, "error": str(error)}
+            print_json({**facts, "salvageable": salvageable})
+        tell(str(error))
+        raise typer.Exit(SALVAGED if salvageable else REFUSED) from None
+    if as_json:
+        print_json(report.as_json())
+    else:
+        typer.echo(f"{report.topics}")
+        typer.echo(f"payload: {report.load or 'the robot file alone'}")
+        if not report.unsure:
+            typer.echo("uncertainty: none in the robot file, so the model has no uncertainty band")
+        table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))
+        bad, unknown = report.named(Verdict.BAD), report.named(Verdict.UNKNOWN)
+        text = f"bad: {', '.join(bad)}" if bad else "good"
+        typer.echo(text + (f"; not judged: {', '.join(unknown)}" if unknown else ""))
+    if not report.good:
+        raise typer.Exit(REFUSED)

@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The maps of ``pkm-twin atlas``: one quantity over the workspace, or along a path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from pkm_twin.atlas.commands import Alone, kind
+from pkm_twin.console import numbers, print_json, refuse_existing
+from pkm_twin.errors import ParameterError
+
+if TYPE_CHECKING:
+    from pkm_twin.atlas.maps.quantity import Case, Found, Quantity
+    from pkm_twin.atlas.sweep import Sweep
+    from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+_SINGULARITY = 0.05
+_NAMES = "P1, P2, P3 or six numbers with commas between, N and N m; or NAME=six numbers"
+
+Along = Annotated[
+    Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+    typer.Option(
+        help="instead of the workspace: a CSV of `pkm-twin path`, or any motion that `pkm-twin "
+        "torques` reads; --out FILE.csv writes the values",
+        show_default=False,
+    ),
+]
+Wrench = Annotated[
+    list[str],
+    typer.Option(
+        help=f"what the surroundings apply to the platform, base axes: {_NAMES}; several times "
+        "for several load cases"
+    ),
+]
+LoadOf = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option(
+        help="MASS[,x,y,z] on the platform in place of the file's, kg and m", show_default=False
+    ),
+]
+Singularity = Annotated[
+    float, typer.Option(help="singularity index (0 to 1) below which a pose does not count")
+]
+Clearance = Annotated[
+    float, typer.Option(help="distance between limbs (m) below which a pose does not count")
+]
+
+
+def _cases(texts: Sequence[str]) -> list[Case]:
+    """Load cases of a command line.
+
+    :raises ParameterError: two of one name, or a wrench that is none.
+    """
+    from pkm_twin.atlas.maps.quantity import Case
+    from pkm_twin.atlas.strain_energy.sweep import WRENCHES, checked_wrench
+
+    found: dict[str, Case] = {}
+    for text in texts:
+        name, given, values = text.rpartition("=")
+        name = name.strip() if given else text
+        if name in found:
+            raise ParameterError("wrench", text, "another name for each load case")
+        wrench = WRENCHES[text] if text in WRENCHES else checked_wrench(numbers(values, 6, _NAMES))
+        found[name] = Case(name, wrench)
+    return list(found.values())
+
+
+@dataclass(frozen=True, eq=False)
+class PathMap:
+    """A quantity along a path: ``time`` (k,), s, joint positions ``q`` (k, n)."""
+
+    robot: Robot
+    quantity: Quantity
+    cases: tuple[Case, ...]
+    source: Path
+    time: Array
+    q: Array
+    least: float
+    least_clearance: float
+
+    def present(self, out: Path | None, picture: bool, overwrite: bool, as_json: bool) -> None:
+        """Print the worst of each case, and write table and picture where a name is given."""
+        from pkm_twin.atlas.maps.figures import sentence
+        from pkm_twin.atlas.maps.sweep import counts, found_of
+
+        if out is not None:
+            if out.suffix != ".csv":
+                raise ParameterError("out", str(out), "a name that ends in .csv")
+            for target in (out, out.with_suffix(".png")):
+                refuse_existing(target, overwrite, self.source)
+        robot, quantity = self.robot, self.quantity
+        pose = robot.forward(self.q)
+        inside = counts(
+            robot, self.q, pose, np.ones(len(self.q), bool), self.least, self.least_clearance
+        )
+        found = [found_of(quantity, robot, self.q, case) for case in self.cases]
+        worst = []
+        for case, one in zip(self.cases, found, strict=True):
+            k = int(np.argmax(one.value if quantity.largest else -one.value))
+            worst.append(
+                {
+                    "case": case.name,
+                    "value": float(one.value[k]),
+                    "unit": quantity.unit(robot, case),
+                    "time_s": float(self.time[k]),
+                    "pose": dict(zip(robot.pose_names, pose[k].tolist(), strict=True)),
+                    "direction": one.direction[k].tolist(),
+                    "element": quantity.elements(robot)[int(one.element[k])],
+                }
+            )
+        files = [] if out is None else self._write(out, picture, pose, inside, found)
+        beyond = int((~inside).sum())
+        if as_json:
+            print_json(
+                {
+                    "robot": robot.name, "kind": quantity.name, "samples": len(self.q),
+                    "samples_that_do_not_count": beyond, "worst": worst, "files": files,
+                }
+            )  # fmt: skip
+            return
+        typer.echo(f"{robot.name}: {quantity.question} {len(self.q)} samples of {self.source}")
+        for answer in worst:
+            typer.echo(f"{sentence(answer)}; at {answer['time_s']:.4g} s")
+        if beyond:
+            typer.echo(f"{beyond} samples are beyond limits, near a singularity or limbs meet")
+        for name in files:
+            typer.echo(name)
+
+    def _write(
+        self, out: Path, picture: bool, pose: Array, inside: NDArray[np.bool_], found: list[Found]
+    ) -> list[str]:
+        import csv
+        import io
+
+        from pkm_twin.files import replace_file
+
+        robot, names = self.robot, self.quantity.elements(self.robot)
+        header = ["time", *robot.pose_names, "counts"]
+        columns: list[list[Any]] = [
+            self.time.tolist(),
+            *pose.T.tolist(),
+            inside.astype(int).tolist(),
+        ]
+        for case, one in zip(self.cases, found, strict=True):
+            before = "" if len(self.cases) == 1 else f"{case.name}."
+            header += [f"{before}{w}" for w in ("value", "x", "y", "z", "element")]
+            columns += [one.value.tolist(), *one.direction.T.tolist()]
+            columns.append([names[k] for k in one.element])
+        text = io.StringIO()
+        csv.writer(text).writerows([header, *zip(*columns, strict=True)])
+        replace_file(out, text.getvalue().encode())
+        return [str(out), *([str(self._draw(out.with_suffix(".png"), found))] if picture else [])]
+
+    def _draw(self, path: Path, found: list[Found]) -> Path:
+        from pkm_twin.atlas import figures, plots
+
+        figure, axes = figures.subplots(
+            len(found), 1, figsize=(9, 3.5 * len(found)), layout="constrained", squeeze=False
+        )
+        names = self.quantity.elements(self.robot)
+        for ax, case, one in zip(axes[:, 0], self.cases, found, strict=True):
+            values, unit = figures.prefixed(one.value, self.quantity.unit(self.robot, case))
+            ax.plot(self.time, values, color="0.7", lw=1)
+            for n, element in enumerate(np.unique(one.element)):
+                own = one.element == element
+                colour = plots.COLOURS[n % len(plots.COLOURS)]
+                ax.plot(self.time[own], values[own], ".", ms=4, color=colour, label=names[element])
+            ax.set_xlabel("time (s)")
+            ax.set_ylabel(f"{self.quantity.name.replace('-', ' ')} ({unit})")
+            ax.set_title(case.name, fontsize=9)
+            title = self.quantity.element
+            ax.legend(title=title, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+            ax.grid(alpha=0.3)
+        figure.suptitle(f"{self.robot.name}: {self.quantity.question}")
+        return plots.save(figure, path)
+
+
+def _made(
+    name: str,
+    machine: Robot,
+    points: int | None,
+    wrench: Sequence[str],
+    payload: str | None,
+    along: Path | None,
+    least_singularity: float,
+    least_clearance: float,
+) -> Sweep | Alone:
+    """The map of a command line, over the workspace or along a path."""
+    from pkm_twin.apps.options import load_of
+    from pkm_twin.atlas.maps.sweep import QUANTITIES, check, map_sweep
+    from pkm_twin.atlas.strain_energy.sweep import has_paper_elements, strain_energy_sweep
+
+    carried = load_of(payload, None)
+    if carried is not None:
+        machine = carried.on(machine)
+    cases = _cases(wrench)
+    plain = (payload, along, least_singularity, least_clearance) == (None, None, _SINGULARITY, 0.0)
+    if name == "strain-energy" and plain and len(cases) < 2 and has_paper_elements(machine):
+        return strain_energy_sweep(machine, cases[0].wrench or "P1" if cases else "P1", points)
+    if along is None:
+        return map_sweep(
+            machine, name, points, cases=cases, least_singularity=least_singularity,
+            least_clearance=least_clearance,
+        )  # fmt: skip
+    from pkm_twin.apps.sizes import motion_of
+
+    quantity = QUANTITIES[name]
+    check(machine, quantity, cases)
+    motion = motion_of(along, machine, (), None)
+    return PathMap(
+        machine, quantity, tuple(cases) or (quantity.default,), along, motion.time, motion.q,
+        least_singularity, least_clearance,
+    )  # fmt: skip
+
+
+def _offer(name: str, doc: str, *, loads: bool = True) -> None:
+    """Make a map a command; with load cases, or without."""
+
+    def loaded(
+        machine: Robot,
+        points: int | None,
+        wrench: Wrench = [],  # noqa: B006  typer copies it
+        payload: LoadOf = None,
+        along: Along = None,
+        least_singularity: Singularity = _SINGULARITY,
+        least_clearance: Clearance = 0.0,
+    ) -> Sweep | Alone:
+        bounds = least_singularity, least_clearance
+        return _made(name, machine, points, wrench, payload, along, *bounds)
+
+    def unloaded(
+        machine: Robot,
+        points: int | None,
+        payload: LoadOf = None,
+        along: Along = None,
+        least_singularity: Singularity = _SINGULARITY,
+        least_clearance: Clearance = 0.0,
+    ) -> Sweep | Alone:
+        return _made(name, machine, points, (), payload, along, least_singularity, least_clearance)
+
+    made: Callable[..., Sweep | Alone] = loaded if loads else unloaded
+    made.__name__, made.__doc__ = name, doc
+    kind(made)
+
+
+_offer("compliance", "Where it is softest: compliance, its direction, or deflections under loads.")
+_offer("payload", "How much it carries: the largest mass that the drives hold at rest.")
+_offer("acceleration", "How hard it accelerates: from rest, in the worst direction.")
+_offer("frequency", "Where it rings lowest: first frequency, actuators locked.", loads=False)
+_offer("pose-error", "Where it is least accurate, by the file's `uncertainty`.", loads=False)
+_offer(
+    "strain-energy",
+    """Which part gives: strain energy of loads, and the elements' parts of it.
+
+    Of upr_rpu, with one wrench at most and no other option, over its regular workspace, next to the
+    2UPR-RPU paper's table 2.
+    """,
+)

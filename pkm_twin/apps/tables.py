@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables as other programs write them: separator, decimal comma, names and units of columns.
+
+What a file's header row makes certain is found by itself, and reported; the rest is options.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import inspect
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Final, Optional, get_type_hints
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+SEPARATORS: Final = {",": ",", ";": ";", "tab": "\t", "\t": "\t"}
+UNITS: Final = {
+    "rad": ("angle", 1.0), "deg": ("angle", math.pi / 180.0), "m": ("length", 1.0),
+    "mm": ("length", 1e-3), "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6),
+}  # fmt: skip
+"""Units of a table: what they are of, and their size in SI."""
+RATES: Final = ("position", "velocity", "acceleration")
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a table is written; None: as its header row says.
+
+    ``columns``: the table's name by ours. ``units``: size in SI of its angles, lengths and times;
+    velocities and accelerations are per second all the same.
+    """
+
+    separator: str | None = None
+    decimal: str | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, float] = field(default_factory=dict)
+
+
+PLAIN: Final = Dialect()
+CHOSEN: ContextVar[Dialect] = ContextVar("dialect", default=PLAIN)
+"""The dialect of the command that runs."""
+
+
+def cells(lines: Iterator[str], told: Callable[[str], None]) -> Iterator[list[str]]:
+    """Rows of a table with decimal points and our names in its header row.
+
+    :param told: called with what was found by itself.
+    """
+    dialect = CHOSEN.get()
+    first = next(lines, "")
+    separator = dialect.separator
+    if separator is None:
+        # Names hold no separators: one that is there, and no other, is certain.
+        there = [mark for mark in (";", "\t") if mark in first]
+        separator = there[0] if len(there) == 1 and "," not in first else ","
+        if separator != ",":
+            told(f"columns are separated by {'tabs' if separator == chr(9) else ';'}")
+    rows = csv.reader(itertools.chain([first], lines), delimiter=separator)
+    header = [name.strip() for name in next(rows, [])]
+    ours = {theirs: name for name, theirs in dialect.columns.items()}
+    yield [ours.get(name, name) for name in header]
+    comma = dialect.decimal == ","
+    for row in rows:
+        if dialect.decimal is None and separator != "," and not comma:
+            comma = any("," in cell for cell in row)
+            if comma:
+                told("numbers have a decimal comma")
+        yield [cell.replace(",", ".") for cell in row] if comma else row
+
+
+def in_si(columns: Mapping[str, Array], robot: Robot | None) -> dict[str, Array]:
+    """Columns of time, joints and pose in SI units.
+
+    :raises ParameterError: units of joints in a table of no robot.
+    """
+    units = CHOSEN.get().units
+    result = dict(columns)
+    if not units:
+        return result
+    if robot is None:
+        raise ParameterError("units", ", ".join(units), "none for this table")
+    kinds = {"time": "time"}
+    pairs = [(f"{n}.{what}", u) for n, u in zip(robot.joint_names, robot.joint_units, strict=True)
+             for what in RATES]  # fmt: skip
+    for name, unit in [*pairs, *zip(robot.pose_names, robot.pose_units, strict=True)]:
+        kinds[name] = UNITS[unit][0]
+    for name, kind in kinds.items():
+        if name in result and kind in units:
+            result[name] = result[name] * units[kind]
+    return result
+
+
+def _dialect(
+    separator: str | None, decimal: str | None, columns: str | None, units: str | None
+) -> Dialect:
+    if separator is not None and separator not in SEPARATORS:
+        raise ParameterError("--separator", separator, "one of , ; tab")
+    if decimal is not None and decimal not in (".", ","):
+        raise ParameterError("--decimal", decimal, ". or ,")
+    names: dict[str, str] = {}
+    for pair in (columns or "").split(",") if columns else []:
+        ours, sign, theirs = pair.partition("=")
+        if not (ours.strip() and sign and theirs.strip()):
+            raise ParameterError("--columns", pair, "NAME=COLUMN, several with commas between")
+        names[ours.strip()] = theirs.strip()
+    sizes: dict[str, float] = {}
+    for word in (units or "").split(",") if units else []:
+        if word.strip() not in UNITS:
+            raise UnknownNameError("--units", word.strip(), tuple(UNITS))
+        kind, size = UNITS[word.strip()]
+        if kind in sizes:
+            raise ParameterError("--units", units, f"one unit of {kind}")
+        sizes[kind] = size
+    mark = None if separator is None else SEPARATORS[separator]
+    return Dialect(mark, decimal, names, sizes)
+
+
+_Text = Optional[str]  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+
+
+def _options(
+    separator: Annotated[
+        _Text, typer.Option(help="of a table's columns: , ; or tab; default: found")
+    ] = None,
+    decimal: Annotated[_Text, typer.Option(help="of a table's numbers: . or ,")] = None,
+    columns: Annotated[
+        _Text,
+        typer.Option(help="names of a table's columns, OURS=THEIRS,...: time=t,arm_1.position=q1"),
+    ] = None,
+    units: Annotated[
+        _Text, typer.Option(help="of a table: of rad, deg, m, mm, s, ms, us; default SI")
+    ] = None,
+) -> None:
+    del separator, decimal, columns, units
+
+
+def tables(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command that reads tables the options of their dialect."""
+    names = inspect.signature(_options).parameters
+
+    @functools.wraps(command)
+    def wrapped(**given: Any) -> None:
+        token = CHOSEN.set(_dialect(*(given.pop(name) for name in names)))
+        try:
+            command(**given)
+        finally:
+            CHOSEN.reset(token)
+
+    hints = get_type_hints(_options, include_extras=True)
+    more = [
+        p.replace(annotation=hints[n], kind=inspect.Parameter.KEYWORD_ONLY)
+        for n, p in names.items()
+    ]
+    own = get_type_hints(command, include_extras=True)
+    kept = [
+        p.replace(annotation=own[n], kind=inspect.Parameter.KEYWORD_ONLY)
+        for n, p in inspect.signature(command).parameters.items()
+    ]
+    vars(wrapped)["__signature__"] = inspect.Signature([*kept, *more])
+    wrapped.__annotations__ = {p.name: p.annotation for p in [*kept, *more]}
+    return wrapped

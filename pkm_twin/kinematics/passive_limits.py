@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether passive joints stay within their ranges: swivels of ball joints, turns and slides.
+
+May import: numpy, pkm_twin's machine, the standard library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PassiveLimit:
+    """The range of one passive joint, from ``low`` to ``high``, rad or m; vectors at home.
+
+    ``kind`` "swivel": the angle between two directions that are both along ``axis`` at home, one
+    fixed in the inner body and one in the outer. "rod": the same of the way from ``at`` on the
+    inner body to ``far`` on the outer one. "turn": about the axis. "slide": of the point ``at``
+    along it.
+    ``home``: the joint's value at home.
+    """
+
+    joint: str
+    kind: str
+    inner: str
+    outer: str
+    at: Array
+    axis: Array
+    low: float
+    high: float
+    home: float = 0.0
+    far: Array | None = None
+
+
+def passive_values(robot: Robot, q: ArrayLike) -> Array:
+    """What ``robot.passive_limits`` bound, shape (..., k), rad or m.
+
+    :param q: joint positions, shape (..., n); errors as ``robot.forward``.
+    """
+    rotations, origins = robot.placements(q)
+    at = robot.engine.tree.at
+    batch = np.shape(q)[:-1]
+    ground = np.broadcast_to(np.eye(3), (*batch, 3, 3))
+
+    def turned(body: str, vector: Array) -> Array:
+        return np.asarray((ground if body == BASE else rotations[body]) @ vector, np.float64)
+
+    def placed(body: str, point: Array) -> Array:
+        if body == BASE:
+            return np.broadcast_to(point, (*batch, 3))
+        return np.asarray(origins[body] + turned(body, point - at[body]), np.float64)
+
+    values = []
+    for limit in robot.passive_limits:
+        axis = turned(limit.inner, limit.axis)
+        if limit.kind == "slide":
+            way = placed(limit.outer, limit.at) - placed(limit.inner, limit.at)
+            values.append(limit.home + (way * axis).sum(-1))
+            continue
+        if limit.kind in ("swivel", "rod"):
+            other = turned(limit.outer, limit.axis)
+            if limit.far is not None:
+                other = placed(limit.outer, limit.far) - placed(limit.inner, limit.at)
+            sine = np.linalg.norm(np.cross(axis, other), axis=-1)
+            values.append(np.arctan2(sine, (axis * other).sum(-1)))
+            continue
+        across = np.eye(3)[np.abs(limit.axis).argmin()]
+        across = np.cross(limit.axis, across)
+        one, other = turned(limit.inner, across), turned(limit.outer, across)
+        sine = (np.cross(one, other) * axis).sum(-1)
+        values.append(limit.home + np.arctan2(sine, (one * other).sum(-1)))
+    return np.stack(values, -1)
+
+
+def within_passive_limits(robot: Robot, q: ArrayLike) -> NDArray[np.bool_]:
+    """Whether passive joints keep their limits, shape (...); a robot without any keeps them.
+
+    :param q: joint positions with an assembly, shape (..., n).
+    """
+    if not robot.passive_limits:
+        return np.ones(np.shape(q)[:-1], bool)
+    values = passive_values(robot, q)
+    low, high = np.array([[one.low, one.high] for one in robot.passive_limits]).T
+    return np.asarray(((values >= low) & (values <= high)).all(-1))

@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of one quantity: equal to brute force pose by pose, and the worst pose is the worst."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.atlas.maps.quantity import Case
+from pkm_twin.atlas.maps.sweep import LEAST, QUANTITIES, counts, found_of, map_sweep
+from pkm_twin.atlas.run import run
+from pkm_twin.atlas.store import open_atlas
+from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.passive_limits import passive_values
+from pkm_twin.kinematics.workspace import reachable, try_forward
+from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.machine.schema import read_yaml
+from stiffness_monitor import compliance, strain_energy
+from stiffness_monitor.modes import natural_frequencies
+from test.machine.random_machines import FILES
+from test.support.command import command
+from test.support.robots import ELASTIC, SHIPPED, load, often, parameters_of, partly_long
+
+DRIVEN = [name for name, robot in SHIPPED.items() if robot.limits.effort is not None]
+WRENCH = (20.0, -10.0, 30.0, 0.5, -0.3, 0.2)
+LENGTHS = {
+    "geometry.arm_length": {"deviation": 1e-4},
+    "geometry.base_radius": {"deviation": 2e-4},
+    "geometry.forearm_length": {"relative": 1e-4},
+}
+
+
+def states(robot, rng, count, least=LEAST):
+    """Joint states that count in a map."""
+    low, high = robot.limits.position.T
+    q = rng.uniform(low, high, (count, len(low)))
+    pose, known = try_forward(robot, q)
+    return q[counts(robot, q, pose, known, least, 0.0)]
+
+
+def found(robot, name, q, wrench=None):
+    return found_of(QUANTITIES[name], robot, q, Case("case", wrench))
+
+
+def directions(rng, count):
+    ways = rng.normal(size=(count, 3))
+    return ways / np.linalg.norm(ways, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("name", partly_long(ELASTIC, "delta", "rps3"))
+def test_elastic_maps_are_brute_force(name, rng):
+    robot = load(name)
+    q = states(robot, rng, 40)[:4]
+    pose = robot.forward(q)
+    matrix = compliance(robot, pose)[:, :3, :3]
+    soft = found(robot, "compliance", q)
+    np.testing.assert_allclose(soft.value, np.linalg.norm(matrix, 2, axis=(1, 2)), rtol=1e-9)
+    moved = np.einsum("kij,kj->ki", matrix, soft.direction)
+    np.testing.assert_allclose(moved, soft.value[:, None] * soft.direction, atol=1e-9)
+    # No direction is softer.
+    tried = np.einsum("di,kij,dj->kd", *[ways := directions(rng, 500)], matrix, ways)
+    assert (tried <= soft.value[:, None] * (1 + 1e-12)).all()
+    for k in range(len(q)):
+        force = np.concatenate([soft.direction[k], np.zeros(3)])
+        elements = strain_energy(robot, pose[k], force)
+        assert elements.elements[soft.element[k]] == elements.dominant or elements.tie
+    loaded = found(robot, "strain-energy", q, WRENCH)
+    expected = strain_energy(robot, pose, WRENCH)
+    np.testing.assert_allclose(loaded.value, expected.total, rtol=1e-9)
+    np.testing.assert_allclose(loaded.shares, expected.factors, rtol=1e-9)
+    deflected = found(robot, "compliance", q, WRENCH)
+    size = np.linalg.norm(compliance(robot, pose)[:, :3] @ np.array(WRENCH), axis=1)
+    np.testing.assert_allclose(deflected.value, size, rtol=1e-9)
+    lowest = found(robot, "frequency", q[:1])
+    np.testing.assert_allclose(lowest.value, natural_frequencies(robot, pose[:1], 1)[:, 0], 1e-9)
+
+
+@pytest.mark.parametrize("name", partly_long(DRIVEN, "delta", "rps3"))
+def test_what_drives_allow_is_brute_force(name, rng):
+    robot = load(name)
+    q = states(robot, rng, 60)[:4]
+    limit, still = robot.limits.effort, np.zeros_like(q[0])
+
+    def used(mass, k):
+        loaded = robot.changed(payload={"mass": mass, "inertia": [0.0, 0.0, 0.0]})
+        return (np.abs(inverse_dynamics(loaded, q[k], still, still, WRENCH)) / limit).max()
+
+    carried = found(robot, "payload", q, WRENCH)
+    for k, value in enumerate(carried.value):
+        if value == 0.0:
+            assert used(0.0, k) > 1.0
+            continue
+        most = brentq(lambda mass, k=k: used(mass, k) - 1.0, 0.0, 2.0 * value, xtol=1e-12)
+        assert value == pytest.approx(most, rel=1e-9)
+    names = [n for n in robot.pose_names if n in "xyz"]
+    fast = found(robot, "acceleration", q)
+    for k, value in enumerate(fast.value):
+        ways = np.vstack([fast.direction[k], directions(rng, 200)])[
+            :, ["xyz".index(n) for n in names]
+        ]
+        # From the pose's own acceleration, one sample at a time.
+        pose = np.zeros((len(ways), len(robot.pose_names)))
+        pose[:, [robot.pose_names.index(n) for n in names]] = value * ways
+        qdd = np.linalg.solve(robot.jacobian(q[k]), pose.T).T
+        share = np.abs(inverse_dynamics(robot, np.tile(q[k], (len(ways), 1)), 0 * qdd, qdd)) / limit
+        if value > 0.0:
+            assert share[0].max() == pytest.approx(1.0, rel=1e-9)
+            assert (
+                share[0].argmax() == fast.element[k] or share[0].max() == share[0][fast.element[k]]
+            )
+            assert share.max() <= 1.0 + 1e-9
+        else:
+            assert share.max() >= 1.0
+
+
+def test_errors_of_the_pose_follow_from_those_of_lengths(rng):
+    robot = robot_of_data(parameters_of("delta") | {"uncertainty": LENGTHS}, "delta")
+    q = states(robot, rng, 20)[:3]
+    steps = {"arm_length": 1e-4, "base_radius": 2e-4, "forearm_length": 1e-4 * 0.390}
+    total = np.zeros((len(q), 3, 3))
+    for key, step in steps.items():
+        ends = []
+        for sign in (-1e-2, 1e-2):
+            value = getattr(robot.geometry, key) + sign * step
+            moved = robot.numbered({f"geometry.{key}": value})
+            ends.append(moved.platform(q)[0])
+        effect = (ends[1] - ends[0]) / 2e-2
+        total += effect[:, :, None] * effect[:, None, :]
+    error = found(robot, "pose-error", q)
+    # Differences of positions of some decimetres over a step of a micrometre.
+    np.testing.assert_allclose(error.value**2, np.linalg.norm(total, 2, axis=(1, 2)), rtol=1e-6)
+    across = np.einsum("ki,kij,kj->k", error.direction, total, error.direction)
+    np.testing.assert_allclose(across, error.value**2, rtol=1e-6)
+
+
+MAPS = [f"{name} compliance" for name in SHIPPED]
+MAPS += [f"{name} {kind}" for name in DRIVEN for kind in ("payload", "acceleration")]
+WORST = ("delta compliance", "five_bar acceleration")
+
+
+@pytest.mark.parametrize("count", often(3000, 100_000))
+@pytest.mark.parametrize("what", partly_long(MAPS, *WORST))
+def test_no_pose_is_worse_than_the_worst(what, count, rng, tmp_path):
+    name, kind = what.split()
+    robot = load(name)
+    sweep = map_sweep(robot, kind, 200)
+    with open_atlas(run(sweep, tmp_path / "a.nc", workers=1)) as data:
+        worst, pose = float(data.worst_value[0]), data.worst_pose.values[0]
+        stored = data.value.values
+    q = robot.inverse(pose)
+    assert found(robot, kind, q[None]).value[0] == pytest.approx(worst, rel=1e-9)
+    assert robot.singularity(q) >= LEAST * (1 - 1e-9)
+    low, high = robot.limits.position.T
+    assert ((q >= low) & (q <= high)).all()
+    tried = found(robot, kind, states(robot, rng, count)).value
+    bad = (lambda values: values) if sweep.quantity.largest else (lambda values: -values)
+    assert bad(tried).max() <= bad(worst) + 1e-9 * abs(worst)
+    assert np.nanmax(bad(stored)) <= bad(worst) + 1e-9 * abs(worst)
+
+
+def test_a_stored_map_has_all_cases_and_is_nan_where_no_pose_counts(tmp_path):
+    robot = load("five_bar")
+    cases = [Case("push", (50.0, 0.0, 0.0, 0.0, 0.0, 0.0)), Case("lift", (0.0, 0.0, 50.0, 0, 0, 0))]
+    sweep = map_sweep(robot, "strain-energy", 400, cases=cases)
+    with open_atlas(run(sweep, tmp_path / "a.nc", workers=1)) as data:
+        grid = np.stack(np.meshgrid(data.x, data.z, indexing="ij"), -1)
+        inside = reachable(robot, grid)
+        inside[inside] = robot.singularity(robot.inverse(grid[inside])) >= LEAST
+        assert list(data.case.values) == ["push", "lift"]
+        np.testing.assert_array_equal(np.isfinite(data.value.values[..., 0]), inside)
+        assert float(data.valid) == pytest.approx(inside.mean())
+        for k, case in enumerate(cases):
+            expected = strain_energy(robot, grid[inside], case.wrench)
+            np.testing.assert_allclose(data.value.values[inside, k], expected.total, rtol=1e-9)
+            np.testing.assert_allclose(data.factor.values[inside, k], expected.factors, rtol=1e-9)
+
+
+def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    points = "time,x,z\n" + "".join(f"{0.01 * k},{0.002 * k},0.36\n" for k in range(20))
+    (tmp_path / "path.csv").write_text(points)
+    done = command(
+        capsys,
+        "atlas",
+        "five_bar",
+        "acceleration",
+        "--along",
+        "path.csv",
+        "--out",
+        "a.csv",
+        "--json",
+    )
+    told = json.loads(done.out)
+    robot = load("five_bar")
+    q = robot.inverse(np.stack([0.002 * np.arange(20), np.full(20, 0.36)], -1))
+    values = found(robot, "acceleration", q).value
+    assert told["worst"][0]["value"] == pytest.approx(values.min())
+    assert told["worst"][0]["time_s"] == pytest.approx(0.01 * values.argmin())
+    assert told["worst"][0]["unit"] == "m/s2"
+    rows = (tmp_path / "a.csv").read_text().splitlines()
+    assert [float(row.split(",")[4]) for row in rows[1:]] == pytest.approx(values.tolist())
+    assert (tmp_path / "a.png").stat().st_size
+
+
+def test_ball_joints_swivel_so_far(rng):
+    data = parameters_of("stewart")
+    joints = data["limbs"]["joints"]
+    for name in ("ball_a", "ball_b"):
+        joints[name]["limits"] = {"swivel": 0.25}
+    joints["foot_a"]["limits"] = {"swivel": 0.2, "axis": [-0.22, -0.11, 0.62]}
+    robot = robot_of_data(data, "tight")
+    q = states(load("stewart"), rng, 400)[:60]
+    angles = passive_values(robot, q)
+    names = [limit.joint for limit in robot.passive_limits]
+    position, turn = robot.platform(q)
+    graph = robot.graph
+    for k, name in enumerate(names):
+        other = name.replace("ball", "foot") if "ball" in name else name.replace("foot", "ball")
+        ball, foot = (name, other) if "ball" in name else (other, name)
+        foot, ball = graph.joints[foot].at, graph.joints[ball].at
+        leg = position + (ball - graph.origin) @ turn.swapaxes(-1, -2) - foot
+        home = np.broadcast_to(ball - foot, leg.shape)
+        rest = np.einsum("kij,kj->ki", turn, home) if "ball" in name else home
+        cosine = (leg * rest).sum(-1) / np.linalg.norm(leg, axis=-1) / np.linalg.norm(rest, axis=-1)
+        np.testing.assert_allclose(angles[:, k], np.arccos(np.minimum(cosine, 1.0)), atol=2e-5)
+    bound = np.array([limit.high for limit in robot.passive_limits])
+    kept = (angles <= bound).all(-1)
+    assert 0 < kept.sum() < len(kept)
+    np.testing.assert_array_equal(reachable(robot, robot.forward(q)), kept)
+    # And written out.
+    again = robot_of_data(robot.parameter_sections(), "again")
+    np.testing.assert_allclose(passive_values(again, q), angles, atol=1e-9)
+
+
+def test_ranges_of_passive_hinges_slides_and_rods(tmp_path):
+    data = parameters_of("rps3")
+    data["limbs"]["joints"]["hinge"]["limits"] = {"position": [-0.1, 0.1]}
+    robot = robot_of_data(data, "tight")
+    q = robot.graph.home + np.array([[0.05, 0.0, 0.0], [0.0, -0.04, 0.03]])
+    turned = robot.passive(q)[:, [robot.passive_joints.index(f"hinge_{k}") for k in (1, 2, 3)]]
+    np.testing.assert_allclose(passive_values(robot, q), turned, atol=1e-12)
+    data = parameters_of("linear_delta")
+    data["limbs"]["rods"]["left"]["swivel"] = 0.3
+    robot = robot_of_data(data, "tight")
+    q = np.array([0.31, 0.27, 0.35])
+    leaned = passive_values(robot, q)
+    rod = robot.graph.rods["left_1"]
+    now = rod.ends[1] - rod.ends[0] + robot.platform(q)[0] - robot.graph.origin - [0, 0, q[0] - 0.3]
+    home = rod.ends[1] - rod.ends[0]
+    angle = np.arccos(now @ home / np.linalg.norm(now) / np.linalg.norm(home))
+    np.testing.assert_allclose(leaned[:2], angle, atol=1e-9)
+    with pytest.raises(ParameterError, match="swivel"):
+        data["limbs"]["joints"]["rail"]["limits"]["swivel"] = 0.3
+        robot_of_data(data, "wrong")
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "field"),
+    [
+        ("payload", {"limits": {"position": [-0.9, 1.3]}}, "limits.effort"),
+        ("compliance", {"members": None}, "members"),
+        ("pose-error", {}, "uncertainty"),
+        ("pose-error", {"uncertainty": {"members.arm.density": {"relative": 0.1}}}, "uncertainty"),
+    ],
+)
+def test_what_a_file_lacks_is_named(kind, changes, field):
+    data = {k: v for k, v in (parameters_of("delta") | changes).items() if v is not None}
+    with pytest.raises(ParameterError) as caught:
+        map_sweep(robot_of_data(data, "delta"), kind)
+    assert caught.value.field == field
+
+
+def test_angular_acceleration_of_a_wrist(rng):
+    """A pose of angles alone: every direction of the angular acceleration, base axes."""
+    data = read_yaml(FILES["rrr3_spherical"])
+    data["limbs"]["joints"]["motor"]["limits"] = {"position": [-1, 1], "effort": 5.0}
+    robot = robot_of_data(data, "wrist")
+    q = robot.graph.home + 0.1 * rng.normal(size=(3, 3))
+    fast = found(robot, "acceleration", q)
+    for k, value in enumerate(fast.value):
+        ways = np.vstack([fast.direction[k], directions(rng, 100)])
+        qdd = np.linalg.solve(robot.platform_jacobian(q[k])[3:], value * ways.T).T
+        share = np.abs(inverse_dynamics(robot, np.tile(q[k], (101, 1)), 0 * qdd, qdd))
+        assert (share / robot.limits.effort).max() == pytest.approx(1.0, rel=1e-9)

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint loads: rainflow by the standard's example, life by hand, open reactions by elasticity."""
+
+import json
+
+import numpy as np
+import pytest
+
+from delta_dynamics import elastic_reactions, least_norm_reactions, reactions
+from delta_dynamics.elastic_reactions import reaction_energies
+from delta_dynamics.reactions import balance
+from pkm_twin.paths.durability import bearing_life, rainflow, turning_points
+from stiffness_monitor import platform_response
+from test.support.command import command
+from test.support.robots import SHIPPED, load, partly_long, random_joints, rigid
+
+ASTM = [-2, 1, -3, 5, -1, 3, -4, 4, -2]
+"""Load of ASTM E1049-85, figure 6."""
+
+
+def test_rainflow_is_the_standards_example():
+    """ASTM E1049-85, 5.4.4: half cycles of 3, 4, 8, 9, 8, 6 and a whole one of 4."""
+    found = rainflow(ASTM)
+    counted = sorted(zip(found.ranges.tolist(), found.counts.tolist(), strict=True))
+    expected = [(3, 0.5), (4, 0.5), (4, 1.0), (6, 0.5), (8, 0.5), (8, 0.5), (9, 0.5)]
+    assert counted == expected
+    whole = found.means[found.counts == 1.0]
+    assert whole.tolist() == [1.0]
+    # More samples between the reversals, and rests, change nothing.
+    fine = np.interp(np.linspace(0, 8, 801), np.arange(9), ASTM)
+    again = rainflow(np.repeat(fine, 2))
+    assert again.ranges.tolist() == pytest.approx(found.ranges.tolist())
+    assert again.counts.tolist() == found.counts.tolist()
+
+
+def test_cycles_hold_all_reversals(rng):
+    for _ in range(50):
+        load_ = rng.normal(size=60)
+        points = turning_points(load_)
+        found = rainflow(load_)
+        # Each reversal to the next is half a cycle.
+        assert found.counts.sum() == pytest.approx((len(points) - 1) / 2)
+        assert found.ranges.max() == pytest.approx(np.ptp(load_))
+        ends, counts = found.spectrum(16)
+        assert counts.sum() == pytest.approx(found.counts.sum())
+        assert ends[-1] == pytest.approx(np.ptp(load_))
+    for flat in ([], [1.0], [2.0, 2.0, 2.0]):
+        assert rainflow(flat).equivalent_range(5.0) == 0.0
+
+
+def test_life_of_a_bearing_by_hand():
+    """Half the turning at 1 kN, half at 2 kN; C = 10 kN, balls; 100 turns a minute."""
+    load_, turned = np.repeat([1000.0, 2000.0], 50), np.full(100, 2 * np.pi)
+    life = bearing_life(load_, turned, 60.0, 10_000.0)
+    mean = ((1000.0**3 + 2000.0**3) / 2) ** (1 / 3)
+    assert life.load == pytest.approx(mean)
+    assert life.life_turns == pytest.approx(1e6 * (10_000.0 / mean) ** 3)
+    assert life.life_hours == pytest.approx(life.life_turns / 100 / 60)
+    assert bearing_life(load_, 0 * turned, 60.0, 10_000.0).life_hours == np.inf
+
+
+@pytest.mark.parametrize("name", ["five_bar", "upr_rpu"])
+def test_open_reactions_are_those_of_the_elastic_frame(name, rng):
+    """Their energies, element by element, are the finite elements'."""
+    robot = load(name).changed(gravity=[0.0, 0.0, 0.0])
+    q = random_joints(robot, rng, 3)
+    still, wrench = np.zeros_like(q), rng.normal(size=(3, 6)) * [50, 50, 50, 5, 5, 5]
+    found = elastic_reactions(robot, q, still, still, wrench)
+    assert not found.indeterminate
+    assert found.residual.max() < 1e-9
+    energies = reaction_energies(robot, q, balance(robot, q, still, still, wrench), found.values)
+    response = platform_response(robot, q, wrench)
+    for k, element in enumerate(response.elements):
+        np.testing.assert_allclose(energies[element], response.energies[:, k], rtol=1e-6)
+    # What statics determines is untouched, and another solution stores more.
+    known = reactions(robot, q, still, still, wrench)
+    mask = known.determinate
+    np.testing.assert_allclose(found.wrenches[mask], known.wrenches[mask], atol=1e-7)
+    other = least_norm_reactions(robot, q, still, still, wrench)
+    more = reaction_energies(robot, q, balance(robot, q, still, still, wrench), other.values)
+    assert (sum(more.values()) > sum(energies.values())).all()
+
+
+def path(robot, folder):
+    time = np.linspace(0.0, 1.0, 41)
+    low, high = robot.limits.position.T
+    wave = np.sin(2 * np.pi * np.outer(time, np.arange(1, len(low) + 1)))
+    q = robot.graph.home + 0.05 * (high - low) * wave
+    header = ",".join(["time", *(f"{name}.position" for name in robot.joint_names)])
+    np.savetxt(folder / "path.csv", np.column_stack([time, q]), delimiter=",", header=header,
+               comments="")  # fmt: skip
+    return folder / "path.csv"
+
+
+@pytest.mark.parametrize("name", partly_long(list(SHIPPED), "five_bar"))
+def test_loads_of_a_path(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robot = load(name)
+    joint = reactions(robot, robot.graph.home, *np.zeros((2, robot.joints_count))).names[-1]
+    (tmp_path / "bearings.yaml").write_text(f"bearings: {{'{joint}': {{C: 5000}}}}")
+    done = command(
+        capsys, "loads", name, path(robot, tmp_path), "--bearings", "bearings.yaml", "--out",
+        "a.csv", "--spectrum", "s.csv", "--picture", "a.png", "--json",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    told = json.loads(done.out)["joints"]
+    rows = (tmp_path / "a.csv").read_text().splitlines()
+    table = np.array([row.split(",") for row in rows[1:]], float)
+    header = rows[0].split(",")
+    force = table[:, [header.index(f"{joint}.f{axis}") for axis in "xyz"]]
+    peak = np.linalg.norm(force, axis=1).max()
+    assert told[joint]["force_peak_N"] == pytest.approx(peak)
+    assert told[joint]["life"]["L10_hours"] > 0.0
+    assert not any(entry["undetermined"] for entry in told.values())
+    assert (tmp_path / "a.png").stat().st_size
+    counted = [line.split(",") for line in (tmp_path / "s.csv").read_text().splitlines()[1:]]
+    assert {line[0] for line in counted} <= set(told)
+
+
+def test_what_nothing_decides_is_named(tmp_path, capsys):
+    """The same machine without members: out of its plane statics is open."""
+    robot = load(rigid("five_bar", tmp_path / "rigid.yaml"))
+    done = command(capsys, "loads", tmp_path / "rigid.yaml", path(robot, tmp_path), "--json")
+    told = json.loads(done.out)["joints"]
+    assert "fy" in told["tip"]["undetermined"]
+    assert "fx" not in told["tip"]["undetermined"]
+    assert told["tip"]["force_peak_N"] is None
+
+
+def test_turning_of_a_hinge_and_of_a_rod(rng):
+    from pkm_twin.apps.joint_loads import joint_loads
+    from pkm_twin.apps.torques import Motion
+
+    robot = load("five_bar")
+    time = np.linspace(0.0, 1.0, 50)
+    q = robot.graph.home + 0.1 * np.outer(np.sin(7 * time), [1.0, -0.6])
+    zero = np.zeros_like(q)
+    found = {j.name: j for j in joint_loads(Motion(robot, time, q, zero, zero, np.zeros((50, 6))))}
+    np.testing.assert_allclose(found["left"].turned, np.abs(np.diff(q[:, 0])), atol=1e-12)
+    elbow = robot.passive(q)[:, robot.passive_joints.index("elbow_right")]
+    np.testing.assert_allclose(found["elbow_right"].turned, np.abs(np.diff(elbow)), atol=1e-12)
+    robot = load("linear_delta")
+    q = 0.3 + 0.03 * np.outer(np.sin(7 * time), [1.0, -0.6, 0.3])
+    zero = np.zeros_like(q)
+    loads = joint_loads(Motion(robot, time, q, zero, zero, np.zeros((50, 6))))
+    rod = robot.graph.rods["left_1"]
+    way = rod.ends[1] - rod.ends[0] + robot.platform(q)[0] - robot.graph.origin
+    way = way - np.outer(q[:, 0] - 0.3, [0, 0, 1])
+    way = way / np.linalg.norm(way, axis=1, keepdims=True)
+    angle = np.arccos(np.minimum((way[1:] * way[:-1]).sum(1), 1.0))
+    own = next(j for j in loads if j.name == rod.joint_names[0])
+    np.testing.assert_allclose(own.turned, angle, rtol=1e-2, atol=1e-6)

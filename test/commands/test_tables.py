@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables as other programs write them are the same motion, and what is not certain is refused."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from test.support.command import command
+from test.support.robots import load
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def motion(tmp_path, monkeypatch):
+    """Times, positions and velocities of a motion of the linear Delta, and the robot."""
+    monkeypatch.chdir(tmp_path)
+    robot = load("five_bar")
+    time = np.linspace(0.0, 0.4, 21)
+    q = robot.graph.home + 0.1 * np.sin(np.outer(time, [5.0, 7.0]))
+    return robot, time, q
+
+
+def written(header, columns, separator=",", point="."):
+    rows = [separator.join(header)]
+    for row in zip(*columns, strict=True):
+        rows.append(separator.join(repr(float(value)).replace(".", point) for value in row))
+    return "\n".join(rows) + "\n"
+
+
+def plain(robot, time, q):
+    return written(["time", *(f"{j}.position" for j in robot.joint_names)], [time, *q.T])
+
+
+def sized(capsys, *words):
+    done = command(capsys, "size", "five_bar", *words, "--json")
+    assert done.code == 0, done.err
+    return json.loads(done.out)["drives"]
+
+
+def numbers_of(data):
+    if isinstance(data, dict):
+        return [n for value in data.values() for n in numbers_of(value)]
+    if isinstance(data, list):
+        return [n for value in data for n in numbers_of(value)]
+    return [data] if isinstance(data, float | int) else []
+
+
+def same(one, other):
+    np.testing.assert_allclose(numbers_of(one), numbers_of(other), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("separator", "point", "options"),
+    [
+        (";", ".", ()),
+        (";", ",", ()),
+        ("\t", ",", ()),
+        (";", ",", ("--separator", ";", "--decimal", ",")),
+        ("\t", ".", ("--separator", "tab")),
+    ],
+)
+def test_separators_and_decimal_commas(separator, point, options, motion, capsys):
+    robot, time, q = motion
+    Path("a.csv").write_text(plain(robot, time, q))
+    header = ["time", *(f"{j}.position" for j in robot.joint_names)]
+    Path("b.csv").write_text(written(header, [time, *q.T], separator, point))
+    same(sized(capsys, "b.csv", *options), sized(capsys, "a.csv"))
+
+
+def test_names_and_units_of_columns(motion, capsys):
+    robot, time, q = motion
+    Path("a.csv").write_text(plain(robot, time, q))
+    Path("b.csv").write_text(written(["t", "q1", "q2"], [1e3 * time, *np.degrees(q.T)], ";", ","))
+    names = f"time=t,{robot.joint_names[0]}.position=q1,{robot.joint_names[1]}.position=q2"
+    same(
+        sized(capsys, "b.csv", "--columns", names, "--units", "deg,ms"), sized(capsys, "a.csv")
+    )  # fmt: skip
+    # Lengths stay as they are where a joint slides.
+    legs = load("stewart")
+    q = np.tile(legs.graph.home, (5, 1))
+    Path("c.csv").write_text(plain(legs, 0.1 * np.arange(5), q))
+    done = command(capsys, "size", "stewart", "c.csv", "--units", "deg", "--json")
+    assert done.code == 0, done.err
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--separator", "|"), ("--decimal", ";"), ("--units", "inch"), ("--units", "deg,rad"),
+        ("--columns", "time"), ("--columns", "time=nothing"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(options, motion, capsys):
+    Path("a.csv").write_text(plain(*motion).replace("time", "t"))
+    assert command(capsys, "size", "five_bar", "a.csv", *options).code == 1
+
+
+def test_an_ambiguous_table_is_refused(motion, capsys):
+    """Commas between columns and a decimal comma: nobody can tell."""
+    robot, time, q = motion
+    header = ["time", *(f"{j}.position" for j in robot.joint_names)]
+    Path("a.csv").write_text(written(header, [time, *q.T], ",", ","))
+    assert command(capsys, "size", "five_bar", "a.csv").code == 1
+
+
+def test_pipes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robot, time = load("delta"), np.linspace(0.0, 0.4, 21)
+    q = robot.graph.home + 0.1 * np.sin(np.outer(time, [5.0, 7.0, 3.0]))
+    base = [sys.executable, "-m", "pkm_twin.apps.cli"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    run = {"capture_output": True, "text": True, "check": True, "env": environment}
+    words = [*base, "torques", "delta", "-", "--out", "-"]
+    first = subprocess.run(words, input=plain(robot, time, q), **run)
+    assert first.stdout.startswith("time,")
+    assert len(first.stdout.splitlines()) == len(time) + 1
+    second = subprocess.run([*base, "size", "delta", "-", "--json"], input=first.stdout, **run)
+    assert json.loads(second.stdout)["efforts"] == "the file's"
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""History and trend: many writers, what a night's recording tells, and what drifts."""
+
+import json
+import multiprocessing
+import os
+import sqlite3
+
+import numpy as np
+import pytest
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.apps.history import Measured, Series, append, measure, read_history
+from pkm_twin.apps.recorded import read_recording
+from pkm_twin.apps.trend import judged
+from test.commands.conftest import DELTA
+from test.support.command import command
+from test.support.robots import load, often
+
+DAY = 86400.0
+
+
+def series(values):
+    values = np.asarray(values, float)
+    nan = np.full(len(values), np.nan)
+    return Series("m", "residual", "j", "N m", DAY * np.arange(len(values)), values, nan)
+
+
+@pytest.mark.parametrize("count", often(300, 5000))
+def test_false_alarms_are_as_rare_as_asked_for(count, rng):
+    """Of series without drift; a rate that is fifty times too high is far outside the noise."""
+    alarms = [judged(series(rng.normal(5.0, 0.3, 30)), 15, 0.05).drifts for _ in range(count)]
+    # Two ways to be wrong, each at most as often.
+    assert np.mean(alarms) < 0.1 + 4 * np.sqrt(0.1 / count)
+
+
+@pytest.mark.parametrize("step", [8.0, -8.0])
+def test_a_step_is_found_where_it_is(step, rng):
+    values = rng.normal(0.0, 1.0, 40)
+    values[25:] += step
+    found = judged(series(values), 15, 1e-3)
+    assert found.drifts
+    assert found.change == 25
+    assert found.after - found.before == pytest.approx(step, abs=1.5)
+    calm = judged(series(values[:25]), 15, 1e-3)
+    assert calm.change is None
+
+
+def test_limits_are_those_of_a_further_recording(rng):
+    """Student's interval of prediction, judged by the share of further ones inside it."""
+    inside = []
+    for _ in range(2000):
+        found = judged(series(rng.normal(size=9)), 8, 0.1)
+        inside.append(not found.beyond[-1])
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.03)
+
+
+def _write(arguments):
+    path, k = arguments
+    numbers = [Measured("residual", "j", float(k), np.nan, "N m")]
+    append(path, f"machine {k % 3}", "delta", f"{k}.mcap", DAY * k, True, numbers)
+
+
+def test_many_write_at_once_and_none_is_lost(tmp_path):
+    path = tmp_path / "nights.db"
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        pool.map(_write, [(path, k) for k in range(24)], chunksize=1)
+    # The same once more takes the place of the first.
+    _write((path, 7))
+    found = read_history(path)
+    assert sorted(one.machine for one in found) == ["machine 0", "machine 1", "machine 2"]
+    assert sorted(np.concatenate([one.value for one in found])) == list(range(24))
+    assert len(read_history(path, "machine 1")) == 1
+    with sqlite3.connect(path) as base:
+        assert base.execute("SELECT count(*) FROM checks").fetchone() == (24,)
+
+
+def motion(robot, seconds=4.0):
+    """A motion of all joints at many speeds, with the efforts of the model."""
+    time = np.arange(0.0, seconds, 0.004)
+    phase = 2 * np.pi * np.outer(time, [0.7, 1.1, 1.3]) + [0.0, 1.0, 2.0]
+    rate = 2 * np.pi * np.array([0.7, 1.1, 1.3])
+    q = 0.2 + 0.25 * np.sin(phase)
+    return time, q, 0.25 * rate * np.cos(phase), -0.25 * rate**2 * np.sin(phase)
+
+
+def night(path, robot, rng, viscous=(0.0, 0.0, 0.0), coulomb=(0.0, 0.0, 0.0), mass=0.0):
+    time, q, qd, qdd = motion(robot)
+    real = robot.changed(payload={"mass": mass}, friction={"viscous": viscous, "coulomb": coulomb})
+    effort = inverse_dynamics(real, q, qd, qdd) + rng.normal(0.0, 0.02, q.shape)
+    names = [f"{j}.{w}" for w in ("position", "velocity", "acceleration", "measured")
+             for j in robot.joint_names]  # fmt: skip
+    table = np.column_stack([time, q, qd, qdd, effort])
+    np.savetxt(path, table, delimiter=",", header=",".join(["time", *names]), comments="")
+    return path
+
+
+def test_a_recording_tells_friction_and_payload(tmp_path, rng):
+    robot = load("delta")
+    viscous, coulomb = (0.05, 0.1, 0.2), (0.1, 0.3, 0.2)
+    path = night(tmp_path / "night.csv", robot, rng, viscous, coulomb, 0.12)
+    found = {(m.quantity, m.part): m for m in measure(read_recording(path, robot))}
+    for k, name in enumerate(robot.joint_names):
+        for what, true in (("viscous", viscous), ("coulomb", coulomb)):
+            one = found[f"friction {what}", name]
+            assert abs(one.value - true[k]) < 5 * one.deviation
+            assert one.deviation < 0.02
+    load_ = found["payload beyond the load", "platform"]
+    assert abs(load_.value - 0.12) < 5 * load_.deviation
+    assert load_.deviation < 0.01
+
+
+def test_nights_of_a_folder_to_a_verdict(tmp_path, capsys, monkeypatch, rng):
+    monkeypatch.chdir(tmp_path)
+    robot = load("delta")
+    for k in range(10):
+        path = night(tmp_path / f"{k}.csv", robot, rng, coulomb=[0.1 + 0.4 * (k >= 7), 0.1, 0.1])
+        stamp = 1.7e9 + DAY * k
+        os.utime(path, (stamp, stamp))
+        command(capsys, "check", path, "--robot", "delta", "--history", "nights.db")
+        done = command(capsys, "trend", "nights.db", "--json")
+        if k == 6:
+            assert done.code == 0
+            assert not json.loads(done.out)["drifts"]
+    assert done.code == 1
+    told = {(s["quantity"], s["part"]): s for s in json.loads(done.out)["series"]}
+    worse = told["friction coulomb", robot.joint_names[0]]
+    assert worse["drifts"]
+    assert worse["changed"].startswith("2023-11-21")
+    assert worse["after"] - worse["before"] == pytest.approx(0.4, abs=0.05)
+    assert not told["friction coulomb", robot.joint_names[1]]["drifts"]
+    done = command(capsys, "trend", "nights.db", "--picture", "trend.png")
+    assert done.code == 1
+    assert (tmp_path / "trend.png").stat().st_size
+
+
+def test_a_folder_is_judged_bag_by_bag(tmp_path, capsys):
+    folder = tmp_path / "night"
+    folder.mkdir()
+    (folder / "good.mcap").write_bytes(DELTA.read_bytes())
+    (folder / "bad.mcap").write_bytes(DELTA.read_bytes()[:5000])
+    done = command(
+        capsys, "check", folder, "--jobs", 2, "--history", tmp_path / "h.db", "--json"
+    )  # fmt: skip
+    assert done.code == 1
+    told = json.loads(done.out)
+    assert [(r["bag"].rpartition("/")[2], r["good"]) for r in told["recordings"]] == [
+        ("bad.mcap", False),
+        ("good.mcap", True),
+    ]
+    (folder / "bad.mcap").unlink()
+    assert command(capsys, "check", folder).code == 0
+    assert {one.machine for one in read_history(tmp_path / "h.db")} == {"delta_cu"}
+
+
+def test_what_is_no_history(tmp_path, capsys):
+    other = tmp_path / "other.db"
+    other.write_text("nothing of that kind, but long enough to be read as a file of a data base")
+    for path in (other, tmp_path / "none.db"):
+        assert command(capsys, "trend", path).code == 1
