@@ -47,12 +47,14 @@ def driven(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
     """
     n = len(friction.viscous)
     position = limits.position
+    velocity, effort = (
+        None if value is None else float(np.broadcast_to(value, n)[k])
+        for value in (limits.velocity, limits.effort)
+    )
     bounds = LimitSpec(
-        None if position is None else array(np.broadcast_to(position, (n, 2))[k]),
-        *(
-            None if value is None else float(np.broadcast_to(value, n)[k])
-            for value in (limits.velocity, limits.effort)
-        ),
+        position=None if position is None else array(np.broadcast_to(position, (n, 2))[k]),
+        velocity=velocity,
+        effort=effort,
     )
     rub = (float(v[k]) for v in (friction.viscous, friction.coulomb, friction.offset))
     return dataclasses.replace(joint, friction=FrictionSpec(*rub), limits=bounds)
