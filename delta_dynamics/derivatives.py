@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics.virtual_work import torque_program
 from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.codegen.expressions import PARAMETERS
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
+from pkm_twin.kinematics.gradients import gradient_program
 from pkm_twin.kinematics.numbers import FileNumbers, geometry_and_masses
 from pkm_twin.machine.robot import Robot
 
@@ -80,15 +82,12 @@ def _derivatives(
     if rows:
         inputs = [array[..., None, :] for array in inputs]
     inputs.append(vectors(weights, n, "weights"))
-    engine = robot.massive()
-    kernel = engine.kernel("torque gradient", _by_motion)
-    outputs, status = kernel(robot.inertial, *inputs)
+    outputs, status = motion_gradient(robot)(robot.inertial, *inputs)
     if status is not None:
         robot.refuse_joints(status, inputs[0], inputs)
     found: dict[str, Array] = {}
     if by:
-        kernel = engine.kernel("torque gradient by numbers", _by_numbers, free=True)
-        (of_geometry, of_masses), status = kernel(robot.inertial, *inputs)
+        (of_geometry, of_masses), status = numbers_gradient(robot)(robot.inertial, *inputs)
         if status is not None:
             robot.refuse_joints(status, inputs[0], inputs)
         slopes = FileNumbers(robot, tuple(by), geometry_and_masses).slopes
@@ -98,28 +97,22 @@ def _derivatives(
     return TorqueDerivatives(by_q, by_qd, by_qdd, found)
 
 
+def motion_gradient(robot: Robot) -> Kernel:
+    """Program of q, qd, qdd, wrench and weights to derivatives by q, qd and qdd."""
+    return robot.massive().kernel("torque gradient", _by_motion)
+
+
+def numbers_gradient(robot: Robot) -> Kernel:
+    """Program of the same to derivatives by the geometry and by the masses."""
+    return robot.massive().kernel("torque gradient by numbers", _by_numbers, free=True)
+
+
 def _by_motion(t: Traced) -> Program:
-    program, weighted = _weighted(t)
-    inputs = [t.tape.inputs(name, t.joints) for name in MOTION]
-    found = t.gradient(weighted, [value for row in inputs for value in row])
-    n = t.joints
-    outputs = {name: t.lift(found[k * n : (k + 1) * n]) for k, name in enumerate(MOTION)}
-    return Program(program.inputs, program.parameters, outputs, program.equations)
+    program = torque_program(t)
+    return gradient_program(t, program, {name: t.tape.inputs(name, t.joints) for name in MOTION})
 
 
 def _by_numbers(t: Traced) -> Program:
-    program, weighted = _weighted(t)
-    masses = t.tape.inputs(PARAMETERS, program.parameters)
-    found = t.gradient(weighted, [*t.geometry, *masses])
-    split = len(t.geometry)
-    outputs = {"geometry": t.lift(found[:split]), "masses": t.lift(found[split:])}
-    return Program(program.inputs, program.parameters, outputs, program.equations)
-
-
-def _weighted(t: Traced) -> tuple[Program, list[tuple[Any, Any]]]:
-    """The program of the torques with weights as inputs beside, and the efforts with theirs."""
     program = torque_program(t)
-    weights = t.tape.inputs("weights", t.joints)
-    inputs = {**program.inputs, "weights": t.joints}
-    pairs = list(zip(program.outputs["efforts"], weights, strict=True))
-    return Program(inputs, program.parameters, program.outputs, program.equations), pairs
+    masses = t.tape.inputs(PARAMETERS, program.parameters)
+    return gradient_program(t, program, {"geometry": t.geometry, "masses": masses})
