@@ -17,6 +17,7 @@ from stiffness_monitor.compliance import (
     strain_energy,
 )
 from stiffness_monitor.correction import Correction, setpoint_correction
+from stiffness_monitor.derivatives import compliance_derivatives
 from stiffness_monitor.response import ElementResponse, element_response
 from stiffness_monitor.uncertainty import compliance_deviation
 
@@ -31,6 +32,7 @@ __all__ = [
     "StrainEnergy",
     "clearance",
     "compliance",
+    "compliance_derivatives",
     "compliance_deviation",
     "element_response",
     "platform_response",

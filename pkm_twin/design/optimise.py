@@ -107,12 +107,17 @@ class Problem:
         return Followed(self.machines(y), self.path)
 
     def pieces(self, y: Array, quantities: Sequence[Quantity]) -> list[Array]:
-        """Of machines (k, d), in batches: of each quantity shape (k, pieces)."""
+        """Of machines (k, d), in batches: of each quantity shape (k, pieces).
+
+        NaN of machines that cannot follow the path.
+        """
         size = max(1, BATCH // len(self.path.time))
-        parts = [
-            [quantity.pieces(followed) for quantity in quantities]
-            for followed in (self.followed(y[k : k + size]) for k in range(0, len(y), size))
-        ]
+        parts = []
+        for k in range(0, len(y), size):
+            followed = self.followed(y[k : k + size])
+            lost = ~np.isfinite(followed.q).all((1, 2))
+            found = [quantity.pieces(followed) for quantity in quantities]
+            parts.append([np.where(lost[:, None], np.nan, rows) for rows in found])
         return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
 
     def point(self, y: Array, constraints: Sequence[Constraint]) -> DesignPoint:

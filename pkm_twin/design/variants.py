@@ -299,7 +299,8 @@ class Variants:
 
     def _by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Programs with the machines that each is right for: one program a structure."""
-        left = ~self._out_of_range
+        # Where there is no assembly at home, there are no numbers for any program.
+        left = ~np.isnan(ask(self.robot)[1](self)).any(1)
         others = self.functions.others
         robots = itertools.chain([self.robot, *others], self._built(left))
         for robot in robots:
