@@ -20,7 +20,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.gradients import gradient_program
-from pkm_twin.kinematics.numbers import FileNumbers, geometry_and_masses
+from pkm_twin.kinematics.numbers import cause_slopes, file_numbers, geometry_and_masses
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -76,25 +76,47 @@ def _derivatives(
     robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: ArrayLike,
     by: Sequence[str], *, rows: bool,
 ) -> TorqueDerivatives:  # fmt: skip
-    n = robot.joints_count
+    inputs = _inputs(robot, motion, wrench, weights, rows=rows)
+    outputs, status = motion_gradient(robot)(robot.inertial, *inputs)
+    if status is not None:
+        robot.refuse_joints(status, inputs[0], inputs)
+    by_q, by_qd, by_qdd = outputs
+    return TorqueDerivatives(by_q, by_qd, by_qdd, _by_paths(robot, inputs, by))
+
+
+def torque_effects(
+    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None
+) -> Array:
+    """What one standard deviation of each of the file's causes changes, shape (..., n, causes)."""
+    inputs = _inputs(robot, (q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
+    return _by_numbers_table(robot, inputs) @ cause_slopes(robot, geometry_and_masses)
+
+
+def _inputs(
+    robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: ArrayLike, *,
+    rows: bool,
+) -> list[Array]:  # fmt: skip
     load = np.zeros(6) if wrench is None else wrench
     inputs = [doubles(value) for value in (*motion, load)]
     if rows:
         inputs = [array[..., None, :] for array in inputs]
-    inputs.append(vectors(weights, n, "weights"))
-    outputs, status = motion_gradient(robot)(robot.inertial, *inputs)
+    return [*inputs, vectors(weights, robot.joints_count, "weights")]
+
+
+def _by_paths(robot: Robot, inputs: Sequence[Array], by: Sequence[str]) -> dict[str, Array]:
+    if not by:
+        return {}
+    slopes = file_numbers(robot, tuple(by), geometry_and_masses).slopes
+    table = _by_numbers_table(robot, inputs) @ slopes
+    return {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
+
+
+def _by_numbers_table(robot: Robot, inputs: Sequence[Array]) -> Array:
+    """By geometry and masses, in a row."""
+    (of_geometry, of_masses), status = numbers_gradient(robot)(robot.inertial, *inputs)
     if status is not None:
         robot.refuse_joints(status, inputs[0], inputs)
-    found: dict[str, Array] = {}
-    if by:
-        (of_geometry, of_masses), status = numbers_gradient(robot)(robot.inertial, *inputs)
-        if status is not None:
-            robot.refuse_joints(status, inputs[0], inputs)
-        slopes = FileNumbers(robot, tuple(by), geometry_and_masses).slopes
-        table = np.concatenate([of_geometry, of_masses], -1) @ slopes
-        found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
-    by_q, by_qd, by_qdd = outputs
-    return TorqueDerivatives(by_q, by_qd, by_qdd, found)
+    return np.concatenate([of_geometry, of_masses], -1)
 
 
 def motion_gradient(robot: Robot) -> Kernel:

@@ -19,7 +19,7 @@ from stiffness_monitor.compliance import (
 from stiffness_monitor.correction import Correction, setpoint_correction
 from stiffness_monitor.derivatives import compliance_derivatives
 from stiffness_monitor.response import ElementResponse, element_response
-from stiffness_monitor.uncertainty import compliance_deviation
+from stiffness_monitor.uncertainty import compliance_deviation, deflection_deviation
 
 __all__ = [
     "AlarmSettings",
@@ -34,6 +34,7 @@ __all__ = [
     "compliance",
     "compliance_derivatives",
     "compliance_deviation",
+    "deflection_deviation",
     "element_response",
     "platform_response",
     "reachable",

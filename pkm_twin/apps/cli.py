@@ -326,8 +326,7 @@ def compliance(
     from pkm_twin import load
     from pkm_twin.apps.limits import beyond_limits as find_beyond
     from pkm_twin.apps.limits import refuse_beyond
-    from pkm_twin.machine.uncertainty import deviation
-    from stiffness_monitor import compliance_deviation, strain_energy
+    from stiffness_monitor import compliance_deviation, deflection_deviation, strain_energy
 
     machine = load(robot)
     names = ", ".join(
@@ -390,7 +389,7 @@ def compliance(
         else f"dominant element {energy.dominant}"
     )
     if machine.uncertainty:
-        turned = deviation(machine, lambda r: strain_energy(r, pose, load_case).deflection)
+        turned = deflection_deviation(machine, pose, load_case)
         doubts = ", ".join(f"{n} {1e6 * v:.2g}" for n, v in zip(axes, turned, strict=True))
         typer.echo(f"its standard deviation by the file's uncertainty: {doubts}")
     typer.echo(f"strain energy {energy.total:.4g} J, {dominant}")

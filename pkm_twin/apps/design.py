@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin design``: numbers of a robot's file that are best for a path, sweeps and tolerances."""
+"""``pkm-twin design``: numbers of a robot's file that are best for a path; sweeps, tolerances."""
 
 from __future__ import annotations
 
@@ -68,7 +68,9 @@ def design_command(
     ] = None,
     payload: Payload = None,
     platform: Platform = None,
-    starts: Annotated[int, typer.Option(help="machines from which the best are improved", min=1)] = 64,
+    starts: Annotated[
+        int, typer.Option(help="machines from which the best are improved", min=1)
+    ] = 64,
     points: Annotated[int, typer.Option(help="of a Pareto front", min=3)] = 9,
     seed: Annotated[int, typer.Option(help="of starts and samples", min=0)] = 0,
     out: Annotated[

@@ -33,9 +33,7 @@ FILE_DIGITS: Final = 12
 """Significant digits of a number that is written."""
 
 
-def read_path(
-    path: Path, robot: Robot, wrench: Sequence[float] | None
-) -> tuple[Robot, PosePath]:
+def read_path(path: Path, robot: Robot, wrench: Sequence[float] | None) -> tuple[Robot, PosePath]:
     """The robot with the motion's payload, and the platform's path.
 
     :raises ParameterError: a table that is no motion, or a payload that is held part of the time.
@@ -44,7 +42,9 @@ def read_path(
     motion = motion_of_bag(path, robot) if is_bag(path) else motion_of_csv(path, robot)
     if motion.load is not None:
         if motion.load.times:
-            raise ParameterError(f"{path}: payload", str(motion.load), "one that is held throughout")
+            raise ParameterError(
+                f"{path}: payload", str(motion.load), "one that is held throughout"
+            )
         robot = motion.load.on(robot)
     load = motion.wrench + (np.zeros(6) if wrench is None else np.asarray(wrench))
     way = PosePath.of_joints(robot, motion.time, motion.q, motion.qd, motion.qdd, load)
@@ -116,7 +116,9 @@ def told(
         old = before.quantities.get(name, math.nan)
         lines.append(f"{name:34}{old:12.5g}{value:12.5g} {QUANTITIES[name].unit(robot)}")
     if not before.feasible:
-        lines.append("before: the file's machine cannot follow the path or does not keep the bounds")
+        lines.append(
+            "before: the file's machine cannot follow the path or does not keep the bounds"
+        )
     if result.front:
         lines += ["Pareto front:", _row([*result.minimise, *best.variables])]
         lines += [
@@ -153,7 +155,7 @@ def used_limits(robot: Robot, path: PosePath) -> list[str]:
     if limits is None:
         return []
     q = robot.inverse(path.pose)
-    beyond = ((q < limits[:, 0]) | (q > limits[:, 1])).any(0)
+    beyond = np.asarray(((q < limits[:, 0]) | (q > limits[:, 1])).any(0))
     return [name for name, out in zip(robot.joint_names, beyond, strict=True) if out]
 
 
@@ -261,7 +263,7 @@ def budget(robot: Robot, sigma: Mapping[str, float], path: Path | None) -> tuple
     def rms(values: Array) -> float:
         return float(np.sqrt((values**2).mean()))
 
-    rows = {}
+    rows: dict[str, Any] = {}
     for name in order:
         moves = np.linalg.norm(found.parts[name][:, :3], axis=-1)
         turns = np.linalg.norm(found.parts[name][:, 3:], axis=-1)
@@ -271,7 +273,7 @@ def budget(robot: Robot, sigma: Mapping[str, float], path: Path | None) -> tuple
             "greatest_angle_rad": float(turns.max()), "share": found.share(name),
         }  # fmt: skip
     worst = int(found.position.argmax())
-    data = {
+    data: dict[str, Any] = {
         "robot": robot.name, "states": len(q), "path": None if path is None else str(path),
         "contributions": rows, "rms_position_m": rms(found.position),
         "greatest_position_m": float(found.position.max()), "rms_angle_rad": rms(found.angle),

@@ -115,7 +115,7 @@ class Problem:
         parts = []
         for k in range(0, len(y), size):
             followed = self.followed(y[k : k + size])
-            lost = ~np.isfinite(followed.q).all((1, 2))
+            lost = np.asarray(~np.isfinite(followed.q).all((1, 2)))
             found = [quantity.pieces(followed) for quantity in quantities]
             parts.append([np.where(lost[:, None], np.nan, rows) for rows in found])
         return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
@@ -146,9 +146,7 @@ class Problem:
 class Search:
     """The least of one quantity under constraints."""
 
-    def __init__(
-        self, problem: Problem, aim: Quantity, constraints: Sequence[Constraint]
-    ) -> None:
+    def __init__(self, problem: Problem, aim: Quantity, constraints: Sequence[Constraint]) -> None:
         self.problem, self.aim, self.constraints = problem, aim, tuple(constraints)
         self._all = [aim, *(c.quantity for c in constraints)]
 
@@ -200,7 +198,10 @@ class Search:
                     np.union1d(old, self._near(k, p[0]))
                     for k, (old, p) in enumerate(zip(chosen, new, strict=True))
                 ]
-            radius, shrinks = 0.5 * max(min(radius, step if step > 0.0 else radius), 1e-9), shrinks + 1
+            radius, shrinks = (
+                0.5 * max(min(radius, step if step > 0.0 else radius), 1e-9),
+                shrinks + 1,
+            )
             if shrinks > SHRINKS:
                 break
         return best, aim, miss
@@ -359,7 +360,9 @@ def design(
         search = Search(problem, aim, bounds)
         values, misses, _ = search.judged(tries)
         rejected = max(rejected, int(np.isinf(misses).sum()))
-        order = sorted(np.flatnonzero(np.isfinite(misses)), key=lambda k: _rank(values, misses, k))
+        order = sorted(
+            np.flatnonzero(np.isfinite(misses)).tolist(), key=lambda k: _rank(values, misses, k)
+        )
         found: tuple[Array, float, float] | None = None
         for k in order[: LOCAL + 1]:
             result = search.descend(tries[k])
@@ -450,4 +453,3 @@ def _none_found(
         return PkmTwinError(f"{name}: none of {len(starts)} machines tried can follow the path")
     bounds = ", ".join(map(str, constraints))
     return PkmTwinError(f"{name}: no machine found that follows the path and keeps {bounds}")
-

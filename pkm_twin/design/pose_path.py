@@ -80,7 +80,7 @@ class PosePath:
     def weights(self) -> Array:
         """Of each sample in the integral over time by trapezoids, shape (t,), s."""
         steps = np.diff(self.time)
-        return 0.5 * (np.append(steps, 0.0) + np.append(0.0, steps))
+        return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)), np.float64)
 
     @property
     def duration(self) -> float:
@@ -115,7 +115,7 @@ class Followed:
 
     def _solved(self, right: Array) -> Array:
         """J^-1 times vectors (k, t, m)."""
-        return np.asarray(_solve(self.jacobian, right))
+        return _solve(self.jacobian, right)
 
     @cached_property
     def qd(self) -> Array:
@@ -157,11 +157,12 @@ class Followed:
         :param weights: w, shape (t, n); ``rates``: r, shape (t, n), None is none.
         """
         state = (self.q, self.qd, self.qdd, self._each(self.path.wrench), weights[None])
-        by_motion, _ = self.many.run(programs.torque_gradient, *state)
+        (by_q, by_qd, by_qdd), _ = self.many.run(programs.torque_gradient, *state)
         (of_geometry, of_masses), _ = self.many.run(programs.torque_numbers, *state)
         if rates is not None:
-            by_motion[1] = by_motion[1] + rates
-        rows = np.concatenate([of_geometry + self._held(*by_motion), of_masses], -1)
+            by_qd = by_qd + rates
+        held = self._held(by_q, (by_qd, by_qdd))
+        rows = np.concatenate([of_geometry + held, of_masses], -1)
         return np.asarray(rows[0] @ self.many.rigid_slopes)
 
     def singularity_slopes(self) -> Array:
@@ -183,23 +184,25 @@ class Followed:
         return np.asarray(by_geometry + numbers[0, :, count:] @ elastic)
 
     def _by_geometry(self, rows: Array) -> Array:
-        return np.asarray(rows[0] @ self.many.rigid_slopes[: rows.shape[-1]])
+        return np.asarray(rows[0] @ self.many.geometry_slopes)
 
-    def _held(self, by_q: Array, by_qd: Array | None = None, by_qdd: Array | None = None) -> Array:
-        """What the joints' following adds to derivatives by the geometry, shape (1, t, g)."""
+    def _held(self, by_q: Array, by_rates: tuple[Array, Array] | None = None) -> Array:
+        """What the joints' following adds to derivatives by the geometry, shape (1, t, g).
+
+        :param by_rates: derivatives by qd and qdd; None where there are none.
+        """
         back = np.swapaxes(self.jacobian, -1, -2)
         weights = np.zeros((*by_q.shape[:-1], 3, by_q.shape[-1]))
-        moving = by_qd is not None and by_qdd is not None
-        qd = self.qd if moving else np.zeros_like(self.q)
-        qdd = self.qdd if moving else qd
+        qd, qdd = np.zeros_like(self.q), np.zeros_like(self.q)
 
         def asked() -> list[Array]:
             flat = weights.reshape(*weights.shape[:-2], -1)
             return self.many.run(programs.pose_motion, self.q, qd, qdd, flat)[0]
 
-        if moving:
-            weights[..., 2, :] = _solve(back, by_qdd)
-            weights[..., 1, :] = _solve(back, by_qd - asked()[1])
+        if by_rates is not None:
+            qd, qdd = self.qd, self.qdd
+            weights[..., 2, :] = _solve(back, by_rates[1])
+            weights[..., 1, :] = _solve(back, by_rates[0] - asked()[1])
             by_q = by_q - asked()[0]
         weights[..., 0, :] = _solve(back, by_q)
         return -asked()[2]
@@ -208,7 +211,7 @@ class Followed:
 def _solve(matrix: Array, right: Array) -> Array:
     """Solutions for vectors; NaN of a singular matrix."""
     try:
-        return np.linalg.solve(matrix, right[..., None])[..., 0]
+        return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0], np.float64)
     except np.linalg.LinAlgError:
         # One of them is: its machine is in a singularity.
         good = np.abs(np.linalg.det(matrix)) > 0.0

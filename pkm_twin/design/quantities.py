@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a design is judged by: quantities of machines on a path, and their derivatives.
 
-A quantity is the greatest (of the singularity index the least) of several smooth pieces: the efforts
-of all joints in all samples, say, or one number.
+A quantity is the greatest (of the singularity index the least) of several smooth pieces: of the
+efforts of all joints in all samples, say, or of one number.
 
 May import: numpy, pkm_twin's core, this package, the standard library.
 """
@@ -56,7 +56,7 @@ class Quantity:
 
     def worst(self, pieces: Array) -> Array:
         """The quantity of pieces (k, p), shape (k,)."""
-        return pieces.min(-1) if self.least else pieces.max(-1)
+        return np.asarray(pieces.min(-1) if self.least else pieces.max(-1), np.float64)
 
     def unit(self, robot: Robot) -> str:
         """Of its values; empty for plain numbers."""
@@ -133,7 +133,7 @@ def _peak_slopes(f: Followed, places: Index) -> Array:
 
 def _rms(f: Followed) -> Array:
     squares = (f.path.weights[:, None] * f.efforts**2).sum(1) / f.path.duration
-    return np.sqrt(squares) * effort_scales(f.many.robot)
+    return np.asarray(np.sqrt(squares) * effort_scales(f.many.robot), np.float64)
 
 
 def _rms_slopes(f: Followed, places: Index) -> Array:
@@ -148,7 +148,7 @@ def _rms_slopes(f: Followed, places: Index) -> Array:
 
 def _energy(f: Followed) -> Array:
     power = np.maximum(f.efforts * f.qd, 0.0)
-    return (f.path.weights[:, None] * power).sum((1, 2))[:, None]
+    return np.asarray((f.path.weights[:, None] * power).sum((1, 2))[:, None], np.float64)
 
 
 def _energy_slopes(f: Followed, places: Index) -> Array:
@@ -158,7 +158,7 @@ def _energy_slopes(f: Followed, places: Index) -> Array:
 
 
 def _deflection(f: Followed) -> Array:
-    return np.linalg.norm(f.deflection[..., :3], axis=-1)[..., None]
+    return np.asarray(np.linalg.norm(f.deflection[..., :3], axis=-1)[..., None], np.float64)
 
 
 def _deflection_slopes(f: Followed, places: Index) -> Array:

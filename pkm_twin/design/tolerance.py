@@ -74,4 +74,4 @@ def workspace_states(robot: Robot, count: int, seed: int = 0) -> Array:
     kept = q[good & (measure >= REGULAR)]
     if not len(kept):
         raise ParameterError("limits.position", None, "limits inside which states are regular")
-    return kept
+    return np.asarray(kept, np.float64)

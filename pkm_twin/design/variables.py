@@ -65,13 +65,13 @@ class Variables:
             highs.append(high)
             starts.append(robot.number(parts[0]))
         own = np.array([robot.number(path) for path in paths])
-        low, high = np.array(lows), np.array(highs)
+        least, greatest = np.array(lows), np.array(highs)
         slopes = np.zeros((len(paths), len(names)))
         for row, (column, side) in enumerate(paths.values()):
-            slopes[row, column] = side * (high - low)[column]
+            slopes[row, column] = side * (greatest - least)[column]
         return cls(
-            tuple(names), tuple(paths), own, slopes, low, high,
-            (np.array(starts) - low) / (high - low),
+            tuple(names), tuple(paths), own, slopes, least, greatest,
+            (np.array(starts) - least) / (greatest - least),
         )  # fmt: skip
 
     def values(self, y: Array) -> Array:

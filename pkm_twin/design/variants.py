@@ -24,6 +24,7 @@ from pkm_twin.codegen.arrays import doubles
 from pkm_twin.codegen.kernels import MISSED, Code, Kernel
 from pkm_twin.design import programs
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.kinematics.derivatives import twist_rows
 from pkm_twin.machine.entries import with_entries
 from pkm_twin.machine.geometry import pattern_of
 from pkm_twin.machine.robot import Robot
@@ -63,7 +64,7 @@ class Variants:
             raise ParameterError("numbers", sizes, "as many of each, one a machine") from None
         self.values: Array = np.stack([np.atleast_1d(row) for row in rows], -1)
         """Of the paths, shape (k, paths)."""
-        self.functions = programs.NumberFunctions(robot, self.paths)
+        self.functions = programs.NumberFunctions.of(robot, self.paths)
         self._own: dict[int, Robot | PkmTwinError] = {}
         self._patterns: dict[int, str] = {}
         self._prepared: dict[int, tuple[Code, Array]] = {}
@@ -146,6 +147,21 @@ class Variants:
         flat, n = self.run(programs.jacobian, q)[0][0], self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], -1, n)
 
+    def platform_jacobian(self, q: ArrayLike) -> Array:
+        """Platform twist per joint rate, shape (k, ..., 6, n)."""
+        flat, n = self.run(programs.jacobian, q)[0][1], self.robot.joints_count
+        return flat.reshape(*flat.shape[:-1], 6, n)
+
+    def platform_slopes(self, q: ArrayLike) -> Array:
+        """Platform twist by each number of one machine, joints held, shape (..., 6, paths).
+
+        :param q: joint positions, shape (samples, n).
+        """
+        states = np.asarray(q, np.float64)[None]
+        rows = twist_rows(len(self.robot.pose_names), self.platform(states)[1])
+        (found,), _ = self.run(programs.platform_slopes, states[..., None, :], rows)
+        return np.asarray(found[0] @ self.geometry_slopes, np.float64)
+
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Second derivative of the pose, shape (k, ..., m)."""
         return self.run(programs.acceleration, q, qd, qdd)[0][0]
@@ -175,9 +191,9 @@ class Variants:
         :param checked: a file may have each of these values.
         """
         made = copy.copy(self)
-        derived = ("valid", "rigid_slopes", "_numbers", "_elastic", "_out_of_range")
-        for name in derived:
-            vars(made).pop(name, None)
+        for name, value in vars(type(self)).items():
+            if isinstance(value, cached_property):
+                vars(made).pop(name, None)
         made.values = values
         made._own, made._patterns, made._prepared = {}, {}, {}
         if checked:
@@ -185,12 +201,22 @@ class Variants:
         return made
 
     @cached_property
-    def _numbers(self) -> tuple[Array, Array]:
-        """Geometry and masses; NaN of a machine whose file's numbers are out of range."""
-        found = self.functions.rigid(self.values)
+    def _geometry(self) -> Array:
+        """NaN of a machine whose file's numbers are out of range."""
+        found = self.functions.geometry(self.values)
         found[self._out_of_range] = np.nan
-        geometry, masses = np.split(found, [len(self.robot.engine.geometry)], 1)
-        return geometry, masses
+        return found
+
+    @cached_property
+    def _masses(self) -> Array:
+        found = self.functions.rigid(self.values)[:, self._geometry.shape[1] :]
+        found[self._out_of_range] = np.nan
+        return found
+
+    @cached_property
+    def geometry_slopes(self) -> Array:
+        """Of the first machine's geometry by the numbers, shape (row, paths)."""
+        return np.asarray(self.functions.geometry.slopes_at(self.values[:1])[0])
 
     @cached_property
     def rigid_slopes(self) -> Array:
@@ -300,7 +326,7 @@ class Variants:
     def _by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Programs with the machines that each is right for: one program a structure."""
         # Where there is no assembly at home, there are no numbers for any program.
-        left = ~np.isnan(ask(self.robot)[1](self)).any(1)
+        left = np.asarray(~np.isnan(ask(self.robot)[1](self)).any(1))
         others = self.functions.others
         robots = itertools.chain([self.robot, *others], self._built(left))
         for robot in robots:

@@ -6,16 +6,17 @@ May import: pkm_twin's codegen, this package, the standard library.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import replace
 
+from pkm_twin.codegen.expressions import Numbers
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.engine import Engine, Traced, forward_program
 
 
-def gradient_program(t: Traced, program: Program, by: Mapping[str, Sequence[Any]]) -> Program:
+def gradient_program(t: Traced, program: Program, by: Mapping[str, Numbers]) -> Program:
     """The gradient of a sum of a program's outputs times ``weights``, an input of their number.
 
     :param by: inputs by which, by name of the output.
@@ -40,6 +41,13 @@ def pose_motion_gradient(engine: Engine) -> Kernel:
     q, qd, qdd and weights (3 m) to derivatives by q (n), qd (n) and the geometry.
     """
     return engine.kernel("pose motion gradient", _pose_motion, free=True)
+
+
+def free_forward(engine: Engine) -> Kernel:
+    """As :attr:`Engine.forward`, for machines of every structure."""
+    return engine.kernel(
+        "free forward", lambda t: replace(forward_program(t), quick=True), free=True
+    )
 
 
 def _by_geometry(t: Traced) -> Program:

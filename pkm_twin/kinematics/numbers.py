@@ -86,6 +86,29 @@ class FileNumbers:
         return table
 
 
+def file_numbers(
+    robot: Robot, paths: Sequence[str], of: Callable[[Robot], Sequence[Any]]
+) -> FileNumbers:
+    """The same, made once a robot."""
+    key = f"numbers {of.__module__}.{of.__qualname__} {' '.join(paths)}"
+    found: FileNumbers | None = robot.calls.get(key)
+    if found is None:
+        found = robot.calls[key] = FileNumbers(robot, paths, of)
+    return found
+
+
+def cause_slopes(robot: Robot, of: Callable[[Robot], Sequence[Any]]) -> Array:
+    """What one standard deviation of each of the robot's causes of doubt adds, (row, causes)."""
+    key = f"causes {of.__module__}.{of.__qualname__}"
+    found: Array | None = robot.calls.get(key)
+    if found is None:
+        causes = robot.causes.values()
+        paths = tuple(dict.fromkeys(path for cause in causes for path in cause))
+        steps = np.array([[cause.get(path, 0.0) for cause in causes] for path in paths])
+        found = robot.calls[key] = FileNumbers(robot, paths, of).slopes @ steps
+    return found
+
+
 def geometry_and_masses(robot: Robot) -> list[Any]:
     """The geometry as ``Engine.geometry`` has it, then the masses as ``Robot.inertial``."""
     graph, load = robot.make_graph(), robot.payload

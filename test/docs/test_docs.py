@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,29 @@ def test_a_new_machine_from_an_empty_file_to_torques(tmp_path, twin, monkeypatch
     assert len(lines) <= 30
     for made in ("my_delta.png", "torques.csv", "loaded.csv", "converted.yaml"):
         assert (tmp_path / made).stat().st_size
+
+
+def test_blocks_of_variants_and_design(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for page in ("variants.md", "design.md"):
+        space = {}
+        for language, block, _ in blocks(page):
+            if language == "python":
+                exec(compile(block, page, "exec"), space)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_commands_of_the_design_page(tmp_path, twin, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for language, block, _ in blocks("design.md"):
+        if language == "bash":
+            run(language, block, tmp_path, twin)
+    assert {path.name for path in tmp_path.iterdir()} >= {"better.yaml", "better.png", "box.nc"}
+
+
+def test_the_example_of_design():
+    runpy.run_path(str(DOCS.parent / "examples/design_a_delta.py"), run_name="__main__")
 
 
 def test_the_parameters_page_is_that_of_the_schemas():

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+from time import process_time
+
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import variants
@@ -13,6 +16,8 @@ from pkm_twin.design.pose_path import Followed
 from pkm_twin.design.quantities import QUANTITIES
 from pkm_twin.design.tolerance import workspace_states
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.kinematics.engine import Engine
+from pkm_twin.machine.entries import with_entries
 from pkm_twin.paths import cycle, timed
 from test.laws.test_derivatives import POINTS, WEIGHTS
 from test.support.robots import load, partly_long
@@ -34,7 +39,11 @@ def wave(name, samples=7):
     angle = speed * time[:, None] + phase
     q = robot.graph.home + 0.02 * units * np.sin(angle) + 0.01 * units
     qd, qdd = 0.02 * units * speed * np.cos(angle), -0.02 * units * speed**2 * np.sin(angle)
-    return robot, (time, q, qd, qdd), PosePath.of_joints(robot, time, q, qd, qdd, rng.normal(size=6))
+    return (
+        robot,
+        (time, q, qd, qdd),
+        PosePath.of_joints(robot, time, q, qd, qdd, rng.normal(size=6)),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +112,9 @@ def test_quantities_are_those_of_each_machine_by_itself(picking):
         power = np.maximum(tau * qd, 0.0)
         assert energy[k] == pytest.approx(squares(power, path.time, axis=0).sum(), rel=1e-4)
         bodies = [body.mass for body in machine.graph.bodies.values()]
-        assert mass[k] == pytest.approx(sum(bodies) + sum(r.mass for r in machine.graph.rods.values()))
+        assert mass[k] == pytest.approx(
+            sum(bodies) + sum(r.mass for r in machine.graph.rods.values())
+        )
 
 
 @pytest.mark.parametrize("aim", partly_long(("peak-effort", "energy"), "peak-effort"))
@@ -164,7 +175,11 @@ def test_what_cannot_be_designed_is_rejected(picking, vary, aim, bounds, error):
 
 def test_an_error_budget_is_that_of_drawn_machines():
     robot = load("delta_cu")
-    sigma = {"geometry.arm_length": 2e-5, "geometry.base_radius": 1e-5, "geometry.platform_radius": 3e-5}
+    sigma = {
+        "geometry.arm_length": 2e-5,
+        "geometry.base_radius": 1e-5,
+        "geometry.platform_radius": 3e-5,
+    }
     q = workspace_states(robot, 20)
     found = pose_errors(robot, q, sigma)
     rng, count = np.random.default_rng(0), 4000
@@ -173,3 +188,45 @@ def test_an_error_budget_is_that_of_drawn_machines():
     apart = position - robot.platform(q)[0]
     np.testing.assert_allclose(found.position, np.sqrt((apart**2).mean(0).sum(-1)), rtol=0.05)
     assert sum(found.share(path) for path in sigma) == pytest.approx(1.0)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+def test_an_optimiser_that_compiles_each_machine_finds_no_better_one(picking, monkeypatch):
+    robot, path = picking
+    began = process_time()
+    found = design(robot, BOX, path, "peak-effort", ["singularity>=0.1"], starts=16)
+    took = process_time() - began
+    structure = Engine.structure.func
+    monkeypatch.setattr(Engine, "structure", property(lambda e: structure(e) + e.graph.key))
+    counted = 0
+
+    def asked(x):
+        """Peak effort of the machine as a robot of its own; much where it misses a bound."""
+        nonlocal counted
+        counted += 1
+        try:
+            machine = with_entries(robot, dict(zip(BOX, x.tolist(), strict=True)))
+            q = machine.inverse(path.pose)
+            miss = 0.1 - machine.singularity(q).min()
+            qd = np.linalg.solve(machine.jacobian(q), path.rate[..., None])
+            bias = machine.pose_acceleration(q, qd[..., 0], np.zeros_like(q))
+            qdd = np.linalg.solve(machine.jacobian(q), (path.acceleration - bias)[..., None])
+            tau = inverse_dynamics(machine, q, qd[..., 0], qdd[..., 0])
+        except (PkmTwinError, ValueError):
+            return 1e3
+        return np.abs(tau).max() + 1e3 * max(0.0, miss)
+
+    start = np.array([robot.number(number) for number in BOX])
+    began = process_time()
+    other = minimize(
+        asked, start, method="Nelder-Mead", bounds=list(BOX.values()),
+        options={"xatol": 1e-4, "fatol": 1e-4},
+    )  # fmt: skip
+    theirs = process_time() - began
+    print(
+        f"design {found.best.quantities['peak-effort']:.5f} N m in {took:.2f} s, "
+        f"Nelder-Mead {other.fun:.5f} N m in {theirs:.1f} s, {counted} machines compiled"
+    )
+    assert found.best.quantities["peak-effort"] <= 1.005 * other.fun
+    assert took < theirs / 20.0
