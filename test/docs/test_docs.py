@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import runpy
@@ -85,6 +86,15 @@ def test_commands_of_the_design_page(tmp_path, twin, monkeypatch):
 
 def test_the_example_of_design():
     runpy.run_path(str(DOCS.parent / "examples/design_a_delta.py"), run_name="__main__")
+
+
+def test_the_notebook_runs():
+    cells = json.loads((DOCS.parent / "examples/variants.ipynb").read_text())["cells"]
+    space = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), space)
+    assert space["found"].best.feasible
 
 
 def test_the_parameters_page_is_that_of_the_schemas():
