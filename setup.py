@@ -59,7 +59,10 @@ setup(
         (f"share/{NAME}/bags", sorted(glob("bags/*.mcap") + glob("bags/*.md"))),
         (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
         (f"share/{NAME}/config/drives", sorted(glob("config/drives/*.yaml"))),
-        (f"share/{NAME}/examples", sorted(glob("examples/*.py") + glob("examples/*.md"))),
+        (
+            f"share/{NAME}/examples",
+            sorted(glob("examples/*.py") + glob("examples/*.md") + glob("examples/*.ipynb")),
+        ),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py") + glob("launch/*.yaml"))),
         (f"share/{NAME}/view", sorted(glob("launch/view/*"))),
     ],

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics.virtual_work import torque_program
 from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.codegen.expressions import PARAMETERS
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Traced
-from pkm_twin.kinematics.numbers import FileNumbers, geometry_and_masses
+from pkm_twin.kinematics.gradients import gradient_program
+from pkm_twin.kinematics.numbers import cause_slopes, file_numbers, geometry_and_masses
 from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
@@ -74,28 +76,43 @@ def _derivatives(
     robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: ArrayLike,
     by: Sequence[str], *, rows: bool,
 ) -> TorqueDerivatives:  # fmt: skip
-    n = robot.joints_count
+    inputs = _inputs(robot, motion, wrench, weights, rows=rows)
+    outputs, status = motion_gradient(robot)(robot.inertial, *inputs)
+    if status is not None:
+        robot.refuse_joints(status, inputs[0], inputs)
+    by_q, by_qd, by_qdd = outputs
+    return TorqueDerivatives(by_q, by_qd, by_qdd, _by_paths(robot, inputs, by))
+
+
+def torque_effects(
+    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None
+) -> Array:
+    """What one standard deviation of each of the file's causes changes, shape (..., n, causes)."""
+    inputs = _inputs(robot, (q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
+    return _by_numbers_table(robot, inputs) @ cause_slopes(robot, geometry_and_masses)
+
+
+def _inputs(
+    robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: ArrayLike, *,
+    rows: bool,
+) -> list[Array]:  # fmt: skip
     load = np.zeros(6) if wrench is None else wrench
     inputs = [doubles(value) for value in (*motion, load)]
     if rows:
         inputs = [array[..., None, :] for array in inputs]
-    inputs.append(vectors(weights, n, "weights"))
-    engine = robot.massive()
-    kernel = engine.kernel("torque gradient", _by_motion)
-    outputs, status = kernel(robot.inertial, *inputs)
-    if status is not None:
-        robot.refuse_joints(status, inputs[0], inputs)
-    found: dict[str, Array] = {}
-    if by:
-        table = _of_numbers(robot, inputs) @ numbers_slopes(robot, by)
-        found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
-    by_q, by_qd, by_qdd = outputs
-    return TorqueDerivatives(by_q, by_qd, by_qdd, found)
+    return [*inputs, vectors(weights, robot.joints_count, "weights")]
+
+
+def _by_paths(robot: Robot, inputs: Sequence[Array], by: Sequence[str]) -> dict[str, Array]:
+    if not by:
+        return {}
+    table = _by_numbers_table(robot, inputs) @ numbers_slopes(robot, by)
+    return {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
 
 
 def numbers_slopes(robot: Robot, by: Sequence[str]) -> Array:
     """Derivatives of geometry and masses by numbers of the file, shape (numbers, paths)."""
-    return FileNumbers(robot, tuple(by), geometry_and_masses).slopes
+    return file_numbers(robot, tuple(by), geometry_and_masses).slopes
 
 
 def torques_by_numbers(
@@ -106,41 +123,34 @@ def torques_by_numbers(
     :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`numbers_slopes`.
         Others as of :func:`torque_derivatives`.
     """
-    inputs = [doubles(value)[..., None, :] for value in (q, qd, qdd, wrench)]
-    return _of_numbers(robot, [*inputs, np.eye(robot.joints_count)]) @ slopes
+    inputs = _inputs(robot, (q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
+    return _by_numbers_table(robot, inputs) @ slopes
 
 
-def _of_numbers(robot: Robot, inputs: Sequence[Array]) -> Array:
-    """Of a motion, a wrench and weights: by geometry and masses, shape (..., numbers)."""
-    kernel = robot.massive().kernel("torque gradient by numbers", _by_numbers, free=True)
-    (of_geometry, of_masses), status = kernel(robot.inertial, *inputs)
+def _by_numbers_table(robot: Robot, inputs: Sequence[Array]) -> Array:
+    """By geometry and masses, in a row."""
+    (of_geometry, of_masses), status = numbers_gradient(robot)(robot.inertial, *inputs)
     if status is not None:
         robot.refuse_joints(status, inputs[0], inputs)
     return np.concatenate([of_geometry, of_masses], -1)
 
 
+def motion_gradient(robot: Robot) -> Kernel:
+    """Program of q, qd, qdd, wrench and weights to derivatives by q, qd and qdd."""
+    return robot.massive().kernel("torque gradient", _by_motion)
+
+
+def numbers_gradient(robot: Robot) -> Kernel:
+    """Program of the same to derivatives by the geometry and by the masses."""
+    return robot.massive().kernel("torque gradient by numbers", _by_numbers, free=True)
+
+
 def _by_motion(t: Traced) -> Program:
-    program, weighted = _weighted(t)
-    inputs = [t.tape.inputs(name, t.joints) for name in MOTION]
-    found = t.gradient(weighted, [value for row in inputs for value in row])
-    n = t.joints
-    outputs = {name: t.lift(found[k * n : (k + 1) * n]) for k, name in enumerate(MOTION)}
-    return Program(program.inputs, program.parameters, outputs, program.equations)
+    program = torque_program(t)
+    return gradient_program(t, program, {name: t.tape.inputs(name, t.joints) for name in MOTION})
 
 
 def _by_numbers(t: Traced) -> Program:
-    program, weighted = _weighted(t)
-    masses = t.tape.inputs(PARAMETERS, program.parameters)
-    found = t.gradient(weighted, [*t.geometry, *masses])
-    split = len(t.geometry)
-    outputs = {"geometry": t.lift(found[:split]), "masses": t.lift(found[split:])}
-    return Program(program.inputs, program.parameters, outputs, program.equations)
-
-
-def _weighted(t: Traced) -> tuple[Program, list[tuple[Any, Any]]]:
-    """The program of the torques with weights as inputs beside, and the efforts with theirs."""
     program = torque_program(t)
-    weights = t.tape.inputs("weights", t.joints)
-    inputs = {**program.inputs, "weights": t.joints}
-    pairs = list(zip(program.outputs["efforts"], weights, strict=True))
-    return Program(inputs, program.parameters, program.outputs, program.equations), pairs
+    masses = t.tape.inputs(PARAMETERS, program.parameters)
+    return gradient_program(t, program, {"geometry": t.geometry, "masses": masses})

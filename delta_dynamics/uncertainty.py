@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from delta_dynamics.derivatives import torque_effects
 from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.uncertainty import deviation
 
 Array = NDArray[np.float64]
 
@@ -86,6 +86,8 @@ def torque_deviation(
     :param q: joint positions, shape (..., n), rad or m; rates ``qd``, accelerations ``qdd``.
     :param wrench: as in ``inverse_dynamics``, shape (..., 6); None: no wrench.
     :returns: shape (..., n), N m or N.
-    :raises ParameterError: a number that cannot vary as the file says.
     """
-    return deviation(robot, lambda r: inverse_dynamics(r, q, qd, qdd, wrench))
+    if not robot.uncertainty:
+        return np.zeros_like(inverse_dynamics(robot, q, qd, qdd, wrench))
+    effects = torque_effects(robot, q, qd, qdd, wrench)
+    return np.asarray(np.sqrt(np.einsum("...k,...k->...", effects, effects)), np.float64)

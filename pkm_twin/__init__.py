@@ -8,14 +8,30 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pkm_twin.design.variants import variants
+    from pkm_twin.kinematics.derivatives import (
+        forward_derivatives,
+        inverse_derivatives,
+        platform_derivatives,
+    )
     from pkm_twin.machine.catalogue import load, robot_names
     from pkm_twin.machine.robot import Robot
 
-__all__ = ["Robot", "load", "robot_names", "variants"]
+__all__ = [
+    "Robot",
+    "forward_derivatives",
+    "inverse_derivatives",
+    "load",
+    "platform_derivatives",
+    "robot_names",
+    "variants",
+]
 __version__ = "0.1.0"
 
 _HOMES = {
     "Robot": "pkm_twin.machine.robot",
+    "forward_derivatives": "pkm_twin.kinematics.derivatives",
+    "inverse_derivatives": "pkm_twin.kinematics.derivatives",
+    "platform_derivatives": "pkm_twin.kinematics.derivatives",
     "load": "pkm_twin.machine.catalogue",
     "robot_names": "pkm_twin.machine.catalogue",
     "variants": "pkm_twin.design.variants",

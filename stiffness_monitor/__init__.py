@@ -17,8 +17,9 @@ from stiffness_monitor.compliance import (
     strain_energy,
 )
 from stiffness_monitor.correction import Correction, setpoint_correction
+from stiffness_monitor.derivatives import compliance_derivatives
 from stiffness_monitor.response import ElementResponse, element_response
-from stiffness_monitor.uncertainty import compliance_deviation
+from stiffness_monitor.uncertainty import compliance_deviation, deflection_deviation
 
 __all__ = [
     "AlarmSettings",
@@ -31,7 +32,9 @@ __all__ = [
     "StrainEnergy",
     "clearance",
     "compliance",
+    "compliance_derivatives",
     "compliance_deviation",
+    "deflection_deviation",
     "element_response",
     "platform_response",
     "reachable",

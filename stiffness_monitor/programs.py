@@ -103,16 +103,19 @@ class Elastic:
         own = self.robot.graph.key if followers is not None and followers.sample else ""
         return repr((_text(self.plan), pattern, self.names, followers, own))
 
-    def _kernel(self, name: str, write: Callable[[Solved], Program]) -> Kernel:
+    def kernel(
+        self, name: str, write: Callable[[Solved], Program], *, free: bool = False
+    ) -> Kernel:
+        """A program on all numbers of the machine; ``free`` as of :meth:`Engine.kernel`."""
         numbers = np.array(numbers_of(self.structure), np.float64)
         return self.robot.engine.kernel_with(
-            numbers, name, lambda t: write(Solved(t, self)), self._key
+            numbers, name, lambda t: write(Solved(t, self)), self._key, free=free
         )
 
     @cached_property
     def compliance(self) -> Kernel:
         """Q to C (36) of the platform, and the measure of :attr:`response`."""
-        return self._kernel("platform compliance", _compliance)
+        return self.kernel("platform compliance", _compliance)
 
     @cached_property
     def response(self) -> Kernel:
@@ -121,17 +124,17 @@ class Elastic:
         The measure is the least pivot over its diagonal entry, which no choice of units changes: 0
         where the frame is a mechanism. Factors are zero where the wrench is.
         """
-        return self._kernel("platform response", _response)
+        return self.kernel("platform response", _response)
 
     @cached_property
     def deflections(self) -> Kernel:
         """Q and wrench to points of every member and their moves, (members, 2, k, 3); measure."""
-        return self._kernel("member deflections", _deflections)
+        return self.kernel("member deflections", _deflections)
 
     @cached_property
     def columns(self) -> Kernel:
         """Q to the columns sqrt(d) b: entries, their rows, their columns; and columns' elements."""
-        return self._kernel("elastic columns", _columns)
+        return self.kernel("elastic columns", _columns)
 
 
 def elastic_of(robot: Robot) -> Elastic:

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.uncertainty import deviation
-from stiffness_monitor.compliance import compliance
+from stiffness_monitor.derivatives import compliance_effects
 
 Array = NDArray[np.float64]
 
@@ -22,6 +21,12 @@ def compliance_deviation(robot: Robot, pose: ArrayLike) -> Array:
     To first order in the deviations, independent causes. Zero for a file that names none.
 
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
-    :raises ParameterError: a number that cannot vary as the file says.
     """
-    return deviation(robot, lambda r: compliance(r, pose))
+    effects = compliance_effects(robot, pose)
+    return np.asarray(np.sqrt((effects**2).sum(-1)), np.float64)
+
+
+def deflection_deviation(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> Array:
+    """Standard deviation of the deflection under a wrench by the same, shape (..., 6)."""
+    effects = np.einsum("...ijk,...j->...ik", compliance_effects(robot, pose), np.asarray(wrench))
+    return np.asarray(np.sqrt((effects**2).sum(-1)), np.float64)

@@ -42,7 +42,7 @@ MAY = {
     "pkm_twin.apps": NODE
     | TWINS
     | {"pkm_twin.console", "pkm_twin.atlas", "pkm_twin.export", "pkm_twin.identification"}
-    | {"pkm_twin.paths"},
+    | {"pkm_twin.paths", "pkm_twin.design"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
 CIRCLES = {frozenset({"pkm_twin.machine", "pkm_twin.kinematics"})}

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Geometry from measured platform poses: weighted least squares with the file as prior.
 
-Gauss and Newton's method on the machine itself, damped where it has to be: every step assembles its
-graph with the new numbers (:mod:`pkm_twin.kinematics.maximal`, nothing is compiled) and takes the
-exact derivatives of its platform (:mod:`pkm_twin.kinematics.sensitivity`). The errors before and
-after are those of the loaded robots.
+Gauss and Newton's method on the machine itself, damped where it has to be: every step computes the
+platform with the new numbers and its exact derivatives, by programs that take them at run time. The
+errors before and after are those of the loaded robots.
 """
 
 from __future__ import annotations
@@ -34,18 +33,19 @@ from pkm_twin.apps.calibration_state import (
     Errors,
     Poses,
     State,
-    change_of,
     moved,
     place_frame,
     start_of,
     value_of,
 )
+from pkm_twin.design import programs
+from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
 from pkm_twin.identification.robust import Weighed, weighed
 from pkm_twin.identification.undetermined import undetermined
-from pkm_twin.kinematics.maximal import GraphChange, Placement
-from pkm_twin.kinematics.sensitivity import platform_twists
-from pkm_twin.machine.entries import data_of, entries
+from pkm_twin.kinematics.derivatives import geometry_numbers
+from pkm_twin.kinematics.numbers import file_numbers
+from pkm_twin.machine.entries import entries, with_entries
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import skew
 
@@ -57,6 +57,8 @@ KNOWN: Final = 0.5
 """A parameter whose deviation stays above this part of its prior one was not observed."""
 HELD_OUT: Final = 4
 """Every so many poses one is held out."""
+STEP: Final = 1e-6
+"""By which a number is moved to see whether the machine can be assembled with another one."""
 SAME: Final = 1e-4
 """Difference of joints that makes another pose, rad or m."""
 SHOWN: Final = 0.1
@@ -161,22 +163,23 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
     :param only: paths, or their beginnings, to choose from.
     :raises ParameterError: a beginning that no number of the geometry has.
     """
-    data, changes = data_of(robot), {}
-    for path in entries(robot):
-        if path.startswith(NOT_GEOMETRY) or (only and not path.startswith(tuple(only))):
-            continue
-        try:
-            change = change_of(robot, data, path)
-        except ParameterError:
-            continue  # a machine that closes only with this very number
-        if not change.nothing(1e-9):
-            changes[path] = change
+    paths = [
+        path
+        for path in entries(robot)
+        if not path.startswith(NOT_GEOMETRY) and (not only or path.startswith(tuple(only)))
+    ]
+    slopes = file_numbers(robot, tuple(paths), geometry_numbers).slopes
+    paths = [path for path, moves in zip(paths, np.abs(slopes).max(0) > 1e-9, strict=True) if moves]
     found: list[str] = []
-    if changes:
-        near = Placement.of(robot, q)
-        twists, possible = platform_twists(robot.graph, q, near, list(changes.values()))
+    if paths:
+        own = np.array([robot.number(path) for path in paths])
+        many = Variants(robot, dict(zip(paths, own, strict=True)))
+        twists = many.platform_slopes(q)
+        beside = many.with_values(own + STEP * np.eye(len(paths)))
+        each = np.broadcast_to(q, (len(paths), *q.shape))
+        possible = beside.run(programs.anywhere, each)[1].all((1, 2))
         good = possible & (np.abs(twists).max((0, 1)) > MOVES)
-        found = [path for path, one in zip(changes, good, strict=True) if one]
+        found = [path for path, one in zip(paths, good, strict=True) if one]
     for beginning in only:
         if not any(path.startswith(beginning) for path in found):
             raise ParameterError("--only", beginning, "the beginning of a geometric number's path")
@@ -313,14 +316,15 @@ def _calibrated(
             f"enough for {len(parameters)} numbers to be fitted",
         )  # fmt: skip
     instrument = [p for p in parameters if p.name in (*FRAME, *TARGET)]
-    start = start_of(robot, learnt)
+    paths = [p.name for p in parameters if not p.name.startswith(BESIDE)]
+    start = start_of(robot, learnt, paths)
     if frame:
         place_frame(start, learnt)
     before = _fit(robot, start, learnt, instrument, progress)[0] if instrument else start
     after, values, covariance, information, noise, steps = _fit(
         robot, before, learnt, parameters, progress
     )
-    built = type(robot).from_data(after.data, robot.name)
+    built = with_entries(robot, after.numbers)
     deviations = np.sqrt(np.diag(covariance))
     told = [
         Parameter(p.name, p.unit, p.before, p.prior, float(v), float(d))
@@ -435,15 +439,14 @@ def _stepped(
 
 def _derivatives(robot: Robot, state: State, parameters: Sequence[Parameter]) -> Array:
     """Of predicted positions and rotations by the parameters, shape (k, 6, parameters)."""
-    tool, joints = state.instrument, robot.joint_names
+    tool = state.instrument
     position, rotation = state.platform
-    paths = [p.name for p in parameters if not p.name.startswith(BESIDE)]
-    changes = [change_of(robot, state.data, path) for path in paths]
-    changes += [GraphChange.of_joint(state.graph, joint) for joint in joints]
-    twists, _ = platform_twists(state.graph, state.q, state.placement, changes)
-    twists[..., len(paths) :] /= -robot.controller.factors
-    names = [*paths, *(f"joint_map.{joint}.offset" for joint in joints)]
-    by_name = dict(zip(names, np.moveaxis(twists, -1, 0), strict=True))
+    twists = [state.machine.platform_jacobian(state.q[None])[0] / -robot.controller.factors]
+    names = [f"joint_map.{joint}.offset" for joint in robot.joint_names]
+    if any(p.name in state.machine.paths for p in parameters):
+        twists.append(state.machine.platform_slopes(state.q))
+        names += state.machine.paths
+    by_name = dict(zip(names, np.moveaxis(np.concatenate(twists, -1), -1, 0), strict=True))
     turn = tool.frame.as_matrix()
     lever = rotation @ tool.target
     out = np.zeros((len(state.q), 6, len(parameters)))

@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """A machine that is being calibrated: its numbers as they are now, and what an instrument sees.
 
-May import: numpy, scipy, pkm_twin's kinematics and machine, the standard library.
+May import: numpy, scipy, pkm_twin's design and machine, the standard library.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.kinematics.maximal import GraphChange, Placement, assembled
-from pkm_twin.machine.entries import data_of, number_at, put
-from pkm_twin.machine.graph import Graph
+from pkm_twin.design.variants import Variants
+from pkm_twin.errors import ParameterError
 from pkm_twin.machine.robot import Robot
 
 if TYPE_CHECKING:
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-STEP: Final = 1e-6
-"""Of a difference quotient of the graph at home: what is linear in it is exact to rounding."""
 FRAME: Final = tuple(f"frame.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 TARGET: Final = ("target.x", "target.y", "target.z")
 BESIDE: Final = (*FRAME, *TARGET, "joint_map.")
@@ -108,51 +105,37 @@ class Instrument:
 
 @dataclass
 class State:
-    """The machine with numbers as they are now, at the poses that are learnt from."""
+    """The machine with numbers as they are now, at the poses that are learnt from.
 
-    data: dict[str, Any]
-    graph: Graph
+    ``machine``: alone among its variants. ``platform``: positions (k, 3) and rotations (k, 3, 3) of
+    its reference point.
+    """
+
+    machine: Variants
     q: Array
-    placement: Placement
+    platform: tuple[Array, Array]
     instrument: Instrument
-
-    @property
-    def platform(self) -> tuple[Array, Array]:
-        """Positions (k, 3) and rotations (k, 3, 3) of the reference point."""
-        name = self.graph.platform
-        return self.placement.point(name, self.graph.origin), self.placement.rotation[name]
 
     def parts(self, poses: Poses) -> list[Array]:
         """The instrument's residuals of the poses that are learnt from, (k, 3) each."""
         both = self.instrument.residuals(poses, *self.platform)
         return [part for part in both if part is not None]
 
-
-def change_of(robot: Robot, data: dict[str, Any], path: str) -> GraphChange:
-    """By one number, from its value in the data, which stay as they are.
-
-    :raises ParameterError: no file has a number next to it.
-    """
-    value = number_at(data, path)
-
-    def graph(shift: float) -> Graph:
-        put(data, path, value + shift)
-        try:
-            return type(robot).graph_of(data)
-        finally:
-            put(data, path, value)
-
-    return GraphChange.between(graph(-STEP), graph(STEP), 2.0 * STEP)
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Of the file, by path."""
+        return dict(zip(self.machine.paths, self.machine.values[0].tolist(), strict=False))
 
 
-def start_of(robot: Robot, poses: Poses) -> State:
-    """The robot as it is, an instrument at its base.
+def start_of(robot: Robot, poses: Poses, paths: Sequence[str]) -> State:
+    """The robot as it is, with numbers that may change, an instrument at its base.
 
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     """
     instrument = Instrument(np.zeros(robot.joints_count))
     q = instrument.joints(robot, poses)
-    return State(data_of(robot), robot.graph, q, Placement.of(robot, q), instrument)
+    machine = Variants(robot, {path: robot.number(path) for path in paths})
+    return State(machine, q, robot.platform(q), instrument)
 
 
 def place_frame(state: State, poses: Poses) -> None:
@@ -193,8 +176,12 @@ def moved(
         np.array([values.get(n, v) for n, v in zip(FRAME[:3], tool.place, strict=True)]),
         np.array([values.get(n, v) for n, v in zip(TARGET, tool.target, strict=True)]),
     )
-    numbers = {n: v for n, v in values.items() if not n.startswith(BESIDE)}
-    data = data_of(robot, numbers)
-    graph = type(robot).graph_of(data) if numbers else state.graph
-    q = new.joints(robot, poses)
-    return State(data, graph, q, assembled(graph, q, state.placement), new)
+    machine, q = state.machine, new.joints(robot, poses)
+    if machine.paths:
+        now = state.numbers
+        row = [values.get(path, now[path]) for path in machine.paths]
+        machine = machine.with_values(np.array([row]))
+    position, rotation = machine.platform(q[None])
+    if not np.isfinite(position).all():
+        raise ParameterError("geometry", None, "numbers with which the machine can be assembled")
+    return State(machine, q, (position[0], rotation[0]), new)

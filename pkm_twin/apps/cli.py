@@ -17,6 +17,7 @@ from rich.text import Text
 from pkm_twin.apps import export, maps  # noqa: F401  maps adds its commands to atlas
 from pkm_twin.apps.calibrate import calibrate_command
 from pkm_twin.apps.check_command import check
+from pkm_twin.apps.design import design_command
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
@@ -338,8 +339,7 @@ def compliance(
     from pkm_twin import load
     from pkm_twin.apps.limits import beyond_limits as find_beyond
     from pkm_twin.apps.limits import refuse_beyond
-    from pkm_twin.machine.uncertainty import deviation
-    from stiffness_monitor import compliance_deviation, strain_energy
+    from stiffness_monitor import compliance_deviation, deflection_deviation, strain_energy
 
     machine = load(robot)
     names = ", ".join(
@@ -405,7 +405,7 @@ def compliance(
         else f"dominant element {energy.dominant}"
     )
     if machine.uncertainty:
-        turned = deviation(machine, lambda r: strain_energy(r, pose, load_case).deflection)
+        turned = deflection_deviation(machine, pose, load_case)
         doubts = ", ".join(f"{n} {1e6 * v:.2g}" for n, v in zip(axes, turned, strict=True))
         typer.echo(f"standard deviation (from the robot file's uncertainty): {doubts}")
     typer.echo(f"strain energy {energy.total:.4g} J, {dominant}")
@@ -499,6 +499,7 @@ def certify(
 app.add_typer(atlases.app, name="atlas")
 app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
+app.command("design")(design_command)
 app.command("path")(tables(path_command))
 app.command()(tables(size))
 app.command()(tables(loads))

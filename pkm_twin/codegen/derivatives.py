@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact derivatives of expressions: backwards as expressions, forwards as numbers.
+"""Exact derivatives of expressions as expressions, backwards and forwards.
 
 Reverse and forward mode of algorithmic differentiation (Griewank and Walther 2008, chapter 3).
 
-May import: numpy, this package, the standard library.
+May import: this package, the standard library.
 """
 
 from __future__ import annotations
@@ -11,12 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
+from pkm_twin.codegen.expressions import Expression, cos, maximum, ordered, sign, sin
 
-from pkm_twin.codegen.expressions import Expression, cos, ordered, sign, sin
-
-Array = NDArray[np.float64]
+_LEAST: Final = 1e-150
 
 
 def _first_of(a: Any, b: Any) -> Any:
@@ -29,6 +26,11 @@ def _angle(y: Any, x: Any) -> tuple[Any, Any]:
     return x / square, -y / square
 
 
+def _root(e: Any) -> Any:
+    """Of a length that is zero in the known case, its square has no slope there either."""
+    return 0.5 / (maximum(e, _LEAST) if e.value == 0.0 else e)
+
+
 _SLOPES: Final[dict[str, Callable[[Any, Any, Any], tuple[Any, ...]]]] = {
     "add": lambda a, b, e: (1.0, 1.0),
     "sub": lambda a, b, e: (1.0, -1.0),
@@ -36,7 +38,7 @@ _SLOPES: Final[dict[str, Callable[[Any, Any, Any], tuple[Any, ...]]]] = {
     "neg": lambda a, b, e: (-1.0,),
     "inv": lambda a, b, e: (-(e * e),),
     # The length of a vector that is zero has none; where it counts, a greater length does.
-    "sqrt": lambda a, b, e: (0.5 / e if isinstance(e, Expression) or e else 0.0,),
+    "sqrt": lambda a, b, e: (_root(e),),
     "sin": lambda a, b, e: (cos(a),),
     "cos": lambda a, b, e: (-sin(a),),
     "abs": lambda a, b, e: (sign(a),),
@@ -74,23 +76,17 @@ def adjoints(sums: Iterable[tuple[Any, Any]], by: Sequence[Expression]) -> list[
     return [bars.get(e.number, 0.0) for e in by]
 
 
-def tangents(results: Sequence[Expression], by: Sequence[Expression]) -> Array:
-    """Derivatives of expressions of parameters in the tape's known case, shape (results, by)."""
-    none = np.zeros(len(by))
-    rows: dict[int, Array] = {e.number: row for e, row in zip(by, np.eye(len(by)), strict=True)}
+def tangents(results: Sequence[Expression], by: Sequence[Expression]) -> list[list[Any]]:
+    """Derivatives of expressions by inputs as expressions, a row of them a result."""
+    rows: dict[int, dict[int, Any]] = {e.number: {k: 1.0} for k, e in enumerate(by)}
     for e in ordered(results):
-        if e.number in rows:
+        arguments = [] if e.op in ("const", "in") else [a for a in (e.a, e.b) if a is not None]
+        if e.number in rows or not any(rows[a.number] for a in arguments):
+            rows.setdefault(e.number, {})
             continue
-        if e.op in ("const", "in"):
-            rows[e.number] = none
-            continue
-        arguments = [a for a in (e.a, e.b) if a is not None]
-        if all(rows[a.number] is none for a in arguments):
-            rows[e.number] = none
-            continue
-        values = [a.value for a in arguments]
-        slopes = _SLOPES[e.op](values[0], values[-1], e.value)
-        rows[e.number] = sum(
-            (s * rows[a.number] for a, s in zip(arguments, slopes, strict=True)), none
-        )
-    return np.array([rows[e.number] for e in results]).reshape(len(results), len(by))
+        total: dict[int, Any] = {}
+        for a, slope in zip(arguments, _SLOPES[e.op](e.a, e.b, e), strict=False):
+            for k, value in rows[a.number].items():
+                total[k] = total.get(k, 0.0) + slope * value
+        rows[e.number] = total
+    return [[rows[e.number].get(k, 0.0) for k in range(len(by))] for e in results]

@@ -199,7 +199,8 @@ class Code:
                 header, code = stored
             else:
                 header = _header(self.program, llvm.LANES)
-                code = llvm.compile_object(llvm.emit(self.program))
+                level = llvm.QUICK if self.program.quick else llvm.OPTIMISATION
+                code = llvm.compile_object(llvm.emit(self.program), level)
                 cache.write(name, header, code)
             prepare, address = llvm.load_object(code)
             prepare = llvm.LOCKED(prepare)

@@ -53,6 +53,8 @@ PREPARE: Final = "prepare"
 STATUS: Final = " status"
 OPTIMISATION: Final = 1
 """LLVM's level: the next one takes up to four times as long for code that is no faster."""
+QUICK: Final = 0
+"""Of programs that are ``quick``: gradients, which take far longer to compile than to run."""
 LONG: Final = 100
 """Entries of an output from which on they are stored in a loop."""
 
@@ -87,7 +89,7 @@ def _features() -> str:
 
 FEATURES: Final = _features()
 FUSED: Final = "+fma" in FEATURES.split(",") or "aarch64" in binding.get_process_triple()
-IDENTITY: Final = f"{llvmlite.__version__} {CPU} {FEATURES} {LANES} {OPTIMISATION}"
+IDENTITY: Final = f"{llvmlite.__version__} {CPU} {FEATURES} {LANES} {OPTIMISATION} {QUICK}"
 """What machine code hangs on beside the program."""
 
 
@@ -567,13 +569,13 @@ def emit(program: Program) -> str:
     return module(binding.get_default_triple(), [_preparation(program), _Writer(program).b])
 
 
-def compile_object(text: str) -> bytes:
+def compile_object(text: str, level: int = OPTIMISATION) -> bytes:
     """Machine code for this processor."""
     module = binding.parse_assembly(text)
     module.verify()
     # No passes before: of straight lines without repetition they make nothing faster, and take
     # as long as all the rest.
-    code: bytes = _machine().emit_object(module)
+    code: bytes = _machine(level).emit_object(module)
     return code
 
 
@@ -589,10 +591,10 @@ def load_object(code: bytes) -> tuple[Any, Any]:
     return tuple(engine.get_function_address(name) for name in (PREPARE, SYMBOL))
 
 
-def _machine() -> Any:
+def _machine(level: int = OPTIMISATION) -> Any:
     target = binding.Target.from_default_triple()
     return target.create_target_machine(
-        cpu=CPU, features=FEATURES, opt=OPTIMISATION, jit=True, reloc="pic"
+        cpu=CPU, features=FEATURES, opt=level, jit=True, reloc="pic"
     )
 
 

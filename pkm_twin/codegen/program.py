@@ -115,12 +115,14 @@ class Program:
     """Outputs by name as expressions of the inputs, of the parameters and of solved unknowns.
 
     ``inputs``: sizes by name, in the order of the call, without parameters and unknowns.
+    ``quick``: better compiled in a tenth of the time than run in two thirds of it.
     """
 
     inputs: Mapping[str, int]
     parameters: int
     outputs: Mapping[str, Sequence[Expression]]
     equations: Equations | None = None
+    quick: bool = False
 
     def __post_init__(self) -> None:
         known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry}

@@ -10,26 +10,26 @@ May import: numpy, pkm_twin's core, delta_dynamics, stiffness_monitor, the stand
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delta_dynamics.virtual_work import masses_kernel, torques
 from pkm_twin.codegen.arrays import doubles
 from pkm_twin.codegen.kernels import MISSED, Code, Kernel
+from pkm_twin.design import programs
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.kinematics.numbers import FileNumbers, geometry_and_masses
+from pkm_twin.kinematics.derivatives import twist_rows
 from pkm_twin.machine.entries import with_entries
 from pkm_twin.machine.geometry import pattern_of
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.tree import Tree
 from stiffness_monitor.compliance import HELD
-from stiffness_monitor.numbers import numbers_of
 from stiffness_monitor.programs import elastic_of
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ class Variants:
             raise ParameterError("numbers", sizes, "as many of each, one a machine") from None
         self.values: Array = np.stack([np.atleast_1d(row) for row in rows], -1)
         """Of the paths, shape (k, paths)."""
-        self._function = FileNumbers(robot, self.paths, geometry_and_masses)
+        self.functions = programs.NumberFunctions.of(robot, self.paths)
         self._own: dict[int, Robot | PkmTwinError] = {}
         self._patterns: dict[int, str] = {}
         self._prepared: dict[int, tuple[Code, Array]] = {}
@@ -99,7 +99,7 @@ class Variants:
         reach = [graph.size if graph.joints[name].slides else 1.0 for name in graph.actuated]
         steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
         away = NEAR * np.array([0.0 * steps, steps, -steps]) * reach
-        (poses, *_), good = self._run(_forward, (home + away)[None])
+        (poses, *_), good = self.run(programs.forward, (home + away)[None])
         sound = good.reshape(len(self), -1) & np.isfinite(poses).reshape(len(self), 3, -1).all(-1)
         return np.asarray(sound.all(1))
 
@@ -118,38 +118,62 @@ class Variants:
     ) -> Array:
         """Efforts, shape (k, ..., n), see :func:`delta_dynamics.inverse_dynamics`."""
         load = np.zeros(6) if wrench is None else wrench
-        return self._run(_torques, q, qd, qdd, load)[0][0]
+        return self.run(programs.torques, q, qd, qdd, load)[0][0]
 
     def mass_matrix(self, q: ArrayLike) -> Array:
         """Shape (k, ..., n, n), see :func:`delta_dynamics.mass_matrix`."""
-        flat = self._run(_masses, q)[0][0]
+        flat = self.run(programs.masses, q)[0][0]
         n = self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], n, n)
 
     def forward(self, q: ArrayLike) -> Array:
         """Poses, shape (k, ..., m), see :meth:`Robot.forward`."""
-        return self._run(_forward, q)[0][0]
+        return self.run(programs.forward, q)[0][0]
 
     def inverse(self, pose: ArrayLike) -> Array:
         """Joint positions, shape (k, ..., n), see :meth:`Robot.inverse`."""
-        names = {id(self.robot.engine.forward): _forward}
+        names = {id(self.robot.engine.forward): programs.forward}
 
         def run(kernel: Kernel, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
-            outputs, good = self._run(names.get(id(kernel), _inverse), *inputs)
+            outputs, good = self.run(names.get(id(kernel), programs.inverse), *inputs)
             status = np.where(good, 0.0, 1.0)
             return outputs, None if good.all() else np.concatenate([status, status], -1)
 
         q, codes = self.robot.judged_inverse(pose, run)
         return q if codes is None else np.where(codes[..., :1] == 0.0, q, np.nan)
 
+    def jacobian(self, q: ArrayLike) -> Array:
+        """Pose rates per joint rate, shape (k, ..., m, n), see :meth:`Robot.jacobian`."""
+        flat, n = self.run(programs.jacobian, q)[0][0], self.robot.joints_count
+        return flat.reshape(*flat.shape[:-1], -1, n)
+
+    def platform_jacobian(self, q: ArrayLike) -> Array:
+        """Platform twist per joint rate, shape (k, ..., 6, n)."""
+        flat, n = self.run(programs.jacobian, q)[0][1], self.robot.joints_count
+        return flat.reshape(*flat.shape[:-1], 6, n)
+
+    def platform_slopes(self, q: ArrayLike) -> Array:
+        """Platform twist by each number of one machine, joints held, shape (..., 6, paths).
+
+        :param q: joint positions, shape (samples, n).
+        """
+        states = np.asarray(q, np.float64)[None]
+        rows = twist_rows(len(self.robot.pose_names), self.platform(states)[1])
+        (found,), _ = self.run(programs.platform_slopes, states[..., None, :], rows)
+        return np.asarray(found[0] @ self.geometry_slopes, np.float64)
+
+    def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
+        """Second derivative of the pose, shape (k, ..., m)."""
+        return self.run(programs.acceleration, q, qd, qdd)[0][0]
+
     def platform(self, q: ArrayLike) -> tuple[Array, Array]:
         """Positions (k, ..., 3) and rotations (k, ..., 3, 3), see :meth:`Robot.platform`."""
-        _, position, rotation = self._run(_forward, q)[0]
+        _, position, rotation = self.run(programs.forward, q)[0]
         return position, rotation.reshape(*rotation.shape[:-1], 3, 3)
 
     def singularity(self, q: ArrayLike) -> Array:
         """Shape (k, ...), see :meth:`Robot.singularity`."""
-        return np.asarray(self._run(_singularity, q)[0][0][..., 0], np.float64)
+        return np.asarray(self.run(programs.singularity, q)[0][0][..., 0], np.float64)
 
     def compliance(self, pose: ArrayLike) -> Array:
         """Shape (k, ..., 6, 6), see :func:`stiffness_monitor.compliance`.
@@ -157,46 +181,84 @@ class Variants:
         :raises ParameterError: the robot's file lacks a section that elasticity needs.
         """
         _ = elastic_of(self.robot)
-        (flat, measure), good = self._run(_compliance, self.inverse(pose))
+        (flat, measure), good = self.run(programs.compliance, self.inverse(pose))
         found = np.where(good & (measure > HELD), flat, np.nan)
         return np.asarray(found.reshape(*flat.shape[:-1], 6, 6), np.float64)
 
+    def with_values(self, values: Array, *, checked: bool = False) -> Variants:
+        """Machines with other values of the same paths, shape (k, paths).
+
+        :param checked: a file may have each of these values.
+        """
+        made = copy.copy(self)
+        for name, value in vars(type(self)).items():
+            if isinstance(value, cached_property):
+                vars(made).pop(name, None)
+        made.values = values
+        made._own, made._patterns, made._prepared = {}, {}, {}
+        if checked:
+            vars(made)["_out_of_range"] = np.zeros(len(values), bool)
+        return made
+
     @cached_property
-    def _numbers(self) -> tuple[Array, Array]:
-        """Geometry and masses; NaN of a machine whose file's numbers are out of range."""
-        found = self._function(self.values)
+    def _geometry(self) -> Array:
+        """NaN of a machine whose file's numbers are out of range."""
+        found = self.functions.geometry(self.values)
         found[self._out_of_range] = np.nan
-        geometry, masses = np.split(found, [len(self.robot.engine.geometry)], 1)
-        return geometry, masses
+        return found
+
+    @cached_property
+    def _masses(self) -> Array:
+        found = self.functions.rigid(self.values)[:, self._geometry.shape[1] :]
+        found[self._out_of_range] = np.nan
+        return found
+
+    @cached_property
+    def geometry_slopes(self) -> Array:
+        """Of the first machine's geometry by the numbers, shape (row, paths)."""
+        return np.asarray(self.functions.geometry.slopes_at(self.values[:1])[0])
+
+    @cached_property
+    def rigid_slopes(self) -> Array:
+        """Of the first machine's geometry and masses by the numbers, shape (row, paths)."""
+        return np.asarray(self.functions.rigid.slopes_at(self.values[:1])[0])
 
     @cached_property
     def _elastic(self) -> Array:
         """Numbers of the elasticity."""
-        function = FileNumbers(self.robot, self.paths, lambda made: numbers_of(made.elastic))
-        return function(self.values)
+        return self.functions.elastic(self.values)
 
     @cached_property
     def _out_of_range(self) -> Mask:
         """Machines with numbers that no file may have."""
         out = np.asarray(np.isnan(self.values).any(1))
+        for columns in self._sections:
+            known = self.values[~out][:, columns]
+            if len(known) and not self._box_fits(columns, known):
+                paths = [self.paths[column] for column in columns]
+                for k in np.flatnonzero(~out):
+                    out[k] = not self._fits(paths, self.values[k, columns].tolist())
+        return out
+
+    @property
+    def whole_box_fits(self) -> bool:
+        """Whether a file may have all numbers between the least and the greatest of each path."""
+        return all(self._box_fits(columns, self.values[:, columns]) for columns in self._sections)
+
+    @property
+    def _sections(self) -> list[list[int]]:
         sections: dict[str, list[int]] = {}
         for column, path in enumerate(self.paths):
             sections.setdefault(path.rpartition(".")[0], []).append(column)
-        for columns in sections.values():
-            rows = self.values[:, columns]
-            known = rows[~out]
-            if not len(known):
-                continue
-            paths = [self.paths[column] for column in columns]
-            # What bounds numbers of a section together is convex: corners that hold do.
-            ends = list(zip(known.min(0).tolist(), known.max(0).tolist(), strict=True))
-            if len(columns) <= CORNERS and all(
-                self._fits(paths, row) for row in itertools.product(*ends)
-            ):
-                continue
-            for k in np.flatnonzero(~out):
-                out[k] = not self._fits(paths, rows[k].tolist())
-        return out
+        return list(sections.values())
+
+    def _box_fits(self, columns: Sequence[int], rows: Array) -> bool:
+        """What bounds numbers of a section together is convex: corners that hold do."""
+        if len(columns) > CORNERS:
+            return False
+        paths = [self.paths[column] for column in columns]
+        ends = zip(rows.min(0).tolist(), rows.max(0).tolist(), strict=True)
+        return all(self._fits(paths, row) for row in set(itertools.product(*ends)))
 
     def _fits(self, paths: Sequence[str], values: Sequence[float]) -> bool:
         """Whether a file may have these numbers."""
@@ -208,7 +270,7 @@ class Variants:
             return False
         return True
 
-    def _prepare(self, ask: _Ask, robot: Robot) -> tuple[Code, Array]:
+    def _prepare(self, ask: programs.Ask, robot: Robot) -> tuple[Code, Array]:
         """A robot's program, and what hangs on each machine's numbers, shape (k, prepared + 1)."""
         kernel, numbers = ask(robot)
         code = kernel.code
@@ -217,7 +279,7 @@ class Variants:
             found = self._prepared[id(code)] = code, code.prepare(numbers(self))
         return found
 
-    def _run(self, ask: _Ask, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
+    def run(self, ask: programs.Ask, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
         """Outputs (k, ..., size) each, and which are good, shape (k, ..., 1)."""
         code, prepared = self._prepare(ask, self.robot)
         rows, batch = self._laid_out(code, inputs)
@@ -261,10 +323,12 @@ class Variants:
             rows.append(np.ascontiguousarray(values))
         return rows, batch
 
-    def _by_structure(self, ask: _Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
+    def _by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Programs with the machines that each is right for: one program a structure."""
-        left = ~self._out_of_range
-        robots = itertools.chain([self.robot], self._built(left))
+        # Where there is no assembly at home, there are no numbers for any program.
+        left = np.asarray(~np.isnan(ask(self.robot)[1](self)).any(1))
+        others = self.functions.others
+        robots = itertools.chain([self.robot, *others], self._built(left))
         for robot in robots:
             try:
                 code, prepared = self._prepare(ask, robot)
@@ -273,6 +337,8 @@ class Variants:
                     raise
                 continue
             fits = left & (prepared[:, -1] <= MISSED)
+            if fits.any() and robot is not self.robot and robot not in others:
+                others.append(robot)
             yield code, prepared, np.flatnonzero(fits)
             left &= ~fits
 
@@ -302,50 +368,9 @@ class Variants:
         return self._patterns[k]
 
 
-_Program = tuple[Kernel, Callable[[Variants], Array]]
-"""A program, and what it takes of the machines, shape (k, size)."""
-_Ask = Callable[[Robot], _Program]
-
-
-def _geometry(many: Variants) -> Array:
-    return many._numbers[0]
-
-
-def _massive(many: Variants) -> Array:
-    return np.concatenate(many._numbers[::-1], 1)
-
-
-def _elastic(many: Variants) -> Array:
-    return np.concatenate([many._numbers[0], many._elastic], 1)
-
-
 def _layout(robot: Robot) -> list[tuple[str, str]]:
     """Bodies with the joints that carry them: the order of the inertial inputs."""
     return [(link.body, str(link.joint)) for link in robot.engine.tree.links.values()]
-
-
-def _forward(robot: Robot) -> _Program:
-    return robot.engine.forward, _geometry
-
-
-def _inverse(robot: Robot) -> _Program:
-    return robot.inverse_kernel, _geometry
-
-
-def _singularity(robot: Robot) -> _Program:
-    return robot.singularity_kernel(), _geometry
-
-
-def _torques(robot: Robot) -> _Program:
-    return torques(robot), _massive
-
-
-def _masses(robot: Robot) -> _Program:
-    return masses_kernel(robot), _massive
-
-
-def _compliance(robot: Robot) -> _Program:
-    return elastic_of(robot).compliance, _elastic
 
 
 def variants(robot: Robot, numbers: Mapping[str, ArrayLike]) -> Variants:

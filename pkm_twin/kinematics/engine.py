@@ -452,7 +452,7 @@ class Engine:
     @property
     def forward(self) -> Kernel:
         """Q to pose (m), position (3) and rotation (9) of the platform."""
-        return self.kernel("forward", _forward)
+        return self.kernel("forward", forward_program)
 
     @property
     def jacobian(self) -> Kernel:
@@ -731,7 +731,8 @@ def _pose_walk(t: Traced) -> Program:
     return Program(sizes, 0, outputs)
 
 
-def _forward(t: Traced) -> Program:
+def forward_program(t: Traced) -> Program:
+    """The program of :attr:`Engine.forward`, to write others with."""
     t.solve()
     position, rotation = t.motion.platform()
     values = poses.values(t.engine.coordinates, position, rotation)

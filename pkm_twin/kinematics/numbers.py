@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.derivatives import tangents
-from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape
+from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape, references
 from pkm_twin.codegen.plain import functions
 from pkm_twin.machine.geometry import geometry_of
 from pkm_twin.machine.inertia import Layout
@@ -46,9 +46,35 @@ class FileNumbers:
         _, self._run = functions(self._results, {GEOMETRY: len(paths)})
 
     @cached_property
+    def _tangents(self) -> list[list[Any]]:
+        return tangents(self._results, self._given)
+
+    @cached_property
     def slopes(self) -> Array:
         """Derivatives of the row by the numbers, at the file's own values, shape (row, paths)."""
-        return tangents(self._results, self._given)
+        return references(self._tangents).reshape(len(self._results), len(self._given))
+
+    @cached_property
+    def _slopes_run(self) -> tuple[list[tuple[int, int]], Callable[..., tuple[Any, ...]]]:
+        """Places of the derivatives that are not zero, and the function of these."""
+        tape = Tape() if not self._results else self._results[0].tape
+        found = [
+            (i, k, tape.lift(value))
+            for i, row in enumerate(self._tangents)
+            for k, value in enumerate(row)
+            if isinstance(value, Expression) or value
+        ]
+        run = functions([e for _, _, e in found], {GEOMETRY: len(self._given)})[1]
+        return [(i, k) for i, k, _ in found], run
+
+    def slopes_at(self, values: Array) -> Array:
+        """The same at values, shape (k, paths): (k, row, paths)."""
+        places, run = self._slopes_run
+        table = np.zeros((len(values), len(self._results), len(self._given)))
+        with np.errstate(all="ignore"):
+            for (i, k), value in zip(places, run(**{GEOMETRY: list(values.T)}), strict=True):
+                table[:, i, k] = value
+        return table
 
     def __call__(self, values: Array) -> Array:
         """Of values, shape (k, paths): (k, row); NaN where a machine's numbers lead to none."""
@@ -58,6 +84,29 @@ class FileNumbers:
         for column, row in zip(table.T, rows, strict=True):
             column[:] = row
         return table
+
+
+def file_numbers(
+    robot: Robot, paths: Sequence[str], of: Callable[[Robot], Sequence[Any]]
+) -> FileNumbers:
+    """The same, made once a robot."""
+    key = f"numbers {of.__module__}.{of.__qualname__} {' '.join(paths)}"
+    found: FileNumbers | None = robot.calls.get(key)
+    if found is None:
+        found = robot.calls[key] = FileNumbers(robot, paths, of)
+    return found
+
+
+def cause_slopes(robot: Robot, of: Callable[[Robot], Sequence[Any]]) -> Array:
+    """What one standard deviation of each of the robot's causes of doubt adds, (row, causes)."""
+    key = f"causes {of.__module__}.{of.__qualname__}"
+    found: Array | None = robot.calls.get(key)
+    if found is None:
+        causes = robot.causes.values()
+        paths = tuple(dict.fromkeys(path for cause in causes for path in cause))
+        steps = np.array([[cause.get(path, 0.0) for cause in causes] for path in paths])
+        found = robot.calls[key] = FileNumbers(robot, paths, of).slopes @ steps
+    return found
 
 
 def geometry_and_masses(robot: Robot) -> list[Any]:

@@ -39,6 +39,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.engine import Engine, Traced
+from pkm_twin.kinematics.gradients import gradient_program
 from pkm_twin.kinematics.motion import (
     Columns,
     Motion,
@@ -55,6 +56,11 @@ from pkm_twin.machine.tree import Tree
 def singularity_kernel(engine: Engine) -> Kernel:
     """The compiled program, q to the measure (1)."""
     return engine.kernel("singularity", _singularity)
+
+
+def singularity_gradient(engine: Engine) -> Kernel:
+    """The program of its derivatives: q and a weight (1) to those by q and by the geometry."""
+    return engine.kernel("singularity gradient", _gradient, free=True)
 
 
 class Placed(Motion):
@@ -112,6 +118,10 @@ def _singularity(t: Traced) -> Program:
     t.solve()
     outputs = {"measure": [t.tape.lift(singularity_measure(t))]}
     return Program({"q": t.joints}, 0, outputs, t.equations())
+
+
+def _gradient(t: Traced) -> Program:
+    return gradient_program(t, _singularity(t), {"q": t.q, "geometry": t.geometry})
 
 
 def singularity_measure(t: Traced | _AtHome) -> Any:

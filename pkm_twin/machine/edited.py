@@ -23,6 +23,14 @@ from pkm_twin.machine.yaml_edit import edit_yaml
 
 
 @dataclass(frozen=True)
+class Chosen:
+    """A new number of a file, and what stands above it."""
+
+    value: float
+    comment: str
+
+
+@dataclass(frozen=True)
 class Fitted:
     """A new number of a file, its standard deviation in the same unit, and where it is from."""
 
@@ -38,7 +46,7 @@ class Fitted:
         return f"+- {self.deviation:.2g}{unit} (standard deviation), {self.source}"
 
 
-def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted]) -> str:
+def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]) -> str:
     """The text of a robot's file with other numbers, each with its comment.
 
     Where the file writes a number once for several limbs, or is no YAML, the text is a new one with

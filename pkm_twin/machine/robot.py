@@ -52,6 +52,7 @@ from pkm_twin.machine.shared import (
 from pkm_twin.machine.uncertainty import (
     Factor,
     UncertaintyEntry,
+    causes_of,
     check_uncertainty,
     factors_of,
 )
@@ -324,6 +325,11 @@ class Robot:
         branch = self.branch if self.has_branch else None
         mark = f"{self.mechanism} {self.closed_key}"
         return engine_of(self.graph, self.coordinates, closed, branch, mark)
+
+    @cached_property
+    def causes(self) -> Mapping[str, Mapping[str, float]]:
+        """By cause of doubt: by path of a number, what one standard deviation adds to it."""
+        return causes_of(self)
 
     @cached_property
     def factors(self) -> tuple[Factor, ...]:

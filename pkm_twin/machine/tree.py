@@ -167,7 +167,9 @@ class Tree:
     def _hang(self, parent: str, body: str, name: str | None) -> None:
         graph = self.graph
         if name is None:
-            at, backwards, actuated = graph.bodies[body].com, False, False
+            # A point of the geometry, which programs have at run time; a centre of mass is none.
+            at = graph.origin if body == graph.platform else graph.frame(body)[0]
+            backwards, actuated = False, False
             freedoms: tuple[Freedom, ...] = ()
             start: tuple[float, ...] = FREE
         else:

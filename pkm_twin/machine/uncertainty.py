@@ -6,9 +6,10 @@ May import: numpy, this package, the standard library.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,23 +52,31 @@ class Factor:
         return np.asarray((call(self.high) - call(self.low)) / (2.0 * STEP), np.float64)
 
 
-def factors_of(robot: Robot) -> tuple[Factor, ...]:
-    """The causes that the robot's file names.
+def causes_of(robot: Robot) -> dict[str, dict[str, float]]:
+    """Of each cause that the file names: by path of a number, what one standard deviation adds."""
+    found = {}
+    for name, entry in robot.uncertainty.items():
+        deviation, relative = entry.deviation, float(entry.relative or 0.0)
+        found[name] = {
+            path: value * relative if deviation is None else deviation
+            for path, value in numbers_below(robot, name).items()
+            if math.isfinite(value)
+        }
+    return found
 
-    :raises ParameterError: a name that no number of the file has, or a number that cannot vary.
+
+def factors_of(robot: Robot) -> tuple[Factor, ...]:
+    """The causes with robots beside.
+
+    :raises ParameterError: a number that cannot vary.
     """
     from pkm_twin.machine.entries import with_entries
 
     found = []
-    for name, entry in robot.uncertainty.items():
-        known = numbers_below(robot, name)
+    for name, steps in robot.causes.items():
         sides = []
         for sign in (-STEP, STEP):
-            if entry.deviation is not None:
-                values = {path: value + sign * entry.deviation for path, value in known.items()}
-            else:
-                factor = 1.0 + sign * float(entry.relative or 0.0)
-                values = {path: value * factor for path, value in known.items()}
+            values = {path: robot.number(path) + sign * step for path, step in steps.items()}
             sides.append(with_entries(robot, values))
         found.append(Factor(name, *sides))
     return tuple(found)
@@ -95,18 +104,3 @@ def check_uncertainty(robot: Robot) -> None:
     """
     for name in robot.uncertainty:
         numbers_below(robot, name)
-
-
-def deviation(robot: Robot, call: Callable[[Robot], Any]) -> Array:
-    """Standard deviation of what is computed from a robot, to first order.
-
-    The causes of the robot's ``uncertainty`` are independent of each other; their effects are
-    derivatives by central differences over a thousandth of a deviation.
-
-    :param call: from a robot to an array.
-    :returns: of the array's shape; zero for a robot without uncertainty.
-    """
-    effects = [factor.effect(call) for factor in robot.factors]
-    if not effects:
-        return np.zeros_like(np.asarray(call(robot), np.float64))
-    return np.asarray(np.sqrt(np.sum(np.square(effects), axis=0)), np.float64)

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import inspect
+import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -71,6 +73,38 @@ def test_the_blocks_of_a_page_run(page, tmp_path, twin, monkeypatch):
     monkeypatch.chdir(tmp_path)
     printed = [run(language, block, tmp_path, twin) for language, block, _ in blocks(page)]
     assert len(printed) == 2 and all(printed)
+
+
+def test_blocks_of_variants_and_design(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for page in ("variants.md", "design.md"):
+        space = {}
+        for language, block, _ in blocks(page):
+            if language == "python":
+                exec(compile(block, page, "exec"), space)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_commands_of_the_design_page(tmp_path, twin, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for language, block, _ in blocks("design.md"):
+        if language == "bash":
+            run(language, block, tmp_path, twin)
+    assert {path.name for path in tmp_path.iterdir()} >= {"better.yaml", "better.png", "box.nc"}
+
+
+def test_the_example_of_design():
+    runpy.run_path(str(DOCS.parent / "examples/design_a_delta.py"), run_name="__main__")
+
+
+def test_the_notebook_runs():
+    cells = json.loads((DOCS.parent / "examples/variants.ipynb").read_text())["cells"]
+    space = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), space)
+    assert space["found"].best.feasible
 
 
 def test_the_parameters_page_is_that_of_the_schemas():

@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin import Robot
+from pkm_twin import Robot, variants
+from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.entries import entries, given, with_entries
@@ -38,24 +39,20 @@ def unsure(name: str, uncertainty: dict[str, Any], **sections: Any) -> Robot:
     return robot_of_data({**data, "uncertainty": uncertainty}, name)
 
 
-def drawn(robot: Robot, rng: np.random.Generator) -> Robot:
-    """One of the machines that the file allows, every cause by a normal deviate of its own."""
+def drawn(robot: Robot, count: int) -> Variants:
+    """Machines that the file allows, every cause by a normal deviate of its own."""
+    rng = np.random.default_rng(2)
     known = {path: value for path, (value, _) in entries(robot).items()}
     values = {}
     for name, entry in robot.uncertainty.items():
-        deviate = rng.normal()
+        deviate = rng.normal(size=count)
         for path, value in known.items():
             if path == name or path.startswith((f"{name}.", f"{name}[")):
                 if entry.deviation is None:
                     values[path] = value * (1.0 + deviate * entry.relative)
                 else:
                     values[path] = value + deviate * entry.deviation
-    return with_entries(robot, values)
-
-
-def spread(robot: Robot, call: Any, count: int) -> Array:
-    rng = np.random.default_rng(2)
-    return np.asarray(np.std([call(drawn(robot, rng)) for _ in range(count)], axis=0))
+    return variants(robot, values)
 
 
 def delta() -> tuple[Robot, Array, Array, Array]:
@@ -70,12 +67,12 @@ def check(count: int, tolerance: float) -> None:
     """Of a standard deviation over k draws the relative error is 1 / sqrt(2 k)."""
     robot, q, qd, qdd = delta()
     found = torque_deviation(robot, q, qd, qdd)
-    expected = spread(robot, lambda r: inverse_dynamics(r, q, qd, qdd), count)
+    expected = np.std(drawn(robot, count).inverse_dynamics(q, qd, qdd), axis=0)
     np.testing.assert_allclose(found, expected, rtol=tolerance)
     head = unsure("upr_rpu", HEAD)
     pose = [-0.6, 0.1, 0.05]
     found = compliance_deviation(head, pose)
-    expected = spread(head, lambda r: compliance(r, pose), count)
+    expected = np.std(drawn(head, count).compliance(pose), axis=0)
     np.testing.assert_allclose(found, expected, rtol=tolerance, atol=1e-3 * expected.max())
 
 

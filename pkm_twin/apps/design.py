@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin design``: numbers of a robot's file that are best for a path; sweeps, tolerances."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Final, Optional
+
+import typer
+
+from pkm_twin.apps.options import Json, Payload, Platform, RobotName, load_of
+from pkm_twin.console import file_name, numbers, print_json, progress, refuse_existing
+from pkm_twin.errors import ParameterError, UnknownNameError
+
+SWEEPS: Final = ("grid", "sobol")
+
+
+def design_command(
+    robot: RobotName,
+    vary: Annotated[
+        list[str],
+        typer.Option(
+            help="PATH=LOW:HIGH, a number of the robot's file and its bounds, e.g. "
+            "geometry.arm_length=0.15:0.3; PATH,PATH,-PATH=LOW:HIGH changes several by the same "
+            "amount",
+            show_default=False,
+        ),
+    ] = [],  # noqa: B006  typer copies it
+    path: Annotated[
+        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        typer.Option(
+            help="motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording",
+            show_default=False,
+        ),
+    ] = None,
+    minimise: Annotated[
+        list[str],
+        typer.Option(
+            help="peak-effort, rms-effort, energy, deflection or mass; two of them give a Pareto "
+            "front",
+            show_default=False,
+        ),
+    ] = [],  # noqa: B006
+    subject_to: Annotated[
+        list[str],
+        typer.Option(help="a bound, e.g. 'singularity>=0.1' or 'peak-effort<=20'"),
+    ] = [],  # noqa: B006
+    tolerance: Annotated[
+        list[str],
+        typer.Option(
+            help="PATH=SIGMA: the standard deviation of a number; prints the pose error budget"
+        ),
+    ] = [],  # noqa: B006
+    sweep: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="grid or sobol: compute machines of the box into --out FILE.nc"),
+    ] = None,
+    samples: Annotated[
+        int, typer.Option(help="machines of a sweep along each axis of a grid, or in all", min=1)
+    ] = 20,
+    wrench: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="fx,fy,fz,mx,my,mz on the platform, N and N m, base axes; added to the path's",
+            show_default=False,
+        ),
+    ] = None,
+    payload: Payload = None,
+    platform: Platform = None,
+    starts: Annotated[
+        int, typer.Option(help="machines from which the best are improved", min=1)
+    ] = 64,
+    points: Annotated[int, typer.Option(help="of a Pareto front", min=3)] = 9,
+    seed: Annotated[int, typer.Option(help="of starts and samples", min=0)] = 0,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            help="the robot's file with the new numbers, FILE.yaml; of a sweep FILE.nc",
+            callback=file_name,
+            show_default=False,
+        ),
+    ] = None,
+    picture: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            help="PNG: efforts before and after, or the Pareto front",
+            callback=file_name,
+            show_default=False,
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the files")] = False,
+    as_json: Json = False,
+) -> None:
+    """Find numbers of a robot's file that are best for a path.
+
+    The platform follows the same path whatever the numbers; machines that cannot follow it are
+    rejected. peak-effort is the greatest effort of any joint, rms-effort the greatest RMS of a
+    joint, energy what the drives give without regeneration, deflection the greatest translation of
+    the reference point under the wrench, mass that of all bodies and rods without payload;
+    singularity is the least index on the path. The search is by exact gradients from several
+    starts; it ends in a local optimum.
+
+    With --sweep all quantities of the machines of a box are written to a NetCDF file. With
+    --tolerance the standard deviations of the platform's position and rotation are printed, by
+    contribution, on the path or else over the workspace.
+    """
+    from pkm_twin import load
+    from pkm_twin.apps import design_report as report
+    from pkm_twin.design import design as find
+    from pkm_twin.design import sweep as sweep_box
+    from pkm_twin.design.optimise import searches
+    from pkm_twin.design.variables import parse_vary
+
+    for target in (out, picture):
+        if target is not None:
+            refuse_existing(target, overwrite, path)
+    machine = load(robot, platform=platform) if platform else load(robot)
+    carried = load_of(payload, None)
+    if carried is not None:
+        machine = carried.on(machine)
+    load_on = None if wrench is None else numbers(wrench, 6, "fx,fy,fz,mx,my,mz")
+    if tolerance:
+        if vary or minimise or sweep or subject_to or out or picture:
+            raise typer.BadParameter("--tolerance goes with --path and --json only")
+        _print(report.budget(machine, _sigmas(tolerance), path), as_json)
+        return
+    if path is None:
+        raise typer.BadParameter("give the motion with --path, see `pkm-twin path`")
+    machine, way = report.read_path(path, machine, load_on)
+    box = parse_vary(vary)
+    if sweep is not None:
+        if sweep not in SWEEPS:
+            raise UnknownNameError("sweep", sweep, SWEEPS)
+        if minimise or subject_to or picture:
+            raise typer.BadParameter("--sweep computes all quantities; no --minimise, --subject-to")
+        if out is None or out.suffix != ".nc":
+            raise ParameterError("out", str(out), "a name that ends in .nc, for --sweep")
+        count = samples ** len(box) if sweep == "grid" else samples
+        with progress("machines", count) as update:
+            table = sweep_box(
+                machine, box, way, report.known_quantities(machine, way), samples,
+                "grid" if sweep == "grid" else "sobol", seed=seed, progress=update,
+            )  # fmt: skip
+        _print(report.write_sweep(machine, table, sweep, path, out), as_json)
+        return
+    if not minimise:
+        raise typer.BadParameter("give --minimise, --sweep or --tolerance")
+    if out is not None and out.suffix not in (".yaml", ".yml"):
+        raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
+    with progress("searches", searches(len(minimise), points)) as update:
+        result = find(
+            machine, box, way, minimise, subject_to, starts=starts, points=points, seed=seed,
+            progress=update,
+        )  # fmt: skip
+    if out is not None:
+        report.write_robot(machine, robot, result, path, out)
+    if picture is not None:
+        report.draw(machine, result, way, picture)
+    _print(report.told(machine, box, result, way, out, picture), as_json)
+
+
+def _print(both: tuple[object, str], as_json: bool) -> None:
+    data, text = both
+    if as_json:
+        print_json(data)
+    else:
+        typer.echo(text)
+
+
+def _sigmas(texts: list[str]) -> dict[str, float]:
+    found = {}
+    for text in texts:
+        path, _, value = text.rpartition("=")
+        try:
+            sigma = float(value)
+        except ValueError:
+            sigma = math.nan
+        if not path or not sigma >= 0.0:
+            raise ParameterError("tolerance", text, "PATH=SIGMA, a standard deviation of 0 or more")
+        found[path] = sigma
+    return found

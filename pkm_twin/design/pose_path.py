@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A path of the platform, and how machines of other numbers follow it.
+
+The pose p and its first and second derivatives in time stay the same. Joints follow:
+
+    q by the inverse,   J qd = p',   J qdd = p'' - J' qd      (J the pose's Jacobian)
+
+A sum w . tau of efforts changes with a number g of the file by what the program itself says, less
+what keeps the pose: with P, V and A the pose, its rate and its acceleration as functions of q, qd,
+qdd and g,
+
+    d(w . tau)/dg = tau_g - a . A_g - v . V_g - p . P_g,
+    J^T a = tau_qdd,   J^T v = tau_qd - A_qd^T a,   J^T p = tau_q - A_q^T a - V_q^T v
+
+(the adjoint of the implicit function theorem, three times).
+
+May import: numpy, pkm_twin's core, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pkm_twin.design import programs
+from pkm_twin.design.variants import Variants
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class PosePath:
+    """A path of the platform over t samples.
+
+    ``time``, shape (t,), s, rising. ``pose``, ``rate`` and ``acceleration``: the pose and its
+    derivatives in time, shape (t, m). ``wrench``: on the platform, shape (t, 6), N and N m, base
+    axes at its reference point.
+    """
+
+    time: Array
+    pose: Array
+    rate: Array
+    acceleration: Array
+    wrench: Array
+
+    @classmethod
+    def of_joints(
+        cls, robot: Robot, time: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike,
+        wrench: ArrayLike | None = None,
+    ) -> PosePath:  # fmt: skip
+        """The path that a robot's platform takes when its joints move so.
+
+        :param time: shape (t,), s; ``q``, ``qd``, ``qdd``: shape (t, n).
+        :param wrench: shape (t, 6) or (6,); None is none.
+        :raises ParameterError: fewer than two samples, or times that do not rise.
+        :raises UnreachableError: a joint state without an assembly. Others as of ``forward``.
+        """
+        times = np.asarray(time, np.float64)
+        if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0.0).all():
+            raise ParameterError("time", list(times.shape), "two or more rising times")
+        rate = (robot.jacobian(q) @ np.asarray(qd, np.float64)[..., None])[..., 0]
+        load = np.zeros(6) if wrench is None else np.asarray(wrench, np.float64)
+        return cls(
+            times, robot.forward(q), rate, robot.pose_acceleration(q, qd, qdd),
+            np.array(np.broadcast_to(load, (len(times), 6))),
+        )  # fmt: skip
+
+    def at(self, rows: Index) -> PosePath:
+        """Some of its samples, in any order."""
+        parts = (self.time, self.pose, self.rate, self.acceleration, self.wrench)
+        return PosePath(*(part[rows] for part in parts))
+
+    @cached_property
+    def weights(self) -> Array:
+        """Of each sample in the integral over time by trapezoids, shape (t,), s."""
+        steps = np.diff(self.time)
+        return np.asarray(0.5 * (np.append(steps, 0.0) + np.append(0.0, steps)), np.float64)
+
+    @property
+    def duration(self) -> float:
+        """From the first sample to the last, s."""
+        return float(self.time[-1] - self.time[0])
+
+
+class Followed:
+    """Machines (k) on a path: joints, efforts and what else is asked; NaN where one cannot.
+
+    Derivatives are of one machine, by its numbers (d).
+    """
+
+    def __init__(self, many: Variants, path: PosePath) -> None:
+        self.many, self.path = many, path
+
+    def _each(self, values: Array) -> Array:
+        """Samples given to every machine by itself: no count of samples is taken for machines."""
+        return np.broadcast_to(values, (len(self.many), *values.shape))
+
+    @cached_property
+    def q(self) -> Array:
+        """Shape (k, t, n)."""
+        return self.many.inverse(self._each(self.path.pose))
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """Pose rates per joint rate, shape (k, t, m, n); one where there is none."""
+        found = self.many.jacobian(self.q)
+        good = np.isfinite(found).all((-1, -2), keepdims=True)
+        return np.where(good, found, np.eye(found.shape[-1]))
+
+    def _solved(self, right: Array) -> Array:
+        """J^-1 times vectors (k, t, m)."""
+        return _solve(self.jacobian, right)
+
+    @cached_property
+    def qd(self) -> Array:
+        """Shape (k, t, n)."""
+        return np.where(np.isfinite(self.q), self._solved(self._each(self.path.rate)), np.nan)
+
+    @cached_property
+    def qdd(self) -> Array:
+        """Shape (k, t, n)."""
+        bent = self.many.pose_acceleration(self.q, self.qd, np.zeros_like(self.qd))
+        return self._solved(self._each(self.path.acceleration) - bent)
+
+    @cached_property
+    def efforts(self) -> Array:
+        """Shape (k, t, n), N m or N."""
+        load = self._each(self.path.wrench)
+        return self.many.inverse_dynamics(self.q, self.qd, self.qdd, load)
+
+    @cached_property
+    def singularity(self) -> Array:
+        """Index of every sample, shape (k, t)."""
+        return self.many.singularity(self.q)
+
+    @cached_property
+    def compliance(self) -> Array:
+        """Shape (k, t, 6, 6)."""
+        return self.many.compliance(self._each(self.path.pose))
+
+    @cached_property
+    def deflection(self) -> Array:
+        """Of the platform under the path's wrench, shape (k, t, 6), m and rad."""
+        return np.asarray((self.compliance @ self.path.wrench[..., None])[..., 0])
+
+    # Derivatives by the numbers, of one machine.
+
+    def effort_slopes(self, weights: Array, rates: Array | None = None) -> Array:
+        """Derivatives of each sample's w . tau + r . qd, shape (t, d).
+
+        :param weights: w, shape (t, n); ``rates``: r, shape (t, n), None is none.
+        """
+        state = (self.q, self.qd, self.qdd, self._each(self.path.wrench), weights[None])
+        (by_q, by_qd, by_qdd), _ = self.many.run(programs.torque_gradient, *state)
+        (of_geometry, of_masses), _ = self.many.run(programs.torque_numbers, *state)
+        if rates is not None:
+            by_qd = by_qd + rates
+        held = self._held(by_q, (by_qd, by_qdd))
+        rows = np.concatenate([of_geometry + held, of_masses], -1)
+        return np.asarray(rows[0] @ self.many.rigid_slopes)
+
+    def singularity_slopes(self) -> Array:
+        """Derivatives of each sample's index, shape (t, d)."""
+        ones = np.ones((1, len(self.path.time), 1))
+        (by_q, by_geometry), _ = self.many.run(programs.singularity_slopes, self.q, ones)
+        return self._by_geometry(by_geometry + self._held(by_q))
+
+    def compliance_slopes(self, weights: Array) -> Array:
+        """Derivatives of each sample's sum of weights times the compliance's entries, (t, d).
+
+        :param weights: shape (t, 6, 6).
+        """
+        flat = weights.reshape(1, len(weights), 36)
+        (by_q, numbers), _ = self.many.run(programs.compliance_slopes, self.q, flat)
+        count = len(self.many.robot.engine.geometry)
+        by_geometry = self._by_geometry(numbers[..., :count] + self._held(by_q))
+        elastic = self.many.functions.elastic.slopes_at(self.many.values)[0]
+        return np.asarray(by_geometry + numbers[0, :, count:] @ elastic)
+
+    def _by_geometry(self, rows: Array) -> Array:
+        return np.asarray(rows[0] @ self.many.geometry_slopes)
+
+    def _held(self, by_q: Array, by_rates: tuple[Array, Array] | None = None) -> Array:
+        """What the joints' following adds to derivatives by the geometry, shape (1, t, g).
+
+        :param by_rates: derivatives by qd and qdd; None where there are none.
+        """
+        back = np.swapaxes(self.jacobian, -1, -2)
+        weights = np.zeros((*by_q.shape[:-1], 3, by_q.shape[-1]))
+        qd, qdd = np.zeros_like(self.q), np.zeros_like(self.q)
+
+        def asked() -> list[Array]:
+            flat = weights.reshape(*weights.shape[:-2], -1)
+            return self.many.run(programs.pose_motion, self.q, qd, qdd, flat)[0]
+
+        if by_rates is not None:
+            qd, qdd = self.qd, self.qdd
+            weights[..., 2, :] = _solve(back, by_rates[1])
+            weights[..., 1, :] = _solve(back, by_rates[0] - asked()[1])
+            by_q = by_q - asked()[0]
+        weights[..., 0, :] = _solve(back, by_q)
+        return -asked()[2]
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    """Solutions for vectors; NaN of a singular matrix."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0], np.float64)
+    except np.linalg.LinAlgError:
+        # One of them is: its machine is in a singularity.
+        good = np.abs(np.linalg.det(matrix)) > 0.0
+        sound = np.where(good[..., None, None], matrix, np.eye(matrix.shape[-1]))
+        found = np.linalg.solve(sound, right[..., None])[..., 0]
+        return np.where(good[..., None], found, np.nan)

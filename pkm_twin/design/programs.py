@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Programs that are asked of many machines, and what each takes of a machine's numbers.
+
+May import: numpy, pkm_twin's core, delta_dynamics, stiffness_monitor, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from delta_dynamics.derivatives import motion_gradient, numbers_gradient
+from delta_dynamics.virtual_work import masses_kernel
+from delta_dynamics.virtual_work import torques as torques_kernel
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.kinematics.derivatives import geometry_numbers
+from pkm_twin.kinematics.gradients import free_forward, platform_gradient, pose_motion_gradient
+from pkm_twin.kinematics.numbers import FileNumbers, geometry_and_masses
+from pkm_twin.kinematics.singularity import singularity_gradient
+from pkm_twin.machine.robot import Robot
+from stiffness_monitor.derivatives import compliance_gradient
+from stiffness_monitor.numbers import numbers_of
+from stiffness_monitor.programs import elastic_of
+
+if TYPE_CHECKING:
+    from pkm_twin.design.variants import Variants
+
+Array = NDArray[np.float64]
+
+
+class NumberFunctions:
+    """What programs take of a robot, as functions of numbers of its file."""
+
+    def __init__(self, robot: Robot, paths: Sequence[str]) -> None:
+        self.robot, self.paths = robot, paths
+        self.others: list[Robot] = []
+        """Robots with these numbers changed, one for each other structure that was needed."""
+        self.geometry = FileNumbers(robot, paths, geometry_numbers)
+
+    @classmethod
+    def of(cls, robot: Robot, paths: tuple[str, ...]) -> NumberFunctions:
+        """The same, made once a robot."""
+        key = f"number functions {' '.join(paths)}"
+        found: NumberFunctions | None = robot.calls.get(key)
+        if found is None:
+            found = robot.calls[key] = cls(robot, paths)
+        return found
+
+    @cached_property
+    def rigid(self) -> FileNumbers:
+        """Geometry, then masses."""
+        return FileNumbers(self.robot, self.paths, geometry_and_masses)
+
+    @cached_property
+    def elastic(self) -> FileNumbers:
+        """What elasticity takes beside the geometry."""
+        return FileNumbers(self.robot, self.paths, lambda made: numbers_of(made.elastic))
+
+
+Asked = tuple[Kernel, Callable[["Variants"], Array]]
+"""A program, and what it takes of the machines, shape (k, size)."""
+Ask = Callable[[Robot], Asked]
+
+
+def of_geometry(many: Variants) -> Array:
+    """Geometry of the machines."""
+    return many._geometry
+
+
+def of_masses(many: Variants) -> Array:
+    """Masses, then geometry."""
+    return np.concatenate([many._masses, many._geometry], 1)
+
+
+def of_elasticity(many: Variants) -> Array:
+    """Geometry, then elasticity."""
+    return np.concatenate([many._geometry, many._elastic], 1)
+
+
+def forward(robot: Robot) -> Asked:
+    """Of q to pose, position and rotation."""
+    return robot.engine.forward, of_geometry
+
+
+def anywhere(robot: Robot) -> Asked:
+    """As :func:`forward`, one program for machines of every structure."""
+    return free_forward(robot.engine), of_geometry
+
+
+def inverse(robot: Robot) -> Asked:
+    """Of the pose to q of some assembly."""
+    return robot.inverse_kernel, of_geometry
+
+
+def jacobian(robot: Robot) -> Asked:
+    """Of q to pose rates per joint rate."""
+    return robot.engine.jacobian, of_geometry
+
+
+def acceleration(robot: Robot) -> Asked:
+    """Of q, qd, qdd to the pose's second derivative."""
+    return robot.engine.acceleration, of_geometry
+
+
+def singularity(robot: Robot) -> Asked:
+    """Of q to the index."""
+    return robot.singularity_kernel(), of_geometry
+
+
+def torques(robot: Robot) -> Asked:
+    """Of q, qd, qdd and wrench to efforts."""
+    return torques_kernel(robot), of_masses
+
+
+def masses(robot: Robot) -> Asked:
+    """Of q to the mass matrix."""
+    return masses_kernel(robot), of_masses
+
+
+def compliance(robot: Robot) -> Asked:
+    """Of q to the compliance and the measure of its frame."""
+    return elastic_of(robot).compliance, of_elasticity
+
+
+def torque_gradient(robot: Robot) -> Asked:
+    """Of the torques, by q, qd and qdd."""
+    return motion_gradient(robot), of_masses
+
+
+def torque_numbers(robot: Robot) -> Asked:
+    """Of the torques, by geometry and masses."""
+    return numbers_gradient(robot), of_masses
+
+
+def platform_slopes(robot: Robot) -> Asked:
+    """Of pose, position and rotation, by geometry."""
+    return platform_gradient(robot.engine), of_geometry
+
+
+def pose_motion(robot: Robot) -> Asked:
+    """Of pose, rate and acceleration, by q, qd and geometry."""
+    return pose_motion_gradient(robot.engine), of_geometry
+
+
+def singularity_slopes(robot: Robot) -> Asked:
+    """Of the index, by q and geometry."""
+    return singularity_gradient(robot.engine), of_geometry
+
+
+def compliance_slopes(robot: Robot) -> Asked:
+    """Of the compliance, by q and all numbers."""
+    return compliance_gradient(elastic_of(robot)), of_elasticity

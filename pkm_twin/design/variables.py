@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a design may change: numbers of the file, alone or several together, between bounds.
+
+May import: numpy, pkm_twin's core, the standard library.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Variables:
+    """Variables (d) as parts of their ranges, 0 to 1, and the numbers (p) of the file by them.
+
+    ``own``: the file's values, shape (p,). ``slopes``: of numbers by variables, shape (p, d).
+    ``low``, ``high``: shape (d,), of the first number of each. ``start``: the file's own, (d,).
+    """
+
+    names: tuple[str, ...]
+    paths: tuple[str, ...]
+    own: Array
+    slopes: Array
+    low: Array
+    high: Array
+    start: Array
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @classmethod
+    def of(cls, robot: Robot, vary: Mapping[str, tuple[float, float]]) -> Variables:
+        """Of names (see :func:`pkm_twin.design.optimise.design`) and their bounds.
+
+        :raises ParameterError: a path that there is not, one that is given twice, or bounds that
+            are none.
+        """
+        if not vary:
+            raise ParameterError("vary", None, "at least one PATH=LOW:HIGH")
+        paths: dict[str, tuple[int, float]] = {}
+        names, lows, highs, starts = [], [], [], []
+        for column, (text, (low, high)) in enumerate(vary.items()):
+            parts = [part.strip() for part in text.split(",")]
+            for part in parts:
+                path = part.removeprefix("-").strip()
+                if path in paths:
+                    raise ParameterError("vary", path, "each number once")
+                paths[path] = column, -1.0 if part.startswith("-") else 1.0
+            if parts[0].startswith("-"):
+                raise ParameterError("vary", text, "a first path without a -")
+            if not (math.isfinite(low) and math.isfinite(high) and low < high):
+                raise ParameterError(f"vary {text}", f"{low:g}:{high:g}", "LOW:HIGH, low first")
+            names.append(parts[0])
+            lows.append(low)
+            highs.append(high)
+            starts.append(robot.number(parts[0]))
+        own = np.array([robot.number(path) for path in paths])
+        least, greatest = np.array(lows), np.array(highs)
+        slopes = np.zeros((len(paths), len(names)))
+        for row, (column, side) in enumerate(paths.values()):
+            slopes[row, column] = side * (greatest - least)[column]
+        return cls(
+            tuple(names), tuple(paths), own, slopes, least, greatest,
+            (np.array(starts) - least) / (greatest - least),
+        )  # fmt: skip
+
+    def values(self, y: Array) -> Array:
+        """Numbers of the file of points (k, d), shape (k, p)."""
+        return np.asarray(self.own + (y - self.start) @ self.slopes.T)
+
+    def named(self, y: Array) -> list[float]:
+        """Values of the variables at a point (d,)."""
+        return [float(v) for v in self.low + y * (self.high - self.low)]
+
+
+def parse_vary(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Bounds by name of ``PATH=LOW:HIGH`` texts.
+
+    :raises ParameterError: another form.
+    """
+    found: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, _, bounds = text.rpartition("=")
+        low, _, high = bounds.partition(":")
+        try:
+            pair = float(low), float(high)
+        except ValueError:
+            raise ParameterError("vary", text, "PATH=LOW:HIGH") from None
+        if not name or name in found:
+            raise ParameterError("vary", text, "PATH=LOW:HIGH, each path once")
+        found[name] = pair
+    return found

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exact derivatives of pose and joints: by each other, and by any number of the robot's file.
+
+May import: numpy, pkm_twin's core, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pkm_twin.codegen.arrays import vectors
+from pkm_twin.kinematics.gradients import platform_gradient
+from pkm_twin.kinematics.numbers import file_numbers
+from pkm_twin.machine.geometry import geometry_of
+from pkm_twin.machine.robot import Robot
+
+Array = NDArray[np.float64]
+
+_NONE = np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Derivatives:
+    """Derivatives of r results at a state, in SI units.
+
+    ``state``: by the n or m numbers of the state, shape (..., r, n). ``by``: by numbers of the
+    file, by path, shape (..., r).
+    """
+
+    state: Array
+    by: Mapping[str, Array]
+
+
+def forward_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
+    """Derivatives of :meth:`Robot.forward`: ``state`` by q (..., m, n), ``by[path]`` (..., m).
+
+    Exact to rounding, by the implicit function theorem; the actuated joints are held where a number
+    of the file changes. Of an overconstrained machine the closures that determine it count.
+
+    :param q: joint positions, shape (..., n), rad or m.
+    :param by: dotted paths of numbers of the file, as :func:`pkm_twin.variants` takes them.
+    :raises ParameterError: a path that there is not. Other errors as of ``forward``.
+    """
+    rows = np.eye(len(robot.pose_names), len(robot.pose_names) + 12)
+    return Derivatives(robot.jacobian(q), _by_numbers(robot, q, rows, by))
+
+
+def inverse_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
+    """Derivatives of :meth:`Robot.inverse`: ``state`` by the pose (..., n, m), ``by`` (..., n).
+
+    The pose is held where a number of the file changes.
+
+    :param pose: shape (..., m), m and rad.
+    :raises ParameterError: a path that there is not. Other errors as of ``inverse``.
+    """
+    found = forward_derivatives(robot, robot.inverse(pose), by)
+    back = np.asarray(np.linalg.inv(found.state), np.float64)
+    return Derivatives(
+        back, {path: -(back @ row[..., None])[..., 0] for path, row in found.by.items()}
+    )
+
+
+def platform_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
+    """Twists of the platform: ``state`` per joint rate (..., 6, n), ``by[path]`` (..., 6).
+
+    Translation of the reference point and rotation vector, base axes, by a change of one; arguments
+    and errors as of :func:`forward_derivatives`.
+    """
+    rows = twist_rows(len(robot.pose_names), robot.platform(q)[1])
+    return Derivatives(robot.platform_jacobian(q), _by_numbers(robot, q, rows, by))
+
+
+def twist_rows(m: int, rotation: Array) -> Array:
+    """Weights over pose, position and rotation that give a twist's six parts.
+
+    :param rotation: of the platform now, shape (..., 3, 3).
+    :returns: shape (..., 6, m + 12).
+    """
+    rows = np.zeros((*rotation.shape[:-2], 6, m + 12))
+    rows[..., :3, m : m + 3] = np.eye(3)
+    turns = np.zeros((*rotation.shape[:-2], 3, 3, 3))
+    # Of R' R^T, which is skew, the entry of each axis.
+    for axis, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
+        turns[..., axis, i, :] = rotation[..., j, :]
+    rows[..., 3:, m + 3 :] = turns.reshape(*rotation.shape[:-2], 3, 9)
+    return rows
+
+
+def _by_numbers(robot: Robot, q: ArrayLike, rows: Array, by: Sequence[str]) -> dict[str, Array]:
+    """Sums of rows over pose, position and rotation, by numbers of the file."""
+    if not by:
+        return {}
+    slopes = file_numbers(robot, tuple(by), geometry_numbers).slopes
+    table = _by_geometry(robot, q, rows) @ slopes
+    return {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
+
+
+def pose_by_geometry(robot: Robot, q: ArrayLike) -> Array:
+    """Of the pose by the engine's geometry, joints held, shape (..., m, k)."""
+    return _by_geometry(robot, q, np.eye(len(robot.pose_names), len(robot.pose_names) + 12))
+
+
+def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
+    states = vectors(q, robot.joints_count, "q")[..., None, :]
+    (found,), status = platform_gradient(robot.engine)(_NONE, states, rows)
+    if status is not None:
+        robot.refuse_joints(status, states, (states,))
+    return found
+
+
+def geometry_numbers(robot: Robot) -> list[Any]:
+    """The geometry as ``Engine.geometry`` has it, of numbers or expressions."""
+    return [*geometry_of(robot.make_graph()), *robot.closed_numbers]

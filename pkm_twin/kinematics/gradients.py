@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gradients of programs as programs: by inputs, and by the machine's geometry.
+
+May import: pkm_twin's codegen, this package, the standard library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from pkm_twin.codegen.expressions import Numbers
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics import pose as poses
+from pkm_twin.kinematics.engine import Engine, Traced, forward_program
+
+
+def gradient_program(t: Traced, program: Program, by: Mapping[str, Numbers]) -> Program:
+    """The gradient of a sum of a program's outputs times ``weights``, an input of their number.
+
+    :param by: inputs by which, by name of the output.
+    """
+    results = [e for row in program.outputs.values() for e in row]
+    weights = t.tape.inputs("weights", len(results))
+    wanted = [e for row in by.values() for e in row]
+    found = iter(t.lift(t.gradient(list(zip(results, weights, strict=True)), wanted)))
+    outputs = {name: [next(found) for _ in row] for name, row in by.items()}
+    inputs = {**program.inputs, "weights": len(results)}
+    return Program(inputs, program.parameters, outputs, program.equations, quick=True)
+
+
+def platform_gradient(engine: Engine) -> Kernel:
+    """Program of sums of pose, position and rotation: q and weights (m + 12) to the geometry's."""
+    return engine.kernel("platform gradient", _by_geometry, free=True)
+
+
+def pose_motion_gradient(engine: Engine) -> Kernel:
+    """Program of the gradient of sums of pose, rates and accelerations of the pose.
+
+    q, qd, qdd and weights (3 m) to derivatives by q (n), qd (n) and the geometry.
+    """
+    return engine.kernel("pose motion gradient", _pose_motion, free=True)
+
+
+def free_forward(engine: Engine) -> Kernel:
+    """As :attr:`Engine.forward`, for machines of every structure."""
+    return engine.kernel(
+        "free forward", lambda t: replace(forward_program(t), quick=True), free=True
+    )
+
+
+def _by_geometry(t: Traced) -> Program:
+    return gradient_program(t, forward_program(t), {"geometry": t.geometry})
+
+
+def _pose_motion(t: Traced) -> Program:
+    t.solve()
+    qd, qdd = t.tape.inputs("qd", t.joints), t.tape.inputs("qdd", t.joints)
+    t.set_rates(qd)
+    t.set_accelerations(qdd)
+    motion, graph, of = t.motion, t.graph, t.engine.coordinates
+    position, rotation = motion.platform()
+    body, omega = graph.platform, motion.omega[graph.platform]
+    velocity = motion.velocity(body, graph.origin)
+    second = poses.accelerations(
+        of, rotation, omega, motion.acceleration(body, graph.origin), motion.alpha[body]
+    )
+    outputs = {
+        "pose": t.lift(poses.values(of, position, rotation)),
+        "rates": t.lift(poses.rates(of, rotation, velocity, omega)),
+        "accelerations": t.lift(second),
+    }
+    sizes = {"q": t.joints, "qd": t.joints, "qdd": t.joints}
+    return gradient_program(
+        t, Program(sizes, 0, outputs, t.equations()), {"q": t.q, "qd": qd, "geometry": t.geometry}
+    )

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`pkm-twin design` as a user runs it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pkm_twin.machine.catalogue import load
+
+VARY = ("--vary", "geometry.arm_length=0.15:0.3", "--vary", "geometry.forearm_length=0.3:0.6")
+TOLERANCES = ("--tolerance", "geometry.arm_length=1e-4", "--tolerance", "geometry.base_radius=5e-5")
+
+
+def good(result):
+    assert result.code == 0, result.err
+    return result
+
+
+@pytest.fixture
+def pick(tmp_path, twin):
+    out = tmp_path / "pick.csv"
+    line = ("path", "delta", "--cycle", "25,200,25", "--duration", "0.5", "--rate", "100")
+    good(twin(*line, "--no-picture", "--out", out))
+    return out
+
+
+def test_a_better_robot_is_written_and_loads(twin, pick, tmp_path):
+    out, picture = tmp_path / "better.yaml", tmp_path / "better.png"
+    line = ("design", "delta", *VARY, "--path", pick, "--minimise", "peak-effort")
+    bound = ("--subject-to", "singularity>=0.2", "--starts", "8")
+    files = ("--out", out, "--picture", picture)
+    data = json.loads(good(twin(*line, *bound, *files, "--json")).out)
+    peak, index = data["quantities"]["peak-effort"], data["quantities"]["singularity"]
+    assert peak["after"] < peak["before"] and peak["unit"] == "N m"
+    assert index["after"] >= 0.2 - 1e-6
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    better = load(out)
+    for path, value in data["numbers"].items():
+        assert better.number(path) == pytest.approx(value, rel=1e-10)
+    assert twin(*line, *files).code == 1
+
+
+def test_a_sweep_is_a_file_with_the_variables_as_axes(twin, pick, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    out = tmp_path / "box.nc"
+    line = ("design", "delta", *VARY, "--path", pick, "--sweep", "grid", "--samples", "4")
+    assert json.loads(good(twin(*line, "--out", out, "--json")).out)["machines"] == 16
+    with xarray.open_dataset(out, engine="h5netcdf") as data:
+        assert data["peak-effort"].shape == (4, 4)
+        assert data["peak-effort"].attrs["units"] == "N m"
+        np.testing.assert_allclose(data["geometry.arm_length"], np.linspace(0.15, 0.3, 4))
+        assert np.isfinite(data["singularity"]).any()
+
+
+def test_a_budget_names_each_contribution(twin, pick):
+    for where in ((), ("--path", pick)):
+        data = json.loads(good(twin("design", "delta", *TOLERANCES, *where, "--json")).out)
+        parts = data["contributions"].values()
+        assert sum(part["share"] for part in parts) == pytest.approx(1.0)
+        squares = sum(part["rms_position_m"] ** 2 for part in parts)
+        assert data["rms_position_m"] == pytest.approx(np.sqrt(squares))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        ("--minimise", "mass"),
+        ("--vary", "geometry.arm_length=0.3:0.15", "--minimise", "mass"),
+        ("--vary", "geometry.arm_length", "--minimise", "mass"),
+        ("--vary", "geometry.arm=0.1:0.2", "--minimise", "mass"),
+        (*VARY, "--minimise", "torque"),
+        (*VARY, "--minimise", "mass", "--subject-to", "mass>=1"),
+        (*VARY, "--minimise", "deflection"),
+        (*VARY, "--sweep", "circle", "--out", "no.nc"),
+        (*VARY, "--sweep", "grid"),
+        (*VARY,),
+    ],
+)
+def test_what_cannot_be_asked_is_rejected_in_a_line(twin, pick, line):
+    result = twin("design", "delta", "--path", pick, *line)
+    assert result.code in (1, 2) and not result.out
+    assert "Traceback" not in result.err

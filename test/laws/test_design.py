@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Design for a path: gradients against differences, optima against grids of machines."""
+
+from __future__ import annotations
+
+from time import process_time
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin import variants
+from pkm_twin.design import PosePath, design, pose_errors, sweep
+from pkm_twin.design.pose_path import Followed
+from pkm_twin.design.quantities import QUANTITIES
+from pkm_twin.design.tolerance import workspace_states
+from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.kinematics.engine import Engine
+from pkm_twin.machine.entries import with_entries
+from pkm_twin.paths import cycle, timed
+from test.laws.test_derivatives import POINTS, WEIGHTS
+from test.support.robots import load, partly_long
+
+NUMBERS = {
+    "delta": ["geometry.arm_length", "geometry.forearm_length", "inertia.platform_mass"],
+    "delta_cu": ["geometry.arm_length", "geometry.base_radius"],
+    "stewart": ["limbs.joints.foot_a.at[0]", "joints.ball_b_2.at[1]", "bodies.platform.mass"],
+}
+BOX = {"geometry.arm_length": (0.1, 0.4), "geometry.forearm_length": (0.25, 0.7)}
+
+
+def wave(name, samples=7):
+    """A path near home that stops nowhere, with a wrench."""
+    robot, rng = load(name), np.random.default_rng(3)
+    units = np.array([robot.graph.size if u == "m" else 1.0 for u in robot.joint_units])
+    time, n = np.linspace(0.0, 0.4, samples), robot.joints_count
+    phase, speed = rng.uniform(0.0, 6.0, n), 9.0
+    angle = speed * time[:, None] + phase
+    q = robot.graph.home + 0.02 * units * np.sin(angle) + 0.01 * units
+    qd, qdd = 0.02 * units * speed * np.cos(angle), -0.02 * units * speed**2 * np.sin(angle)
+    return (
+        robot,
+        (time, q, qd, qdd),
+        PosePath.of_joints(robot, time, q, qd, qdd, rng.normal(size=6)),
+    )
+
+
+@pytest.fixture(scope="module")
+def picking():
+    """The Delta's pick-and-place path."""
+    robot = load("delta")
+    motion = timed(robot, cycle(robot, 0.025, 0.2, 0.025), duration=0.5).uniform(100.0)
+    path = PosePath.of_joints(robot, motion.time, motion.q, motion.qd, motion.qdd)
+    return robot, path
+
+
+@pytest.mark.parametrize("name", partly_long(("delta", "delta_cu", "stewart"), "delta"))
+def test_joints_follow_and_gradients_are_those_of_differences(name):
+    robot, (_, q, qd, qdd), path = wave(name)
+    own = {number: robot.number(number) for number in NUMBERS[name]}
+    many = variants(robot, own)
+    f = Followed(many, path)
+    for found, given in ((f.q, q), (f.qd, qd), (f.qdd, qdd)):
+        np.testing.assert_allclose(found[0], given, rtol=0, atol=1e-11)
+    rng = np.random.default_rng(0)
+    weights, rates = rng.normal(size=(2, *q.shape))
+    table = rng.normal(size=(len(q), 6, 6))
+    slopes = [f.effort_slopes(weights, rates), f.singularity_slopes()]
+    elastic = name != "stewart"
+    if elastic:
+        slopes.append(f.compliance_slopes(table))
+    for k, number in enumerate(own):
+        step = 1e-3 * abs(own[number])
+        values = np.tile(list(own.values()), (len(POINTS), 1))
+        values[:, k] += step * POINTS
+        near = Followed(many.with_values(values), path)
+        sums = [(near.efforts * weights + near.qd * rates).sum(-1), near.singularity]
+        if elastic:
+            sums.append((near.compliance * table).sum((-1, -2)))
+        for found, of, told in zip(slopes, sums, ("effort", "index", "compliance"), strict=True):
+            if told == "index" and name == "stewart":
+                continue  # the farthest of several joints as far as each other: a kink
+            expected = WEIGHTS @ of / step
+            size = max(np.abs(expected).max(), 1e-6 * np.abs(of).max() / step)
+            np.testing.assert_allclose(found[:, k], expected, rtol=0, atol=1e-8 * size)
+
+
+def test_quantities_are_those_of_each_machine_by_itself(picking):
+    robot, path = picking
+    many = variants(robot, {"geometry.arm_length": [0.19, 0.24], "inertia.platform_mass": 0.3})
+    f = Followed(many, path)
+    peak, rms, energy, mass = (
+        q.worst(q.pieces(f))
+        for q in map(QUANTITIES.get, ("peak-effort", "rms-effort", "energy", "mass"))
+    )
+    for k, machine in enumerate(many):
+        q = machine.inverse(path.pose)
+        qd = np.linalg.solve(machine.jacobian(q), path.rate[..., None])[..., 0]
+        # Accelerations from rates alone, by differences of positions half a sample away.
+        h = 1e-5
+        ahead = path.pose + h * path.rate + 0.5 * h * h * path.acceleration
+        behind = path.pose - h * path.rate + 0.5 * h * h * path.acceleration
+        qdd = (machine.inverse(ahead) - 2.0 * q + machine.inverse(behind)) / h**2
+        tau = inverse_dynamics(machine, q, qd, qdd)
+        assert peak[k] == pytest.approx(np.abs(tau).max(), rel=1e-4)
+        whole = path.time[-1] - path.time[0]
+        squares = np.trapezoid if hasattr(np, "trapezoid") else np.trapz
+        assert rms[k] == pytest.approx(
+            np.sqrt(squares(tau**2, path.time, axis=0) / whole).max(), rel=1e-4
+        )
+        power = np.maximum(tau * qd, 0.0)
+        assert energy[k] == pytest.approx(squares(power, path.time, axis=0).sum(), rel=1e-4)
+        bodies = [body.mass for body in machine.graph.bodies.values()]
+        assert mass[k] == pytest.approx(
+            sum(bodies) + sum(r.mass for r in machine.graph.rods.values())
+        )
+
+
+@pytest.mark.parametrize("aim", partly_long(("peak-effort", "energy"), "peak-effort"))
+def test_the_optimum_is_that_of_a_grid_of_machines(picking, aim):
+    robot, path = picking
+    result = design(robot, BOX, path, aim, ["singularity>=0.1"], starts=8)
+    table = sweep(robot, BOX, path, [aim, "singularity"], 25)
+    kept = np.where(table.quantities["singularity"] >= 0.1, table.quantities[aim], np.inf)
+    found = result.best.quantities[aim]
+    assert 0.95 * np.nanmin(kept) < found < 1.0002 * np.nanmin(kept)
+    assert result.best.feasible and result.best.quantities["singularity"] >= 0.1 - 1e-6
+    assert result.rejected > 0 and np.isnan(table.quantities[aim]).any()
+    for number, value in result.best.numbers.items():
+        assert result.robot.number(number) == value
+        assert BOX[number][0] <= value <= BOX[number][1]
+
+
+@pytest.mark.long
+def test_a_pareto_front_falls(picking):
+    robot, path = picking
+    aims = ("peak-effort", "energy")
+    result = design(robot, BOX, path, aims, ["singularity>=0.1"], starts=16, points=4)
+    table = np.array([[point.quantities[aim] for aim in aims] for point in result.front])
+    assert len(table) == 4 and all(point.feasible for point in result.front)
+    assert (np.diff(table[:, 0]) > 0.0).all() and (np.diff(table[:, 1]) < 0.0).all()
+
+
+def test_several_numbers_change_together(picking):
+    robot, path = picking
+    name = "inertia.arm_mass, -inertia.platform_mass"
+    low = robot.number("inertia.arm_mass")
+    result = design(robot, {name: (low, low + 0.05)}, path, "mass")
+    both = result.best.numbers
+    moved = both["inertia.arm_mass"] - low
+    rest = robot.number("inertia.platform_mass") - both["inertia.platform_mass"]
+    assert moved == pytest.approx(rest, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("vary", "aim", "bounds", "error"),
+    [
+        ({"geometry.arm": (0.1, 0.2)}, "mass", [], ParameterError),
+        ({"geometry.arm_length": (0.2, 0.1)}, "mass", [], ParameterError),
+        (BOX, "torque", [], UnknownNameError),
+        (BOX, "singularity", [], ParameterError),
+        (BOX, "deflection", [], ParameterError),
+        (BOX, "mass", ["singularity<=0.1"], ParameterError),
+        (BOX, "mass", ["mass"], ParameterError),
+        pytest.param(BOX, "mass", ["singularity>=0.99"], PkmTwinError, marks=pytest.mark.long),
+        ({"geometry.forearm_length": (0.05, 0.1)}, "mass", [], PkmTwinError),
+    ],
+)
+def test_what_cannot_be_designed_is_rejected(picking, vary, aim, bounds, error):
+    robot, path = picking
+    with pytest.raises(error):
+        design(robot, vary, path, aim, bounds, starts=4)
+
+
+def test_an_error_budget_is_that_of_drawn_machines():
+    robot = load("delta_cu")
+    sigma = {
+        "geometry.arm_length": 2e-5,
+        "geometry.base_radius": 1e-5,
+        "geometry.platform_radius": 3e-5,
+    }
+    q = workspace_states(robot, 20)
+    found = pose_errors(robot, q, sigma)
+    rng, count = np.random.default_rng(0), 4000
+    drawn = {path: robot.number(path) + s * rng.normal(size=count) for path, s in sigma.items()}
+    position, _ = variants(robot, drawn).platform(np.broadcast_to(q, (count, *q.shape)))
+    apart = position - robot.platform(q)[0]
+    np.testing.assert_allclose(found.position, np.sqrt((apart**2).mean(0).sum(-1)), rtol=0.05)
+    assert sum(found.share(path) for path in sigma) == pytest.approx(1.0)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+def test_an_optimiser_that_compiles_each_machine_finds_no_better_one(picking, monkeypatch):
+    robot, path = picking
+    began = process_time()
+    found = design(robot, BOX, path, "peak-effort", ["singularity>=0.1"], starts=16)
+    took = process_time() - began
+    structure = Engine.structure.func
+    monkeypatch.setattr(Engine, "structure", property(lambda e: structure(e) + e.graph.key))
+    counted = 0
+
+    def asked(x):
+        """Peak effort of the machine as a robot of its own; much where it misses a bound."""
+        nonlocal counted
+        counted += 1
+        try:
+            machine = with_entries(robot, dict(zip(BOX, x.tolist(), strict=True)))
+            q = machine.inverse(path.pose)
+            miss = 0.1 - machine.singularity(q).min()
+            qd = np.linalg.solve(machine.jacobian(q), path.rate[..., None])
+            bias = machine.pose_acceleration(q, qd[..., 0], np.zeros_like(q))
+            qdd = np.linalg.solve(machine.jacobian(q), (path.acceleration - bias)[..., None])
+            tau = inverse_dynamics(machine, q, qd[..., 0], qdd[..., 0])
+        except (PkmTwinError, ValueError):
+            return 1e3
+        return np.abs(tau).max() + 1e3 * max(0.0, miss)
+
+    start = np.array([robot.number(number) for number in BOX])
+    began = process_time()
+    other = minimize(
+        asked, start, method="Nelder-Mead", bounds=list(BOX.values()),
+        options={"xatol": 1e-4, "fatol": 1e-4},
+    )  # fmt: skip
+    theirs = process_time() - began
+    print(
+        f"design {found.best.quantities['peak-effort']:.5f} N m in {took:.2f} s, "
+        f"Nelder-Mead {other.fun:.5f} N m in {theirs:.1f} s, {counted} machines compiled"
+    )
+    assert found.best.quantities["peak-effort"] <= 1.005 * other.fun
+    assert took < theirs / 20.0
