@@ -151,7 +151,7 @@ def check(
     jobs: Annotated[int, typer.Option(help="processes for a folder of bags", min=1)] = 1,
     as_json: Json = False,
 ) -> None:
-    """Compare a recording with the model, or all recordings of a folder.
+    """Compare a recording, or a folder of them, with the model.
 
     Checks that the file is complete, that a node would accept every joint state and wrench, that
     there are no gaps, that joints stay inside their limits and away from singularities, and that
