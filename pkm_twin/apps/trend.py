@@ -13,7 +13,6 @@ from typing import Annotated, Any, Final, Optional
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from scipy import stats  # type: ignore[import-untyped]
 
 from pkm_twin.apps.history import Series, read_history
 from pkm_twin.apps.options import Json
@@ -80,6 +79,8 @@ def judged(series: Series, baseline: int, alarm: float) -> Judged:
 
     :param alarm: chance of a false alarm of this series.
     """
+    from scipy import stats  # type: ignore[import-untyped]
+
     y, k = series.value, len(series.value)
     if k < FEWEST:
         none = math.nan
