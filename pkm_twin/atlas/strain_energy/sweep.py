@@ -262,7 +262,7 @@ def _layers(robot: Robot, step: float) -> tuple[Array, Array]:
     reach = circles(robot, ticks)
     kept = reach.radius >= LEAST_RADIUS
     if not kept.any():
-        raise ParameterError("limits", robot.name, "limits that leave a regular workspace")
+        raise ParameterError("limits", robot.name, "limits that leave room for an inscribed circle")
     return reach.z[kept], reach.radius[kept]
 
 
