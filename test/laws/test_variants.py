@@ -302,8 +302,9 @@ def test_closures_that_are_left_out_follow_from_the_others():
 
 def test_a_robot_that_is_rigid_has_no_compliance():
     data = parameters_of("five_bar")
-    for body in data["bodies"].values():
-        body.pop("member", None)
+    for entry in [*data["bodies"].values(), *data["joints"].values()]:
+        entry.pop("member", None)
+        entry.pop("compliance", None)
     robot = robot_of_data(data, "rigid")
     with pytest.raises(ParameterError):
         variants(robot, {"payload.mass": [0.0, 1.0]}).compliance(robot.home())
