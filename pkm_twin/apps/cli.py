@@ -16,6 +16,7 @@ from rich.text import Text
 
 from pkm_twin.apps import export
 from pkm_twin.apps.calibrate import calibrate_command
+from pkm_twin.apps.drive_friction import drive_friction_command
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
@@ -541,6 +542,7 @@ def certify(
 app.add_typer(atlases.app, name="atlas")
 app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
+app.command("drive-friction")(drive_friction_command)
 app.command("path")(path_command)
 app.command()(size)
 app.command()(guard_check)

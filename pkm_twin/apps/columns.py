@@ -34,6 +34,8 @@ MAX_CSV_LINE = 1024**2
 def read_columns(path: Path) -> dict[str, Array]:
     """Columns of a CSV with a header row, by name, shape (rows,) each.
 
+    Lines above the header that begin with # are comments.
+
     :raises ParameterError: not readable, too large, or a value is no finite number.
     """
     try:
@@ -97,12 +99,15 @@ def _lines(text: TextIO, path: Path) -> Iterator[str]:
 
 
 def _parse_columns(path: Path, rows: Iterator[list[str]]) -> dict[str, Array]:
-    header = [name.strip() for name in next(rows, [])]
+    first, above = next(rows, []), 0
+    while first and first[0].startswith("#"):
+        first, above = next(rows, []), above + 1
+    header = [name.strip() for name in first]
     if len(set(header)) != len(header):
         raise ParameterError(f"{path}: header row", ", ".join(header), "different names")
     data = array.array("d")
-    number = 1
-    for number, row in enumerate(rows, 2):
+    number = 1 + above
+    for number, row in enumerate(rows, 2 + above):
         if len(row) != len(header):
             raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
         try:
