@@ -54,6 +54,7 @@ setup(
         (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
         (f"share/{NAME}/config/drives", sorted(glob("config/drives/*.yaml"))),
         (f"share/{NAME}/examples", sorted(glob("examples/*.py") + glob("examples/*.md"))),
+        (f"share/{NAME}/examples/machines/hexapod", sorted(glob("examples/machines/hexapod/*"))),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py") + glob("launch/*.yaml"))),
         (f"share/{NAME}/view", sorted(glob("launch/view/*"))),
     ],

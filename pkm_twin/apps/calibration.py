@@ -9,14 +9,16 @@ after are those of the loaded robots.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.apps.calibration_faults import (
+    HALF,
     MOVED,
     Fault,
     Outlier,
@@ -40,12 +42,14 @@ from pkm_twin.apps.calibration_state import (
     start_of,
     value_of,
 )
+from pkm_twin.apps.transmission import Transmission, by_map, numbers
 from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
 from pkm_twin.identification.robust import Weighed, weighed
 from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.kinematics.maximal import GraphChange, Placement
 from pkm_twin.kinematics.sensitivity import platform_twists
 from pkm_twin.machine.entries import data_of, entries
+from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import skew
 
@@ -62,6 +66,8 @@ SAME: Final = 1e-4
 SHOWN: Final = 0.1
 """Part of the greatest weight below which a number is not named in a combination."""
 STEPS: Final = 60
+WEIGHED: Final = 12
+"""Steps after which noise and weights stay: else they and the fit may go round in circles."""
 POOR: Final = 0.25
 GOOD: Final = 0.75
 """Parts of what a linear machine would gain: below the one steps are damped more, above less."""
@@ -71,8 +77,8 @@ CONVERGED: Final = 1e-3
 """Part of its deviation by which no parameter moves in the last step."""
 GAINED: Final = 1e-4
 """Or by which the sum of squares over the noise falls."""
-CONTROLLER: Final = "controller units"
-"""Of a joint's sensor whose numbers are not the model's in rad or m."""
+LINEAR: Final = re.compile(r"\.(at|ends)\[|^origin\[|\.home$")
+"""Numbers in which the graph of a machine's file is linear."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
 
 
@@ -117,6 +123,8 @@ class Calibration:
     """Squares of the machine's changes over their prior standard deviations, summed."""
     placed: bool = False
     """Whether another place of the instrument may explain the poses better."""
+    joint_map: JointMap = field(default_factory=lambda: JointMap.of((), {}))
+    """With the fitted numbers."""
 
     @property
     def _unknown(self) -> Array:
@@ -192,6 +200,7 @@ def calibrate(
     frame: bool = False,
     target: bool = False,
     prior: float = 0.01,
+    transmission: Transmission = Transmission.AUTO,
     accept: bool = False,
     progress: Callable[[int], None] = lambda _: None,
 ) -> Calibration:
@@ -202,12 +211,19 @@ def calibrate(
     :param paths: numbers of the robot's file, of :func:`geometric`.
     :param prior: standard deviation that lengths have without the poses, m; angles have it at the
         platform's radius.
+    :param transmission: which ratios of the joint map are fitted; ``auto``: those of sliding joints
+        that have one.
     :param accept: calibrate with poses that this machine was not in, too.
     :raises ParameterError: too few poses, poses of another machine, unit or frame, poses that tell
         no number, or a fit that does not settle.
     """
     extra = [*(FRAME if frame else ()), *(TARGET if target else ())]
-    parameters = _parameters(robot, paths, offsets, extra, prior)
+    q = robot.controller.positions(poses.joints)
+
+    def listed(extra: Sequence[str]) -> list[Parameter]:
+        return _parameters(robot, q, paths, offsets, transmission, extra, prior)
+
+    parameters = listed(extra)
 
     def fitted(frame: bool, parameters: Sequence[Parameter]) -> tuple[Calibration, State]:
         return _calibrated(robot, poses, parameters, frame, prior, progress)
@@ -216,9 +232,8 @@ def calibrate(
         """The same with the instrument's frame; None where that is no machine either."""
         if frame:
             return None
-        more = _parameters(robot, paths, offsets, [*FRAME, *extra], prior)
         try:
-            other = fitted(True, more)
+            other = fitted(True, listed([*FRAME, *extra]))
         except PkmTwinError:
             return None
         return None if other[0].faults else other
@@ -233,7 +248,8 @@ def calibrate(
     if result.faults or result.cost > MOVED or result.placed:
         other = placed()
         if other is not None and (
-            result.faults or result.cost - other[0].cost > MOVED
+            result.faults
+            or (result.cost - other[0].cost > MOVED and other[0].cost < HALF * result.cost)
             or other[0].noise < 0.5 * result.noise
         ):  # fmt: skip
             result = replace(result, faults=(_place(other[1]), *result.faults))
@@ -257,8 +273,9 @@ def _learnt(poses: Poses) -> NDArray[np.bool_]:
 
 
 def _parameters(
-    robot: Robot, paths: Sequence[str], offsets: bool, extra: Sequence[str], prior: float
-) -> list[Parameter]:
+    robot: Robot, q: Array, paths: Sequence[str], offsets: bool, transmission: Transmission,
+    extra: Sequence[str], prior: float,
+) -> list[Parameter]:  # fmt: skip
     """What is fitted, as it is before."""
     known = entries(robot)
     angle = prior / robot.size
@@ -269,28 +286,26 @@ def _parameters(
         Parameter(path, known[path][1], known[path][0], prior if known[path][1] == "m" else angle)
         for path in fitted
     ]
-    if offsets:
-        for joint, unit, factor, old in zip(
-            robot.joint_names, robot.joint_units, robot.controller.factors,
-            robot.controller.offsets, strict=True,
-        ):  # fmt: skip
-            size = (prior if unit == "m" else angle) * abs(factor)
-            own = unit if abs(factor) == 1.0 else CONTROLLER
-            parameters.append(Parameter(f"joint_map.{joint}.offset", own, float(old), float(size)))
+    mapped = numbers(robot, q, transmission, offsets, prior, angle)
+    parameters += [Parameter(*number) for number in mapped]
     # Where the instrument stands is not known at all.
     far = 100.0 * robot.engine.tree.size
-    return parameters + [
+    return parameters + _placing(extra, far)
+
+
+def _placing(names: Sequence[str], far: float) -> list[Parameter]:
+    return [
         Parameter(name, "rad" if name[-2] == "r" else "m", 0.0, 10.0 if name[-2] == "r" else far)
-        for name in extra
+        for name in names
     ]
 
 
 def _looks_placed(
-    robot: Robot, state: State, poses: Poses, table: Array, told: Sequence[Parameter]
-) -> bool:
+    robot: Robot, state: State, poses: Poses, noise: Weighed, table: Array,
+    told: Sequence[Parameter],
+) -> bool:  # fmt: skip
     parts = state.parts(poses)
-    noise = weighed(parts, len(told))
-    six = _parameters(robot, (), False, FRAME, 1.0)
+    six = _placing(FRAME, 1.0)
     columns = _derivatives(robot, state, six)
     halves = [columns[:, :3], columns[:, 3:]][: len(parts)]
     asked = [(p.before - p.value) / p.prior for p in told]
@@ -349,7 +364,8 @@ def _calibrated(
         built, tuple(told), covariance, condition, noise.noise[0],
         noise.noise[1] if len(noise.noise) > 1 else None, fitted_errors, held_errors, steps,
         outliers, tuple(faults), cost_of(changes),
-        not frame and _looks_placed(robot, after, learnt, information, told),
+        not frame and _looks_placed(robot, after, learnt, noise, information, told),
+        after.instrument.map,
     )  # fmt: skip
     return result, after
 
@@ -370,11 +386,24 @@ def _fit(
     def right(state: State, values: Array, noise: Weighed) -> Array:
         return np.concatenate([noise.over(state.parts(poses)), (centre - values) / prior])
 
-    damping, problem = 0.0, f"{STEPS} steps"
+    constant: dict[str, GraphChange] = {}
+    # Errors of drives in metres are not those of drives in radians.
+    alike = len(set(robot.joint_units)) == 1
+    drives = [Parameter(f"joint_map.{j}.offset", "", 0.0, 1.0) for j in robot.joint_names if alike]
+    damping, problem, settled = 0.0, f"{STEPS} steps", False
+    # By the residuals of the instrument alone first: then the drives' part of them is known.
     for steps in range(1, STEPS + 1):
         progress(1)
-        noise = weighed(state.parts(poses), len(parameters))
-        columns = _derivatives(robot, state, parameters)
+        columns = _derivatives(robot, state, [*parameters, *drives], constant)
+        if settled and drives:
+            slopes = state.instrument.map.slopes(state.q)
+            by_drives = columns[..., len(parameters) :] * slopes[:, None]
+            noise = weighed(state.parts(poses), len(parameters), by_drives)
+            drives = []
+        elif steps <= WEIGHED and (drives or not alike):
+            noise = weighed(state.parts(poses), len(parameters))
+        last, settled = not drives, False
+        columns = columns[..., : len(parameters)]
         halves = [columns[:, :3], columns[:, 3:]][: len(noise.noise)]
         table = noise.over(halves)
         left, before = np.vstack([table, np.diag(1.0 / prior)]), right(state, values, noise)
@@ -402,11 +431,15 @@ def _fit(
         if trial is None:
             break
         state, values = trial, values + move
-        if settled:
+        if settled and last:
             return state, values, covariance, table * prior, noise, steps
+        order = np.argsort(-np.abs(move) / np.sqrt(np.diag(covariance)))[:3]
+        problem = f"{steps} steps, {', '.join(parameters[k].name for k in order)} still move"
         if gained > GOOD:
             damping = 0.1 * damping if damping > 1.0 else 0.0
-    raise _UnsettledError("poses", problem, "poses to which a fit settles")
+    raise _UnsettledError(
+        "poses", problem, "poses to which a fit settles: measure more, or fit less (--only)"
+    )
 
 
 def _move(left: Array, right: Array, damping: Array) -> Array:
@@ -433,17 +466,26 @@ def _stepped(
     return moved(robot, state, poses, new, turn)
 
 
-def _derivatives(robot: Robot, state: State, parameters: Sequence[Parameter]) -> Array:
-    """Of predicted positions and rotations by the parameters, shape (k, 6, parameters)."""
+def _derivatives(
+    robot: Robot, state: State, parameters: Sequence[Parameter],
+    constant: dict[str, GraphChange] | None = None,
+) -> Array:  # fmt: skip
+    """Of predicted positions and rotations by the parameters, shape (k, 6, parameters).
+
+    :param constant: changes of the graph that stay the same in all steps; filled here.
+    """
     tool, joints = state.instrument, robot.joint_names
     position, rotation = state.platform
     paths = [p.name for p in parameters if not p.name.startswith(BESIDE)]
-    changes = [change_of(robot, state.data, path) for path in paths]
+    kept = {} if constant is None else constant
+    changes = [kept.get(path) or change_of(robot, state.data, path) for path in paths]
+    linear = not any("azimuth" in path for path in paths) and robot.mechanism == "machine"
+    kept |= {p: c for p, c in zip(paths, changes, strict=True) if linear and LINEAR.search(p)}
     changes += [GraphChange.of_joint(state.graph, joint) for joint in joints]
     twists, _ = platform_twists(state.graph, state.q, state.placement, changes)
-    twists[..., len(paths) :] /= -robot.controller.factors
-    names = [*paths, *(f"joint_map.{joint}.offset" for joint in joints)]
-    by_name = dict(zip(names, np.moveaxis(twists, -1, 0), strict=True))
+    by_joints = twists[..., len(paths) :]
+    by_name = dict(zip(paths, np.moveaxis(twists[..., : len(paths)], -1, 0), strict=True))
+    by_name |= by_map(robot, tool.map, state.q, by_joints)
     turn = tool.frame.as_matrix()
     lever = rotation @ tool.target
     out = np.zeros((len(state.q), 6, len(parameters)))

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.apps.transmission import centred, changed
 from pkm_twin.kinematics.maximal import GraphChange, Placement, assembled
 from pkm_twin.machine.entries import data_of, number_at, put
 from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.robot import Robot
 
 if TYPE_CHECKING:
@@ -69,14 +71,14 @@ class Errors:
 class Instrument:
     """What is fitted beside the machine: its joints' sensors, where the instrument stands."""
 
-    offsets: Array
+    map: JointMap
     frame: Rotation = field(default_factory=lambda: rotations().identity())
     place: Array = field(default_factory=lambda: np.zeros(3))
     target: Array = field(default_factory=lambda: np.zeros(3))
 
-    def joints(self, robot: Robot, poses: Poses) -> Array:
+    def joints(self, poses: Poses) -> Array:
         """The model's joint positions (k, n) at measured poses."""
-        return robot.controller.positions(poses.joints - self.offsets)
+        return self.map.positions(poses.joints)
 
     def seen(self, position: Array, rotation: Array) -> tuple[Array, Array]:
         """What it should see of the platform: positions and rotations in its own frame."""
@@ -95,7 +97,7 @@ class Instrument:
 
     def parts(self, robot: Robot, poses: Poses) -> list[Array]:
         """Of a loaded robot: residuals of positions and, where measured, rotations, (k, 3) each."""
-        both = self.residuals(poses, *robot.platform(self.joints(robot, poses)))
+        both = self.residuals(poses, *robot.platform(self.joints(poses)))
         return [part for part in both if part is not None]
 
     def errors(self, robot: Robot, poses: Poses) -> Errors:
@@ -150,8 +152,8 @@ def start_of(robot: Robot, poses: Poses) -> State:
 
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     """
-    instrument = Instrument(np.zeros(robot.joints_count))
-    q = instrument.joints(robot, poses)
+    instrument = Instrument(centred(robot, robot.controller.positions(poses.joints)))
+    q = instrument.joints(poses)
     return State(data_of(robot), robot.graph, q, Placement.of(robot, q), instrument)
 
 
@@ -182,13 +184,9 @@ def moved(
     :param turn: of the instrument's frame since ``state``, a rotation vector, shape (3,), rad.
     :raises ParameterError: numbers that no file may have, or no machine can be assembled with.
     """
-    old, tool = robot.controller.offsets, state.instrument
-    offsets = [
-        values.get(f"joint_map.{j}.offset", o) - o
-        for j, o in zip(robot.joint_names, old, strict=True)
-    ]
+    tool = state.instrument
     new = Instrument(
-        np.array(offsets),
+        changed(robot, tool.map, values),
         rotations().from_rotvec(turn) * tool.frame,
         np.array([values.get(n, v) for n, v in zip(FRAME[:3], tool.place, strict=True)]),
         np.array([values.get(n, v) for n, v in zip(TARGET, tool.target, strict=True)]),
@@ -196,5 +194,5 @@ def moved(
     numbers = {n: v for n, v in values.items() if not n.startswith(BESIDE)}
     data = data_of(robot, numbers)
     graph = type(robot).graph_of(data) if numbers else state.graph
-    q = new.joints(robot, poses)
+    q = new.joints(poses)
     return State(data, graph, q, assembled(graph, q, state.placement), new)

@@ -137,7 +137,7 @@ def _line(table: Array, values: Array) -> tuple[Array, Array]:
     left = values - table @ found
     freedoms = max(1, len(values) - table.shape[1])
     variance = float(left @ left) / freedoms
-    return found, variance * np.linalg.pinv(table.T @ table)
+    return np.asarray(found, np.float64), np.asarray(variance * np.linalg.pinv(table.T @ table))
 
 
 def _law(name: str, terms: dict[str, Array], friction: Array) -> Law:

@@ -24,6 +24,8 @@ from pkm_twin.machine.rotations import about_vector
 
 RANK: Final = 1e-10
 """Part of the greatest singular value below which a direction is held by nothing."""
+SOUND: Final = 1e8
+"""Condition number below which equations as many as unknowns are solved as they are."""
 TURNS: Final = 20
 """Most corrections of an assembly."""
 CLOSED: Final = 1e-9
@@ -111,6 +113,12 @@ class GraphChange:
             (high.origin - low.origin) / step,
         )
 
+    def moves(self, name: str) -> bool:
+        """Whether anything of a joint or rod changes."""
+        if name in self.ends:
+            return bool(self.ends[name].any())
+        return bool(self.points[name].any() or self.axes[name].any() or self.homes[name])
+
     def nothing(self, tolerance: float) -> bool:
         """Whether no vector changes."""
         parts = [*self.points.values(), *self.axes.values(), *self.ends.values(), self.origin]
@@ -124,15 +132,17 @@ class Equations:
     def __init__(
         self, graph: Graph, q: Array, placement: Placement, changes: Sequence[GraphChange] = ()
     ) -> None:
-        self.graph, self.q, self.changes = graph, q, changes
+        self.graph, self.q, self._count = graph, q, len(changes)
         self.placement, self.rotation = placement, placement.rotation
         self.bodies = {name: 6 * k for k, name in enumerate(graph.bodies)}
         self._values: list[Array] = []
         self._rows: list[Array] = []
         self._right: list[Array] = []
         for joint in graph.joints.values():
+            self._choose(changes, joint.name)
             self._joint(joint)
         for rod in graph.rods.values():
+            self._choose(changes, rod.name)
             self._rod(rod)
 
     @property
@@ -151,10 +161,15 @@ class Equations:
         """Their derivatives by the changes, shape (..., rows, changes)."""
         return np.stack(self._right, -2)
 
+    def _choose(self, changes: Sequence[GraphChange], name: str) -> None:
+        """Those that move a joint or rod: most numbers are another's."""
+        self._columns = [k for k, change in enumerate(changes) if change.moves(name)]
+        self.changes = [changes[k] for k in self._columns]
+
     def twists(self) -> tuple[Array, Array]:
         """Body twists by change, shape (..., 6 bodies, changes), and what they miss of the rows."""
         table, right = self.table, self.by_changes
-        found = np.linalg.pinv(table, rcond=RANK) @ -right
+        found = _inverse(table) @ -right
         return np.asarray(found, np.float64), np.asarray(table @ found + right, np.float64)
 
     def correction(self) -> Array:
@@ -181,7 +196,9 @@ class Equations:
                 )
         self._values.append(value)
         self._rows.append(row)
-        self._right.append(geometry)
+        right = np.zeros((*self.q.shape[:-1], self._count))
+        right[..., self._columns] = geometry
+        self._right.append(right)
 
     def _turned(self, body: str, vectors: Sequence[Array]) -> Array:
         """Vectors of a body, one a change, base axes now, shape (..., 3, changes)."""
@@ -236,11 +253,13 @@ class Equations:
 
     def _axis_turn(self, joint: Joint, which: int, vector: Array) -> Array:
         """How a vector that an axis carries along changes with it, shape (..., 3, changes)."""
-        if not len(joint.axes) or not self.changes:
-            return np.zeros((*vector.shape, len(self.changes)))
-        axis = joint.axes[which]
-        turns = [np.cross(axis, change.axes[joint.name][which]) for change in self.changes]
-        return np.stack([np.cross(turn, vector) for turn in turns], -1)
+        turned = np.zeros((*vector.shape, len(self.changes)))
+        if len(joint.axes):
+            for k, change in enumerate(self.changes):
+                by = change.axes[joint.name][which]
+                if by.any():
+                    turned[..., k] = np.cross(np.cross(joint.axes[which], by), vector)
+        return turned
 
     def _angle(
         self, joint: Joint, inner: tuple[Array, int], outer: tuple[Array, int],
@@ -294,6 +313,19 @@ class Equations:
         value = 0.5 * ((apart * apart).sum(-1) - home @ home)
         parts = [(b, xb, apart, none), (a, xa, -apart, none)]
         self._add(value, parts, _dot(moved, apart) - longer)
+
+
+def _inverse(table: Array) -> Array:
+    """Pseudo-inverses; of a machine that is not overconstrained plain ones, which cost less."""
+    if table.shape[-2] == table.shape[-1]:
+        try:
+            found = np.linalg.inv(table)
+        except np.linalg.LinAlgError:
+            found = np.full_like(table, np.nan)
+        norms = np.abs(table).sum(-1).max(-1) * np.abs(found).sum(-1).max(-1)
+        if (norms < SOUND).all():
+            return np.asarray(found, np.float64)
+    return np.asarray(np.linalg.pinv(table, rcond=RANK), np.float64)
 
 
 def _dot(columns: Array, vector: Array) -> Array:

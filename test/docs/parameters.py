@@ -64,6 +64,10 @@ JOINT_MAP = """Converts between the controller's names and numbers of a joint an
 controller = offset + sign * ratio * model for positions, without the offset for velocities and
 accelerations, divided by sign * ratio for efforts, so that power is the same on both sides.
 
+`ratio_change`: the ratio is ratio * (1 + ratio_change * (model - ratio_at)), as of a spool; only
+`calibrate` and `robot.controller.positions` convert such a joint, everything else rejects it.
+`unit`: the name of the controller's unit, as rev, for tables.
+
 Messages and bags carry the controller's names and numbers, and so does the table of poses that
 `calibrate` reads. Everything else has the model's: the Python API, parameters of nodes
 (`effort_limits`, `friction.*`, `start`), the tables of `torques` and `fit`, the exported code, and
