@@ -10,7 +10,7 @@ SEED ?= 1
 ENDLESS := test/bags/test_fuzz.py test/fuzz/test_nodes.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale pages clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality pages clean help
 
 help:
 	@echo "make demo         set up .venv, run both nodes on the recorded bags, table and picture in out/"
@@ -24,6 +24,7 @@ help:
 	@echo "make soak         ten million poses, and all nodes in all weathers, in flat memory (MINUTES)"
 	@echo "make audit        known vulnerabilities of what is installed"
 	@echo "make scale        what sweeps cost, into docs/scale.md"
+	@echo "make reality      public recordings of real machines into docs/reality.md"
 	@echo "make pages        docs/parameters.md from the schemas, pictures of imports, robots and the page"
 	@echo "make clean        remove .venv, out and caches"
 
@@ -92,6 +93,9 @@ audit: $(VENV)/audit.stamp
 
 scale: $(VENV)/test.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.atlas.scale docs/scale.md
+
+reality: $(VENV)/test.stamp
+	$(BIN)/python -m tools.reality docs/reality.md
 
 pages: $(VENV)/test.stamp
 	$(BIN)/python -m test.docs.parameters docs/parameters.md

@@ -8,17 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from pkm_twin import Robot
 from pkm_twin.apps.calibration import calibrate
 from pkm_twin.apps.calibration_state import Poses
+from pkm_twin.apps.cli import app
 from pkm_twin.apps.pose_table import parse_columns, read_poses
 from pkm_twin.apps.transmission import Transmission
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.entries import data_of
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
+from pkm_twin.ros.messages import JointReader
 from test.support.robots import load, random_joints
 
 Array = NDArray[np.float64]
@@ -131,3 +135,27 @@ def test_columns_that_there_are_not_are_rejected(tmp_path: Path, columns: list[s
     path = recording(tmp_path)
     with pytest.raises(ParameterError):
         read_poses(path, load(EXAMPLES / "hexapod.yaml"), parse_columns(columns))
+
+
+@pytest.mark.parametrize("how", ["shared", "travel"])
+def test_the_written_file_converts_the_controllers_numbers(tmp_path: Path, how: str) -> None:
+    robot, _ = spools()
+    text = (EXAMPLES.parents[2] / "config/linear_delta.yaml").read_text()
+    entries = yaml.safe_dump({"joint_map": data_of(robot)["joint_map"]})
+    (tmp_path / "mine.yaml").write_text(text + entries)
+    changes = np.array([0.3, -0.2, 0.1]) if how == "travel" else np.zeros(3)
+    poses = measured(changes, np.full(3, 1.02))
+    header = ",".join([*(f"{name}.position" for name in robot.controller.names), "x", "y", "z"])
+    table = np.hstack([poses.joints, poses.position])
+    np.savetxt(tmp_path / "poses.csv", table, "%.17g", ",", header=header, comments="")
+    arguments = ["mine.yaml", "poses.csv", "--out", "out.yaml", "--transmission", how]
+    paths = [str(tmp_path / one) if "." in one else one for one in arguments]
+    result = CliRunner().invoke(app, ["calibrate", *paths, "--only", "rods.left_1.ends[0]"])
+    assert result.exit_code == 0, result.output
+    assert max(map(len, result.output.splitlines())) < 400 and "rev" in result.output
+    found = load(tmp_path / "out.yaml")
+    seen = found.platform(found.controller.positions(poses.joints))[0]
+    assert np.sqrt(np.mean((seen - poses.position) ** 2)) < 1.5 * NOISE
+    if how == "travel":
+        with pytest.raises(ParameterError):
+            JointReader(found)
