@@ -245,11 +245,13 @@ def calibrate(
         if other is None:
             raise
         raise RejectedPosesError(_place(other[1])) from error
-    if result.faults or result.cost > MOVED or result.placed:
+    # Ratios that are a little off look like a shift of the instrument.
+    saved = MOVED * (1 + sum(p.name.endswith(".ratio") for p in parameters))
+    if result.faults or result.cost > saved or result.placed:
         other = placed()
         if other is not None and (
             result.faults
-            or (result.cost - other[0].cost > MOVED and other[0].cost < HALF * result.cost)
+            or (result.cost - other[0].cost > saved and other[0].cost < HALF * result.cost)
             or other[0].noise < 0.5 * result.noise
         ):  # fmt: skip
             result = replace(result, faults=(_place(other[1]), *result.faults))
