@@ -71,6 +71,8 @@ WEIGHED: Final = 12
 POOR: Final = 0.25
 GOOD: Final = 0.75
 """Parts of what a linear machine would gain: below the one steps are damped more, above less."""
+LIGHT: Final = 0.01
+"""The least damping, in squares of prior standard deviations."""
 TRIALS: Final = 8
 """Dampings of a step that are tried."""
 CONVERGED: Final = 1e-3
@@ -429,7 +431,7 @@ def _fit(
                 gained = (sums[0] - float(row @ row)) / max(sums[0] - sums[1], 1e-300)
                 if settled or gained > POOR:
                     break
-            damping = max(10.0 * damping, 1.0)
+            damping = max(10.0 * damping, LIGHT)
         if trial is None:
             break
         state, values = trial, values + move
@@ -438,7 +440,7 @@ def _fit(
         order = np.argsort(-np.abs(move) / np.sqrt(np.diag(covariance)))[:3]
         problem = f"{steps} steps, {', '.join(parameters[k].name for k in order)} still move"
         if gained > GOOD:
-            damping = 0.1 * damping if damping > 1.0 else 0.0
+            damping = 0.1 * damping if damping > LIGHT else 0.0
     raise _UnsettledError(
         "poses", problem, "poses to which a fit settles: measure more, or fit less (--only)"
     )
