@@ -71,6 +71,9 @@ WEIGHED: Final = 12
 POOR: Final = 0.25
 GOOD: Final = 0.75
 """Parts of what a linear machine would gain: below the one steps are damped more, above less."""
+SLOW: Final = 0.02
+"""Or so little in each of several steps, ``IDLE``: no number moves by its deviation any more."""
+IDLE: Final = 3
 LIGHT: Final = 0.01
 """The least damping, in squares of prior standard deviations."""
 TRIALS: Final = 8
@@ -394,7 +397,7 @@ def _fit(
     # Errors of drives in metres are not those of drives in radians.
     alike = len(set(robot.joint_units)) == 1
     drives = [Parameter(f"joint_map.{j}.offset", "", 0.0, 1.0) for j in robot.joint_names if alike]
-    damping, problem, settled = 0.0, f"{STEPS} steps", False
+    damping, problem, settled, idle = 0.0, f"{STEPS} steps", False, 0
     # By the residuals of the instrument alone first: then the drives' part of them is known.
     for steps in range(1, STEPS + 1):
         progress(1)
@@ -435,6 +438,9 @@ def _fit(
         if trial is None:
             break
         state, values = trial, values + move
+        idle = idle + 1 if gained * (sums[0] - sums[1]) < SLOW else 0
+        settled = settled or idle >= IDLE
+        idle = 0 if settled else idle
         if settled and last:
             return state, values, covariance, table * prior, noise, steps
         order = np.argsort(-np.abs(move) / np.sqrt(np.diag(covariance)))[:3]
