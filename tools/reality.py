@@ -164,9 +164,9 @@ are in [examples/machines/hexapod](../examples/machines/hexapod). Every fourth p
 |---|---|---|---|
 {table}
 
-The last row is an independent fit with scipy: both nodes, the length at zero and the transmission
-of a leg by the residual of that leg's length, nodes known to 10 mm as in `calibrate`. It knows no
-closed loop.
+The last row is an independent fit with scipy, one leg at a time: the centres of the leg's two outer
+joints, its length at zero and its transmission, by the residual of its length. Centres are known to
+10 mm as in `calibrate`. This fit knows no closed loop.
 
 Revolutions a metre, with standard deviations:
 

@@ -116,7 +116,7 @@ def fit(
                 trial = _stepped(robot, state, poses, parameters, values, move)
             except PkmTwinError as error:
                 # No machine has such numbers, or none of them is in these poses: a smaller step.
-                problem = str(error)
+                trial, problem = None, str(error)
             else:
                 row = right(trial, values + move, noise)
                 gained = (sums[0] - float(row @ row)) / max(sums[0] - sums[1], 1e-300)

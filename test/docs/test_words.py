@@ -39,7 +39,7 @@ BANNED = {
 """Regular expressions of whole words, and what to write."""
 WAITING = {
     "docs": {
-        "calibration.md", "commands.md", "export_c.md", "export_fmu.md", "export_ros2_control.md",
+        "commands.md", "export_c.md", "export_fmu.md", "export_ros2_control.md",
         "gallery.md", "identification.md", "scale.md", "uncertainty.md", "variants.md",
     },
     "commands": {"atlas", "calibrate", "show"},
