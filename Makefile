@@ -10,7 +10,7 @@ SEED ?= 1
 ENDLESS := test/bags/test_fuzz.py test/fuzz/test_nodes.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale pages docs clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality pages docs clean help
 
 help:
 	@echo "make demo         set up .venv, run the main nodes on the recorded bags, table and picture in out/"
@@ -24,6 +24,7 @@ help:
 	@echo "make soak         ten million poses, and all nodes under load, with constant memory (MINUTES)"
 	@echo "make audit        known vulnerabilities of the installed packages"
 	@echo "make scale        measure the cost of workspace maps, into docs/scale.md"
+	@echo "make reality      compare recordings of real machines with the models, into docs/reality.md"
 	@echo "make pages        write the generated pages and pictures of docs/"
 	@echo "make docs         build the site, in out/site"
 	@echo "make clean        remove .venv, out and caches"
@@ -94,6 +95,9 @@ audit: $(VENV)/audit.stamp
 
 scale: $(VENV)/test.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.atlas.scale docs/scale.md
+
+reality: $(VENV)/test.stamp
+	$(BIN)/python -m tools.reality docs/reality.md
 
 pages: $(VENV)/test.stamp
 	$(BIN)/python -m test.docs.parameters docs/parameters.md

@@ -63,6 +63,7 @@ setup(
             f"share/{NAME}/examples",
             sorted(glob("examples/*.py") + glob("examples/*.md") + glob("examples/*.ipynb")),
         ),
+        (f"share/{NAME}/examples/machines/hexapod", sorted(glob("examples/machines/hexapod/*"))),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py") + glob("launch/*.yaml"))),
         (f"share/{NAME}/view", sorted(glob("launch/view/*"))),
     ],

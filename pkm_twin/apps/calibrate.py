@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from textwrap import fill
 from typing import Annotated, Any
 
 import numpy as np
@@ -14,80 +14,25 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from pkm_twin.apps.calibration import (
-    HELD_OUT,
-    STEPS,
-    Calibration,
-    Parameter,
-    calibrate,
-    geometric,
-)
+from pkm_twin.apps.calibration import HELD_OUT, Calibration, calibrate, geometric
 from pkm_twin.apps.calibration_faults import Outlier
-from pkm_twin.apps.calibration_state import FRAME, TARGET, Errors, Poses, rotations
-from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.calibration_fit import STEPS, Parameter
+from pkm_twin.apps.calibration_state import BESIDE, Errors
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
 from pkm_twin.apps.options import Accept, BeyondLimits, Json, RobotName
+from pkm_twin.apps.pose_table import LENGTHS, parse_columns, read_poses
+from pkm_twin.apps.transmission import Transmission, written
 from pkm_twin.console import file_name, print_json, progress, refuse_existing, table_console
-from pkm_twin.errors import ParameterError, UnknownNameError, one_line
+from pkm_twin.errors import ParameterError, one_line
 from pkm_twin.machine.edited import Fitted, edited_yaml, write_edited
-from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
-ANGLES = ("roll", "pitch", "yaw")
+WIDTH = 100
+"""Columns of a line of text."""
 MOST_SHOWN = 10
 """Outliers that are printed."""
-FARTHEST = 1e4
-"""No instrument stands farther from what it measures, m."""
-QUATERNION = ("qx", "qy", "qz", "qw")
-
-
-def read_poses(path: Path, robot: Robot) -> Poses:
-    """Measured poses of a CSV.
-
-    Columns, in any order: ``JOINT.position`` of every joint, in the controller's names and numbers;
-    ``x y z``, m; and, where measured, ``roll pitch yaw``, rad, or ``qx qy qz qw``, of the platform
-    relative to home.
-
-    :raises ParameterError: a column is missing, or a value is no finite number.
-    """
-    columns = read_columns(path)
-    joints = [f"{name}.position" for name in robot.controller.names]
-    known = [*joints, "x", "y", "z", *ANGLES, *QUATERNION]
-    for name in columns:
-        if name.endswith(".position") and name not in known:
-            raise UnknownNameError(f"{path}: column", name, known)
-
-    def stack(names: Sequence[str]) -> Array:
-        missing = [name for name in names if name not in columns]
-        if missing:
-            raise ParameterError(str(path), ", ".join(columns), f"a column {missing[0]!r}")
-        return np.stack([columns[name] for name in names], -1)
-
-    def stack_some(names: Sequence[str]) -> Array | None:
-        return stack(names) if any(name in columns for name in names) else None
-
-    q, position = stack(joints), stack("xyz")
-    for names, bound, unit in ((("x", "y", "z"), FARTHEST, "m"), (ANGLES, 2.0 * np.pi, "rad")):
-        for name in names:
-            values = columns.get(name, np.zeros(1))
-            if np.abs(values).max() > bound:
-                worst = int(np.abs(values).argmax())
-                raise ParameterError(
-                    f"{path}: line {worst + 2}: {name}",
-                    float(values[worst]),
-                    f"{unit}, up to {bound:.3g} in size",
-                )
-    angles, quaternion = stack_some(ANGLES), stack_some(QUATERNION)
-    rotation = None
-    if quaternion is not None:
-        if not (np.linalg.norm(quaternion, axis=1) > 1e-6).all():
-            raise ParameterError(f"{path}: qx qy qz qw", 0.0, "quaternions of length one")
-        rotation = rotations().from_quat(quaternion).as_matrix()
-    elif angles is not None:
-        rotation = rotations().from_euler("xyz", angles).as_matrix()
-    return Poses(q, position, rotation)
 
 
 def calibrate_command(
@@ -122,6 +67,24 @@ def calibrate_command(
             min=1e-6, max=1.0, help="how well lengths are known before, m (standard deviation)"
         ),
     ] = 0.01,
+    transmission: Annotated[
+        Transmission,
+        typer.Option(
+            help="ratios of joint_map to fit: each joint's, one factor shared by all, each and its "
+            "change with travel (a spool), or none (file); auto: each of sliding joints that have "
+            "a ratio"
+        ),
+    ] = Transmission.AUTO,
+    columns: Annotated[
+        list[str],
+        typer.Option(
+            help="NAME=HEADER of columns with other headers, separated by commas: "
+            "'leg_*.position=motor_*, x=pos_x [mm]'; may be repeated"
+        ),
+    ] = [],  # noqa: B006  typer copies it
+    unit: Annotated[
+        str, typer.Option(help="of x, y and z where their headers have none: m, cm, mm or um")
+    ] = "m",
     beyond_limits: BeyondLimits = False,
     accept: Accept = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
@@ -142,9 +105,11 @@ def calibrate_command(
 
     if out.suffix not in (".yaml", ".yml"):
         raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
+    if unit not in LENGTHS:
+        raise ParameterError("unit", unit, f"one of {', '.join(LENGTHS)}")
     refuse_existing(out, overwrite, poses)
     machine = load(robot)
-    measured = read_poses(poses, machine)
+    measured = read_poses(poses, machine, parse_columns(columns), unit)
     q = machine.controller.positions(measured.joints)
     _, beyond = find_beyond(machine, q)
     if not beyond_limits:
@@ -161,14 +126,19 @@ def calibrate_command(
 
         result = calibrate(
             machine, measured, paths, offsets=offsets, frame=frame, target=target, prior=prior,
-            accept=accept, progress=step,
+            transmission=transmission, accept=accept, progress=step,
         )  # fmt: skip
     marks = [*(f"accepted all the same: {fault}" for fault in result.faults), *notes]
     source = f"calibrated with {one_line(poses.name, 100)}"
     values = {
         p.name: Fitted(p.value, p.deviation, p.unit, source)
         for p in result.parameters
-        if p.name not in (*FRAME, *TARGET)
+        if not p.name.startswith(BESIDE)
+    }
+    mapped = {p.name: (p.value, p.deviation) for p in result.parameters}
+    values |= {
+        path: Fitted(*number, source)
+        for path, number in written(machine, result.joint_map, mapped).items()
     }
     head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
     head += [f"Outlier, hardly counted: {_outlier_text(one)}." for one in result.outliers]
@@ -229,7 +199,7 @@ def _errors(errors: Errors) -> dict[str, float]:
 
 def _print(result: Calibration) -> None:
     table = Table(title=Text("calibrated numbers"))
-    for column in ("number", "before", "after", "deviation", "unit", "observed"):
+    for column in ("number", "before", "after", "standard deviation", "unit", "observed"):
         table.add_column(column)
     for p in result.parameters:
         table.add_row(Text(p.name), *_row(p))
@@ -260,7 +230,7 @@ def _print(result: Calibration) -> None:
     if open_lines:
         typer.echo("the poses do not determine, and the file's values stay:")
     for line in open_lines:
-        typer.echo(f"  {line}")
+        typer.echo(fill(line, WIDTH, initial_indent="  ", subsequent_indent="    "))
 
 
 def _outlier_text(one: Outlier) -> str:

@@ -9,13 +9,14 @@ errors before and after are those of the loaded robots.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.apps.calibration_faults import (
+    HALF,
     MOVED,
     Fault,
     Outlier,
@@ -26,6 +27,7 @@ from pkm_twin.apps.calibration_faults import (
     outliers_of,
     place_fault,
 )
+from pkm_twin.apps.calibration_fit import KNOWN, Parameter, UnsettledError, derivatives, fit
 from pkm_twin.apps.calibration_state import (
     BESIDE,
     FRAME,
@@ -33,28 +35,25 @@ from pkm_twin.apps.calibration_state import (
     Errors,
     Poses,
     State,
-    moved,
     place_frame,
     start_of,
-    value_of,
 )
+from pkm_twin.apps.transmission import Transmission, numbers
 from pkm_twin.design import programs
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
-from pkm_twin.identification.robust import Weighed, weighed
+from pkm_twin.identification.robust import Weighed
 from pkm_twin.identification.undetermined import undetermined
 from pkm_twin.kinematics.derivatives import geometry_numbers
 from pkm_twin.kinematics.numbers import file_numbers
 from pkm_twin.machine.entries import entries, with_entries
+from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.rotations import skew
 
 Array = NDArray[np.float64]
 
 MOVES: Final = 1e-6
 """A number that moves the platform less than this, per unit, is no number of the geometry."""
-KNOWN: Final = 0.5
-"""A parameter whose deviation stays above this part of its prior one was not observed."""
 HELD_OUT: Final = 4
 """Every so many poses one is held out."""
 STEP: Final = 1e-6
@@ -63,36 +62,7 @@ SAME: Final = 1e-4
 """Difference of joints that makes another pose, rad or m."""
 SHOWN: Final = 0.1
 """Part of the greatest weight below which a number is not named in a combination."""
-STEPS: Final = 60
-POOR: Final = 0.25
-GOOD: Final = 0.75
-"""Parts of what a linear machine would gain: below the one steps are damped more, above less."""
-TRIALS: Final = 8
-"""Dampings of a step that are tried."""
-CONVERGED: Final = 1e-3
-"""Part of its deviation by which no parameter moves in the last step."""
-GAINED: Final = 1e-4
-"""Or by which the sum of squares over the noise falls."""
-CONTROLLER: Final = "controller units"
-"""Of a joint's sensor whose numbers are not the model's in rad or m."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One number that is fitted, in its unit, with standard deviations before and after."""
-
-    name: str
-    unit: str
-    before: float
-    prior: float
-    value: float = np.nan
-    deviation: float = np.nan
-
-    @property
-    def observed(self) -> bool:
-        """Whether the poses tell it: they, not the prior, make its deviation."""
-        return self.deviation < KNOWN * self.prior
 
 
 @dataclass(frozen=True)
@@ -119,6 +89,8 @@ class Calibration:
     """Squares of the machine's changes over their prior standard deviations, summed."""
     placed: bool = False
     """Whether another place of the instrument may explain the poses better."""
+    joint_map: JointMap = field(default_factory=lambda: JointMap.of((), {}))
+    """With the fitted numbers."""
 
     @property
     def _unknown(self) -> Array:
@@ -195,6 +167,7 @@ def calibrate(
     frame: bool = False,
     target: bool = False,
     prior: float = 0.01,
+    transmission: Transmission = Transmission.AUTO,
     accept: bool = False,
     progress: Callable[[int], None] = lambda _: None,
 ) -> Calibration:
@@ -205,12 +178,19 @@ def calibrate(
     :param paths: numbers of the robot's file, of :func:`geometric`.
     :param prior: standard deviation that lengths have without the poses, m; angles have it at the
         platform's radius.
+    :param transmission: which ratios of the joint map are fitted; ``auto``: those of sliding joints
+        that have one.
     :param accept: calibrate with poses that this machine was not in, too.
     :raises ParameterError: too few poses, poses of another machine, unit or frame, poses that tell
         no number, or a fit that does not settle.
     """
     extra = [*(FRAME if frame else ()), *(TARGET if target else ())]
-    parameters = _parameters(robot, paths, offsets, extra, prior)
+    q = robot.controller.positions(poses.joints)
+
+    def listed(extra: Sequence[str]) -> list[Parameter]:
+        return _parameters(robot, q, paths, offsets, transmission, extra, prior)
+
+    parameters = listed(extra)
 
     def fitted(frame: bool, parameters: Sequence[Parameter]) -> tuple[Calibration, State]:
         return _calibrated(robot, poses, parameters, frame, prior, progress)
@@ -219,34 +199,32 @@ def calibrate(
         """The same with the instrument's frame; None where that is no machine either."""
         if frame:
             return None
-        more = _parameters(robot, paths, offsets, [*FRAME, *extra], prior)
         try:
-            other = fitted(True, more)
+            other = fitted(True, listed([*FRAME, *extra]))
         except PkmTwinError:
             return None
         return None if other[0].faults else other
 
     try:
         result, _ = fitted(frame, parameters)
-    except (_UnsettledError, UnreachableError) as error:
+    except (UnsettledError, UnreachableError) as error:
         other = placed()
         if other is None:
             raise
         raise RejectedPosesError(_place(other[1])) from error
-    if result.faults or result.cost > MOVED or result.placed:
+    # Ratios that are a little off look like a shift of the instrument.
+    saved = MOVED * (1 + sum(p.name.endswith(".ratio") for p in parameters))
+    if result.faults or result.cost > saved or result.placed:
         other = placed()
         if other is not None and (
-            result.faults or result.cost - other[0].cost > MOVED
+            result.faults
+            or (result.cost - other[0].cost > saved and other[0].cost < HALF * result.cost)
             or other[0].noise < 0.5 * result.noise
         ):  # fmt: skip
             result = replace(result, faults=(_place(other[1]), *result.faults))
     if result.faults and not accept:
         raise RejectedPosesError(result.faults[0])
     return result
-
-
-class _UnsettledError(ParameterError):
-    """A fit that does not settle."""
 
 
 def _place(state: State) -> Fault:
@@ -260,8 +238,9 @@ def _learnt(poses: Poses) -> NDArray[np.bool_]:
 
 
 def _parameters(
-    robot: Robot, paths: Sequence[str], offsets: bool, extra: Sequence[str], prior: float
-) -> list[Parameter]:
+    robot: Robot, q: Array, paths: Sequence[str], offsets: bool, transmission: Transmission,
+    extra: Sequence[str], prior: float,
+) -> list[Parameter]:  # fmt: skip
     """What is fitted, as it is before."""
     known = entries(robot)
     angle = prior / robot.size
@@ -272,29 +251,26 @@ def _parameters(
         Parameter(path, known[path][1], known[path][0], prior if known[path][1] == "m" else angle)
         for path in fitted
     ]
-    if offsets:
-        for joint, unit, factor, old in zip(
-            robot.joint_names, robot.joint_units, robot.controller.factors,
-            robot.controller.offsets, strict=True,
-        ):  # fmt: skip
-            size = (prior if unit == "m" else angle) * abs(factor)
-            own = unit if abs(factor) == 1.0 else CONTROLLER
-            parameters.append(Parameter(f"joint_map.{joint}.offset", own, float(old), float(size)))
+    mapped = numbers(robot, q, transmission, offsets, prior, angle)
+    parameters += [Parameter(*number) for number in mapped]
     # Where the instrument stands is not known at all.
     far = 100.0 * robot.engine.tree.size
-    return parameters + [
+    return parameters + _placing(extra, far)
+
+
+def _placing(names: Sequence[str], far: float) -> list[Parameter]:
+    return [
         Parameter(name, "rad" if name[-2] == "r" else "m", 0.0, 10.0 if name[-2] == "r" else far)
-        for name in extra
+        for name in names
     ]
 
 
 def _looks_placed(
-    robot: Robot, state: State, poses: Poses, table: Array, told: Sequence[Parameter]
-) -> bool:
+    robot: Robot, state: State, poses: Poses, noise: Weighed, table: Array,
+    told: Sequence[Parameter],
+) -> bool:  # fmt: skip
     parts = state.parts(poses)
-    noise = weighed(parts, len(told))
-    six = _parameters(robot, (), False, FRAME, 1.0)
-    columns = _derivatives(robot, state, six)
+    columns = derivatives(robot, state, FRAME)
     halves = [columns[:, :3], columns[:, 3:]][: len(parts)]
     asked = [(p.before - p.value) / p.prior for p in told]
     return looks_placed(table, noise.over(halves), np.append(noise.over(parts), asked))
@@ -320,8 +296,8 @@ def _calibrated(
     start = start_of(robot, learnt, paths)
     if frame:
         place_frame(start, learnt)
-    before = _fit(robot, start, learnt, instrument, progress)[0] if instrument else start
-    after, values, covariance, information, noise, steps = _fit(
+    before = fit(robot, start, learnt, instrument, progress)[0] if instrument else start
+    after, values, covariance, information, noise, steps = fit(
         robot, before, learnt, parameters, progress
     )
     built = with_entries(robot, after.numbers)
@@ -353,115 +329,7 @@ def _calibrated(
         built, tuple(told), covariance, condition, noise.noise[0],
         noise.noise[1] if len(noise.noise) > 1 else None, fitted_errors, held_errors, steps,
         outliers, tuple(faults), cost_of(changes),
-        not frame and _looks_placed(robot, after, learnt, information, told),
+        not frame and _looks_placed(robot, after, learnt, noise, information, told),
+        after.instrument.map,
     )  # fmt: skip
     return result, after
-
-
-def _fit(
-    robot: Robot, start: State, poses: Poses, parameters: Sequence[Parameter],
-    progress: Callable[[int], None],
-) -> tuple[State, Array, Array, Array, Weighed, int]:  # fmt: skip
-    """Robust least squares over all parameters, the noise found with them.
-
-    :raises ParameterError: it does not settle.
-    """
-    state = start
-    values = np.array([value_of(start, p.name, p.before) for p in parameters])
-    centre = np.array([p.before for p in parameters])
-    prior = np.array([p.prior for p in parameters])
-
-    def right(state: State, values: Array, noise: Weighed) -> Array:
-        return np.concatenate([noise.over(state.parts(poses)), (centre - values) / prior])
-
-    damping, problem = 0.0, f"{STEPS} steps"
-    for steps in range(1, STEPS + 1):
-        progress(1)
-        noise = weighed(state.parts(poses), len(parameters))
-        columns = _derivatives(robot, state, parameters)
-        halves = [columns[:, :3], columns[:, 3:]][: len(noise.noise)]
-        table = noise.over(halves)
-        left, before = np.vstack([table, np.diag(1.0 / prior)]), right(state, values, noise)
-        # In units of the prior no singular value is below one.
-        _, sizes, axes = np.linalg.svd(left * prior, full_matrices=False)
-        spread = prior[:, None] * axes.T / sizes
-        covariance = spread @ spread.T
-        trial, gained = None, 0.0
-        for _ in range(TRIALS):
-            move = _move(left, before, np.sqrt(damping) / prior)
-            small = bool(np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))))
-            sums = [float(row @ row) for row in (before, before - left @ move)]
-            settled = small or sums[0] - sums[1] < GAINED
-            try:
-                trial = _stepped(robot, state, poses, parameters, values, move)
-            except PkmTwinError as error:
-                # No machine has such numbers, or none of them is in these poses: a smaller step.
-                problem = str(error)
-            else:
-                row = right(trial, values + move, noise)
-                gained = (sums[0] - float(row @ row)) / max(sums[0] - sums[1], 1e-300)
-                if settled or gained > POOR:
-                    break
-            damping = max(10.0 * damping, 1.0)
-        if trial is None:
-            break
-        state, values = trial, values + move
-        if settled:
-            return state, values, covariance, table * prior, noise, steps
-        if gained > GOOD:
-            damping = 0.1 * damping if damping > 1.0 else 0.0
-    raise _UnsettledError("poses", problem, "poses to which a fit settles")
-
-
-def _move(left: Array, right: Array, damping: Array) -> Array:
-    """A step of Gauss and Newton's method, damped where that is not zero (Levenberg, Marquardt).
-
-    Along a direction that the poses tell badly the machine may turn away from its tangent: without
-    damping a step then goes beyond, and back, for ever.
-    """
-    rows, end = (left, right)
-    if damping.any():
-        rows = np.vstack([left, np.diag(damping)])
-        end = np.concatenate([right, np.zeros(len(damping))])
-    return np.asarray(np.linalg.lstsq(rows, end, rcond=None)[0], np.float64)
-
-
-def _stepped(
-    robot: Robot, state: State, poses: Poses, parameters: Sequence[Parameter], values: Array,
-    move: Array,
-) -> State:  # fmt: skip
-    names = [p.name for p in parameters]
-    by = dict(zip(names, move.tolist(), strict=True))
-    turn = np.array([by.get(name, 0.0) for name in FRAME[3:]])
-    new = dict(zip(names, (values + move).tolist(), strict=True))
-    return moved(robot, state, poses, new, turn)
-
-
-def _derivatives(robot: Robot, state: State, parameters: Sequence[Parameter]) -> Array:
-    """Of predicted positions and rotations by the parameters, shape (k, 6, parameters)."""
-    tool = state.instrument
-    position, rotation = state.platform
-    twists = [state.machine.platform_jacobian(state.q[None])[0] / -robot.controller.factors]
-    names = [f"joint_map.{joint}.offset" for joint in robot.joint_names]
-    if any(p.name in state.machine.paths for p in parameters):
-        twists.append(state.machine.platform_slopes(state.q))
-        names += state.machine.paths
-    by_name = dict(zip(names, np.moveaxis(np.concatenate(twists, -1), -1, 0), strict=True))
-    turn = tool.frame.as_matrix()
-    lever = rotation @ tool.target
-    out = np.zeros((len(state.q), 6, len(parameters)))
-    for k, p in enumerate(parameters):
-        if p.name in FRAME:
-            axis = np.eye(3)[FRAME.index(p.name) % 3]
-            if p.name in FRAME[:3]:
-                out[:, :3, k] = axis
-            else:
-                out[:, :3, k] = np.cross(axis, (position + lever) @ turn.T)
-                out[:, 3:, k] = axis
-        elif p.name in TARGET:
-            out[:, :3, k] = rotation[..., TARGET.index(p.name)] @ turn.T
-        else:
-            linear, angular = by_name[p.name][:, :3], by_name[p.name][:, 3:]
-            shifted = linear - (skew(lever) @ angular[..., None])[..., 0]
-            out[:, :3, k], out[:, 3:, k] = shifted @ turn.T, angular @ turn.T
-    return out

@@ -28,6 +28,8 @@ FAR: Final = 5.0
 MOVED: Final = 14.0
 """Squares of prior standard deviations, summed over all numbers, that another place of the
 instrument must save: with sound priors six free numbers save so much in 3 of 100 cases."""
+HALF: Final = 0.5
+"""And the part of all squares below which they then are: an error of the model saves a few too."""
 EXPLAINED: Final = 0.8
 """Part of the sum of squares below which another place of the instrument is tried."""
 MOST: Final = 0.25

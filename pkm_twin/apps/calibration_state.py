@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.apps.transmission import centred, changed
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.robot import Robot
 
 if TYPE_CHECKING:
@@ -66,14 +68,14 @@ class Errors:
 class Instrument:
     """What is fitted beside the machine: its joints' sensors, where the instrument stands."""
 
-    offsets: Array
+    map: JointMap
     frame: Rotation = field(default_factory=lambda: rotations().identity())
     place: Array = field(default_factory=lambda: np.zeros(3))
     target: Array = field(default_factory=lambda: np.zeros(3))
 
-    def joints(self, robot: Robot, poses: Poses) -> Array:
+    def joints(self, poses: Poses) -> Array:
         """The model's joint positions (k, n) at measured poses."""
-        return robot.controller.positions(poses.joints - self.offsets)
+        return self.map.positions(poses.joints)
 
     def seen(self, position: Array, rotation: Array) -> tuple[Array, Array]:
         """What it should see of the platform: positions and rotations in its own frame."""
@@ -92,7 +94,7 @@ class Instrument:
 
     def parts(self, robot: Robot, poses: Poses) -> list[Array]:
         """Of a loaded robot: residuals of positions and, where measured, rotations, (k, 3) each."""
-        both = self.residuals(poses, *robot.platform(self.joints(robot, poses)))
+        both = self.residuals(poses, *robot.platform(self.joints(poses)))
         return [part for part in both if part is not None]
 
     def errors(self, robot: Robot, poses: Poses) -> Errors:
@@ -132,8 +134,8 @@ def start_of(robot: Robot, poses: Poses, paths: Sequence[str]) -> State:
 
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     """
-    instrument = Instrument(np.zeros(robot.joints_count))
-    q = instrument.joints(robot, poses)
+    instrument = Instrument(centred(robot, robot.controller.positions(poses.joints)))
+    q = instrument.joints(poses)
     machine = Variants(robot, {path: robot.number(path) for path in paths})
     return State(machine, q, robot.platform(q), instrument)
 
@@ -165,18 +167,14 @@ def moved(
     :param turn: of the instrument's frame since ``state``, a rotation vector, shape (3,), rad.
     :raises ParameterError: numbers that no file may have, or no machine can be assembled with.
     """
-    old, tool = robot.controller.offsets, state.instrument
-    offsets = [
-        values.get(f"joint_map.{j}.offset", o) - o
-        for j, o in zip(robot.joint_names, old, strict=True)
-    ]
+    tool = state.instrument
     new = Instrument(
-        np.array(offsets),
+        changed(robot, tool.map, values),
         rotations().from_rotvec(turn) * tool.frame,
         np.array([values.get(n, v) for n, v in zip(FRAME[:3], tool.place, strict=True)]),
         np.array([values.get(n, v) for n, v in zip(TARGET, tool.target, strict=True)]),
     )
-    machine, q = state.machine, new.joints(robot, poses)
+    machine, q = state.machine, new.joints(poses)
     if machine.paths:
         now = state.numbers
         row = [values.get(path, now[path]) for path in machine.paths]

@@ -18,6 +18,7 @@ from pkm_twin.apps import export, maps  # noqa: F401  maps adds its commands to 
 from pkm_twin.apps.calibrate import calibrate_command
 from pkm_twin.apps.check_command import check
 from pkm_twin.apps.design import design_command
+from pkm_twin.apps.drive_friction import drive_friction_command
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.fit import fit
 from pkm_twin.apps.guard_check import guard_check
@@ -500,6 +501,7 @@ app.add_typer(atlases.app, name="atlas")
 app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
 app.command("design")(design_command)
+app.command("drive-friction")(drive_friction_command)
 app.command("path")(tables(path_command))
 app.command()(tables(size))
 app.command()(tables(loads))

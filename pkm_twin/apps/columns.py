@@ -39,6 +39,8 @@ def read_columns(path: Path, robot: Robot | None = None) -> dict[str, Array]:
 
     :param path: ``-`` is stdin. ``robot``: whose joints and pose the columns may be of.
 
+    Lines above the header that begin with # are comments.
+
     :raises ParameterError: not readable, too large, or a value is no finite number.
     """
     try:
@@ -110,12 +112,15 @@ def _lines(text: TextIO, path: Path) -> Iterator[str]:
 
 
 def _parse_columns(path: Path, rows: Iterator[list[str]]) -> dict[str, Array]:
-    header = [name.strip() for name in next(rows, [])]
+    first, above = next(rows, []), 0
+    while first and first[0].startswith("#"):
+        first, above = next(rows, []), above + 1
+    header = [name.strip() for name in first]
     if len(set(header)) != len(header):
         raise ParameterError(f"{path}: header row", ", ".join(header), "different names")
     data = array.array("d")
-    number = 1
-    for number, row in enumerate(rows, 2):
+    number = 1 + above
+    for number, row in enumerate(rows, 2 + above):
         if len(row) != len(header):
             raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
         try:

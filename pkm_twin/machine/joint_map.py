@@ -5,6 +5,11 @@ controller = offset + sign * ratio * model. So ``offset`` is what the controller
 model's joint is at zero, and ``ratio`` how many of the controller's units are one of the model's:
 turns of a motor a turn of the joint, millimetres a metre. Power is the same on both sides.
 
+The effective radius of a spool changes with what is wound on it: the ratio is then
+``ratio * (1 + ratio_change * (model - ratio_at))``, and controller = offset + sign * ratio *
+(model + ratio_change / 2 * (model - ratio_at)^2). Only positions are converted by such a map: rates
+and efforts need the position beside them, so nodes, bags and trajectories reject it.
+
 Messages and bags carry the controller's numbers, everything else computes with the model's. A joint
 number enters through :class:`pkm_twin.ros.messages.JointReader` and leaves as
 :data:`ControllerNumbers`, which only this module makes and which the publishers ask for.
@@ -39,6 +44,11 @@ class JointMapEntry:
     ratio: float = schema.number(
         at_least=1e-6, at_most=1e6, unit="the controller's per the model's", default=1.0
     )
+    ratio_change: float = schema.number(
+        at_least=-1e3, at_most=1e3, unit="per the model's", default=0.0
+    )
+    ratio_at: float = schema.number(unit="the model's", default=0.0)
+    unit: str | None = schema.text(default=None)
 
     def verify(self, path: str) -> None:
         """A sign is 1 or -1."""
@@ -48,11 +58,18 @@ class JointMapEntry:
 
 @dataclass(frozen=True, eq=False)
 class JointMap:
-    """The controller's names, and factors and offsets of its positions, shape (n,) each."""
+    """The controller's names, and factors and offsets of its positions, shape (n,) each.
+
+    ``changes``: of the ratios, relative, per unit of the model's position from ``centres`` on.
+    ``units``: names of the controller's units, None where the file has none.
+    """
 
     names: tuple[str, ...]
     factors: Array
     offsets: Array
+    changes: Array
+    centres: Array
+    units: tuple[str | None, ...]
 
     @classmethod
     def of(cls, joints: Sequence[str], entries: Mapping[str, JointMapEntry]) -> JointMap:
@@ -71,33 +88,73 @@ class JointMap:
             names,
             np.array([row.sign * row.ratio for row in rows]),
             np.array([row.offset for row in rows]),
+            np.array([row.ratio_change for row in rows]),
+            np.array([row.ratio_at for row in rows]),
+            tuple(row.unit for row in rows),
         )
 
     @property
     def plain(self) -> bool:
         """Whether numbers are the same on both sides."""
-        return bool((self.factors == 1.0).all() and (self.offsets == 0.0).all())
+        return bool((self.factors == 1.0).all() and (self.offsets == 0.0).all() and self.even)
+
+    @property
+    def even(self) -> bool:
+        """Whether every ratio is the same at all positions."""
+        return bool((self.changes == 0.0).all())
+
+    def check_even(self) -> None:
+        """Raise where rates and efforts depend on the position.
+
+        :raises ParameterError: a ratio changes with travel.
+        """
+        if not self.even:
+            worst = int(np.abs(self.changes).argmax())
+            raise ParameterError(
+                f"joint_map.{self.names[worst]}.ratio_change", float(self.changes[worst]),
+                "0: only positions can be converted where the ratio changes with travel",
+            )  # fmt: skip
 
     def positions(self, controller: Array) -> Array:
-        """The model's positions of the controller's, shape (..., n)."""
-        return np.asarray((controller - self.offsets) / self.factors, np.float64)
+        """The model's positions of the controller's, shape (..., n).
+
+        NaN beyond the position where a changing ratio falls to zero.
+        """
+        model = np.asarray((controller - self.offsets) / self.factors, np.float64)
+        if self.even:
+            return model
+        away = model - self.centres
+        with np.errstate(invalid="ignore"):
+            root = np.sqrt(1.0 + 2.0 * self.changes * away)
+        return np.asarray(self.centres + 2.0 * away / (1.0 + root), np.float64)
+
+    def slopes(self, model: Array) -> Array:
+        """The controller's units per the model's at the model's positions, shape (..., n)."""
+        return np.asarray(self.factors * (1.0 + self.changes * (model - self.centres)), np.float64)
 
     def rates(self, controller: Array) -> Array:
         """The model's velocities or accelerations of the controller's, shape (..., n)."""
+        self.check_even()
         return np.asarray(controller / self.factors, np.float64)
 
     def efforts(self, controller: Array) -> Array:
         """The model's efforts of the controller's, shape (..., n)."""
+        self.check_even()
         return np.asarray(controller * self.factors, np.float64)
 
     def controller_positions(self, model: Array) -> ControllerNumbers:
         """The controller's positions of the model's, shape (..., n)."""
-        return ControllerNumbers(self.offsets + self.factors * model)
+        away = model - self.centres
+        return ControllerNumbers(
+            self.offsets + self.factors * (model + 0.5 * self.changes * away * away)
+        )
 
     def controller_rates(self, model: Array) -> ControllerNumbers:
         """The controller's velocities, accelerations or position differences, shape (..., n)."""
+        self.check_even()
         return ControllerNumbers(self.factors * model)
 
     def controller_efforts(self, model: Array) -> ControllerNumbers:
         """The controller's efforts of the model's, shape (..., n)."""
+        self.check_even()
         return ControllerNumbers(model / self.factors)

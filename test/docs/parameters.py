@@ -66,6 +66,10 @@ JOINT_MAP = """Converts between the controller's names and values of a joint and
 controller = offset + sign * ratio * model for positions, without the offset for velocities and
 accelerations, divided by sign * ratio for efforts, so that power is the same on both sides.
 
+`ratio_change`: the ratio is ratio * (1 + ratio_change * (model - ratio_at)), as of a spool. Only
+`calibrate` and `robot.controller.positions` convert such a joint; everything else rejects it.
+`unit`: the name of the controller's unit, for example rev, for tables.
+
 Messages, bags and the table of poses for `calibrate` contain the controller's names and values.
 Everything else uses those of the model: the Python API, parameters of nodes (`effort_limits`,
 `friction.*`, `start`), the tables of `torques` and `fit`, the exported code, and `machine_state`'s

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin drive-friction``: torque constant and friction law by weights hung from a drive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.options import Json
+from pkm_twin.console import print_json
+from pkm_twin.errors import ParameterError
+
+GRAVITY = 9.80665
+"""Standard gravity, m/s2."""
+
+
+def drive_friction_command(
+    table: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV, a row a weight: mass_kg or torque_nm, iq_up_A, iq_down_A, perhaps speed",
+            show_default=False,
+        ),
+    ],
+    lever: Annotated[
+        float,
+        typer.Option(help="of mass_kg: metres of travel a radian of the motor (spool radius)"),
+    ] = 0.0,
+    as_json: Json = False,
+) -> None:
+    """Fit a drive's torque constant and friction to slow traverses with weights, up and down.
+
+    Friction that grows with the load is accepted where a constant (Coulomb, and viscous at one
+    speed) is rejected by an F test at 5 % and leaves more of the runs that are held out one by one.
+    """
+    from pkm_twin.identification.hanging_mass import drive_friction, lines
+
+    columns = read_columns(table)
+    for name in ("iq_up_A", "iq_down_A"):
+        if name not in columns:
+            raise ParameterError(str(table), ", ".join(columns), f"a column {name!r}")
+    if "torque_nm" in columns:
+        torque = columns["torque_nm"]
+    elif "mass_kg" in columns:
+        if not lever > 0.0:
+            raise ParameterError("lever", lever, "metres a radian, above 0, for a column mass_kg")
+        torque = GRAVITY * lever * columns["mass_kg"]
+    else:
+        raise ParameterError(str(table), ", ".join(columns), "a column 'mass_kg' or 'torque_nm'")
+    found = drive_friction(torque, columns["iq_up_A"], columns["iq_down_A"], columns.get("speed"))
+    if as_json:
+        print_json(found.as_json())
+        return
+    for line in lines(found):
+        typer.echo(line)
