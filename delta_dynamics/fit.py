@@ -47,7 +47,7 @@ class Number:
 
     ``deviation``: NaN where it is withheld, as the model does not explain the recordings.
     ``share``: that of the noise alone over that of before. ``status``: ``fitted``; ``combination``:
-    known only together with others; ``not excited``: the motion tells nothing, the file's value
+    known only in combination; ``not excited``: the motion does not identify it, the file's value
     stays.
     """
 
@@ -106,7 +106,7 @@ class Fit:
     verdict: Verdict
     """Whether the model explains the recordings."""
     accepted: tuple[str, ...] = ()
-    """Why this machine cannot have made them, where they were fitted all the same."""
+    """Why this machine cannot have made them, although they were fitted."""
 
     def of(self, status: Status) -> tuple[Number, ...]:
         """The numbers of a status."""
@@ -144,7 +144,7 @@ def fit(
         if fault is not None:
             faults.append(f"{recording.name}: {fault}")
     if faults and not accept:
-        raise PkmTwinError(f"{faults[0]}; --accept fits it all the same")
+        raise PkmTwinError(f"{faults[0]}; --accept fits it nevertheless")
     rows = [made.only(chosen, everything.values) for made in whole]
     solved = solve(parameters, rows)
     result, delays = solved.estimate, solved.delays
@@ -160,8 +160,8 @@ def fit(
     result = replace(result, covariance=verdict.widened(result.covariance))
     if not result.directions or all(n.status == "not excited" for n in numbers):
         raise PkmTwinError(
-            f"no excitation: the motion tells nothing of {', '.join(what)}; a trajectory that "
-            "does: pkm-twin excite"
+            f"no excitation: the motion does not identify {', '.join(what)}; pkm-twin excite "
+            "designs a motion that does"
         )
     judged = []
     for recording, made in zip(recordings, rows, strict=True):

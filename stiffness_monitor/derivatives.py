@@ -49,6 +49,8 @@ def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()
 
 def compliance_effects(robot: Robot, pose: ArrayLike) -> Array:
     """What one standard deviation of each of the file's causes changes, (..., 6, 6, causes)."""
+    if not robot.causes:
+        return np.zeros((*compliance(robot, pose).shape, 0))
     return _square(_tables(robot, pose)[1] @ cause_slopes(robot, elastic_numbers))
 
 

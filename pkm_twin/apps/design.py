@@ -21,7 +21,7 @@ def design_command(
     vary: Annotated[
         list[str],
         typer.Option(
-            help="PATH=LOW:HIGH, a number of the robot's file and its bounds, e.g. "
+            help="PATH=LOW:HIGH: a value of the robot's file and its bounds, e.g. "
             "geometry.arm_length=0.15:0.3; PATH,PATH,-PATH=LOW:HIGH changes several by the same "
             "amount",
             show_default=False,
@@ -44,20 +44,21 @@ def design_command(
     ] = [],  # noqa: B006
     subject_to: Annotated[
         list[str],
-        typer.Option(help="a bound, e.g. 'singularity>=0.1' or 'peak-effort<=20'"),
+        typer.Option(help="bound on a quantity, e.g. 'singularity>=0.1' or 'peak-effort<=20'"),
     ] = [],  # noqa: B006
     tolerance: Annotated[
         list[str],
         typer.Option(
-            help="PATH=SIGMA: the standard deviation of a number; prints the pose error budget"
+            help="PATH=SIGMA: the standard deviation of a value; prints the pose error budget"
         ),
     ] = [],  # noqa: B006
     sweep: Annotated[
         Optional[str],  # noqa: UP045
-        typer.Option(help="grid or sobol: compute machines of the box into --out FILE.nc"),
+        typer.Option(help="grid or sobol: compute machines within the bounds into --out FILE.nc"),
     ] = None,
     samples: Annotated[
-        int, typer.Option(help="machines of a sweep along each axis of a grid, or in all", min=1)
+        int,
+        typer.Option(help="machines of a sweep: per axis of a grid, or in total with sobol", min=1),
     ] = 20,
     wrench: Annotated[
         Optional[str],  # noqa: UP045
@@ -69,14 +70,14 @@ def design_command(
     payload: Payload = None,
     platform: Platform = None,
     starts: Annotated[
-        int, typer.Option(help="machines from which the best are improved", min=1)
+        int, typer.Option(help="machines to start from; the best are optimised", min=1)
     ] = 64,
-    points: Annotated[int, typer.Option(help="of a Pareto front", min=3)] = 9,
-    seed: Annotated[int, typer.Option(help="of starts and samples", min=0)] = 0,
+    points: Annotated[int, typer.Option(help="points of a Pareto front", min=3)] = 9,
+    seed: Annotated[int, typer.Option(help="seed of starts and samples", min=0)] = 0,
     out: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(
-            help="the robot's file with the new numbers, FILE.yaml; of a sweep FILE.nc",
+            help="FILE.yaml: the robot's file with the new values; for a sweep FILE.nc",
             callback=file_name,
             show_default=False,
         ),
@@ -92,18 +93,18 @@ def design_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the files")] = False,
     as_json: Json = False,
 ) -> None:
-    """Find numbers of a robot's file that are best for a path.
+    """Optimise values of a robot's file for a path.
 
-    The platform follows the same path whatever the numbers; machines that cannot follow it are
-    rejected. peak-effort is the greatest effort of any joint, rms-effort the greatest RMS of a
-    joint, energy what the drives give without regeneration, deflection the greatest translation of
-    the reference point under the wrench, mass that of all bodies and rods without payload;
-    singularity is the least index on the path. The search is by exact gradients from several
-    starts; it ends in a local optimum.
+    The platform of every machine follows the same path; machines that cannot follow it are
+    rejected. peak-effort is the greatest effort of any joint, rms-effort the greatest RMS effort of
+    a joint, energy what the drives supply without regeneration, deflection the greatest translation
+    of the reference point under the wrench, mass that of all bodies and rods without payload;
+    singularity is the least singularity index on the path. The search uses exact gradients from
+    several starts and ends in a local optimum.
 
-    With --sweep all quantities of the machines of a box are written to a NetCDF file. With
-    --tolerance the standard deviations of the platform's position and rotation are printed, by
-    contribution, on the path or else over the workspace.
+    --sweep writes all quantities of machines within the bounds to a NetCDF file. --tolerance prints
+    the standard deviations of the platform's position and rotation, with the share of each value,
+    on the path or, without --path, over the workspace.
     """
     from pkm_twin import load
     from pkm_twin.apps import design_report as report

@@ -91,7 +91,7 @@ class Combination:
 
 @dataclass(frozen=True)
 class Group:
-    """Elements that the loads do not tell apart, and what is known of them together."""
+    """Elements that the loads do not distinguish, and what is known of them together."""
 
     elements: tuple[str, ...]
     known: tuple[Combination, ...]
@@ -118,7 +118,7 @@ class ElasticFit:
     verdict: Verdict
     """Whether elastic elements explain the deflections."""
     accepted: tuple[str, ...] = ()
-    """Why this machine cannot have made the recordings, where they were fitted all the same."""
+    """Why this machine cannot have made the recordings, although they were fitted."""
 
     def of(self, status: str) -> tuple[Number, ...]:
         """The numbers of a status."""
@@ -162,7 +162,7 @@ def fit_elements(
     :param update: called with the number of recordings whose poses are solved.
     :param accept: fit recordings that this machine cannot have made, too.
     :raises ParameterError: a robot without elastic members.
-    :raises PkmTwinError: recordings that are too short, whose loads tell nothing, or that this
+    :raises PkmTwinError: recordings that are too short, whose loads identify nothing, or that this
         machine cannot have made.
     """
     parts = []
@@ -201,7 +201,7 @@ def fit_elements(
         refuse_faults(faults, accept)
     numbers = _numbers(robot, names, factors, found, verdict)
     if all(number.status == "not excited" for number in numbers):
-        raise PkmTwinError("no excitation: the loads tell nothing of any element's compliance")
+        raise PkmTwinError("no excitation: the loads identify no element's compliance")
     plain = found.covariance[: len(names), : len(names)]
     found = replace(found, covariance=verdict.widened(found.covariance))
     own = found.covariance[: len(names), : len(names)]
@@ -219,10 +219,10 @@ def fit_elements(
 def refuse_faults(faults: Sequence[str], accept: bool) -> None:
     """Refuse recordings that a machine cannot have made.
 
-    :raises PkmTwinError: by the first fault, where they are not accepted all the same.
+    :raises PkmTwinError: by the first fault, unless they are accepted.
     """
     if faults and not accept:
-        raise PkmTwinError(f"{faults[0]}; --accept fits it all the same")
+        raise PkmTwinError(f"{faults[0]}; --accept fits it nevertheless")
 
 
 def _numbers(
@@ -262,7 +262,7 @@ def _check(recording: Deflected) -> None:
 
 
 def _check_loads(recordings: Sequence[Deflected], robot: Robot) -> None:
-    """One load in one pose tells one deflection, whatever its size.
+    """One load in one pose gives one deflection, whatever its size.
 
     :raises PkmTwinError: that is all there is.
     """
@@ -276,8 +276,8 @@ def _check_loads(recordings: Sequence[Deflected], robot: Robot) -> None:
     apart = float(np.ptp(q, axis=0).max())
     if singular[1:].max(initial=0.0) < ALIKE * singular[0] and apart < ALIKE * robot.size:
         raise PkmTwinError(
-            "no excitation: one load direction in one pose; other directions or other poses tell "
-            "elements apart"
+            "no excitation: one load direction in one pose; use other directions or other poses to "
+            "distinguish elements"
         )
 
 

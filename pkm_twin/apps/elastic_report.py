@@ -120,9 +120,9 @@ def yaml_head(result: ElasticFit, recordings: Sequence[str]) -> list[str]:
 
 
 def group_text(group: Group) -> str:
-    """One line on elements that are not told apart."""
+    """One line on elements that the loads do not distinguish."""
     told = "; ".join(_sum_text(one) for one in group.known) or "nothing"
-    return f"Loads do not tell {' and '.join(group.elements)} apart; known is {told}"
+    return f"Loads do not distinguish {' and '.join(group.elements)}; they identify {told}"
 
 
 def _sum_text(one: Combination) -> str:
@@ -141,13 +141,13 @@ def print_fit(result: ElasticFit) -> None:
         table.add_column(name, justify="right")
     table.add_column("")
     for n in _shown(result):
-        note = "only together with others" if n.status == "combination" else ""
+        note = "known only in combination with others" if n.status == "combination" else ""
         table.add_row(str(n.key[-1]), f"{n.before:.6g}", f"{n.after:.6g}", n.spread, note)
     table_console().print(table)
     idle = result.of("not excited")
     if idle:
         names = ", ".join(str(n.key[-1]) for n in idle)
-        typer.echo(f"the loads tell nothing of, and the file's value stays: {names}")
+        typer.echo(f"not excited by the loads, the file's value stays: {names}")
     for group in result.groups:
         typer.echo(group_text(group))
     e = result.estimate
@@ -199,7 +199,7 @@ def elastic_page(result: ElasticFit, recordings: Sequence[str], notes: Sequence[
     idle = result.of("not excited")
     if idle:
         names = ", ".join(html.escape(str(n.key[-1])) for n in idle)
-        parts.append(f"<p>The loads tell nothing of, and the file's value stays: {names}.</p>")
+        parts.append(f"<p>Not excited by the loads, the file's value stays: {names}.</p>")
     parts += [f"<p>{html.escape(group_text(group))}.</p>" for group in result.groups]
     parts += ["<h2>Numbers, before and now</h2>", picture(changes_figure(shown))]
     parts.append("<h2>Held out: the last third of each recording</h2>")

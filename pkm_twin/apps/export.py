@@ -64,16 +64,20 @@ def c(
 @app.command("ros2-control")
 def ros2_control(
     robot: RobotName,
-    out: Annotated[Path, typer.Option(help="folder of the package, made anew")],
+    out: Annotated[Path, typer.Option(help="folder of the new package")],
     bandwidth: Annotated[
-        float, typer.Option(help="of the gains, by the masses at home; 0: no gains", metavar="HZ")
+        float,
+        typer.Option(
+            help="bandwidth for the gains, from the masses at home; 0: no gains", metavar="HZ"
+        ),
     ] = 0.0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace its files")] = False,
 ) -> None:
-    """Write a package of plugins for ros2_control, in C++ and without pkm_twin.
+    """Write a package of C++ plugins for ros2_control.
 
     A chainable feedforward controller (inverse dynamics plus PD), a kinematics_interface and an
-    inverse_dynamics_solver, on the robot's exported C. Build it with colcon.
+    inverse_dynamics_solver use the robot's exported C. Build the package with colcon; it builds
+    and runs without pkm_twin.
     """
     from pkm_twin import load
     from pkm_twin.export.ros2_control import ros2_control_package
@@ -85,7 +89,7 @@ def ros2_control(
 def fmu(
     robot: RobotName,
     out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.fmu")],
-    fmi: Annotated[int, typer.Option(help="version of FMI, 2 or 3")] = 3,
+    fmi: Annotated[int, typer.Option(help="FMI version, 2 or 3")] = 3,
     kind: Annotated[
         str, typer.Option(help="dynamics: motion under efforts; torques: efforts of a motion")
     ] = "dynamics",
@@ -93,7 +97,7 @@ def fmu(
 ) -> None:
     """Write a Functional Mock-up Unit, for model exchange and co-simulation.
 
-    Its sources are inside; where this machine has a C compiler, a binary for it, too.
+    It contains C sources and, if this computer has a C compiler, a binary for this platform.
     """
     from pkm_twin import load
     from pkm_twin.export import fmu as units
@@ -135,7 +139,7 @@ def sdf(
     out: Annotated[Path, typer.Option(help="the file to write", metavar="FILE.sdf")],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
 ) -> None:
-    """Write an SDF model: links, and joints that close the loops, too."""
+    """Write an SDF model: links and all joints, also those that close the loops."""
     from pkm_twin import load
     from pkm_twin.machine.robot_urdf import robot_sdf
 

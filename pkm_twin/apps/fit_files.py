@@ -91,7 +91,7 @@ def fitted_yaml(text: str, result: Fitted, recordings: Sequence[str]) -> str:
         told = [n for n in numbers if n.status != "not excited"]
         spread = ", ".join(n.spread for n in told)
         alone = all(n.status == "fitted" for n in told)
-        how = "" if alone else "; known only together with others"
+        how = "" if alone else "; known only in combination with others"
         was = ", ".join(f"{n.before:.6g}" for n in told)
         unit = f" {told[0].unit}" if told[0].unit else ""
         notes[base] = (

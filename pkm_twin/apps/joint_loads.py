@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Final, Optional
 
 import numpy as np
 import typer
@@ -27,7 +27,9 @@ from pkm_twin.files import STANDARD, replace_file
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.robot import Robot
-from pkm_twin.paths.durability import Life, bearing_life, rainflow
+
+if TYPE_CHECKING:
+    from pkm_twin.paths.durability import Life
 
 Array = NDArray[np.float64]
 
@@ -155,6 +157,8 @@ def life_of(robot: Robot, load: JointLoad, spec: BearingSpec, time: Array) -> Li
 
     :raises ParameterError: Y without an axis.
     """
+    from pkm_twin.paths.durability import bearing_life
+
     force = load.own[:, :3]
     amount = np.linalg.norm(force, axis=-1)
     if spec.Y is not None:
@@ -178,6 +182,8 @@ def report(
     exponent: float,
 ) -> tuple[dict[str, Any], str]:
     """The result as plain data and as text."""
+    from pkm_twin.paths.durability import rainflow
+
     robot = motion.robot
     data: dict[str, Any] = {
         "robot": robot.name, "samples": len(motion.time),
@@ -247,6 +253,8 @@ def table(motion: Motion, loads: list[JointLoad]) -> str:
 
 def spectra(loads: list[JointLoad]) -> str:
     """Rainflow counts by joint, component and class of range, as CSV."""
+    from pkm_twin.paths.durability import rainflow
+
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(["joint", "component", "range_up_to", "cycles"])
@@ -261,6 +269,7 @@ def spectra(loads: list[JointLoad]) -> str:
 def draw(motion: Motion, loads: list[JointLoad], path: Path) -> None:
     """Forces of the joints with the largest ones over time, and their rainflow spectra."""
     from pkm_twin.atlas import figures, plots
+    from pkm_twin.paths.durability import rainflow
 
     sizes = {load.name: np.linalg.norm(load.wrench[:, :3], axis=-1) for load in loads if load.known}
     order = sorted(sizes, key=lambda name: -float(sizes[name].max()))[:SHOWN]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _SINGULARITY = 0.05
-_NAMES = "P1, P2, P3 or six numbers with commas between, N and N m; or NAME=six numbers"
+_NAMES = "P1, P2, P3 or six numbers separated by commas, N and N m; or NAME=six numbers"
 
 Along = Annotated[
     Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
@@ -37,14 +37,15 @@ Along = Annotated[
 Wrench = Annotated[
     list[str],
     typer.Option(
-        help=f"what the surroundings apply to the platform, base axes: {_NAMES}; several times "
-        "for several load cases"
+        help=f"force and moment on the platform, base axes: {_NAMES}; several times for several "
+        "load cases"
     ),
 ]
 LoadOf = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option(
-        help="MASS[,x,y,z] on the platform in place of the file's, kg and m", show_default=False
+        help="MASS[,x,y,z] on the platform instead of the file's payload, kg and m",
+        show_default=False,
     ),
 ]
 Singularity = Annotated[
@@ -252,16 +253,20 @@ def _offer(name: str, doc: str, *, loads: bool = True) -> None:
     kind(made)
 
 
-_offer("compliance", "Where it is softest: compliance, its direction, or deflections under loads.")
-_offer("payload", "How much it carries: the largest mass that the drives hold at rest.")
-_offer("acceleration", "How hard it accelerates: from rest, in the worst direction.")
-_offer("frequency", "Where it rings lowest: first frequency, actuators locked.", loads=False)
-_offer("pose-error", "Where it is least accurate, by the file's `uncertainty`.", loads=False)
+_offer("compliance", "The softest pose: compliance and its direction, or deflections under loads.")
+_offer("payload", "The largest mass that the drives hold at rest.")
+_offer("acceleration", "The acceleration from rest that the drives reach in every direction.")
+_offer("frequency", "The first natural frequency, actuators locked.", loads=False)
+_offer(
+    "pose-error",
+    "The standard deviation of the position, from the file's `uncertainty`.",
+    loads=False,
+)
 _offer(
     "strain-energy",
-    """Which part gives: strain energy of loads, and the elements' parts of it.
+    """The strain energy of loads, and each element's share.
 
-    Of upr_rpu, with one wrench at most and no other option, over its regular workspace, next to the
-    2UPR-RPU paper's table 2.
+    For upr_rpu with at most one wrench and no other option, the map covers the largest inscribed
+    circle of each height, and the command compares the result with table 2 of the 2UPR-RPU paper.
     """,
 )

@@ -13,7 +13,6 @@ from typing import Annotated, Any, Final, Optional
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from scipy import stats  # type: ignore[import-untyped]
 
 from pkm_twin.apps.history import Series, read_history
 from pkm_twin.apps.options import Json
@@ -80,6 +79,8 @@ def judged(series: Series, baseline: int, alarm: float) -> Judged:
 
     :param alarm: chance of a false alarm of this series.
     """
+    from scipy import stats  # type: ignore[import-untyped]
+
     y, k = series.value, len(series.value)
     if k < FEWEST:
         none = math.nan
@@ -115,15 +116,15 @@ def trend(
     ],
     machine: Annotated[
         Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-        typer.Option(help="of this machine only", show_default=False),
+        typer.Option(help="report this machine only", show_default=False),
     ] = None,
     baseline: Annotated[
-        int, typer.Option(help="recordings that the control limits are from, the first", min=3)
+        int, typer.Option(help="number of first recordings that set the control limits", min=3)
     ] = 15,
     false_alarm: Annotated[
         float,
         typer.Option(
-            help="chance that a history without drift is reported as one", min=1e-9, max=0.5
+            help="probability of a false alarm for a history without drift", min=1e-9, max=0.5
         ),
     ] = 0.01,
     picture: Annotated[

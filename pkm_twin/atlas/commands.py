@@ -34,7 +34,7 @@ _Real = Optional[float]  # noqa: UP045
 _Text = Optional[str]  # noqa: UP045
 _File = Optional[Path]  # noqa: UP045
 
-Html = Annotated[bool, typer.Option("--html", help="also one page to turn and zoom, no network")]
+Html = Annotated[bool, typer.Option("--html", help="also an offline interactive HTML page")]
 Json = Annotated[bool, typer.Option("--json", help="machine-readable output")]
 
 
@@ -79,13 +79,15 @@ def show(
     out: Annotated[
         _File,
         typer.Option(
-            help="stem of the PNGs; default the file's", show_default=False, callback=file_name
+            help="stem of the PNGs; default: that of the file",
+            show_default=False,
+            callback=file_name,
         ),
     ] = None,
     html: Html = False,
     as_json: Json = False,
 ) -> None:
-    """Draw a stored atlas again: PNGs, and with --html a page to turn and zoom."""
+    """Plot a stored map: PNGs, and with --html an offline interactive HTML page."""
     _present(file, True, html, as_json, out)
 
 
@@ -136,21 +138,21 @@ def _compute(
     *,
     context: typer.Context,
     points: Annotated[
-        _Number, typer.Option(max=MOST, help="samples, about; default: the kind's own grid")
+        _Number, typer.Option(max=MOST, help="approximate number of samples; default: by kind")
     ] = None,
     out: Annotated[
         _File,
         typer.Option(
-            help="file to write; default ROBOT_KIND.nc", show_default=False, callback=file_name
+            help="file to write; default: ROBOT_KIND.nc", show_default=False, callback=file_name
         ),
     ] = None,
     workers: Annotated[
-        _Number, typer.Option(help="processes on this machine; default one a core")
+        _Number, typer.Option(help="processes on this computer; default: one per core")
     ] = None,
     scheduler: Annotated[
-        _Text, typer.Option(help="address of a Dask scheduler, tcp://HOST:8786, that does the work")
+        _Text, typer.Option(help="address of a Dask scheduler: tcp://HOST:8786")
     ] = None,
-    picture: Annotated[bool, typer.Option(help="also PNGs beside the file")] = True,
+    picture: Annotated[bool, typer.Option(help="also PNGs next to the file")] = True,
     html: Html = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the target")] = False,
     as_json: Json = False,
@@ -183,7 +185,7 @@ def _compute(
         except KeyboardInterrupt:
             typer.echo(
                 f"pkm-twin: stopped; finished parts are in {target}.parts, "
-                "the same command goes on from there",
+                "the same command continues from there",
                 err=True,
             )
             raise typer.Exit(INTERRUPTED) from None
@@ -195,13 +197,13 @@ def workspace(
     machine: Robot,
     points: int | None,
     least_singularity: Annotated[
-        float, typer.Option(help="distance to a singularity (0 to 1) that is too little")
+        float, typer.Option(help="singularity index (0 to 1) below which a pose does not count")
     ] = 0.0,
     least_clearance: Annotated[
-        float, typer.Option(help="distance between limbs (m) that is too little")
+        float, typer.Option(help="distance between limbs (m) below which a pose does not count")
     ] = 0.0,
 ) -> Sweep:
-    """Reach, singularities, limb interference, regular part."""
+    """Reach, singularities, limb interference, largest inscribed cylinder."""
     from pkm_twin.atlas.workspace.sweep import workspace_sweep
 
     return workspace_sweep(
@@ -214,16 +216,16 @@ def isotropy(
     machine: Robot,
     points: int | None,
     height: Annotated[
-        _Real, typer.Option(help="z of the poses (m); default the home pose's")
+        _Real, typer.Option(help="z of the poses (m); default: that of the home pose")
     ] = None,
     energy: Annotated[
         float, typer.Option(help="the platform's kinetic energy for F_max (J)")
     ] = 100.0,
     beyond_limits: Annotated[
-        bool, typer.Option("--beyond-limits", help="also poses beyond the limits, marked")
+        bool, typer.Option("--beyond-limits", help="also poses beyond the limits, marked as such")
     ] = False,
 ) -> Sweep:
-    """Kinetic energy and driving force over directions (prru, delta)."""
+    """Kinetic energy and driving force by direction, for three pose coordinates."""
     from pkm_twin.atlas.isotropy.sweep import isotropy_sweep
 
     return isotropy_sweep(
@@ -233,7 +235,7 @@ def isotropy(
 
 @kind
 def modes(machine: Robot, points: int | None) -> Sweep:
-    """The six lowest natural frequencies and their shapes."""
+    """The six lowest natural frequencies and their mode shapes."""
     from pkm_twin.atlas.modes.sweep import modes_sweep
 
     return modes_sweep(machine, points)
@@ -267,7 +269,7 @@ def _present(file: Path, picture: bool, html: bool, as_json: bool, out: Path | N
 
 
 def _factors(data: Dataset) -> Table:
-    """Global factors beside the paper's table 2."""
+    """Global factors compared with the paper's table 2."""
     from pkm_twin.atlas.strain_energy.stored import wrench_of
     from pkm_twin.atlas.strain_energy.sweep import table_2
 

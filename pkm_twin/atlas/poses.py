@@ -167,7 +167,7 @@ def pose_axes(robot: Robot, points: int, least: float, least_clearance: float) -
         raise ParameterError("least_clearance", least_clearance, "0 or more, m")
     if least_clearance > 0.0 and not has_clearance(robot):
         raise ParameterError(
-            "least_clearance", least_clearance, "0: the file does not tell the members' diameters"
+            "least_clearance", least_clearance, "0: the file does not give the members' diameters"
         )
     box = workspace_box(robot)
     count = len(box)

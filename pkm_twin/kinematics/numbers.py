@@ -105,6 +105,7 @@ def cause_slopes(robot: Robot, of: Callable[[Robot], Sequence[Any]]) -> Array:
         causes = robot.causes.values()
         paths = tuple(dict.fromkeys(path for cause in causes for path in cause))
         steps = np.array([[cause.get(path, 0.0) for cause in causes] for path in paths])
+        steps = steps.reshape(len(paths), len(causes))
         found = robot.calls[key] = FileNumbers(robot, paths, of).slopes @ steps
     return found
 

@@ -63,10 +63,10 @@ def test_fit_of_the_recorded_bag_writes_a_robot_with_a_softer_joint_and_a_report
     )
     text = out.read_text()
     assert "element_compliance.3U: fitted from upr_rpu_soft_joint.mcap, +- " in text
-    assert "# Loads do not tell 3R and 3U apart" in text
+    assert "# Loads do not distinguish 3R and 3U" in text
     page = (tmp_path / "fitted.html").read_text()
     assert page.count("data:image/png;base64,") == 2
-    assert "Loads do not tell 3R and 3U apart" in page
+    assert "Loads do not distinguish 3R and 3U" in page
     again = command(capsys, "fit", "upr_rpu", SOFT, "--what", "compliance", "--out", out)
     assert again.code == 1
     assert "exists" in again.err

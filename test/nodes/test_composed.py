@@ -63,8 +63,8 @@ def test_nodes_of_one_process_answer_with_their_own_parameters_and_end_together(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "expected delta_dynamics"),
-        (("command_gate",), "command_gate has to outlive"),
+        ((), "delta_dynamics"),
+        (("command_gate",), "command_gate"),
         (("machine_state", "machine_state"), "each once"),
         (("machine_stat",), "composed machine_stat"),
     ],

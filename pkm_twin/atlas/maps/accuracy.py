@@ -34,7 +34,9 @@ def _causes(robot: Robot) -> tuple[Factor, ...]:
     found = [f for f in robot.factors if f.effect(lambda r: r.platform(home)[0]).any()]
     if not found:
         raise ParameterError(
-            "uncertainty", None, "the deviation of a number of the geometry that moves the platform"
+            "uncertainty",
+            None,
+            "the standard deviation of a length or angle that moves the platform",
         )
     return tuple(found)
 

@@ -238,13 +238,14 @@ class Worst:
     found: Found
 
 
-def worst_of(sweep: MapSweep, case: Case, starts: Array) -> Worst:
+def worst_of(sweep: MapSweep, case: Case, starts: Array, quantity: Quantity | None = None) -> Worst:
     """The worst pose of the workspace.
 
     :param starts: poses that count, shape (k, m).
+    :param quantity: the sweep's, with another size of the search.
     :raises ParameterError: no pose counts.
     """
-    robot, quantity = sweep.robot, sweep.quantity
+    robot, quantity = sweep.robot, quantity or sweep.quantity
     limits = robot.limits.position
     by_joints = limits is not None and bool(np.isfinite(limits).all())
     rng = np.random.default_rng(0)

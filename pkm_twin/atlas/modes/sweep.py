@@ -221,7 +221,9 @@ def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:
     # A little inside: on the edge rounding decides.
     best = largest_cylinder(circles(robot, np.linspace(*height_range(robot), LAYERS)))
     if best.radius == 0.0:
-        raise ParameterError("limits", robot.name, "limits that leave a regular workspace")
+        raise ParameterError(
+            "limits", robot.name, "limits that leave room for an inscribed cylinder"
+        )
     side = total ** (1 / 3)
     layers = max(3, 2 * round(side / 4) + 1)
     azimuths = 4 * max(2, round(side * 1.8 / 4))

@@ -64,7 +64,7 @@ def plane(
 
 
 def global_factors(atlas: Dataset, ax: Axes | None = None) -> Axes:
-    """Global strain-energy factors, beside the paper's where it prints them."""
+    """Global strain-energy factors, compared with the paper's where it prints them."""
     ax = figures.axes_or_new(ax)
     names = [str(name) for name in atlas.element.values]
     bars = [("this atlas", atlas.global_factor.values, plots.COLOURS[0])]
@@ -85,7 +85,7 @@ def global_factors(atlas: Dataset, ax: Axes | None = None) -> Axes:
 
 
 def stack(atlas: Dataset, ax: Any = None, layers: int = 6) -> Any:
-    """Total energy on slices of the regular workspace, stacked by height, on 3-D axes."""
+    """Total energy on slices of the workspace, stacked by height, on 3-D axes."""
     if ax is None:
         ax = (
             figures.pyplot()
@@ -138,7 +138,7 @@ def _energy_plane(atlas: Dataset) -> Figure:
 def _energy_slices(atlas: Dataset) -> Figure:
     figure = figures.new_figure(figsize=(8, 6.2), layout="constrained")
     stack(atlas, figure.add_subplot(projection="3d"))
-    figure.suptitle(f"{load_case(atlas)}: total strain energy over the regular workspace")
+    figure.suptitle(f"{load_case(atlas)}: total strain energy over the workspace")
     return figure
 
 

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, ClassVar, Final
 
@@ -117,7 +118,7 @@ class StrainEnergySweep(Sweep):
             **worst_coordinates(self.whole),
         }
 
-    @property
+    @cached_property
     def whole(self) -> MapSweep:
         """The map of the same over the whole workspace, whose worst pose is stored."""
         return map_sweep(self.robot, self.kind, cases=[Case("wrench", self.wrench)])
@@ -182,7 +183,10 @@ class StrainEnergySweep(Sweep):
             attrs = {**SHARE, "long_name": f"global strain-energy factor, {what}"}
             result[name] = Variable(("element",), values, attrs)
         whole = self.whole
-        return result | worst_variables(whole, [worst_of(whole, whole.cases[0], np.empty((0, 3)))])
+        # Three coordinates and a smooth quantity: a small part of the usual search is enough.
+        quantity = replace(whole.quantity, samples=1024, population=48, rounds=80)
+        worst = worst_of(whole, whole.cases[0], np.empty((0, 3)), quantity)
+        return result | worst_variables(whole, [worst])
 
 
 def strain_energy_sweep(
@@ -258,7 +262,7 @@ def _layers(robot: Robot, step: float) -> tuple[Array, Array]:
     reach = circles(robot, ticks)
     kept = reach.radius >= LEAST_RADIUS
     if not kept.any():
-        raise ParameterError("limits", robot.name, "limits that leave a regular workspace")
+        raise ParameterError("limits", robot.name, "limits that leave room for an inscribed circle")
     return reach.z[kept], reach.radius[kept]
 
 
