@@ -50,7 +50,8 @@ def structure_on(
         values = np.empty(3, dtype=object)
         values[:] = [next(left) for _ in range(3)]
         k = _known(places, values)
-        if k is not None:
+        # On a free tape the end is a number of its own: it may be differentiated by.
+        if k is not None and not values[0].tape.free:
             for known, value in zip(places[k], values, strict=True):
                 snapped(value - known)
             values = places[k]

@@ -264,7 +264,7 @@ def test_halves_of_a_cone_are_the_cone(rng):
 
 def test_a_search_without_end_says_so(monkeypatch):
     monkeypatch.setattr(cones, "MOST", 100)
-    with pytest.raises(SearchError, match="allowed: 100"):
+    with pytest.raises(SearchError, match="at most 100"):
         least_direction(scaled_forms(0, 6))
 
 

@@ -20,7 +20,7 @@ from pkm_twin.machine.entries import entries, with_entries
 from stiffness_monitor import compliance
 from stiffness_monitor.programs import elastic_of, followed
 from test.machine.random_machines import plain
-from test.support.robots import elastic, load, often, partly_long, some_robots
+from test.support.robots import elastic, load, often, parameters_of, partly_long, some_robots
 
 MACHINES = Path(__file__).resolve().parents[1] / "machine"
 ASIDE = ("limits", "joint_map", "uncertainty", "member", "section", "compliance", "radius")
@@ -301,6 +301,10 @@ def test_closures_that_are_left_out_follow_from_the_others():
 
 
 def test_a_robot_that_is_rigid_has_no_compliance():
-    robot = load("five_bar")
+    data = parameters_of("five_bar")
+    for entry in [*data["bodies"].values(), *data["joints"].values()]:
+        entry.pop("member", None)
+        entry.pop("compliance", None)
+    robot = robot_of_data(data, "rigid")
     with pytest.raises(ParameterError):
         variants(robot, {"payload.mass": [0.0, 1.0]}).compliance(robot.home())

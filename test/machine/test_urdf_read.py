@@ -289,7 +289,7 @@ REFUSED = {
     "no inertia": (
         '<inertia ixx="0.2" iyy="0.1" izz="0.1"/>',
         "",
-        "link.bob.inertial.inertia: None",
+        "link.bob.inertial.inertia: missing",
     ),
     "no moment": ('ixx="0.2"', "", "link.bob.inertial.inertia.ixx"),
     "no mass": ('<mass value="3"/>', "", "link.bob.inertial.mass"),
@@ -332,7 +332,7 @@ REFUSED = {
     "closure's link": (
         "</robot>",
         '<constraint name="k" type="link"><parent link="world"/></constraint></robot>',
-        "constraint.k.child: None",
+        "constraint.k.child: missing",
     ),
     "closure on itself": (
         "</robot>",
@@ -340,7 +340,7 @@ REFUSED = {
         "</robot>",
         "k: 'bob'.*between two links",
     ),
-    "no platform": ('"tool"', '"bit"', "platform: None.*one of bit, bob, crank, stand, world"),
+    "no platform": ('"tool"', '"bit"', "platform: missing.*one of bit, bob, crank, stand, world"),
     "platform at rest": ('"stand"', '"platform"', "platform: 'platform'.*can move"),
 }
 
@@ -449,7 +449,7 @@ def test_an_open_loop_is_refused_with_its_miss(tmp_path):
 def test_files_that_are_no_files_or_too_much_are_refused(tmp_path):
     with pytest.raises(ParameterError, match="not a file"):
         read_urdf(tmp_path)
-    with pytest.raises(ParameterError, match="readable URDF"):
+    with pytest.raises(ParameterError, match="no such file"):
         read_urdf(tmp_path / "none.urdf")
     deep = tmp_path / "deep.urdf"
     deep.write_text("<robot>" + "<a>" * 100_000)

@@ -109,5 +109,5 @@ def test_a_wrench_without_a_correction_has_its_compliance(peer, launch):
             peer.send("/wrench", load_case)
 
     peer.until(lambda: peer.received("/loose/compliance_stamped"), repeat=push)
-    peer.until(lambda: "no correction or judgement: " in process.output)
+    peer.until(lambda: "no correction or alarm: " in process.output)
     assert values_of(peer.diagnostics("/loose"))["exceptions"] == "0"

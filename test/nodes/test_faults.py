@@ -397,7 +397,7 @@ class TestClocks:
             clock.clock.sec, clock.clock.nanosec = sec, nanosec
             timed.peer.send("/clock", clock)
         array = timed.diagnostics(lambda a: int(values_of(a)["clock messages refused"]) >= 1)
-        assert "messages of /clock were no time" in text_of(array)
+        assert "messages of /clock had an invalid time" in text_of(array)
         assert stamp_of(array) == self.start + SECOND
         assert values_of(array)["exceptions"] == "0"
 

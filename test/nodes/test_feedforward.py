@@ -436,7 +436,7 @@ class TestJumps:
             assert twin.joint_state(*message) is not None
             return
         reason, text = reject(twin.joint_state, *message)
-        assert (reason, "another assembly mode" in text) == ("jump", True)
+        assert (reason, "the assembly mode changed" in text) == ("jump", True)
         assert text.startswith("x of the platform")
         assert twin.stream.stops == {"jump": 1}
 
