@@ -98,7 +98,7 @@ def calibrate_command(
     after, is the calibration's accuracy.
 
     Poses that this machine cannot have been in are rejected with the reason, and so are poses in
-    another frame than the base's without --frame; --accept calibrates all the same and marks the
+    another frame than the base's without --frame; --accept calibrates anyway and marks the
     file.
     """
     from pkm_twin import load
@@ -128,7 +128,7 @@ def calibrate_command(
             machine, measured, paths, offsets=offsets, frame=frame, target=target, prior=prior,
             transmission=transmission, accept=accept, progress=step,
         )  # fmt: skip
-    marks = [*(f"accepted all the same: {fault}" for fault in result.faults), *notes]
+    marks = [*(f"accepted anyway: {fault}" for fault in result.faults), *notes]
     source = f"calibrated with {one_line(poses.name, 100)}"
     values = {
         p.name: Fitted(p.value, p.deviation, p.unit, source)

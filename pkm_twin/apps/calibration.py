@@ -321,7 +321,7 @@ def _calibrated(
     good = np.array([p.observed for p in told])
     if not good.any() and not faults:
         raise ParameterError(
-            "poses", len(poses.joints), "poses apart from each other: these tell no number"
+            "poses", len(poses.joints), "poses farther apart: these determine none of the numbers"
         )
     singular = np.linalg.svd(information[:, good], compute_uv=False)
     condition = float(singular[0] / singular[-1]) if good.any() else np.inf

@@ -50,7 +50,7 @@ class RejectedPosesError(ParameterError):
     """Poses that this machine was not in."""
 
     def __init__(self, fault: Fault) -> None:
-        Exception.__init__(self, one_line(f"{fault}; --accept calibrates all the same", 2000))
+        Exception.__init__(self, one_line(f"{fault}; --accept calibrates anyway", 2000))
         self.field, self.value, self.bound = "poses", fault.what, fault.right
 
 

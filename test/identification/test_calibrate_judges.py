@@ -105,7 +105,7 @@ def test_changes_beyond_their_prior_are_rejected_or_marked(tmp_path: Path) -> No
     assert accepted.exit_code == 0, accepted.output
     (reason,) = json.loads(accepted.stdout)["accepted"]
     assert "geometry.forearm_length" in reason
-    assert "accepted all the same" in (tmp_path / "mine.yaml").read_text()
+    assert "accepted anyway" in (tmp_path / "mine.yaml").read_text()
     wider = run(tmp_path, "delta_cu", there, *only, "--prior", "0.1", "--overwrite", "--json")
     assert wider.exit_code == 0 and json.loads(wider.stdout)["accepted"] == []
 
