@@ -101,7 +101,7 @@ def test_interrupted_and_resumed(call, small_atlases, tmp_path):
     _, errors = process.communicate()
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
-    assert "goes on from there" in errors
+    assert "continues from there" in errors
     assert parts.exists()
     assert not (tmp_path / "cut.nc").exists()
     call(*words, "--out", "cut.nc", "--workers", "1")

@@ -27,8 +27,8 @@ NOT_RUN = {
 """Lines that are parsed but not run, and why."""
 ENDS = {"pkm-twin recover damaged.mcap saved.mcap": 3}
 """Exit codes other than 0, as the page says."""
-SLOW = r"pkm-twin (torques \S+ \S+\.mcap|atlas|show) .*"
-"""Lines of seconds that test_torques.py and test/atlas have on other files: with `make long`."""
+SLOW = r"pkm-twin (torques (\S+\.mcap|\S+ \S+\.mcap|better\.yaml)|atlas|show|design|excite)\b.*"
+"""Lines of seconds that other tests run on smaller files: with `make long`."""
 PROGRAMS = ("pkm-twin ", "head -c ")
 """Ours, and what prepares a file for it."""
 INLINE_NAMES = r"ROBOT|FILE|BAG|TOPIC|COMMAND|KIND|HOST| N\b"
@@ -112,7 +112,7 @@ def test_it_parses_as_it_stands(tree, page, line):
 def folder(tmp_path_factory):
     """A clone, as far as the lines read it: what is not there they have to make."""
     path = tmp_path_factory.mktemp("typed")
-    for name in ("bags", "config"):
+    for name in ("bags", "config", "examples"):
         (path / name).symlink_to(REPOSITORY / name)
     return path
 

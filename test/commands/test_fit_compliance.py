@@ -77,7 +77,7 @@ def test_fit_of_a_table_with_three_gauges_says_what_it_found(capsys, tmp_path, m
     path = table(tmp_path / "static.csv", deflection=("dx", "dy", "dz"))
     done = command(capsys, "fit", "upr_rpu", path, "--what", "compliance", "--no-report")
     assert done.code == 0, done.err
-    assert "apart; known is" in done.out
+    assert "do not distinguish" in done.out
     assert "static.csv, held out, dz: residual" in done.out
     assert "held out, rx" not in done.out
     assert load(str(tmp_path / "fitted.yaml")).element_compliance["1B"] == pytest.approx(
