@@ -329,7 +329,7 @@ def compliance(
     beyond_limits: BeyondLimits = False,
     as_json: Json = False,
 ) -> None:
-    """Compute compliance at a pose and strain energy under a load.
+    """Compute compliance and strain energy at a pose.
 
     Example: `pkm-twin compliance upr_rpu -0.6 0 0 --wrench 30,-50,-40,10,-20,50`.
 
