@@ -7,14 +7,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    __version__: str
     from pkm_twin.design.variants import variants
-    from pkm_twin.kinematics.derivatives import (
+    from pkm_twin.robot.catalogue import load, robot_names
+    from pkm_twin.robot.derivatives import (
         forward_derivatives,
         inverse_derivatives,
         platform_derivatives,
     )
-    from pkm_twin.machine.catalogue import load, robot_names
-    from pkm_twin.machine.robot import Robot
+    from pkm_twin.robot.robot import Robot
 
 __all__ = [
     "Robot",
@@ -25,21 +26,22 @@ __all__ = [
     "robot_names",
     "variants",
 ]
-__version__ = "0.1.0"
 
 _HOMES = {
-    "Robot": "pkm_twin.machine.robot",
-    "forward_derivatives": "pkm_twin.kinematics.derivatives",
-    "inverse_derivatives": "pkm_twin.kinematics.derivatives",
-    "platform_derivatives": "pkm_twin.kinematics.derivatives",
-    "load": "pkm_twin.machine.catalogue",
-    "robot_names": "pkm_twin.machine.catalogue",
+    "Robot": "pkm_twin.robot.robot",
+    "forward_derivatives": "pkm_twin.robot.derivatives",
+    "inverse_derivatives": "pkm_twin.robot.derivatives",
+    "platform_derivatives": "pkm_twin.robot.derivatives",
+    "load": "pkm_twin.robot.catalogue",
+    "robot_names": "pkm_twin.robot.catalogue",
     "variants": "pkm_twin.design.variants",
 }
 """Loaded when they are asked for: a command or a node answers signals before it loads numpy."""
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("importlib.metadata").version(__name__)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_HOMES[name]), name)

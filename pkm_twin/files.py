@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that a user names: regular ones only, and written whole or not at all; numbers in them.
-
-May import: the standard library.
-"""
+"""Files that a user names: regular ones only, and written whole or not at all; numbers in them."""
 
 from __future__ import annotations
 

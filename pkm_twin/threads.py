@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One thread for linear algebra: matrices here are small, and threads cost more than they bring.
-
-May import: threadpoolctl if present, the standard library.
-"""
+"""One thread for linear algebra: matrices here are small, and threads cost more than they bring."""
 
 from __future__ import annotations
 

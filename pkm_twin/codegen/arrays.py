@@ -3,8 +3,6 @@
 
 numpy converts more than can be meant: it drops the mask of a masked array and the imaginary part
 of a complex one, reads text and dates as numbers, and makes NaN of None.
-
-May import: numpy, the standard library.
 """
 
 from __future__ import annotations

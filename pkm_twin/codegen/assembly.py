@@ -3,8 +3,6 @@
 
 Only what :mod:`pkm_twin.codegen.llvm` says of that language stands here. Types are texts; a
 :class:`Value` is the name of a result, or a constant, with its type.
-
-May import: the standard library.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled programs on disk, named by their content. An optimisation: without it all works.
-
-May import: the standard library.
-"""
+"""Compiled programs on disk, named by their content. An optimisation: without it all works."""
 
 from __future__ import annotations
 

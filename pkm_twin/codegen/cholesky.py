@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse symmetric matrices that are not negative, as straight-line expressions.
-
-May import: numpy, this package, the standard library.
-"""
+"""Sparse symmetric matrices that are not negative, as straight-line expressions."""
 
 from __future__ import annotations
 

@@ -2,8 +2,6 @@
 """Exact derivatives of expressions as expressions, backwards and forwards.
 
 Reverse and forward mode of algorithmic differentiation (Griewank and Walther 2008, chapter 3).
-
-May import: this package, the standard library.
 """
 
 from __future__ import annotations

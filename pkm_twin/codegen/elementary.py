@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coefficients of sine, cosine and arctangent, as all compiled back ends compute them.
-
-May import: the standard library.
-"""
+"""Coefficients of sine, cosine and arctangent, as all compiled back ends compute them."""
 
 from __future__ import annotations
 

@@ -4,8 +4,6 @@
 Formulas are written for numbers and run on expressions too: numpy's object arrays of expressions
 add, multiply and take sines like arrays of floats. Equal expressions of one tape are one object,
 and what is zero, one or constant folds away while it is written.
-
-May import: numpy, the standard library.
 """
 
 from __future__ import annotations

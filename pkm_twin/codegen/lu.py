@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse linear equations as straight-line expressions, pivots chosen beforehand on numbers.
-
-May import: numpy, this package, the standard library.
-"""
+"""Sparse linear equations as straight-line expressions, pivots chosen beforehand on numbers."""
 
 from __future__ import annotations
 

@@ -3,8 +3,6 @@
 
 The same expressions, the same order of tests as the vector code; without fused products, so
 results agree to rounding, not to the bit.
-
-May import: numpy, this package, the standard library.
 """
 
 from __future__ import annotations

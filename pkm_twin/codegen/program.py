@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a back end gets: results as expressions of inputs, and equations to be solved before.
-
-May import: this package, the standard library.
-"""
+"""What a back end gets: results as expressions of inputs, and equations to be solved before."""
 
 from __future__ import annotations
 

@@ -4,8 +4,6 @@
 Parallel and perpendicular axes, axes and ball joints that meet, bars of one length and direction:
 an overconstrained machine moves only while they hold. Found are those that hold within a tolerance,
 among joints of one body, and :func:`idealized` makes them hold exactly by least changes.
-
-May import: numpy, pkm_twin's machine, this package, the standard library.
 """
 
 from __future__ import annotations

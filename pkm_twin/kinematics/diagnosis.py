@@ -4,8 +4,6 @@
 Conditions that hold nearly are made to hold exactly, from the least deviations on: where that gives
 the right mobility, those of them without which it does not are the cause, by name and deviation.
 Else what moves although the actuated joints are held is named, or which of them cannot move.
-
-May import: numpy, pkm_twin's machine, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -17,7 +15,8 @@ import numpy as np
 
 from pkm_twin.errors import MobilityError, ParameterError
 from pkm_twin.kinematics.conditions import Condition, Conditions
-from pkm_twin.kinematics.engine import RANK, Engine
+from pkm_twin.kinematics.iterations import RANK
+from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.spins import idle_bodies, null
 from pkm_twin.machine.graph import Array, Graph
 
@@ -33,29 +32,29 @@ _CLEAR: Final = 1e-5
 """Singular values below this share of the greatest are those of deviations."""
 
 
-def mobility_error(engine: Engine) -> MobilityError:
+def mobility_error(linkage: Linkage) -> MobilityError:
     """The error of a machine whose actuated joints do not determine it, with the causes."""
     # What nearly holds takes freedoms away; where there are too many, none is lost.
-    lost = engine.mobility.freedoms < engine.joints
-    causes = near_conditions(engine.graph) if lost else []
+    lost = linkage.mobility.freedoms < linkage.joints
+    causes = near_conditions(linkage.graph) if lost else []
     texts = [c.text for c in causes[:MOST]]
     if len(causes) > MOST:
         texts.append(f"and {len(causes) - MOST} deviations more")
     if not causes:
-        texts = [*_loose(engine), *_locked(engine)]
-    return MobilityError(engine.joints, engine.mobility.freedoms, texts)
+        texts = [*_loose(linkage), *_locked(linkage)]
+    return MobilityError(linkage.joints, linkage.mobility.freedoms, texts)
 
 
-def singular_home(engine: Engine, rank: int, beside: int) -> ParameterError:
+def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
     """The error of a machine whose home is a singularity, with what can move in it alone."""
-    motion, ju = engine.regular_state()
+    motion, ju = linkage.regular_state()
     del motion
-    here = null(engine.scaled_at_home()[0], _NONE)
+    here = null(linkage.scaled_at_home()[0], _NONE)
     there = null(ju, _NONE)
     # What is free at home and not beside it.
     extra = here - there @ (there.T @ here)
     names = (
-        _owners(engine, extra) if here.shape[1] > there.shape[1] else list(engine.graph.actuated)
+        _owners(linkage, extra) if here.shape[1] > there.shape[1] else list(linkage.graph.actuated)
     )
     return ParameterError(
         "joints", f"rank {rank} of the closures at home, {beside} near it",
@@ -91,48 +90,48 @@ def is_right(graph: Graph | None) -> bool:
     """Whether at home the actuated joints determine the machine and move independently."""
     if graph is None:
         return False
-    engine = Engine(graph, ())
-    ju, _ = engine.scaled_at_home()
-    return null(ju, _NONE).shape[1] == 0 and engine.mobility.freedoms == engine.joints
+    linkage = Linkage(graph)
+    ju, _ = linkage.scaled_at_home()
+    return null(ju, _NONE).shape[1] == 0 and linkage.mobility.freedoms == linkage.joints
 
 
 def is_clear(graph: Graph) -> bool:
     """Whether no closure at home holds by a small deviation alone, be it of rounding."""
-    both = np.hstack(Engine(graph, ()).scaled_at_home())
+    both = np.hstack(Linkage(graph).scaled_at_home())
     values = np.linalg.svd(both, compute_uv=False) if both.size else np.zeros(0)
     share = values / max(1.0, float(values.max(initial=0.0)))
     return not ((share > RANK) & (share < _CLEAR)).any()
 
 
-def _loose(engine: Engine) -> list[str]:
+def _loose(linkage: Linkage) -> list[str]:
     """What moves while the actuated joints are held, in words."""
-    motion, ju = engine.regular_state()
+    motion, ju = linkage.regular_state()
     free = null(ju, _NONE)
     if not free.shape[1]:
         return []
-    graph = engine.graph
+    graph = linkage.graph
     spinning = [s for s in idle_bodies(graph, motion, free) if graph.platform not in s[0]]
     texts = []
     for bodies, _, _ in spinning:
         at = [j.name for j in graph.joints.values() if (j.inner in bodies) != (j.outer in bodies)]
         texts.append(f"{' with '.join(bodies)} can turn alone, at {' and '.join(at)}")
     ways = np.array([way for _, _, way in spinning]).reshape(-1, free.shape[1])
-    names = _owners(engine, free @ null(ways, _NONE))
+    names = _owners(linkage, free @ null(ways, _NONE))
     if names:
         texts.append(f"with the actuated joints held, {', '.join(names)} can move")
     return texts
 
 
-def _locked(engine: Engine) -> list[str]:
+def _locked(linkage: Linkage) -> list[str]:
     """Actuated joints that cannot move, or only together."""
-    ju, jq = engine.scaled_at_home()
+    ju, jq = linkage.scaled_at_home()
     unknown = ju.shape[1]
     moves = null(np.hstack([ju, jq]), _NONE)[unknown:]
-    names = np.array(engine.graph.actuated)
+    names = np.array(linkage.graph.actuated)
     rank = int(np.linalg.matrix_rank(moves, _NONE)) if moves.size else 0
-    if rank == engine.joints:
+    if rank == linkage.joints:
         return []
-    sizes = np.linalg.norm(moves, axis=1) if moves.size else np.zeros(engine.joints)
+    sizes = np.linalg.norm(moves, axis=1) if moves.size else np.zeros(linkage.joints)
     still = names[sizes < _NONE].tolist()
     tied = [n for n in names if n not in still]
     texts = [f"{', '.join(still)} cannot move"] if still else []
@@ -141,9 +140,9 @@ def _locked(engine: Engine) -> list[str]:
     return texts
 
 
-def _owners(engine: Engine, motions: Array) -> list[str]:
+def _owners(linkage: Linkage, motions: Array) -> list[str]:
     """Joints, and bodies that only rods hold, in motions of shape (unknown rates, count)."""
     parts = np.abs(motions).max(1, initial=0.0) > _NONE
-    owners: Sequence[str] = engine.tree.owners
+    owners: Sequence[str] = linkage.tree.owners
     found = dict.fromkeys(o for o, part in zip(owners, parts, strict=True) if part)
     return [name.removeprefix("free body ") for name in found]

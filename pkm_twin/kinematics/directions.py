@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Directions spread over a sphere.
-
-May import: numpy, the standard library.
-"""
+"""Directions spread over a sphere."""
 
 from __future__ import annotations
 

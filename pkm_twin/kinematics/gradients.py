@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gradients of programs as programs: by inputs, and by the machine's geometry.
-
-May import: pkm_twin's codegen, this package, the standard library.
-"""
+"""Gradients of programs as programs: by inputs, and by the machine's geometry."""
 
 from __future__ import annotations
 
@@ -13,7 +10,9 @@ from pkm_twin.codegen.expressions import Numbers
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics import pose as poses
-from pkm_twin.kinematics.engine import Engine, Traced, forward_program
+from pkm_twin.kinematics.engine import Engine
+from pkm_twin.kinematics.programs import forward_program
+from pkm_twin.kinematics.traced import Traced
 
 
 def gradient_program(t: Traced, program: Program, by: Mapping[str, Numbers]) -> Program:
@@ -59,7 +58,7 @@ def _pose_motion(t: Traced) -> Program:
     qd, qdd = t.tape.inputs("qd", t.joints), t.tape.inputs("qdd", t.joints)
     t.set_rates(qd)
     t.set_accelerations(qdd)
-    motion, graph, of = t.motion, t.graph, t.engine.coordinates
+    motion, graph, of = t.motion, t.graph, t.scheme.coordinates
     position, rotation = motion.platform()
     body, omega = graph.platform, motion.omega[graph.platform]
     velocity = motion.velocity(body, graph.origin)

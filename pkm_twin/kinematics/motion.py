@@ -4,8 +4,6 @@
 Nothing is differentiated: columns of Jacobians are axes and levers, accelerations are the
 recursion of rigid bodies in base axes (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter
 2). Rates u belong to the unknowns, qd to the actuated joints.
-
-May import: numpy, pkm_twin's machine and codegen, the standard library.
 """
 
 from __future__ import annotations

@@ -5,8 +5,6 @@ A spherical joint and a free body's ball are three revolutes in a row (x, y and 
 universal joint is two, a cylindrical one a slide and a turn, a translation three slides, a screw a
 turn and the slide that its thread makes (``NAME_slide``, of an actuated one too). Rods are links on
 two revolutes, that turn them from their direction at home.
-
-May import: numpy, pkm_twin's codegen, machine and this package, the standard library.
 """
 
 from __future__ import annotations
@@ -19,8 +17,9 @@ import numpy as np
 
 from pkm_twin.codegen.expressions import Numbers, Objects, atan2, sqrt
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.engine import Engine, Traced
+from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.motion import cross
+from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import Array, Rod
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.tree import Link

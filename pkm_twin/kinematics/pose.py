@@ -3,8 +3,6 @@
 
 A coordinate is a coordinate of the position, a turn atan2(a, b) or an elevation asin(s) of signed
 entries of the rotation matrix. Written on numbers and expressions alike.
-
-May import: pkm_twin's codegen and machine, numpy, the standard library.
 """
 
 from __future__ import annotations

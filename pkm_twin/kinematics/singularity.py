@@ -21,8 +21,6 @@ truth: of a parallelogram also the couple that a pair of rods passes.
 
 The platform is one of the bodies, hence the bound of 1. It is zero where joints move and the
 platform does not: at the edge of reach.
-
-May import: numpy, pkm_twin's machine and codegen, this package.
 """
 
 from __future__ import annotations
@@ -38,8 +36,9 @@ from pkm_twin.codegen.expressions import Objects, maximum, minimum, norm, plain,
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
-from pkm_twin.kinematics.engine import Engine, Traced
+from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.gradients import gradient_program
+from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import (
     Columns,
     Motion,
@@ -49,6 +48,7 @@ from pkm_twin.kinematics.motion import (
     matrices,
     numbers,
 )
+from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import BASE, Array, Graph, Rod
 from pkm_twin.machine.tree import Tree
 
@@ -134,16 +134,16 @@ def singularity_at_home(graph: Graph) -> float:
 
     :raises SingularityError: something moves although the actuated joints are locked.
     """
-    return float(singularity_measure(_AtHome(Engine(graph, ()))))
+    return float(singularity_measure(_AtHome(Linkage(graph))))
 
 
 class _AtHome:
     """What the measure asks of a traced machine, on numbers at home."""
 
-    def __init__(self, engine: Engine) -> None:
-        self.graph, self.joints = engine.graph, engine.joints
-        self.motion, rows = engine.at(engine.tree.home, engine.graph.home)
-        ju, jq = (numbers(m) for m in matrices(engine.tree, rows))
+    def __init__(self, linkage: Linkage) -> None:
+        self.graph, self.joints = linkage.graph, linkage.joints
+        self.motion, rows = linkage.at(linkage.tree.home, linkage.graph.home)
+        ju, jq = (numbers(m) for m in matrices(linkage.tree, rows))
         if ju.size and np.linalg.matrix_rank(ju, 1e-9) < ju.shape[1]:
             raise SingularityError("home", (), 0.0, 1e-9)
         self._rates = -np.linalg.lstsq(ju, jq, rcond=1e-9)[0]

@@ -3,8 +3,6 @@
 
 A bar between two ball joints, a pin between two hinges of one axis, small spheres that a drawing
 program leaves in a closure: such a freedom moves neither the platform nor, to speak of, a mass.
-
-May import: numpy, pkm_twin's machine, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.kinematics.conditions import merged
-from pkm_twin.kinematics.engine import Engine
+from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.machine.graph import BASE, Array, Graph, Joint, array
 from pkm_twin.machine.joints import across, unit
@@ -37,12 +35,12 @@ def without_spins(graph: Graph) -> tuple[Graph, list[str]]:
     of its hinges becomes fixed, or one of its ball joints a universal joint across its axis: as
     many freedoms as there are spins, so that no closure loses one that it needs.
     """
-    engine = Engine(graph, ())
-    motion, ju = engine.regular_state()
+    linkage = Linkage(graph)
+    motion, ju = linkage.regular_state()
     spins = null(ju, RANK)
     # What is in no loop hangs loose and is left to be found so.
-    looped = _looped(engine.tree)
-    spins = spins @ null(spins[[o not in looped for o in engine.tree.owners]], RANK, absolute=True)
+    looped = _looped(linkage.tree)
+    spins = spins @ null(spins[[o not in looped for o in linkage.tree.owners]], RANK, absolute=True)
     for body, point, rows, most in (
         (graph.platform, graph.origin, slice(6), RANK),
         *(
@@ -53,7 +51,7 @@ def without_spins(graph: Graph) -> tuple[Graph, list[str]]:
         spins = spins @ null(twist(motion, body, point)[rows] @ spins, most, absolute=True)
     joints, held = dict(graph.joints), []
     while spins.shape[1]:
-        found = _hinge(engine, spins) or _ball(engine, motion, spins)
+        found = _hinge(linkage, spins) or _ball(linkage, motion, spins)
         if found is None:
             break
         name, axes, spins = found
@@ -141,9 +139,9 @@ _Found = tuple[str, Array, Array]
 """A joint, its new axes, and the spins that are left."""
 
 
-def _hinge(engine: Engine, spins: Array) -> _Found | None:
+def _hinge(linkage: Linkage, spins: Array) -> _Found | None:
     """The hinge that takes the largest part in a spin, to be fixed."""
-    joints, owners = engine.graph.joints, engine.tree.owners
+    joints, owners = linkage.graph.joints, linkage.tree.owners
     parts = [
         float(np.linalg.norm(row)) if joint is not None and joint.kind == "revolute" else 0.0
         for row, joint in zip(spins, map(joints.get, owners), strict=True)
@@ -156,9 +154,9 @@ def _hinge(engine: Engine, spins: Array) -> _Found | None:
     return owners[at], np.zeros((0, 3)), left
 
 
-def _ball(engine: Engine, motion: Motion, spins: Array) -> _Found | None:
+def _ball(linkage: Linkage, motion: Motion, spins: Array) -> _Found | None:
     """A ball joint of a part that spins alone, to be a universal joint across the spin."""
-    graph = engine.graph
+    graph = linkage.graph
     for bodies, axis, way in idle_bodies(graph, motion, spins):
         for joint in graph.joints.values():
             if joint.kind == "spherical" and {joint.inner, joint.outer} & set(bodies):

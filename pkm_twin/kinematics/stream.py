@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One sample of a stream beside the one before: pose, rates, what they do not explain, singularity.
-
-May import: numpy, pkm_twin's codegen, this package.
-"""
+"""One sample of a stream next to the last: pose, rates, unexplained motion, singularity."""
 
 from __future__ import annotations
 
@@ -14,8 +11,9 @@ from pkm_twin.codegen.expressions import PARAMETERS, absolute
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics import pose as poses
-from pkm_twin.kinematics.engine import Engine, Traced
+from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.singularity import singularity_measure
+from pkm_twin.kinematics.traced import Traced
 
 
 def stream_kernel(engine: Engine) -> Kernel:
@@ -34,13 +32,13 @@ def stream_kernel(engine: Engine) -> Kernel:
 
 
 def _stream(t: Traced) -> Program:
-    n, m = t.joints, len(t.engine.coordinates)
+    n, m = t.joints, len(t.scheme.coordinates)
     scales = t.tape.inputs(PARAMETERS, m)
     before = t.tape.inputs("before", n + m + m * n + m + 1)
     t.solve()
     position, rotation = t.motion.platform()
-    pose = scales * np.array(poses.values(t.engine.coordinates, position, rotation), dtype=object)
-    columns = [poses.rates(t.engine.coordinates, rotation, v, w) for v, w in t.twists()]
+    pose = scales * np.array(poses.values(t.scheme.coordinates, position, rotation), dtype=object)
+    columns = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in t.twists()]
     rates = scales[:, None] * np.array(columns, dtype=object).T
     last = before[n + m : n + m + m * n].reshape(m, n)
     move = t.q - before[:n]

@@ -3,8 +3,6 @@
 
 Every joint is a row of single steps, along or about one axis each; a closure compares two frames.
 Only numbers, once a file: speed is no concern here.
-
-May import: numpy, the URDF file's parts.
 """
 
 from __future__ import annotations

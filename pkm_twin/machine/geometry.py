@@ -2,8 +2,6 @@
 """The numbers of a graph's geometry in a row, and the same graph on other numbers or expressions.
 
 Masses and friction are apart, see ``machine.inertia``.
-
-May import: numpy, pkm_twin's codegen, this package's graph, tree and joint types.
 """
 
 from __future__ import annotations
@@ -89,7 +87,7 @@ def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
         ends = take(rod.ends)
         rods[name] = replace(rod, ends=ends, pair=None if rod.pair is None else take(rod.pair))
     origin = take(graph.origin)
-    return SizedGraph(graph.bodies, joints, rods, graph.platform, origin, list(left))
+    return SizedGraph(graph.bodies, joints, rods, graph.platform, origin, graph.laws, list(left))
 
 
 def pattern_of(tree: Tree) -> str:

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine as a graph of bodies, joints and rods at its home pose, every vector in base axes.
-
-May import: numpy, pkm_twin's errors, joint types, the standard library.
-"""
+"""A machine as a graph of bodies, joints and rods at its home pose, every vector in base axes."""
 
 from __future__ import annotations
 
@@ -145,13 +142,17 @@ class Rod:
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Bodies, joints and rods by name; ``platform`` carries the tool at ``origin`` (at home)."""
+    """Bodies, joints and rods by name; ``platform`` carries the tool at ``origin`` (at home).
+
+    ``laws``: of the drives' friction beside the basic one, see :mod:`~pkm_twin.machine.friction`.
+    """
 
     bodies: Mapping[str, Body]
     joints: Mapping[str, Joint]
     rods: Mapping[str, Rod]
     platform: str
     origin: Array
+    laws: tuple[str, ...] = ()
 
     @property
     def actuated(self) -> tuple[str, ...]:
@@ -214,7 +215,7 @@ class Graph:
             for j in self.joints.values()
         ]  # fmt: skip
         rods = [(r.name, r.inner, r.outer, r.pair is not None) for r in self.rods.values()]
-        return repr((list(self.bodies), joints, rods, self.platform))
+        return repr((list(self.bodies), joints, rods, self.platform, *self.laws))
 
     @property
     def key(self) -> str:
@@ -231,7 +232,8 @@ class Graph:
             (r.name, r.inner, r.outer, r.ends.tolist(), None if r.pair is None else r.pair.tolist())
             for r in self.rods.values()
         ]
-        return repr((list(self.bodies), joints, rods, self.platform, self.origin.tolist()))
+        place = self.origin.tolist()
+        return repr((list(self.bodies), joints, rods, self.platform, place, *self.laws))
 
     def check(self) -> None:
         """Refuse what no machine can be, by the name of the field.
@@ -301,3 +303,25 @@ def rotation_about_z(angle: Any) -> Array:
     """Rotation by an angle (rad) about base z, shape (3, 3)."""
     c, s = cos(angle), sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def limb_numbers(graph: Graph) -> dict[str, int]:
+    """By body and rod the number of its limb: what hangs together without base and platform."""
+    outside = {BASE, graph.platform}
+    links = [(j.inner, j.outer) for j in graph.joints.values()]
+    links += [(r.inner, r.name) for r in graph.rods.values()]
+    links += [(r.name, r.outer) for r in graph.rods.values()]
+    number: dict[str, int] = {}
+    for name in [*graph.bodies, *graph.rods]:
+        if name in number or name in outside:
+            continue
+        found, todo = {name}, [name]
+        while todo:
+            here = todo.pop()
+            for a, b in links:
+                for x, y in ((a, b), (b, a)):
+                    if x == here and y not in found and y not in outside:
+                        found.add(y)
+                        todo.append(y)
+        number |= dict.fromkeys(found, max(number.values(), default=-1) + 1)
+    return number | {graph.platform: -1}

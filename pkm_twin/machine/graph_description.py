@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graph as the plain data of a ``mechanism: machine`` description, limbs written out.
-
-May import: numpy, this package's graph.
-"""
+"""A graph as the plain data of a ``mechanism: machine`` description, limbs written out."""
 
 from __future__ import annotations
 

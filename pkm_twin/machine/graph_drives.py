@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction and limits of a machine's drives: of its joints' entries, and back into them.
-
-May import: numpy, this package, the standard library.
-"""
+"""Friction and limits of a machine's drives: of its joints' entries, and back into them."""
 
 from __future__ import annotations
 
@@ -14,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.machine.friction import all_keys
 from pkm_twin.machine.graph import Graph, array
 from pkm_twin.machine.graph_file import FrictionSpec, JointSpec, LimitSpec
 from pkm_twin.machine.sections import friction_of, limits_of
@@ -25,12 +23,11 @@ def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
     """Friction and limits of the actuated joints."""
     drives = graph.actuated
     limits = [joints[j].limits or LimitSpec() for j in drives]
+    rubs = [joints[j].friction or FrictionSpec() for j in drives]
     n = len(drives)
     return {
         "friction": friction_of(n)(
-            viscous=array([graph.joints[j].viscous for j in drives]),
-            coulomb=array([graph.joints[j].coulomb for j in drives]),
-            offset=array([_offset(joints[j]) for j in drives]),
+            **{key: array([getattr(rub, key) for rub in rubs]) for key in all_keys()}
         ),
         "limits": limits_of(n)(
             position=_together([v.position for v in limits], [-math.inf, math.inf]),
@@ -56,8 +53,8 @@ def driven(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
         velocity=velocity,
         effort=effort,
     )
-    rub = (float(v[k]) for v in (friction.viscous, friction.coulomb, friction.offset))
-    return dataclasses.replace(joint, friction=FrictionSpec(*rub), limits=bounds)
+    rub = FrictionSpec(**{key: float(getattr(friction, key)[k]) for key in all_keys()})
+    return dataclasses.replace(joint, friction=rub, limits=bounds)
 
 
 def _together(values: list[Any], absent: Any) -> Array | None:
@@ -65,7 +62,3 @@ def _together(values: list[Any], absent: Any) -> Array | None:
     if all(value is None for value in values):
         return None
     return array([absent if value is None else value for value in values])
-
-
-def _offset(joint: JointSpec) -> float:
-    return 0.0 if joint.friction is None else joint.friction.offset

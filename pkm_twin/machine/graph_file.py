@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine's file as a graph: the entries of bodies, joints and rods, and limbs written out.
-
-May import: numpy, this package, errors, the standard library.
-"""
+"""A machine's file as a graph: the entries of bodies, joints and rods, and limbs written out."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
-from pkm_twin.machine.entries import number_in, placed
+from pkm_twin.machine.friction import all_keys, check_laws
 from pkm_twin.machine.graph import (
     Body,
     Graph,
@@ -28,7 +25,8 @@ from pkm_twin.machine.graph import (
 )
 from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
-from pkm_twin.machine.sections import DriveSpec, check_angles, length, mass
+from pkm_twin.machine.places import number_in, placed
+from pkm_twin.machine.sections import DriveSpec, check_angles, length, mass, rare
 from pkm_twin.machine.shared import Key
 
 Array = NDArray[np.float64]
@@ -77,16 +75,28 @@ class BodySpec:
             raise ParameterError(f"{path}.com", None, "the centre of mass of a body with mass, m")
 
 
+_Laws: Any = dataclasses.make_dataclass(
+    "_Laws",
+    [
+        (key, float, rare(key, schema.number(unit=one.unit, default=0.0, **one.bounds)))
+        for key, one in all_keys().items()
+    ],
+    frozen=True,
+    eq=False,
+)
+
+
 @dataclass(frozen=True, eq=False)
-class FrictionSpec:
+class FrictionSpec(_Laws):  # type: ignore[misc]  # its fields are those of the laws
     """Friction of one joint: N m s/rad or N s/m, and N m or N.
 
-    ``offset``: what an actuated joint's drive needs beside, whatever the motion.
+    ``offset``: what an actuated joint's drive needs beside, whatever the motion; the parameters of
+    other laws, of actuated joints too, are in :mod:`~pkm_twin.machine.friction`.
     """
 
-    viscous: float = schema.number(at_least=0.0, unit="{effort} per {joint}/s", default=0.0)
-    coulomb: float = schema.number(at_least=0.0, unit="{effort}", default=0.0)
-    offset: float = schema.number(unit="{effort}", default=0.0)
+    def verify(self, path: str) -> None:
+        """A law has all of its parameters."""
+        check_laws(self, path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,10 +177,12 @@ class JointSpec:
         freedoms = self._freedoms()
         if self.actuated and len(freedoms) != 1:
             raise ParameterError(f"{path}.actuated", self.type, "a joint of one freedom")
-        if self.friction is not None and self.friction.offset and not self.actuated:
-            raise ParameterError(
-                f"{path}.friction.offset", self.friction.offset, "0 at a joint that is not actuated"
-            )
+        for key in all_keys():
+            value = getattr(self.friction, key, 0.0)
+            if value and not self.actuated and key not in ("viscous", "coulomb"):
+                raise ParameterError(
+                    f"{path}.friction.{key}", value, "0 at a joint that is not actuated"
+                )
         if self.rotor_inertia and self.drive is not None:
             raise ParameterError(f"{path}.drive", "given", "either drive or rotor_inertia")
         swivels = self.limits is not None and self.limits.swivel is not None
@@ -244,7 +256,7 @@ class Source:
 
 
 PER_COPY: Final = (
-    ["rotor_inertia"], ["friction", "viscous"], ["friction", "coulomb"], ["friction", "offset"],
+    ["rotor_inertia"], *(["friction", key] for key in all_keys()),
 )  # fmt: skip
 """Keys of a limb's numbers that may be lists, one number a copy."""
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}

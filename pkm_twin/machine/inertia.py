@@ -2,8 +2,6 @@
 """Run-time inputs of the dynamics: ten numbers a body, rods, gravity, friction, rotors.
 
 Efforts are linear in every one of them, so a payload or a mass changes no program.
-
-May import: numpy, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -15,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.expressions import plain
+from pkm_twin.machine.friction import keys_of
 from pkm_twin.machine.graph import Array, Graph, Joint
 from pkm_twin.machine.tree import Tree
 
@@ -23,11 +22,13 @@ Objects = NDArray[Any]
 TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 """Names of a body's ten numbers: mass, kg; first moments, kg m; inertia, kg m2."""
 PARTS: Final = (
-    "bodies", "rods", "gravity", "viscous", "coulomb", "offset", "rotors", "passive",
+    "bodies", "rods", "gravity", "viscous", "coulomb", "offset", "laws", "rotors", "passive",
 )  # fmt: skip
 """Parts of the inputs, in order."""
 GRAVITY: Final = 2
-"""Part of the inputs, see :meth:`Layout.part`."""
+LAW_VALUES: Final = 6
+ROTORS: Final = 7
+"""Parts of the inputs, see :meth:`Layout.part`."""
 
 
 def ten_numbers(mass: float, com: Array, inertia: Array) -> Array:
@@ -45,20 +46,25 @@ def transport(axes: Array, lever: Array) -> Array:
     :param axes: the new axes as columns in the old ones, shape (3, 3).
     :param lever: from the new point to the old one, in the old axes, shape (3,), m.
     """
-    columns = []
-    for ten in np.eye(10):
-        mass, first, about = ten[0], ten[1:4], matrix_of(ten)
-        crossed = np.outer(lever, first)
-        about = about + 2.0 * np.trace(crossed) * np.eye(3) - crossed - crossed.T
-        about = about + mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
-        columns.append(_numbers(mass, axes.T @ (first + mass * lever), axes.T @ about @ axes))
-    return np.array(columns).T
+    # A row a number: its mass, first moments and inertia.
+    mass, first = np.eye(10)[:, :1], np.eye(10)[:, 1:4]
+    crossed = lever[:, None] * first[:, None, :]
+    about = _UNITS + 2.0 * (first @ lever)[:, None, None] * np.eye(3)
+    about = about - crossed - crossed.swapaxes(-1, -2)
+    about = about + mass[..., None] * (lever @ lever * np.eye(3) - np.outer(lever, lever))
+    turned = axes.T @ about @ axes
+    moved = [mass, (first + mass * lever) @ axes, turned[:, (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]]
+    return plain(np.concatenate(moved, 1).T)
 
 
 def matrix_of(ten: Array) -> Array:
     """The inertia matrix in ten numbers, shape (3, 3)."""
     xx, yy, zz, xy, xz, yz = ten[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+_UNITS: Final = np.array([matrix_of(ten) for ten in np.eye(10)])
+"""Inertia matrices of a unit of each of the ten numbers."""
 
 
 def _numbers(mass: float, first: Array, about: Array) -> Array:
@@ -115,6 +121,7 @@ class Layout:
             n,
             n,
             n,
+            n * len(keys_of(graph.laws)),
             n,
             3 * len(loaded_joints(graph)),
         ]
@@ -132,11 +139,18 @@ class Layout:
 
     @property
     def friction(self) -> NDArray[np.intp]:
-        """Indices of all friction, that of passive joints too."""
-        starts = self.starts
-        passive = np.arange(starts[7], starts[8])
+        """Indices of all friction that efforts are linear in, that of passive joints too."""
+        starts, keys = self.starts, keys_of(self.tree.graph.laws).values()
+        passive = np.arange(starts[8], starts[9])
         rubs = passive[np.arange(len(passive)) % 3 < 2]
-        return np.concatenate([np.arange(starts[3], starts[6]), rubs]).astype(np.intp)
+        linear = np.repeat([one.linear for one in keys], len(self.tree.graph.actuated))
+        laws = np.arange(starts[6], starts[7])[linear.astype(bool)]
+        return np.concatenate([np.arange(starts[3], starts[6]), laws, rubs]).astype(np.intp)
+
+    def laws(self, part: Objects) -> dict[str, Objects]:
+        """Parameters of the drives' friction laws by key, shape (n,) each, of part ``laws``."""
+        keys = keys_of(self.tree.graph.laws)
+        return dict(zip(keys, part.reshape(len(keys), -1) if keys else [], strict=True))
 
     def body(self, name: str) -> slice:
         """The ten numbers of a body."""
@@ -170,6 +184,7 @@ class Layout:
                     friction.viscous,
                     friction.coulomb,
                     friction.offset,
+                    *(getattr(friction, key) for key in keys_of(self.tree.graph.laws)),
                     [j.rotor_inertia for j in drives],
                     [
                         value

@@ -11,10 +11,8 @@ The effective radius of a spool changes with what is wound on it: the ratio is t
 and efforts need the position beside them, so nodes, bags and trajectories reject it.
 
 Messages and bags carry the controller's numbers, everything else computes with the model's. A joint
-number enters through :class:`pkm_twin.ros.messages.JointReader` and leaves as
+number enters through :class:`pkm_twin.messages.reading.JointReader` and leaves as
 :data:`ControllerNumbers`, which only this module makes and which the publishers ask for.
-
-May import: numpy, this package's schema, the standard library.
 """
 
 from __future__ import annotations

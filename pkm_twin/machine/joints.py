@@ -3,8 +3,6 @@
 
 Everything else follows: the steps of the tree, the closures of a cut joint, the loads that a joint
 transmits, what it releases in an elastic frame, units and passive coordinates.
-
-May import: numpy, pkm_twin's codegen, the standard library.
 """
 
 from __future__ import annotations

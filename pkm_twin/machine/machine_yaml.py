@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A description of ``mechanism: machine`` as a YAML file that people read and edit.
-
-May import: yaml, the standard library.
-"""
+"""A description of ``mechanism: machine`` as a YAML file that people read and edit."""
 
 from __future__ import annotations
 

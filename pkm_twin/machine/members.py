@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Elastic members of a machine: round bars between points of its bodies, and their sections.
-
-May import: numpy, pkm_twin's codegen, this package, the standard library.
-"""
+"""Elastic members of a machine: round bars between points of its bodies, and their sections."""
 
 from __future__ import annotations
 

@@ -4,8 +4,6 @@
 ``connect`` and ``weld`` constraints close loops, a ``joint`` constraint on one joint alone locks
 it; a body on a free joint is held by closures only. Sites are links without mass. Actuated are the
 joints that actuators drive.
-
-May import: mujoco, numpy, the URDF file's parts.
 """
 
 from __future__ import annotations

@@ -3,8 +3,6 @@
 
 The model stands at home as it is: every body's frame is parallel to the base there, ``ref`` of a
 joint is its value at home. Loops are ``connect`` and ``weld`` constraints.
-
-May import: numpy, the standard library, the tree for simulators, the URDF writer's parts.
 """
 
 from __future__ import annotations

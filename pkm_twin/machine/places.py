@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of a robot's file by dotted path, and the same robot with some of them changed.
-
-May import: numpy, this package, the standard library.
-"""
+"""The numbers of a file by dotted path."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import copy
 import dataclasses
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -18,11 +15,6 @@ from pkm_twin.codegen.expressions import plain
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
 
-if TYPE_CHECKING:
-    from pkm_twin.machine.graph import Graph
-    from pkm_twin.machine.robot import Robot
-
-R = TypeVar("R", bound="Robot")
 T = TypeVar("T")
 _PART: Final = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 Key = str | int
@@ -40,10 +32,12 @@ def full_keys(path: str) -> list[Key]:
     return [*keys, keys[-1]] if moment else keys
 
 
-def entries(robot: Robot) -> dict[str, tuple[float, str]]:
-    """Every number that the robot's file gives, by dotted path, with its unit."""
-    data = {k: v for k, v in given(robot.parameter_sections()).items() if k != "uncertainty"}
-    return dict(_walk(data, robot.parameter_units(), ""))
+def numbers_of(
+    sections: Mapping[str, Any], units: Mapping[str, Any]
+) -> dict[str, tuple[float, str]]:
+    """Every number that sections of a file give, by dotted path, with its unit."""
+    data = {k: v for k, v in given(sections).items() if k != "uncertainty"}
+    return dict(_walk(data, units, ""))
 
 
 def _walk(data: Any, units: Any, path: str) -> Iterator[tuple[str, tuple[float, str]]]:
@@ -138,24 +132,6 @@ def merged(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
-def data_of(robot: Robot, values: Mapping[str, float] | None = None) -> dict[str, Any]:
-    """What the robot's file gives, as plain data, with other numbers by dotted path.
-
-    :raises ParameterError: a path that there is not.
-    """
-    made = robot.numbered(values) if values else robot
-    data: dict[str, Any] = copy.deepcopy(given(made.parameter_sections()))
-    return data
-
-
-def with_entries(robot: R, values: Mapping[str, float]) -> R:
-    """The robot of the same file with other numbers.
-
-    :raises ParameterError: a path that there is not, or a value that the file may not have.
-    """
-    return type(robot).from_data(data_of(robot, values), robot.name)
-
-
 def put(data: Any, path: str, value: float) -> None:
     """Change one number of plain data in place.
 
@@ -206,11 +182,3 @@ def has_entry(data: Any, path: str) -> bool:
         else:
             return False
     return data is not None
-
-
-def changed_graph(robot: Robot, path: str, value: float) -> Graph:
-    """The graph with one number changed; nothing is compiled.
-
-    :raises ParameterError: no file has it.
-    """
-    return type(robot).graph_of(data_of(robot, {path: value}))

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the poses of a machine are laid out: about an axis, or along its pose coordinates.
-
-May import: numpy, the standard library.
-"""
+"""How the poses of a machine are laid out: about an axis, or along its pose coordinates."""
 
 from __future__ import annotations
 

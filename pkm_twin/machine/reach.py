@@ -1,19 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bounds of a graph's workspace from the lengths of its bodies and the limits of its slides.
-
-May import: numpy, this package, the standard library.
-"""
+"""Bounds of a workspace: limits of slides and lengths of bodies, ranges of passive joints."""
 
 from __future__ import annotations
 
 import heapq
 import itertools
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import BASE, Array, Graph
+
+
+@dataclass(frozen=True, eq=False)
+class PassiveLimit:
+    """The range of one passive joint, from ``low`` to ``high``, rad or m; vectors at home.
+
+    ``kind`` "swivel": the angle between two directions that are both along ``axis`` at home, one
+    fixed in the inner body and one in the outer. "rod": the same of the way from ``at`` on the
+    inner body to ``far`` on the outer one. "turn": about the axis. "slide": of the point ``at``
+    along it.
+    ``home``: the joint's value at home.
+    """
+
+    joint: str
+    kind: str
+    inner: str
+    outer: str
+    at: Array
+    axis: Array
+    low: float
+    high: float
+    home: float = 0.0
+    far: Array | None = None
 
 
 def position_box(graph: Graph, limits: Array | None) -> Array:

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotation matrices: about an axis, and roll, pitch and yaw of REP 103, Rz(yaw) Ry(pitch) Rx(roll).
-
-May import: numpy, the standard library.
-"""
+"""Rotation matrices: about an axis, and from REP 103's rpy, Rz(yaw) Ry(pitch) Rx(roll)."""
 
 from __future__ import annotations
 
@@ -18,15 +15,6 @@ def about(axis: Array, angle: ArrayLike) -> Array:
     """Rotations by angles (...,), rad, about a unit vector (3,), shape (..., 3, 3)."""
     across = skew(np.asarray(axis, np.float64))
     sine, rest = np.sin(angle)[..., None, None], 1.0 - np.cos(angle)[..., None, None]
-    rotation: Array = np.eye(3) + sine * across + rest * (across @ across)
-    return rotation
-
-
-def about_vector(turns: Array) -> Array:
-    """Rotations by rotation vectors (..., 3), rad, shape (..., 3, 3)."""
-    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
-    across = skew(turns)
-    sine, rest = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
     rotation: Array = np.eye(3) + sine * across + rest * (across @ across)
     return rotation
 

@@ -1,128 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files: strict YAML to frozen dataclasses, each refusal naming field and bound.
+"""Parameter files: plain data to frozen dataclasses, each refusal naming field and bound.
 
 A mechanism declares its schema as frozen dataclasses whose fields are made by the functions below.
 A field's metadata hold its ``check``, its ``key`` in the file, its ``unit`` (``{joint}``,
 ``{effort}`` and ``{rotor}`` stand for those of the actuated joints), its ``bound`` in words, its
 ``default``, of a nested section its ``section``, and of names to sections that of the ``entries``.
-
-May import: numpy, yaml, the standard library.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import re
-import stat
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from pkm_twin.errors import FileError, ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError
 
-MAX_FILE_SIZE: Final = 256 * 1024
-"""Largest parameter file that is read, bytes; the shipped ones are below 4 kB."""
 MAX_SIZE: Final = 1e18
 """Beyond every quantity of a machine in SI units; products of such numbers stay finite."""
 
 Array = NDArray[np.float64]
 Check = Callable[[str, Any], Any]
 T = TypeVar("T")
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """Plain YAML only: no tags, aliases, merges or duplicate keys, no integer beyond all floats.
-
-    Numbers are decimal: 1_0, 1:30 and 010 are numbers in YAML 1.1 (10, 90, 8), and slips here.
-    """
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("aliases are not allowed in parameter files")
-        event = self.peek_event()  # type: ignore[no-untyped-call]
-        if getattr(event, "tag", None) is not None:
-            raise yaml.YAMLError("tags are not allowed in parameter files")
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
-            raise yaml.YAMLError("merge keys are not allowed in parameter files")
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
-        if len(mapping) < len(node.value):
-            seen = set()
-            for key, _ in node.value:
-                name = self.construct_object(key, deep=True)
-                if name in seen:
-                    raise yaml.YAMLError(f"key {name!r} stands twice")
-                seen.add(name)
-        return mapping
-
-    def construct_yaml_int(self, node: Any) -> int:
-        if not re.fullmatch(r"[-+]?(0|[1-9][0-9]*)", node.value):
-            raise yaml.YAMLError(f"{node.value}: write a decimal number, or text in quotes")
-        value: int = super().construct_yaml_int(node)
-        if value.bit_length() > 1023:
-            raise yaml.YAMLError("an integer too large for a float")
-        return value
-
-    def construct_yaml_float(self, node: Any) -> float:
-        if "_" in node.value or ":" in node.value:
-            raise yaml.YAMLError(f"{node.value}: write a decimal number, or text in quotes")
-        return float(super().construct_yaml_float(node))
-
-
-_StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_yaml_int)
-_StrictLoader.add_constructor("tag:yaml.org,2002:float", _StrictLoader.construct_yaml_float)
-# YAML 1.1 reads 1e-10 and 5.0e6 as strings; everybody means the numbers.
-_StrictLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
-    list("-+.0123456789"),
-)
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a parameter file.
-
-    :raises ParameterError: not readable, too large, not plain YAML, or not a mapping.
-    """
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise OSError("not a file")
-        with path.open("rb") as file:
-            content = file.read(MAX_FILE_SIZE + 1)
-        if len(content) > MAX_FILE_SIZE:
-            raise ParameterError(
-                str(path), f"{path.stat().st_size} bytes", f"at most {MAX_FILE_SIZE} bytes"
-            )
-        text = content.decode("utf-8")
-    except ParameterError:
-        raise
-    except (OSError, ValueError) as error:
-        raise FileError(path, error, "plain YAML") from None
-    return parse_yaml(text, str(path))
-
-
-def parse_yaml(text: str, name: str) -> dict[str, Any]:
-    """What a parameter file of this text says.
-
-    :param name: the file's.
-    :raises ParameterError: not plain YAML, or not a mapping.
-    """
-    try:
-        data = yaml.load(text, Loader=_StrictLoader)  # noqa: S506
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        if isinstance(error, ParameterError):
-            raise
-        raise FileError(name, error, "plain YAML") from None
-    if not isinstance(data, dict):
-        raise ParameterError(name, type(data).__name__, "a mapping of keys to values")
-    return data
 
 
 def number(
@@ -136,7 +38,7 @@ def number(
     """Field: one finite number within bounds."""
 
     def check(field: str, value: Any) -> float:
-        return _number(field, value, above, at_least, at_most)
+        return _number(field, value, above, at_least, at_most, unit=unit)
 
     return _field(check, default, "number" + _bound(above, at_least, at_most), unit)
 
@@ -146,6 +48,7 @@ def vector(
     *,
     above: float = -math.inf,
     at_least: float = -math.inf,
+    at_most: float = math.inf,
     infinite: bool = False,
     spread: bool = False,
     key: str | None = None,
@@ -163,26 +66,35 @@ def vector(
         items = _sequence(field, value, size)
         return frozen(
             [
-                _number(f"{field}[{i}]", item, above, at_least, math.inf, infinite)
+                _number(f"{field}[{i}]", item, above, at_least, at_most, infinite)
                 for i, item in enumerate(items)
             ]
         )
 
-    bound = f"{size} numbers" + _bound(above, at_least, math.inf, infinite)
+    bound = f"{size} numbers" + _bound(above, at_least, at_most, infinite)
     if spread:
         bound += "; one stands for all"
     return _field(check, default, bound, unit, key=key)
 
 
-def many(*, unit: str = "", default: Any = dataclasses.MISSING) -> Any:
-    """Field: one number or more, read-only array."""
+def many(
+    *,
+    above: float = -math.inf,
+    at_most: float = math.inf,
+    unit: str = "",
+    default: Any = dataclasses.MISSING,
+) -> Any:
+    """Field: one number or more, read-only array; also none, where that is the default."""
+    least = 1 if default is dataclasses.MISSING else 0
 
     def check(field: str, value: Any) -> Array:
-        if not isinstance(value, (list, tuple)) or not value:
+        if not isinstance(value, (list, tuple, np.ndarray)) or len(value) < least:
             raise ParameterError(field, value, "a list of numbers")
-        return frozen([_number(f"{field}[{i}]", item) for i, item in enumerate(value)])
+        return frozen(
+            [_number(f"{field}[{i}]", item, above, at_most=at_most) for i, item in enumerate(value)]
+        )
 
-    return _field(check, default, "one number or more", unit)
+    return _field(check, default, "one number or more" + _bound(above, at_most=at_most), unit)
 
 
 def matrix(rows: int, columns: int, *, unit: str = "", default: Any = dataclasses.MISSING) -> Any:
@@ -446,6 +358,7 @@ def plain(value: Any) -> Any:
         return {
             f.metadata.get("key") or f.name: plain(getattr(value, f.name))
             for f in dataclasses.fields(value)
+            if not f.metadata.get("rare") or np.any(getattr(value, f.name))
         }
     if isinstance(value, np.ndarray):
         return value.tolist()
@@ -524,8 +437,11 @@ def _number(
     at_least: float = -math.inf,
     at_most: float = math.inf,
     infinite: bool = False,
+    unit: str = "",
 ) -> float:
     bound = "a finite number" + _bound(above, at_least, at_most, infinite)
+    if at_most < math.inf and "{" not in unit:
+        bound += f" {unit}".rstrip()
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise ParameterError(field, value, bound)
     try:

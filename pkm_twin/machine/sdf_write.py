@@ -3,8 +3,6 @@
 
 SDF has graphs of joints, so that a loop is closed by a joint as any other. The model stands at
 home: every frame is parallel to the base there, and a joint's position counts from home.
-
-May import: numpy, the standard library, the tree for simulators, the URDF writer's parts.
 """
 
 from __future__ import annotations

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sections that parameter files of every mechanism have, and fields that many have.
-
-May import: numpy, this package's graph and schema, errors, the standard library.
-"""
+"""Sections that parameter files of every mechanism have, and fields that many have."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache as remembered
 from typing import Any, Final, Protocol
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
+from pkm_twin.machine.friction import BASIC, all_keys, check_laws
 from pkm_twin.machine.graph import MIN_LENGTH
 
 Array = NDArray[np.float64]
@@ -115,15 +114,25 @@ class DriveSpec:
 def friction_of(joints: int) -> Any:
     """Schema of friction at so many actuated joints: viscous per rate, Coulomb by its sign.
 
-    ``offset``: what the drive needs beside, whatever the motion.
+    ``offset``: what the drive needs beside, whatever the motion; then the parameters of the other
+    laws of :mod:`~pkm_twin.machine.friction`.
     """
     field: dict[str, Any] = {"spread": True, "default": [0.0] * joints}
-    units = {"viscous": "{effort} per {joint}/s", "coulomb": "{effort}"}
     entries = [
-        (n, Array, schema.vector(joints, unit=u, at_least=0.0, **field)) for n, u in units.items()
+        (key, Array, rare(key, schema.vector(joints, unit=one.unit, **one.bounds, **field)))
+        for key, one in all_keys().items()
     ]
-    entries.append(("offset", Array, schema.vector(joints, unit="{effort}", **field)))
-    return _section("Friction", entries, joints)
+    return _section("Friction", entries, joints, {"verify": check_laws})
+
+
+def rare(key: str, field: Any) -> Any:
+    """A field of friction, which a description leaves out where it is zero, if not the basic law's.
+
+    :param field: as of ``dataclasses.field``.
+    """
+    if key not in BASIC.parameters:
+        field.metadata = {**field.metadata, "rare": True}
+    return field
 
 
 @remembered
@@ -138,14 +147,16 @@ def limits_of(joints: int) -> Any:
     return _section("Limits", entries, joints)
 
 
-def _section(name: str, entries: list[tuple[str, Any, Any]], joints: int) -> Any:
+def _section(
+    name: str, entries: list[tuple[str, Any, Any]], joints: int, more: Mapping[str, Any] = {}
+) -> Any:
     """A section's class for so many joints; what it makes passes between processes."""
 
     def reduce(self: Any) -> tuple[Any, ...]:
         return _rebuilt, (name, joints, [getattr(self, entry[0]) for entry in entries])
 
     return dataclasses.make_dataclass(
-        name, entries, frozen=True, eq=False, namespace={"__reduce__": reduce}
+        name, entries, frozen=True, eq=False, namespace={"__reduce__": reduce, **more}
     )
 
 

@@ -4,18 +4,18 @@
 Efforts are linear in masses, first moments and second moments, not in centres and inertias about
 them; and one number of a file may stand for three limbs. What a file can hold and what efforts are
 linear in meet here.
-
-May import: numpy, this package, the standard library.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
 
+from pkm_twin.machine.friction import all_keys
 from pkm_twin.machine.graph import Array, Body, Graph
 from pkm_twin.machine.inertia import TEN, matrix_of, ten_numbers, transport
 
@@ -173,8 +173,17 @@ def shared_payload(
 def drive_units(graph: Graph, joint: str) -> dict[str, str]:
     """Units of a joint's friction and rotor."""
     slides = graph.joints[joint].slides
-    effort, rate, rotor = ("N", "N s/m", "kg") if slides else ("N m", "N m s/rad", "kg m2")
-    return {"viscous": rate, "coulomb": effort, "offset": effort, "rotor_inertia": rotor}
+    units = {key: one.in_units(slides=slides) for key, one in all_keys().items()}
+    return units | {"rotor_inertia": "kg" if slides else "kg m2"}
+
+
+def friction_number(graph: Graph, joint: str, key: str, value: float, path: Key) -> Shared:
+    """A parameter of a joint's friction that the effort is linear in."""
+    name = f"{joint}.{key}"
+    return shared_number(
+        "friction", name, drive_units(graph, joint)[key], value, math.nan, path, others=[name],
+        signed=all_keys()[key].at_least is None,
+    )  # fmt: skip
 
 
 def point_mass(place: Array) -> Array:

@@ -2,8 +2,6 @@
 """A tree of bodies for simulators, which have no links without mass and several joints a body.
 
 Links between the axes of one joint are left out, so that a body has its joints in a row.
-
-May import: numpy, pkm_twin's codegen, this package's graph, joints and URDF tree.
 """
 
 from __future__ import annotations

@@ -5,8 +5,6 @@ Actuated joints come first, then those of fewest freedoms, so that there are few
 that only rods hold hangs free on the base. Revolute and prismatic joints have one number a step;
 a spherical joint's body and a free one have a unit quaternion of their absolute orientation, with
 the angular velocity in base axes as its rate: no chart, and nothing of the parents' turning.
-
-May import: numpy, pkm_twin's codegen, this package's graph, the standard library.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A URDF file as it stands: links, joints and loop closures, each in its own frames.
-
-May import: numpy, the standard library, the parameter files' reader.
-"""
+"""A URDF file as it stands: links, joints and loop closures, each in its own frames."""
 
 from __future__ import annotations
 
@@ -17,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
-from pkm_twin.machine import schema, urdf_loops, urdf_xml
+from pkm_twin.machine import urdf_loops, urdf_xml
+from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import UNLIMITED, Pose
 
@@ -254,7 +252,7 @@ def _beside(path: Path) -> dict[str, Any]:
         # An empty one is the target of a conversion that reads this very URDF.
         if not other.is_file() or other.stat().st_size == 0:
             continue
-        data = schema.read_yaml(other)
+        data = read_yaml(other)
         if not any(key in data for key in urdf_loops.BESIDE):
             continue
         for key in urdf_loops.BESIDE:

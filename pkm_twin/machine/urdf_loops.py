@@ -4,8 +4,6 @@
 ``<constraint>`` elements (urdfdom pull request 264), ``<loop>`` elements (Chignoli, Slotine,
 Wensing, Kim 2024, URDF+, arXiv:2411.19753), pairs of frames in a YAML file (Batto, De Matteis,
 Mansard 2025, Extended URDF, arXiv:2504.04767).
-
-May import: numpy, the standard library, the XML's parts.
 """
 
 from __future__ import annotations

@@ -6,8 +6,6 @@ at home, and a joint at home has the value ``home``. Loops that the tree cuts ar
 elements (urdfdom pull request 264), which parsers of trees pass over; ``cylindrical_joint``,
 ``translation_joint``, ``<dynamics>`` and ``angle`` (between a universal joint's axes, rad, where it
 is not a right one) are additions to that proposal.
-
-May import: numpy, the standard library, the rotations, the bounds of what is read.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""XML from strangers: elements, numbers and frames of a URDF, every refusal by the field's name.
-
-May import: numpy, the standard library, the parameter files' bounds.
-"""
+"""XML from strangers: elements, numbers and frames of a URDF, every refusal by the field's name."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New numbers in a YAML file that stays otherwise as its author wrote it, comments and all.
-
-May import: yaml, this package's schema and errors, the standard library.
-"""
+"""New numbers in a YAML file that stays otherwise as its author wrote it, comments and all."""
 
 from __future__ import annotations
 

@@ -20,17 +20,17 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.expressions import norm, plain
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.kinematics.engine import choose_coordinates
-from pkm_twin.kinematics.motion import matrices, numbers
-from pkm_twin.kinematics.passive_limits import PassiveLimit
+from pkm_twin.kinematics.masses import check_masses
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
+from pkm_twin.kinematics.scheme import choose_coordinates
 from pkm_twin.machine import schema
-from pkm_twin.machine.entries import check_number, full_keys, given, number_in, placed
+from pkm_twin.machine.friction import linear_keys
 from pkm_twin.machine.graph import (
     BASE,
     Body,
     Graph,
     array,
+    limb_numbers,
     rotation_about_z,
 )
 from pkm_twin.machine.graph_drives import driven, drives_of
@@ -47,18 +47,21 @@ from pkm_twin.machine.graph_file import (
 from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure
-from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.robot_urdf import robot_description
+from pkm_twin.machine.places import check_number, full_keys, given, number_in, placed
+from pkm_twin.machine.reach import PassiveLimit
 from pkm_twin.machine.sections import DriveSpec, Payload
 from pkm_twin.machine.shared import (
     Key,
     Shared,
     behind_gear,
     drive_units,
+    friction_number,
     shared_body,
     shared_number,
 )
-from pkm_twin.machine.uncertainty import UncertaintyEntry, check_uncertainty
+from pkm_twin.machine.uncertainty import UncertaintyEntry
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.robot_urdf import robot_description
 
 Array = NDArray[np.float64]
 M = TypeVar("M", bound="Machine")
@@ -69,7 +72,7 @@ MOST_JOINTS: Final = 6
 
 _KEYS: Final = (
     "mechanism", "gravity", "platform", "origin", "pose", "payload", *KINDS, "limbs", "joint_map",
-    "uncertainty", "element_compliance",
+    "uncertainty", "element_compliance", "modal_damping",
 )  # fmt: skip
 _ELASTIC: Final = (
     ("bodies", "member"), ("joints", "compliance"), ("rods", "section"), ("rods", "radius"),
@@ -120,11 +123,10 @@ class Machine(Robot):
             "gravity": schema.checked(
                 schema.vector(3), "gravity", data.get("gravity", [0, 0, -9.81])
             ),
-            "element_compliance": schema.checked(
-                cls.__dataclass_fields__["element_compliance"],
-                "element_compliance",
-                data.get("element_compliance") or {},
-            ),
+            **{
+                key: schema.checked(cls.__dataclass_fields__[key], key, data.get(key) or empty)
+                for key, empty in (("element_compliance", {}), ("modal_damping", []))
+            },
         }
         robot = cls(
             mechanism="machine",
@@ -137,18 +139,11 @@ class Machine(Robot):
         )
         _ = robot.controller
         robot.engine.check()
-        robot.check_masses()
+        check_masses(robot.engine, robot.graph)
         _ = robot.passive_limits
-        check_uncertainty(robot)
+        _ = robot.causes
         robot.check_elements()
         return robot
-
-    @classmethod
-    def graph_of(cls, data: Mapping[str, Any]) -> Graph:
-        """Of a file that a robot was made of; what its joints hold is not looked at."""
-        graph = graph_of_entries(data, written_out(data)[0])
-        graph.check()
-        return graph
 
     def changed(self: M, **sections: Mapping[str, object] | object) -> M:
         """As of every robot; friction and limits are those of the joints' entries too."""
@@ -293,20 +288,13 @@ class Machine(Robot):
         for name, joint in graph.joints.items():
             if not (joint.actuated or joint.loaded):
                 continue
-            units, source = drive_units(graph, name), self.sources["joints", name]
+            source = self.sources["joints", name]
             tail: Key = () if source.copies == 1 else (source.copy,)
-            for what in ("viscous", "coulomb", "offset"):
-                if what == "offset" and not joint.actuated:
-                    continue
+            for what in linear_keys(self.laws) if joint.actuated else ("viscous", "coulomb"):
                 k = graph.actuated.index(name) if joint.actuated else 0
                 value = getattr(friction, what)[k] if joint.actuated else getattr(joint, what)
-                result.append(
-                    shared_number(
-                        "friction", f"{name}.{what}", units[what], float(value), math.nan,
-                        (*source.path, "friction", what, *tail), others=[f"{name}.{what}"],
-                        signed=what == "offset",
-                    )
-                )  # fmt: skip
+                path = (*source.path, "friction", what, *tail)
+                result.append(friction_number(graph, name, what, float(value), path))
             if joint.actuated or joint.rotor_inertia:
                 rotors.setdefault(source.path, []).append(name)
         for path, names in rotors.items():
@@ -362,47 +350,10 @@ class Machine(Robot):
         far = max((float(np.linalg.norm(p - body.com)) for p in points), default=0.0)
         return far if far > 1e-3 * graph.size else 0.1 * graph.size
 
-    def check_masses(self) -> None:
-        """Refuse actuated joints that move no mass at all.
-
-        :raises ParameterError: by a massless body that must move alone.
-        """
-        engine, graph = self.engine, self.graph
-        motion, rows = engine.at(engine.tree.home, graph.home)
-        ju, jq = (numbers(m) for m in matrices(engine.tree, rows))
-        moved = -np.linalg.solve(ju[engine.kept], jq[engine.kept])
-        n = len(graph.actuated)
-        table = []
-        for j in range(n):
-            motion.set_rates(moved[:, j], np.eye(n)[j])
-            column = [
-                np.sqrt(graph.joints[name].rotor_inertia) * np.eye(n)[j][k]
-                for k, name in enumerate(graph.actuated)
-            ]
-            for body in graph.bodies.values():
-                root = _root(body.inertia)
-                column += [*(math.sqrt(body.mass) * numbers(motion.velocity(body.name, body.com)))]
-                column += [*(root @ numbers(motion.omega[body.name]))]
-            for rod in graph.rods.values():
-                ends = zip((rod.inner, rod.outer), rod.ends, strict=True)
-                for body_name, end in ends:
-                    column += [*(math.sqrt(rod.mass) * numbers(motion.velocity(body_name, end)))]
-            table.append(column)
-        values = np.array(table, float)
-        size = np.linalg.norm(values, axis=1, keepdims=True)
-        if (size > 0.0).all() and np.linalg.matrix_rank(values / size, 1e-6) == n:
-            return
-        joint = graph.joints[graph.actuated[int(np.argmin(size))]]
-        idle = next((b for b in (joint.outer, joint.inner) if b != BASE), graph.platform)
-        raise ParameterError(
-            f"bodies.{idle}.mass", graph.bodies[idle].mass,
-            f"mass or rotor_inertia that resists {joint.name}: no massless body can move alone",
-        )  # fmt: skip
-
     @cached_property
     def beams(self) -> tuple[Beam, ...]:
         """Bodies with a member, and rods with a section or radius, limb by limb."""
-        limb = _limbs(self.graph)
+        limb = limb_numbers(self.graph)
         beams = []
         for name, body in self.specs["bodies"].items():
             m = body.member
@@ -522,31 +473,3 @@ class Machine(Robot):
             )
         beams = tuple(beam for beam in self.beams if beam.name in sections)
         return Structure(beams, sections, compliances)
-
-
-def _root(inertia: Array) -> Array:
-    """A matrix whose square is a symmetric one."""
-    values, vectors = np.linalg.eigh(inertia)
-    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, np.float64)
-
-
-def _limbs(graph: Graph) -> dict[str, int]:
-    """By body and rod the number of its limb: what hangs together without base and platform."""
-    outside = {BASE, graph.platform}
-    links = [(j.inner, j.outer) for j in graph.joints.values()]
-    links += [(r.inner, r.name) for r in graph.rods.values()]
-    links += [(r.name, r.outer) for r in graph.rods.values()]
-    number: dict[str, int] = {}
-    for name in [*graph.bodies, *graph.rods]:
-        if name in number or name in outside:
-            continue
-        found, todo = {name}, [name]
-        while todo:
-            here = todo.pop()
-            for a, b in links:
-                for x, y in ((a, b), (b, a)):
-                    if x == here and y not in found and y not in outside:
-                        found.add(y)
-                        todo.append(y)
-        number |= dict.fromkeys(found, max(number.values(), default=-1) + 1)
-    return number | {graph.platform: -1}

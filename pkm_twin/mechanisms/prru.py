@@ -57,7 +57,6 @@ from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.inertia import transport
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
 from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import SINGULARITY_BOUND, Inverse, Robot
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.machine.shared import (
     Key,
@@ -68,6 +67,8 @@ from pkm_twin.machine.shared import (
     shared_body,
     shared_number,
 )
+from pkm_twin.robot.mechanism import Inverse
+from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 
 Array = NDArray[np.float64]
 

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any, Final
 
 from pkm_twin.errors import ParameterError, UnknownNameError, one_line, warn
-from pkm_twin.machine import schema
-from pkm_twin.machine.plausibility import findings
-from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.urdf_read import read_tree
+from pkm_twin.machine.strict_yaml import read_yaml
+from pkm_twin.robot.plausibility import findings
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.urdf_read import read_tree
 
 CATALOGUE: Final = {
     "delta": "pkm_twin.mechanisms.delta:Delta",
+    "linear_delta": "pkm_twin.mechanisms.linear_delta:LinearDelta",
     "machine": "pkm_twin.mechanisms.machine:Machine",
     "prru": "pkm_twin.mechanisms.prru:Prru",
     "upr_rpu": "pkm_twin.mechanisms.upr_rpu:UprRpu",
@@ -78,7 +79,7 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
         return _told(path, replace(robot_read, home_choice=reading.home))
     if platform is not None:
         raise ParameterError("platform", platform, "none, because the file names its platform")
-    return _told(path, robot_of_data(schema.read_yaml(path), path.stem))
+    return _told(path, robot_of_data(read_yaml(path), path.stem))
 
 
 def _told(path: Path, robot: Robot) -> Robot:

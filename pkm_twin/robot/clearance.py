@@ -5,8 +5,6 @@ A member is a straight round bar, taken as a capsule: all points within its radi
 between its two joints. Members of one limb share joints, so they are not compared. Nor is anything
 whose shape no parameter tells: platform and base (rings of joints, no bodies), sliders and their
 guides, joints' housings, the crosspieces that carry a parallelogram's two rods.
-
-May import: numpy, pkm_twin's core, the standard library.
 """
 
 from __future__ import annotations
@@ -21,9 +19,9 @@ from pkm_twin.codegen.expressions import maximum, minimum, sqrt
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.motion import cross
-from pkm_twin.machine.robot import Robot
+from pkm_twin.kinematics.traced import Traced
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

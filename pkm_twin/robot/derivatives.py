@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact derivatives of pose and joints: by each other, and by any number of the robot's file.
-
-May import: numpy, pkm_twin's core, the standard library.
-"""
+"""Exact derivatives of pose and joints: by each other, and by any number of the robot's file."""
 
 from __future__ import annotations
 
@@ -15,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import vectors
 from pkm_twin.kinematics.gradients import platform_gradient
-from pkm_twin.kinematics.numbers import file_numbers
 from pkm_twin.machine.geometry import geometry_of
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.numbers import cause_slopes, file_numbers
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -103,6 +100,16 @@ def _by_numbers(robot: Robot, q: ArrayLike, rows: Array, by: Sequence[str]) -> d
 def pose_by_geometry(robot: Robot, q: ArrayLike) -> Array:
     """Of the pose by the engine's geometry, joints held, shape (..., m, k)."""
     return _by_geometry(robot, q, np.eye(len(robot.pose_names), len(robot.pose_names) + 12))
+
+
+def position_effects(robot: Robot, q: ArrayLike) -> Array:
+    """What one standard deviation of each of the file's causes moves the platform, joints held.
+
+    :returns: translations of the reference point, shape (..., 3, causes), m.
+    """
+    causes, m = cause_slopes(robot, geometry_numbers), len(robot.pose_names)
+    table = _by_geometry(robot, q, np.eye(3, m + 12, m))[..., list(causes.chosen)]
+    return np.asarray(table @ causes.slopes, np.float64)
 
 
 def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot's file with some numbers changed in place: its comments and its layout stay.
-
-May import: yaml, this package, the standard library.
-"""
+"""A robot's file with some numbers changed in place: its comments and its layout stay."""
 
 from __future__ import annotations
 
@@ -15,11 +12,11 @@ import yaml
 
 from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.files import replace_file
-from pkm_twin.machine.catalogue import TREES, robot_path
-from pkm_twin.machine.entries import given, has_entry, keys_of
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
-from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.places import given, has_entry, keys_of
 from pkm_twin.machine.yaml_edit import edit_yaml
+from pkm_twin.robot.catalogue import TREES, robot_path
+from pkm_twin.robot.robot import Robot
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]
     every body, joint and rod written out.
 
     :param source: the name or path that the robot was loaded by.
-    :param values: by dotted path, of :func:`pkm_twin.machine.entries.entries`; of ``joint_map``
+    :param values: by dotted path, of :func:`pkm_twin.robot.entries.entries`; of ``joint_map``
         also such as the file does not have yet.
     :raises ParameterError: a path that no such file can have.
     """

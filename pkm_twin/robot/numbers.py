@@ -3,13 +3,12 @@
 
 The functions that make a robot's graph and masses of its file are run once on expressions of the
 numbers; arrays of numbers then take microseconds each, and no robot is built.
-
-May import: numpy, pkm_twin's core, the standard library.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -21,8 +20,8 @@ from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape, references
 from pkm_twin.codegen.plain import functions
 from pkm_twin.machine.geometry import geometry_of
 from pkm_twin.machine.inertia import Layout
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.tree import Tree
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -97,22 +96,34 @@ def file_numbers(
     return found
 
 
-def cause_slopes(robot: Robot, of: Callable[[Robot], Sequence[Any]]) -> Array:
-    """What one standard deviation of each of the robot's causes of doubt adds, (row, causes)."""
+@dataclass(frozen=True, eq=False)
+class CauseSlopes:
+    """What one standard deviation of each cause of doubt adds to the numbers of a row.
+
+    ``chosen``: places of the numbers that any cause changes; ``slopes``: shape (chosen, causes).
+    """
+
+    chosen: tuple[int, ...]
+    slopes: Array
+
+
+def cause_slopes(robot: Robot, of: Callable[[Robot], Sequence[Any]]) -> CauseSlopes:
+    """The same of a robot's causes, made once a robot."""
     key = f"causes {of.__module__}.{of.__qualname__}"
-    found: Array | None = robot.calls.get(key)
+    found: CauseSlopes | None = robot.calls.get(key)
     if found is None:
         causes = robot.causes.values()
         paths = tuple(dict.fromkeys(path for cause in causes for path in cause))
         steps = np.array([[cause.get(path, 0.0) for cause in causes] for path in paths])
-        steps = steps.reshape(len(paths), len(causes))
-        found = robot.calls[key] = FileNumbers(robot, paths, of).slopes @ steps
+        table = FileNumbers(robot, paths, of).slopes @ steps.reshape(len(paths), len(causes))
+        chosen = np.flatnonzero(table.any(1))
+        found = robot.calls[key] = CauseSlopes(tuple(chosen.tolist()), table[chosen])
     return found
 
 
 def geometry_and_masses(robot: Robot) -> list[Any]:
     """The geometry as ``Engine.geometry`` has it, then the masses as ``Robot.inertial``."""
-    graph, load = robot.make_graph(), robot.payload
+    graph, load = robot.with_laws(robot.make_graph()), robot.payload
     layout = Layout(Tree(graph))
     inertial = layout.pack(graph, robot.gravity, robot.friction)
     inertial = inertial + layout.payload(load.mass, load.com, load.inertia)

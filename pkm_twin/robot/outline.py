@@ -2,8 +2,6 @@
 """What a machine looks like: bars and faces between points of its bodies, all given at home.
 
 The one source of every picture: drawings, URDF visuals, the page of ``pkm-twin view``.
-
-May import: numpy, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.members import Place
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -61,6 +59,15 @@ def telescope(joint: Joint) -> bool:
     return joint.kind == "prismatic" and joint.inner != BASE and joint.home != 0.0
 
 
+def tube_start(graph: Graph, joint: Joint) -> Array:
+    """Where the tube of a telescope begins at home: at its other joint, on the axis, (3,) m."""
+    axis = joint.axes[0]
+    for other in graph.joints.values():
+        if other is not joint and joint.inner in (other.inner, other.outer):
+            return np.asarray(joint.at + axis * ((other.at - joint.at) @ axis), np.float64)
+    return joint.at
+
+
 def body_points(graph: Graph) -> dict[str, list[Array]]:
     """Points of each body's joints and rods at home, the base's too, shape (3,) each.
 
@@ -74,9 +81,10 @@ def body_points(graph: Graph) -> dict[str, list[Array]]:
         inner = outer = joint.at
         if telescope(joint):
             # A tube of half the length at home; the ram begins amid it and stays in it.
-            inner = joint.at + joint.home * joint.axes[0] / 2
-            outer = joint.at + joint.home * joint.axes[0] / 4
-            points[joint.inner].append(joint.at)
+            foot = tube_start(graph, joint)
+            inner = foot + joint.home * joint.axes[0] / 2
+            outer = foot + joint.home * joint.axes[0] / 4
+            points[joint.inner].append(foot)
         points[joint.inner].append(inner)
         points[joint.outer].append(outer)
     for rod in graph.rods.values():
@@ -118,7 +126,7 @@ def robot_bars(robot: Robot) -> tuple[Bar, ...]:
 
 
 def face(points: Sequence[Array]) -> Array:
-    """Corners of a plate through points, in their order around it, shape (k, 3).
+    """Corners of the convex plate that covers points, in their order around it, shape (k, 3).
 
     Empty where fewer than three are given or they stand on one line.
     """
@@ -130,25 +138,46 @@ def face(points: Sequence[Array]) -> Array:
     if not spans[1] > _FLAT * spans[0]:
         return np.zeros((0, 3))
     flat = (corners - middle) @ axes[:2].T
-    return np.asarray(corners[np.argsort(np.arctan2(flat[:, 1], flat[:, 0]))], np.float64)
+    order = np.lexsort(flat.T)
+    return corners[_half_hull(flat, order) + _half_hull(flat, order[::-1])]
+
+
+def _half_hull(flat: Array, order: NDArray[np.int64]) -> list[int]:
+    """One side of the hull of points in a plane, without its last point (Andrew 1979)."""
+    least = _FLAT * float(np.abs(flat).max()) ** 2
+    found: list[int] = []
+    for k in order:
+        while len(found) > 1:
+            (ax, ay), (bx, by) = flat[found[-1]] - flat[found[-2]], flat[k] - flat[found[-1]]
+            if ax * by - ay * bx > least:
+                break
+            found.pop()
+        found.append(int(k))
+    return found[:-1]
 
 
 def base_face(graph: Graph) -> Array:
     """Corners of the plate that the base's joints stand on; slides stand on rails instead."""
-    found = [p for j in graph.joints.values() if j.kind in _STANDING for p in _on(j, BASE)]
-    return face(found)
+    return face(list(_fixed(graph, BASE)))
 
 
 def platform_face(graph: Graph) -> Array:
-    """Corners of the platform: its joints and rods' ends."""
-    return face(body_points(graph)[graph.platform][1:])
+    """Corners of the platform: its joints and rods' ends, without what it slides along."""
+    return face(list(_fixed(graph, graph.platform)))
 
 
 _STANDING: Final = ("revolute", "universal", "spherical", "cylindrical", "fixed")
 
 
-def _on(joint: Joint, body: str) -> tuple[Array, ...]:
-    return (joint.at,) if body in (joint.inner, joint.outer) else ()
+def _fixed(graph: Graph, body: str) -> Iterable[Array]:
+    """Points of a body that its joints do not move along it."""
+    for joint in graph.joints.values():
+        if joint.kind in _STANDING and body in (joint.inner, joint.outer):
+            yield joint.at
+    for rod in graph.rods.values():
+        for name, end in zip((rod.inner, rod.outer), rod.ends, strict=True):
+            if name == body:
+                yield end
 
 
 def _others(points: Sequence[Array], radius: float) -> list[Array]:

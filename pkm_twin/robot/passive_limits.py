@@ -1,43 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether passive joints stay within their ranges: swivels of ball joints, turns and slides.
-
-May import: numpy, pkm_twin's machine, the standard library.
-"""
+"""Whether passive joints stay within their ranges: swivels of ball joints, turns and slides."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.machine.graph import BASE
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class PassiveLimit:
-    """The range of one passive joint, from ``low`` to ``high``, rad or m; vectors at home.
-
-    ``kind`` "swivel": the angle between two directions that are both along ``axis`` at home, one
-    fixed in the inner body and one in the outer. "rod": the same of the way from ``at`` on the
-    inner body to ``far`` on the outer one. "turn": about the axis. "slide": of the point ``at``
-    along it.
-    ``home``: the joint's value at home.
-    """
-
-    joint: str
-    kind: str
-    inner: str
-    outer: str
-    at: Array
-    axis: Array
-    low: float
-    high: float
-    home: float = 0.0
-    far: Array | None = None
 
 
 def passive_values(robot: Robot, q: ArrayLike) -> Array:

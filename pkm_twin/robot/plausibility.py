@@ -3,8 +3,6 @@
 
 Each is compared with the machine itself, so that small and large machines are judged alike. What
 no machine can have is rejected by the schema; what is here is taken as it stands, with a warning.
-
-May import: numpy, this package, kinematics, the standard library.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.conditions import merged
 from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.machine.graph import BASE, Array, Graph, Joint
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 LARGEST: Final = 20.0
 """Extent of a machine, m, from which on its lengths look like millimetres."""

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot as a URDF, MJCF, SDF, and as a ``mechanism: machine`` description.
-
-May import: numpy, this package, the names of passive joints.
-"""
+"""A robot as a URDF, MJCF, SDF, and as a ``mechanism: machine`` description."""
 
 from __future__ import annotations
 
@@ -15,14 +12,15 @@ from numpy.typing import NDArray
 from pkm_twin.errors import warn
 from pkm_twin.kinematics.passive import single_joints
 from pkm_twin.machine import schema
-from pkm_twin.machine.entries import has_entry
+from pkm_twin.machine.friction import all_keys
 from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.mjcf_write import write_mjcf
-from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.places import has_entry
 from pkm_twin.machine.sdf_write import write_sdf
-from pkm_twin.machine.urdf_tree import urdf_tree
 from pkm_twin.machine.urdf_write import MOCK, UrdfBody, UrdfDrive, UrdfTree, write_urdf
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.urdf_tree import urdf_tree
 
 Array = NDArray[np.float64]
 
@@ -39,6 +37,7 @@ def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
         element, as for a description that a controller_manager must not make hardware of.
     :param prefix: of the names of all links and joints.
     """
+    _warn_of_laws(robot, "URDF")
     return write_urdf(robot_tree(robot), hardware, prefix)
 
 
@@ -49,6 +48,7 @@ def robot_mjcf(robot: Robot, efforts: Sequence[float] | None = None) -> str:
 
     :param efforts: of the actuators in the keyframe ``home``, shape (n,), N m or N.
     """
+    _warn_of_laws(robot, "MJCF")
     tree = robot_tree(robot)
     for name in tree.actuated:
         if robot.friction.offset[tree.actuated.index(name)]:
@@ -58,6 +58,7 @@ def robot_mjcf(robot: Robot, efforts: Sequence[float] | None = None) -> str:
 
 def robot_sdf(robot: Robot) -> str:
     """The robot as an SDF model, see docs/simulators.md; gravity is the world's."""
+    _warn_of_laws(robot, "SDF")
     tree = robot_tree(robot)
     left_out = [
         f"{what} of {joint.name}"
@@ -71,6 +72,12 @@ def robot_sdf(robot: Robot) -> str:
     if left_out:
         warn(tree.name, f"SDF has no place for {', '.join(left_out)}")
     return write_sdf(tree)
+
+
+def _warn_of_laws(robot: Robot, where: str) -> None:
+    """Of friction that a format has no place for."""
+    if robot.laws:
+        warn("friction", f"{where} has no {' or '.join(robot.laws)} friction: it is left out")
 
 
 def robot_tree(robot: Robot) -> UrdfTree:
@@ -101,6 +108,8 @@ def robot_description(robot: Robot) -> dict[str, Any]:
             data[kind][name] |= entry
     if elastic and robot.element_compliance:
         data["element_compliance"] = dict(robot.element_compliance)
+    if elastic and robot.modal_damping.size:
+        data["modal_damping"] = robot.modal_damping.tolist()
     data["gravity"] = robot.gravity.tolist()
     pose = [coordinate.name for coordinate in robot.coordinates]
     # A mechanism may have coordinates of its own.
@@ -126,11 +135,12 @@ def robot_description(robot: Robot) -> dict[str, Any]:
                 limits[key] = value
         if limits:
             joint["limits"] = limits
-        offset = float(robot.friction.offset[robot.graph.actuated.index(name)])
-        if drive.damping or drive.friction or offset:
-            joint["friction"] = {"viscous": drive.damping, "coulomb": drive.friction}
-        if offset:
-            joint["friction"]["offset"] = offset
+        k = robot.graph.actuated.index(name)
+        more = {key: float(getattr(robot.friction, key)[k]) for key in all_keys()}
+        if any(more.values()):
+            joint["friction"] = {
+                key: value for key, value in more.items() if value or key in ("viscous", "coulomb")
+            }
     for key in ("joint_map", "uncertainty"):
         told = {
             name: {field: value for field, value in entry.items() if value is not None}

@@ -4,8 +4,6 @@
 The actuated joints stand where the file wants them: at the initial values of ``<ros2_control>``,
 else at zero, else, where the limits leave zero out, amid the limits. Of several such assemblies the
 one as drawn is taken, else the best conditioned; where there is none, the best conditioned near it.
-
-May import: numpy, this package, kinematics, the standard library.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A URDF or MJCF with its loop closures as plain data of a ``mechanism: machine`` description.
-
-May import: numpy, the files' parts, the assembly and its home.
-"""
+"""A URDF or MJCF with its loop closures as plain data of a ``mechanism: machine`` description."""
 
 from __future__ import annotations
 
@@ -18,9 +15,9 @@ from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.urdf_file import Joint, Link, Urdf
-from pkm_twin.machine.urdf_home import Home, HomeSearch
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
+from pkm_twin.robot.urdf_home import Home, HomeSearch
 
 Array = NDArray[np.float64]
 
@@ -75,7 +72,7 @@ def read_tree(
 
     A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package.
 
-    Links that fixed joints hold together are one body. Home: see :mod:`pkm_twin.machine.urdf_home`;
+    Links that fixed joints hold together are one body. Home: see :mod:`pkm_twin.robot.urdf_home`;
     ``home`` of a joint is its value there, so that joint values are the URDF's. Parts that only
     spin about themselves are held, and axes that a rounded file leaves nearly parallel, or nearly
     meeting, are made so where the machine could not move otherwise.

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graph and the single joints of its spanning tree as what the URDF writer takes.
-
-May import: numpy, this package's graph, outline and URDF writer, the names of passive joints.
-"""
+"""A graph and the single joints of its spanning tree as what the URDF writer takes."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ import numpy as np
 
 from pkm_twin.kinematics.passive import Axis
 from pkm_twin.machine.graph import BASE, Graph, Joint
-from pkm_twin.machine.outline import bars
 from pkm_twin.machine.urdf_write import (
     GROUND,
     PLATFORM,
@@ -25,6 +21,7 @@ from pkm_twin.machine.urdf_write import (
     UrdfTree,
 )
 from pkm_twin.machine.urdf_xml import plain_name
+from pkm_twin.robot.outline import bars
 
 PAYLOAD: Final = "payload"
 """The link of a payload, apart from the platform's."""

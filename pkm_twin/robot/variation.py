@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine beside its model: the same robot with parameters that differ by a stated spread.
-
-May import: numpy, this package, the standard library.
-"""
+"""A machine beside its model: the same robot with parameters that differ by a stated spread."""
 
 from __future__ import annotations
 
@@ -14,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.entries import given
-from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.places import given
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Distribution = Literal["normal", "uniform"]

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reachable workspace of a machine, and the regular one of a height and two tilts.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
-"""
+"""Reachable workspace of a machine, and the regular one of a height and two tilts."""
 
 from __future__ import annotations
 
@@ -16,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
-from pkm_twin.kinematics.passive_limits import within_passive_limits
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.clearance import has_clearance, joint_clearance
+from pkm_twin.robot.passive_limits import within_passive_limits
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -1,0 +1,422 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One program over batches of samples, of one machine or of many, by the best back end there is."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Callable, Sequence
+from functools import cache as remembered
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pkm_twin.codegen import cache
+from pkm_twin.codegen.arrays import doubles
+from pkm_twin.codegen.parts import in_parts
+from pkm_twin.codegen.plain import PlainCode
+from pkm_twin.codegen.program import Program
+from pkm_twin.codegen.rooms import Array, Space, aligned, caller, take_none
+
+SWITCH: Final = "PKM_TWIN_PLAIN"
+"""Set to 1: plain Python, as on a machine without llvmlite."""
+STEPS: Final = (4, 16, 64, 256, 1024)
+"""Steps in which samples are tried again that one step does not reach."""
+
+
+GOOD: Final = 0.0
+REFUSED: Final = 1.0
+NOT_FINITE: Final = 2.0
+
+
+MOST: Final = 1_000_000
+"""Upper limit of the numbers in an input, an output or the parameters."""
+_WRITERS: Final = ("codegen", "machine", "kinematics", "robot", "mechanisms", "streams")
+"""Folders beside this one whose sources write programs."""
+SMALL: Final = 4096
+"""Samples of a batch that is copied into a room of its own."""
+KEPT_ROOMS: Final = 16
+"""Sizes of small batches whose rooms are kept."""
+
+
+_F8: Final = np.dtype(np.float64)
+_NO_INPUT: Final = np.zeros(0)
+
+
+@remembered
+def _llvm() -> ModuleType | None:
+    if os.environ.get(SWITCH, "0") not in ("", "0"):
+        return None
+    try:
+        from pkm_twin.codegen import llvm
+    except ImportError:
+        return None
+    return llvm
+
+
+def compiled() -> bool:
+    """Whether programs are compiled; else they run as plain Python."""
+    return _llvm() is not None
+
+
+@remembered
+def _sources() -> str:
+    """What the package's formulas hang on: a changed file compiles anew."""
+    root = Path(__file__).resolve().parents[1]
+    folders = [root / name for name in _WRITERS]
+    folders += [root.parent / name for name in ("delta_dynamics", "stiffness_monitor")]
+    paths = sorted(path for place in folders for path in place.glob("*.py"))
+    return cache.digest(*(path.read_text(encoding="utf-8") for path in paths))
+
+
+def _strides(row: Array) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Number and bytes from one to the next, of samples and of machines."""
+    return (row.shape[1], row.strides[1]), (row.shape[0], row.strides[0])
+
+
+def _axes(array: Array) -> int:
+    return array.ndim
+
+
+class Code:
+    """One program over batches, of one machine or of many.
+
+    What hangs on parameters alone is prepared once a machine, see :meth:`prepare`.
+
+    :param build: writes the program; called only where no compiled one is stored.
+    :param key: text that the program's content hangs on, beside the package's own sources.
+    """
+
+    def __init__(self, build: Callable[[], Program], key: str) -> None:
+        self._build, self._key = build, key
+        self._lock = threading.Lock()
+        self._spaces: dict[int, list[Space]] = {}
+        """Rooms that nobody uses, by their number of samples."""
+
+    @cached_property
+    def program(self) -> Program:
+        """The program itself."""
+        return self._build()
+
+    @cached_property
+    def _loaded(self) -> tuple[dict[str, Any], Any, Any, Any]:
+        """Sizes, then the code that prepares, that for batches and that for one sample."""
+        llvm = _llvm()
+        with self._lock:
+            if llvm is None:
+                plain = PlainCode(self.program)
+                return _header(self.program, 1), plain.prepare, plain, None
+            from pkm_twin.codegen import native
+
+            name = cache.digest(self._key, _sources(), llvm.IDENTITY)
+            stored = cache.read(name)
+            if stored and _sound(stored[0]) and cache.is_object(stored[1], native.SYMBOL):
+                header, code = stored
+            else:
+                header = _header(self.program, llvm.LANES)
+                level = native.QUICK if self.program.quick else native.OPTIMISATION
+                code = native.compile_object(llvm.emit(self.program), level)
+                cache.write(name, header, code)
+            prepare, address = native.load_object(code)
+            prepare = native.LOCKED(prepare)
+            return header, prepare, native.PROTOTYPE(address), native.LOCKED(address)
+
+    @cached_property
+    def sizes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Sizes of inputs and outputs."""
+        header = self._loaded[0]
+        return tuple(header["inputs"]), tuple(header["outputs"])
+
+    @cached_property
+    def _stepped(self) -> bool:
+        return bool(self._loaded[0]["stepped"])
+
+    def prepare(self, p: Array) -> Array:
+        """What samples need of a machine's parameters.
+
+        :param p: parameters, shape (k, parameters), contiguous, or of one machine (parameters,).
+        :returns: shape (k, prepared), or (prepared,): last by how much the parameters miss
+            what the program takes for constant, squared.
+        """
+        header, prepare, _, locked = self._loaded
+        if p.shape[-1] != header["parameters"]:
+            raise ValueError(f"{header['parameters']} parameters, the shape is {p.shape}")
+        rows = np.ascontiguousarray(np.atleast_2d(p), np.float64)
+        if locked is None:
+            return np.asarray(prepare(rows).reshape(*p.shape[:-1], -1), np.float64)
+        result = aligned(len(rows), header["prepared"])
+        words = np.array([len(rows), rows.ctypes.data, rows.shape[1], result.ctypes.data], np.int64)
+        prepare(words.ctypes.data)
+        return result.reshape(*p.shape[:-1], -1)
+
+    @property
+    def functions(self) -> tuple[Any, Any] | None:
+        """The code for batches and that for one sample, which holds the interpreter's lock."""
+        return None if self._loaded[3] is None else self._loaded[2:]
+
+    @property
+    def parameters(self) -> int:
+        """How many parameters there are."""
+        return int(self._loaded[0]["parameters"])
+
+    def run(self, prepared: Array, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
+        """Evaluate over leading batch axes.
+
+        :param prepared: of one machine, contiguous.
+        :param inputs: one array an input, shape (..., size), broadcast against each other.
+        :returns: outputs, shape (..., size) each, NaN in refused samples; and the status, None
+            if all samples are good, else shape (..., 2): 0 good, 1 refused, 2 not finite; and the
+            part of the way from home that was reached.
+        :raises ValueError: an input that is no real numbers, or whose last axis has another size.
+        """
+        arrays = self._checked(inputs)
+        whole = max(arrays, key=_axes, default=_NO_INPUT)
+        if whole.ndim == 1:
+            return self.run_one(prepared, arrays)
+        shape = whole.shape[:-1]
+        if all(a.flags.c_contiguous and a.shape[:-1] in ((), shape) for a in arrays):
+            quick = self._quick(prepared, arrays, shape)
+            if quick is not None:
+                outputs, status = quick
+                if status is not None:
+                    count = len(status)
+                    rows = [a.reshape(1, 1 if a.ndim == 1 else count, a.shape[-1]) for a in arrays]
+                    flat = [output.reshape(count, output.shape[-1]) for output in outputs]
+                    status = self._finished(prepared.reshape(1, -1), rows, flat, status, count)
+                return outputs, None if status is None else status.reshape(*shape, 2)
+        batch = np.broadcast_shapes(*(array.shape[:-1] for array in arrays))
+        count = math.prod(batch)
+        if count == 0:
+            return [np.empty((*batch, size)) for size in self.sizes[1]], None
+        rows = []
+        for array in arrays:
+            size = array.shape[-1]
+            one = array.size == size
+            whole = array.reshape(size) if one else np.broadcast_to(array, (*batch, size))
+            # The code reads doubles side by side, which a column of a table is not.
+            rows.append(np.ascontiguousarray(whole).reshape(1, 1 if one else count, size))
+        outputs, status = self._solved(prepared.reshape(1, -1), rows, count)
+        shaped = [output.reshape(*batch, output.shape[-1]) for output in outputs]
+        return shaped, None if status is None else status.reshape(*batch, 2)
+
+    def _quick(
+        self, prepared: Array, arrays: Sequence[Array], shape: tuple[int, ...]
+    ) -> tuple[list[Array], Array | None] | None:
+        """A small batch in one step, as :meth:`_run`; None where it is too large."""
+        _, _, code, locked = self._loaded
+        count = math.prod(shape)
+        if locked is None or not 0 < count <= SMALL:
+            return None
+        # Copies into a room cost less than to find where arrays lie.
+        space = self._room(prepared, count)
+        for view, array in zip(space.inputs, arrays, strict=True):
+            view[...] = array if array.ndim <= 2 else array.reshape(count, -1)
+        bad = code(space.address)
+        outputs = [view.copy() for view in space.outputs]
+        if len(shape) > 1 or count == 1:
+            outputs = [output.reshape(*shape, -1) for output in outputs]
+        status = space.status.reshape(count, 2).copy() if bad else None
+        self._give(space, count)
+        return outputs, status
+
+    def _room(self, prepared: Array, count: int) -> Space:
+        """A room for so many samples of a machine, for :meth:`_give` to have back."""
+        free = self._spaces.get(count)
+        if free is None:
+            if len(self._spaces) >= KEPT_ROOMS:
+                self._spaces = {}
+            free = self._spaces[count] = []
+        try:
+            space = free.pop()
+        except IndexError:
+            space = Space(*self.sizes, count)
+        if prepared is not space.prepared:
+            space.point_at(prepared)
+        return space
+
+    def _give(self, space: Space, count: int) -> None:
+        """Give a room back; one whose kind is not kept any more goes."""
+        free = self._spaces.get(count)
+        if free is not None:
+            free.append(space)
+
+    def run_each(self, prepared: Array, *inputs: Array) -> tuple[list[Array], Array | None]:
+        """The same of many machines.
+
+        :param prepared: shape (k, prepared).
+        :param inputs: shape (k, samples, size), or (1, samples, size) for all machines alike, or
+            (k or 1, 1, size) for all samples alike.
+        :returns: outputs, shape (k, samples, size) each, and the status, None or (k, samples, 2).
+        """
+        arrays = self._checked(inputs)
+        machines, count = len(prepared), max(array.shape[1] for array in arrays)
+        if machines * count == 0:
+            return [np.empty((machines, count, size)) for size in self.sizes[1]], None
+        rows = [np.ascontiguousarray(array) for array in arrays]
+        outputs, status = self._solved(np.ascontiguousarray(prepared), rows, count)
+        shaped = [output.reshape(machines, count, -1) for output in outputs]
+        return shaped, None if status is None else status.reshape(machines, count, 2)
+
+    def _checked(self, inputs: Sequence[ArrayLike]) -> list[Array]:
+        arrays = [doubles(value) for value in inputs]
+        for array, size in zip(arrays, self.sizes[0], strict=True):
+            if array.ndim == 0 or array.shape[-1] != size:
+                raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
+        return arrays
+
+    def run_one(self, prepared: Array, inputs: Sequence[Any]) -> tuple[list[Array], Array | None]:
+        """One sample of checked shapes, (size,) each; results as those of :meth:`run`."""
+        code = self._loaded[3]
+        if code is None:
+            rows = [np.asarray(value, _F8).reshape(1, 1, -1) for value in inputs]
+            outputs, status = self._run(prepared.reshape(1, -1), rows, 1, 1)
+        else:
+            space = self._room(prepared, 1)
+            for view, value in zip(space.inputs, inputs, strict=True):
+                view[:] = value
+            if not code(space.address):
+                results = [view.copy() for view in space.outputs]
+                self._give(space, 1)
+                return results, None
+            rows = [view.reshape(1, 1, -1).copy() for view in space.inputs]
+            outputs = [view.reshape(1, -1).copy() for view in space.outputs]
+            status = space.status.reshape(1, 2).copy()
+            self._give(space, 1)
+        status = self._finished(prepared.reshape(1, -1), rows, outputs, status, 1)
+        return [output[0] for output in outputs], None if status is None else status[0]
+
+    def first_of_one(self, prepared: Array) -> Callable[..., Array | None]:
+        """The first output of one sample, as fast as can be; on plain Python always None.
+
+        The function takes arrays of doubles of exactly the inputs' shapes, (size,) each, else it
+        raises TypeError or ValueError; it gives None where a sample is not good at once.
+        """
+        code = self._loaded[3]
+        if code is None:
+            return take_none
+        sizes = self.sizes
+
+        def room() -> tuple[Any, ...]:
+            space = Space(*sizes)
+            space.point_at(prepared)
+            return (*space.takers(), space.address, space.outputs[0].copy, space)
+
+        result: Callable[..., Array | None] = caller(len(sizes[0]))(code, room, np.ndarray)
+        return result
+
+    def _solved(
+        self, prepared: Array, rows: Sequence[Array], count: int
+    ) -> tuple[list[Array], Array | None]:
+        """All samples of all machines, with more steps where one does not do."""
+        outputs, status = self._run(prepared, rows, count, 1)
+        return outputs, self._finished(prepared, rows, outputs, status, count)
+
+    def _finished(
+        self,
+        prepared: Array,
+        rows: Sequence[Array],
+        outputs: Sequence[Array],
+        status: Array | None,
+        count: int,
+    ) -> Array | None:
+        """The status after more steps, with outputs written in place; None if all is good."""
+        if status is None or not self._stepped:
+            return status
+        self._try_again(prepared, rows, outputs, status, count)
+        return status if status[:, 0].any() else None
+
+    def _try_again(
+        self,
+        prepared: Array,
+        rows: Sequence[Array],
+        outputs: Sequence[Array],
+        status: Array,
+        count: int,
+    ) -> None:
+        """Samples that one step did not reach, in more and more steps; written in place."""
+        for steps in STEPS:
+            left = np.flatnonzero(status[:, 0] == REFUSED)
+            if not len(left):
+                return
+            machines, samples = np.divmod(left, count)
+            for machine in np.unique(machines) if len(prepared) > 1 else [0]:
+                own = left[machines == machine] if len(prepared) > 1 else left
+                at = samples[machines == machine] if len(prepared) > 1 else samples
+                picked = [
+                    row[machine if len(row) > 1 else 0][at if row.shape[1] > 1 else [0]][None]
+                    for row in rows
+                ]
+                alone = prepared[machine : machine + 1]
+                found, again = self._run(alone, picked, len(own), steps)
+                for output, values in zip(outputs, found, strict=True):
+                    output[own] = values
+                status[own] = np.array([GOOD, 1.0]) if again is None else again
+
+    def _run(
+        self, prepared: Array, rows: Sequence[Array], count: int, steps: int
+    ) -> tuple[list[Array], Array | None]:
+        header, _, code, locked = self._loaded
+        machines = len(prepared)
+        if locked is None:
+            parts = [
+                code.run(one, [row[k if len(row) > 1 else 0] for row in rows], count, steps)
+                for k, one in enumerate(prepared)
+            ]
+            status = np.concatenate([part[1] for part in parts])
+            outputs = [
+                np.concatenate([part[0][k] for part in parts])
+                for k in range(len(header["outputs"]))
+            ]
+            return outputs, status if status[:, 0].any() else None
+        outputs = [np.empty((machines * count, size)) for size in header["outputs"]]
+        status = np.empty((machines * count, 2))
+
+        def part(begin: int, end: int) -> bool:
+            """Some of the machines, or of a single machine's samples; whether one is not good."""
+            many = machines > 1
+            size = (end - begin, count) if many else (1, end - begin)
+            own = prepared[begin:] if many else prepared
+            words = [*size, steps, own.ctypes.data, prepared.shape[1]]
+            for row in rows:
+                every, leap = (0 if n == 1 else step // 8 for n, step in _strides(row))
+                at = begin * (leap if many else every)
+                words += [row.ctypes.data + 8 * at, every, leap]
+            at = begin * count if many else begin
+            words += [array[at:].ctypes.data for array in [*outputs, status]]
+            # Named: its address alone would not keep it while the code reads it.
+            told = np.array(words, np.int64)
+            return bool(code(told.ctypes.data))
+
+        whole = machines if machines > 1 else count
+        bad = in_parts(part, whole, machines * count)
+        return outputs, status if bad else None
+
+
+def _header(program: Program, lanes: int) -> dict[str, Any]:
+    return {
+        "inputs": list(program.inputs.values()),
+        "outputs": [len(row) for row in program.outputs.values()],
+        "parameters": program.parameters + program.geometry,
+        "prepared": lanes * (len(program.prepared) + 1),
+        "stepped": program.equations is not None,
+    }
+
+
+def _sound(header: dict[str, Any]) -> bool:
+    """Whether a stored header is one that `_header` can have written."""
+    match header:
+        case {
+            "inputs": [*taken],
+            "outputs": [*given],
+            "parameters": p,
+            "prepared": k,
+            "stepped": s,
+        }:
+            sizes = (*taken, *given, p, k)
+            return type(s) is bool and all(type(n) is int and 0 <= n < MOST for n in sizes)
+    return False

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A graph at home and near it, on numbers: closures, rank, mobility."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+from weakref import WeakValueDictionary
+
+import numpy as np
+
+from pkm_twin.codegen.expressions import Numbers
+from pkm_twin.kinematics.iterations import RANK, newton
+from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
+from pkm_twin.machine.graph import Array, Graph
+from pkm_twin.machine.tree import Tree
+
+SAMPLES: Final = 6
+"""States near home, beside it, in which pivots have to be good."""
+
+
+@dataclass(frozen=True)
+class Mobility:
+    """What the graph at home says.
+
+    ``freedoms``: of the whole machine. ``rank``: of all closures. ``redundant``: closures less
+    their rank. ``parts``: the cut joints and rods among which they are. ``unknowns``: of the tree.
+    """
+
+    freedoms: int
+    closures: int
+    rank: int
+    redundant: int
+    parts: tuple[str, ...]
+    unknowns: int
+
+
+class Linkage:
+    """A graph's tree and closures, on numbers."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph, self.tree = graph, Tree(graph)
+
+    @property
+    def joints(self) -> int:
+        """Number of actuated joints."""
+        return len(self.graph.actuated)
+
+    def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
+        """Motion and closures in a state, on numbers."""
+        motion = Motion(self.tree, x, q)
+        return motion, motion.closures()
+
+    def _scaled(self, rows: Sequence[Row]) -> tuple[Array, Array]:
+        """Derivatives by u and by qd, every row and column of unit one."""
+        ju, jq = (numbers(m) for m in matrices(self.tree, rows))
+        left = np.array([row.scale for row in rows]).reshape(-1, 1)
+        drives = np.array([self._drive_scale(name) for name in self.graph.actuated])
+        return left * ju / np.array(self.tree.scales), left * jq / drives
+
+    def _drive_scale(self, name: str) -> float:
+        return 1.0 / self.tree.size if self.graph.joints[name].slides else 1.0
+
+    def close(self, q: Numbers, start: Numbers | None = None) -> Array | None:
+        """Unknowns of a state near a known one, on numbers; None where they are not found."""
+        scales = np.array(self.tree.scales)
+
+        def look(x: Numbers) -> tuple[Array, Array]:
+            _, rows = self.at(x, q)
+            values = np.array([row.scale * float(row.value) for row in rows])
+            return values, self._scaled(rows)[0]
+
+        def move(x: Numbers, step: Array) -> Array:
+            return np.array(Motion(self.tree, x, q).retracted(x, step / scales), float)
+
+        x = np.array(self.tree.home if start is None else start, float)
+        return newton(x, look, move) if self.at(x, q)[1] else x
+
+    @cached_property
+    def samples(self) -> list[tuple[Array, Array]]:
+        """States (x, q) at home and near it, found by the first linkage of a geometry for all."""
+        first = _firsts.setdefault(self.graph.key, self)
+        if first is not self:
+            return first.samples
+        # The one that chooses pose coordinates is followed by the one that has them.
+        hold(self)
+        return self._near_home()
+
+    def _near_home(self) -> list[tuple[Array, Array]]:
+        """The same in every run."""
+        graph, home = self.graph, self.graph.home
+        states = [(np.array(self.tree.home, float), home)]
+        random = np.random.default_rng(0)
+        reach = np.array(
+            [0.15 * self.tree.size if self._drive_scale(n) != 1.0 else 0.3 for n in graph.actuated]
+        )
+        for _ in range(4 * SAMPLES):
+            if len(states) > SAMPLES:
+                break
+            way = random.uniform(-1.0, 1.0, len(home)) * reach
+            x: Array | None = states[0][0]
+            for part in (0.5, 1.0):
+                x = None if x is None else self.close(home + part * way, x)
+            if x is not None:
+                states.append((x, home + way))
+            else:
+                reach = reach * 0.8
+        return states
+
+    @cached_property
+    def _sampled(self) -> tuple[Array, Array]:
+        """Scaled derivatives by u and qd in the samples, shape (k, rows, ...)."""
+        pairs = [self._scaled(self.at(x, q)[1]) for x, q in self.samples]
+        return np.array([a for a, _ in pairs]), np.array([b for _, b in pairs])
+
+    def scaled_at_home(self) -> tuple[Array, Array]:
+        """Derivatives of the closures at home by u and by qd, every row and column of unit one."""
+        return self._scaled(self.at(self.tree.home, self.graph.home)[1])
+
+    def regular_state(self) -> tuple[Motion, Array]:
+        """The motion in a state of the highest rank at or beside home, and derivatives by u."""
+        k = int(np.argmax([rank_of(ju) for ju in self._sampled[0]]))
+        return self.at(*self.samples[k])[0], np.asarray(self._sampled[0][k], np.float64)
+
+    @cached_property
+    def mobility(self) -> Mobility:
+        """Freedoms, rank and redundancy at home."""
+        _, rows = self.at(self.tree.home, self.graph.home)
+        both = np.hstack(self._scaled(rows))
+        rank = rank_of(both)
+        parts: tuple[str, ...] = ()
+        if rank < len(rows):
+            left = np.linalg.svd(both)[0][:, rank:]
+            used = np.abs(left).max(1) > 1e-6
+            parts = tuple(dict.fromkeys(r.part for r, u in zip(rows, used, strict=True) if u))
+        unknowns = self.tree.unknown_rates
+        return Mobility(
+            unknowns + self.joints - rank, len(rows), rank, len(rows) - rank, parts, unknowns
+        )
+
+
+def rank_of(matrix: Array) -> int:
+    """Number of singular values above :data:`RANK`."""
+    if not matrix.size:
+        return 0
+    s = np.linalg.svd(matrix, compute_uv=False)
+    return int((s > RANK * max(1.0, float(s[0]))).sum())
+
+
+_firsts: Final[WeakValueDictionary[str, Linkage]] = WeakValueDictionary()
+"""The first linkage of a graph that something still holds."""
+_recent: Final[deque[Linkage]] = deque(maxlen=16)
+"""Held although no machine may: loading a file again takes no engine anew."""
+
+
+def hold(linkage: Linkage) -> None:
+    """Keep a linkage until 16 others are kept."""
+    if linkage not in _recent:
+        _recent.append(linkage)

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The programs of kinematics: pose, Jacobians, placements, accelerations, inverse."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from pkm_twin.codegen.expressions import Numbers
+from pkm_twin.codegen.lu import SparseLU
+from pkm_twin.codegen.program import UNKNOWNS, Equations, Program
+from pkm_twin.kinematics import pose as poses
+from pkm_twin.kinematics.motion import Motion, Row, matrices
+from pkm_twin.kinematics.traced import Traced
+
+POSE_WEIGHT: Final = 100.0
+"""What the pose weighs against closures where not all can be met: so a closure falls short."""
+
+
+def walk_program(t: Traced) -> Program:
+    """The closures where they do not hold, for telling why."""
+    tree = t.tree
+    motion = Motion(tree, t.x, t.q)
+    rows = motion.closures()
+    table, _ = matrices(tree, rows)
+    move = t.tape.inputs("move", tree.unknown_rates)
+    scales = np.array(tree.scales)
+    entries = [
+        row.scale * e / c
+        for row, line in zip(rows, table, strict=True)
+        for e, c in zip(line, scales, strict=True)
+    ]
+    outputs = {
+        "values": t.lift([row.scale * row.value for row in rows]),
+        "table": t.lift(entries),
+        "moved": t.lift(motion.retracted(t.x, move / scales)),
+    }
+    sizes = {UNKNOWNS: len(tree.home), "q": t.joints, "move": tree.unknown_rates}
+    return Program(sizes, 0, outputs)
+
+
+def pose_walk_program(t: Traced) -> Program:
+    """The same of a pose, the actuated joints unknown too."""
+    scheme, tree, tape = t.scheme, t.tree, t.tape
+    size, free = len(tree.home), tree.unknown_rates
+    everything = tape.inputs(UNKNOWNS, size + t.joints)
+    goal = tape.inputs("pose", len(scheme.coordinates))
+    motion = Motion(tree, everything[:size], everything[size:])
+    rows = motion.closures()
+    equations = poses.rows(scheme.coordinates, motion, goal)
+    table = np.vstack([np.hstack(matrices(tree, rows)), scheme.pose_rows(motion, goal)])
+    scales = [row.scale for row in rows] + [POSE_WEIGHT * scale for scale in t.pose_scales]
+    columns = [*tree.scales, *t.drive_scales]
+    entries = [
+        scale * entry / column
+        for scale, line in zip(scales, table, strict=True)
+        for entry, column in zip(line, columns, strict=True)
+    ]
+    values = [row.value for row in rows] + [value for value, _ in equations]
+    move = tape.inputs("move", free + t.joints) / np.array(columns)
+    moved = [*motion.retracted(everything[:size], move[:free]), *(everything[size:] + move[free:])]
+    outputs = {
+        "values": t.lift([s * v for s, v in zip(scales, values, strict=True)]),
+        "table": t.lift(entries),
+        "moved": t.lift(moved),
+    }
+    sizes = {UNKNOWNS: size + t.joints, "pose": len(goal), "move": free + t.joints}
+    return Program(sizes, 0, outputs)
+
+
+def forward_program(t: Traced) -> Program:
+    """The program of :attr:`.engine.Engine.forward`, to write others with."""
+    t.solve()
+    position, rotation = t.motion.platform()
+    values = poses.values(t.scheme.coordinates, position, rotation)
+    outputs = {
+        "pose": t.lift(values),
+        "position": t.lift(position),
+        "rotation": t.lift(np.ravel(rotation)),
+    }
+    return Program({"q": t.joints}, 0, outputs, t.equations())
+
+
+def jacobian_program(t: Traced) -> Program:
+    """The program of :attr:`.engine.Engine.jacobian`."""
+    t.solve()
+    _, rotation = t.motion.platform()
+    twists = t.twists()
+    rates = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists]
+    outputs = {
+        "rates": t.lift([row[i] for i in range(len(t.scheme.coordinates)) for row in rates]),
+        "twist": t.lift([pair[part][i] for part in (0, 1) for i in range(3) for pair in twists]),
+    }
+    return Program({"q": t.joints}, 0, outputs, t.equations())
+
+
+def placement_program(t: Traced) -> Program:
+    """The program of :attr:`.engine.Engine.placement`."""
+    t.solve()
+    rows: list[Any] = []
+    for body in t.graph.bodies:
+        rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
+    return Program({"q": t.joints}, 0, {"bodies": t.lift(rows)}, t.equations())
+
+
+def acceleration_program(t: Traced) -> Program:
+    """The program of :attr:`.engine.Engine.acceleration`."""
+    t.solve()
+    qd, qdd = t.tape.inputs("qd", t.joints), t.tape.inputs("qdd", t.joints)
+    t.set_rates(qd)
+    t.set_accelerations(qdd)
+    motion, graph = t.motion, t.graph
+    body = graph.platform
+    second = poses.accelerations(
+        t.scheme.coordinates, motion.turned(body), motion.omega[body],
+        motion.acceleration(body, graph.origin), motion.alpha[body],
+    )  # fmt: skip
+    sizes = {"q": t.joints, "qd": t.joints, "qdd": t.joints}
+    return Program(sizes, 0, {"acceleration": t.lift(second)}, t.equations())
+
+
+def inverse_program(t: Traced) -> Program:
+    """The program of :attr:`.engine.Engine.inverse`."""
+    scheme, tree, tape = t.scheme, t.tree, t.tape
+    n, size, split = scheme.joints, len(tree.home), tree.unknown_rates
+    everything = tape.inputs(UNKNOWNS, size + n)
+    goal = tape.inputs("pose", len(scheme.coordinates))
+    home = [*tree.home, *t.graph.home]
+    origin = [0.0 if c.axis is None else t.graph.origin[c.axis] for c in scheme.coordinates]
+
+    def system(state: Numbers, pose: Numbers) -> tuple[Motion, list[Row], list[Any], SparseLU]:
+        """Closures, pose equations, and the factors of their derivatives."""
+        motion = Motion(tree, state[:size], state[size:])
+        rows = motion.closures()
+        table = np.hstack(matrices(tree, rows))[scheme.kept]
+        matrix = np.vstack([table, scheme.pose_rows(motion, pose)])
+        equations = [value for value, _ in poses.rows(scheme.coordinates, motion, pose)]
+        return motion, rows, equations, SparseLU(matrix, scheme.inverse_pivots)
+
+    motion, rows, equations, lu = system(everything, goal)
+    step = -lu.solve([rows[k].value for k in scheme.kept] + equations)
+    joints = everything[size:] + step[split:]
+    moved = [*motion.retracted(everything[:size], step[:split]), *joints]
+    at_home = system(home, origin)[3]
+    solved = Equations(
+        "pose", t.lift(home), t.lift(origin), None, t.lift(moved),
+        t.square(step, [*tree.scales, *t.drive_scales]),
+        tape.lift(at_home.inverse_determinant / lu.inverse_determinant),
+        t.square(
+            [r.value for r in rows] + equations, [r.scale for r in rows] + t.pose_scales
+        ),
+    )  # fmt: skip
+    return Program({"pose": len(goal)}, 0, {"q": t.lift(everything[size:])}, solved)

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What programs of a graph hang on: closures that are solved, their pivots, pose coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from pkm_twin.codegen.expressions import Numbers, Objects
+from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
+from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics import pose as poses
+from pkm_twin.kinematics.diagnosis import mobility_error, singular_home
+from pkm_twin.kinematics.linkage import Linkage, rank_of
+from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
+from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.machine.geometry import geometry_of, pattern_of
+from pkm_twin.machine.graph import Array, Graph
+
+
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """What a mechanism's closed forms hang on beside the graph.
+
+    ``numbers``: shape (k,). ``start``: where there is one, of such numbers and q to the values of
+    passive tree joints beside home, by name, from the inner to the outer body.
+    """
+
+    numbers: Array
+    start: Callable[[Numbers, Objects], Mapping[str, Sequence[Any]]] | None = None
+
+
+Branch = Callable[[Motion], Sequence[Any]]
+"""A mechanism's numbers that are above zero in its own branch, of the motion."""
+
+
+class Scheme(Linkage):
+    """A linkage with pose coordinates and closed forms, and how its equations are solved."""
+
+    def __init__(
+        self,
+        graph: Graph,
+        coordinates: Sequence[Coordinate],
+        closed: Closed | None = None,
+        branch: Branch | None = None,
+        mark: str = "",
+    ) -> None:
+        super().__init__(graph)
+        self.coordinates = tuple(coordinates)
+        self.closed, self.branch, self._mark = closed or Closed(np.zeros(0)), branch, mark
+
+    @cached_property
+    def geometry(self) -> Array:
+        """What programs take of the machine's geometry, shape (k,)."""
+        return np.concatenate([geometry_of(self.graph), self.closed.numbers])
+
+    @cached_property
+    def structure(self) -> str:
+        """Text of all that programs hang on: machines of one structure share them."""
+        return repr((
+            self._mark, self.graph.topology, pattern_of(self.tree), self.coordinates,
+            self.closed.start is not None, self.branch is not None, self.kept, self.pivots,
+        ))  # fmt: skip
+
+    @cached_property
+    def kept(self) -> list[int]:
+        """Closures that determine the unknowns; the others only judge.
+
+        :raises ParameterError: something can move while the actuated joints are held.
+        """
+        ju, _ = self._sampled
+        rows = independent_rows(ju)
+        if len(rows) < self.tree.unknown_rates:
+            raise mobility_error(self)
+        return rows
+
+    @cached_property
+    def pivots(self) -> Order:
+        """Of the kept closures by the unknowns, good in states near home."""
+        return pivot_order(self._sampled[0][:, self.kept])
+
+    @cached_property
+    def inverse_pivots(self) -> Order:
+        """The same of kept closures and pose by the unknowns and q."""
+        samples = []
+        for x, q in self.samples:
+            there, closed = self.at(x, q)
+            position, rotation = (numbers(part) for part in there.platform())
+            here = [float(v) for v in poses.values(self.coordinates, position, rotation)]
+            samples.append(self._inverse_matrix(there, closed, here))
+        return pivot_order(np.array(samples))
+
+    def check(self) -> None:
+        """Refuse a graph that its actuated joints and pose coordinates do not determine.
+
+        :raises ParameterError: by the field.
+        """
+        near = [rank_of(np.hstack([a, b])) for a, b in zip(*self._sampled, strict=True)]
+        if len(near) > 1 and near[0] < min(near[1:]):
+            raise singular_home(self, near[0], min(near[1:]))
+        if self.mobility.freedoms != self.joints:
+            raise mobility_error(self)
+        _ = self.kept
+        if len(self.coordinates) != self.joints:
+            raise ParameterError(
+                "pose",
+                [c.name for c in self.coordinates],
+                f"{self.joints} coordinates, the mobility",
+            )
+        motion, rows = self.at(*self.samples[0])
+        matrix = self._inverse_matrix(motion, rows, self.home_pose.tolist())
+        if rank_of(matrix) < len(matrix):
+            raise ParameterError(
+                "pose", [c.name for c in self.coordinates],
+                "coordinates that determine the platform's pose at home",
+            )  # fmt: skip
+
+    @cached_property
+    def home_pose(self) -> Array:
+        """Pose coordinates at home, shape (m,)."""
+        origin = self.graph.origin
+        return np.array([0.0 if c.axis is None else origin[c.axis] for c in self.coordinates])
+
+    def _inverse_matrix(self, motion: Motion, rows: Sequence[Row], pose: Numbers) -> Array:
+        """Scaled derivatives of kept closures and pose equations by u and qd."""
+        ju, jq = self._scaled(rows)
+        extra = self.pose_rows(motion, pose)
+        table = np.array(self._pose_scales)[:, None] * numbers(extra)
+        n = self.tree.unknown_rates
+        drives = np.array([self._drive_scale(name) for name in self.graph.actuated])
+        lower = np.hstack([table[:, :n] / np.array(self.tree.scales), table[:, n:] / drives])
+        return np.vstack([np.hstack([ju, jq])[self.kept], lower])
+
+    @property
+    def _pose_scales(self) -> list[float]:
+        return [1.0 / self.tree.size if c.axis is not None else 1.0 for c in self.coordinates]
+
+    def pose_rows(self, motion: Motion, pose: Numbers) -> Objects:
+        """Derivatives of the pose equations by the unknown rates and qd."""
+        n = self.tree.unknown_rates
+        table = np.zeros((len(self.coordinates), n + self.joints), dtype=object)
+        for i, (_, columns) in enumerate(poses.rows(self.coordinates, motion, pose)):
+            for (kind, k), value in columns.items():
+                table[i, k if kind == "u" else n + k] = value
+        return table
+
+
+def choose_coordinates(graph: Graph) -> tuple[str, ...]:
+    """Pose coordinates that determine the platform at home, the first ones that do.
+
+    :raises ParameterError: something is free to move while the actuated joints are held.
+    """
+    scheme = Scheme(graph, ())
+    motion, closed = scheme.at(scheme.tree.home, graph.home)
+    ju, jq = (numbers(m) for m in matrices(scheme.tree, closed))
+    kept = scheme.kept
+    rates = np.vstack([-np.linalg.solve(ju[kept], jq[kept]), np.eye(scheme.joints)])
+    chosen: list[str] = []
+    table = np.zeros((0, scheme.joints))
+    for name, coordinate in poses.COORDINATES.items():
+        row = np.zeros(scheme.tree.unknown_rates + scheme.joints)
+        ((_, columns),) = poses.rows((coordinate,), motion, [0.0])
+        for (kind, k), value in columns.items():
+            row[k if kind == "u" else scheme.tree.unknown_rates + k] = float(value)
+        scale = 1.0 / scheme.tree.size if coordinate.axis is not None else 1.0
+        extended = np.vstack([table, scale * row @ rates])
+        if np.linalg.matrix_rank(extended, 1e-6) == len(extended):
+            chosen.append(name)
+            table = extended
+    return tuple(chosen)

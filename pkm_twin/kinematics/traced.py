@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A machine's motion on expressions, solved for its unknowns: what programs are written with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+
+from pkm_twin.codegen.derivatives import adjoints
+from pkm_twin.codegen.expressions import GEOMETRY, Expression, Numbers, Objects, Tape, snapped_all
+from pkm_twin.codegen.lu import SparseLU
+from pkm_twin.codegen.program import UNKNOWNS, Equations
+from pkm_twin.kinematics.motion import Motion, cross, matrices
+from pkm_twin.kinematics.scheme import Scheme
+from pkm_twin.machine.geometry import graph_on
+from pkm_twin.machine.graph import Array
+from pkm_twin.machine.tree import Tree
+
+NO_NUMBERS: Final = np.zeros(0)
+
+
+class Traced:
+    """A machine's motion on expressions of its geometry: what programs are written with."""
+
+    def __init__(self, scheme: Scheme, more: Array = NO_NUMBERS, *, free: bool = False) -> None:
+        self.scheme = scheme
+        self.tape = Tape([*scheme.geometry.tolist(), *more.tolist()], free=free)
+        given = self.tape.inputs(GEOMETRY, len(self.tape.reference))
+        end = len(scheme.geometry)
+        own = end - len(scheme.closed.numbers)
+        self.geometry = given[:end]
+        self.graph = graph_on(scheme.graph, given[:own])
+        self.closed = given[own:end]
+        """Numbers of the mechanism's closed forms."""
+        self.more = given[end:]
+        """Numbers beside the geometry's, see :meth:`.engine.Engine.kernel_with`."""
+        self.tree, self.joints = Tree(self.graph), scheme.joints
+        self.x = self.tape.inputs(UNKNOWNS, len(self.tree.home))
+        self.q = self.tape.inputs("q", self.joints)
+
+    def solve(self) -> None:
+        """Take unknowns and closures."""
+        self.motion = Motion(self.tree, self.x, self.q)
+        self.rows = self.motion.closures()
+        self.ju, self.jq = matrices(self.tree, self.rows)
+        self.lu = SparseLU(self.ju[self.scheme.kept], self.scheme.pivots)
+
+    @property
+    def drive_scales(self) -> list[Any]:
+        """What makes joint rates of unit one."""
+        joints = (self.graph.joints[name] for name in self.graph.actuated)
+        return [1.0 / self.tree.size if joint.slides else 1.0 for joint in joints]
+
+    @property
+    def pose_scales(self) -> list[Any]:
+        """What makes pose coordinates of unit one."""
+        size = self.tree.size
+        return [1.0 if c.axis is None else 1.0 / size for c in self.scheme.coordinates]
+
+    def equations(self) -> Equations:
+        """Newton's method for the unknowns at q, from home or the mechanism's closed form."""
+        scheme, tree = self.scheme, self.tree
+        step = -self.lu.solve([self.rows[k].value for k in scheme.kept])
+        closed = scheme.closed.start
+        start = self._along() if closed is None else self._ordered(closed(self.closed, self.q))
+        return Equations(
+            "q", self.lift(tree.home), self.lift(self.graph.home), self.lift(start),
+            self.lift(self.motion.retracted(self.x, step)),
+            self.square(step, tree.scales),
+            self.tape.lift(self._at_home[2].inverse_determinant / self.lu.inverse_determinant),
+            self.square([r.value for r in self.rows], [r.scale for r in self.rows]),
+            closed is None,
+            () if scheme.branch is None else self.lift(scheme.branch(self.motion)),
+        )  # fmt: skip
+
+    @cached_property
+    def home(self) -> Motion:
+        """The motion at home."""
+        return Motion(self.tree, self.tree.home, self.graph.home)
+
+    @cached_property
+    def _at_home(self) -> tuple[Motion, Objects, SparseLU]:
+        """At home: the motion, derivatives of the kept closures by qd, factors of those by u."""
+        motion = self.home
+        ju, jq = (snapped_all(m[self.scheme.kept]) for m in matrices(self.tree, motion.closures()))
+        return motion, jq, SparseLU(ju, self.scheme.pivots)
+
+    def _along(self) -> list[Any]:
+        """Unknowns along the tangent at home: nearer than home itself."""
+        motion, jq, lu = self._at_home
+        away = self.q - self.graph.home
+        # Solved by joint: what is left to a sample are products with what is prepared.
+        columns = snapped_all([-lu.solve(jq[:, j]) for j in range(self.joints)])
+        return motion.retracted(self.tree.home, columns.T @ away)
+
+    def _ordered(self, values: Mapping[str, Sequence[Any]]) -> list[Any]:
+        """Unknowns of joints' values."""
+        result: list[Any] = list(self.tree.home)
+        for link in self.tree.links.values():
+            steps = link.steps
+            if steps and not steps[0].actuated:
+                given = list(values[str(link.joint)])
+                given = given if steps[0].sign > 0.0 else given[::-1]
+                for step, value in zip(steps, given, strict=True):
+                    result[step.position] = value
+        return result
+
+    def lift(self, values: Numbers) -> list[Expression]:
+        """Results as expressions."""
+        return [self.tape.lift(value) for value in values]
+
+    def square(self, values: Numbers, scales: Numbers) -> Expression:
+        """Sum of the squares of values times scales."""
+        total: Any = 0.0
+        for value, scale in zip(values, scales, strict=True):
+            part = value * scale
+            total = total + part * part
+        return self.tape.lift(total)
+
+    def gradient(self, sums: Sequence[tuple[Any, Any]], by: Sequence[Expression]) -> list[Any]:
+        """Derivatives by inputs of a sum of results times factors, the closures held closed.
+
+        The unknowns x follow from f(x, q, g) = 0: with J' m = ds/du, J = df/du, the derivative is
+        ds - m df (adjoint of the implicit function theorem).
+        """
+        found = adjoints(sums, [*by, *self.x])
+        direct, by_x = found[: len(by)], found[len(by) :]
+        multipliers = self.lu.solve_transposed(self._by_rates(by_x))
+        values = [self.rows[k].value for k in self.scheme.kept]
+        through = adjoints(list(zip(values, multipliers, strict=True)), by)
+        return [a - b for a, b in zip(direct, through, strict=True)]
+
+    def _by_rates(self, by_x: Sequence[Any]) -> list[Any]:
+        """Derivatives by the unknown rates, of those by the unknowns: see ``Motion.retracted``."""
+        result: list[Any] = [0.0] * self.tree.unknown_rates
+        for link in self.tree.links.values():
+            for step in link.steps:
+                k, r = step.position, step.rate
+                if step.actuated:
+                    continue
+                if not (step.ball or step.free):
+                    result[r] = by_x[k]
+                    continue
+                w, v = self.x[k], np.array(self.x[k + 1 : k + 4], dtype=object)
+                dw, dv = by_x[k], np.array(by_x[k + 1 : k + 4], dtype=object)
+                result[r : r + 3] = list((w * dv - dw * v + cross(v, dv)) * 0.5)
+                if step.free:
+                    result[r + 3 : r + 6] = by_x[k + 4 : k + 7]
+        return result
+
+    def set_rates(self, qd: Numbers) -> Objects:
+        """Rates of everything by qd; returns those of the unknowns."""
+        kept = self.scheme.kept
+        u = self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object)))
+        self.motion.set_rates(u, qd)
+        return u
+
+    def set_accelerations(self, qdd: Numbers, gravity: Any | None = None) -> None:
+        """Accelerations of everything by qdd, after the rates."""
+        kept = self.scheme.kept
+        self.motion.set_accelerations(np.zeros(self.tree.unknown_rates), qdd)
+        bias = [self.rows[k].bias() for k in kept]
+        self.motion.set_accelerations(-self.lu.solve(bias), qdd, gravity)
+
+    def rate_columns(self) -> list[Objects]:
+        """Rates of the unknowns per joint rate."""
+        kept = self.scheme.kept
+        return [self.lu.solve(-self.jq[kept][:, j]) for j in range(self.joints)]
+
+    def twists(self) -> list[tuple[Any, Any]]:
+        """Velocity of the reference point and angular velocity of the platform per joint rate."""
+        motion, body = self.motion, self.graph.platform
+        position, _ = motion.platform()
+        linear, angular = motion.point_columns(body, position), motion.turn_columns(body)
+        result = []
+        for j, u in enumerate(self.rate_columns()):
+            pair = []
+            for columns in (linear, angular):
+                total: Any = np.zeros(3, dtype=object)
+                for (kind, k), column in columns.items():
+                    if kind == "u":
+                        total = total + np.asarray(column, dtype=object) * u[k]
+                    elif k == j:
+                        total = total + column
+                pair.append(total)
+            result.append((pair[0], pair[1]))
+        return result

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Friction laws of drives: one class a law, with its parameters and the effort that it takes.
+
+Schema, compiled dynamics, plant, regressor and fit read the classes; another law is one class in
+this file. Laws add up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.codegen.expressions import absolute, cos, maximum, minimum, references, sign, sin
+from pkm_twin.errors import ParameterError
+
+Array = NDArray[np.float64]
+Values = Mapping[str, Any]
+"""A law's parameters by key: a number, an expression or an array."""
+
+HALVINGS: Final = 7
+"""Of the argument of :func:`decay`."""
+PADE: Final = (30240.0, 15120.0, 3360.0, 420.0, 30.0, 1.0)
+"""Of the exponential function, diagonal, order five."""
+LEAST: Final = 1e-9
+"""Divisor in place of a parameter that is not given: its law's effort is zero."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a law, one a drive.
+
+    ``unit``: with ``{effort}`` and ``{joint}`` (rad or m). ``linear``: the effort is linear in it;
+    any other is above zero where one of its law's linear parameters is not zero.
+    """
+
+    unit: str
+    at_least: float | None = 0.0
+    at_most: float | None = None
+    linear: bool = True
+
+    @property
+    def bounds(self) -> dict[str, Any]:
+        """As the schema takes them."""
+        both = {"at_least": self.at_least, "at_most": self.at_most}
+        return {key: value for key, value in both.items() if value is not None}
+
+    def in_units(self, *, slides: bool) -> str:
+        """The unit of a drive that slides or turns."""
+        effort, joint = ("N", "m") if slides else ("N m", "rad")
+        text = self.unit.replace("{effort} per {joint}/s", "N s/m" if slides else "N m s/rad")
+        return text.format(effort=effort, joint=joint)
+
+
+class FrictionLaw:
+    """A friction law of a drive.
+
+    Its effort is by_position(q) + (dry(q, speed) + share(q, speed) |load|) sign(rate). The load is
+    the drive's effort without friction, its rotor's inertia included.
+    """
+
+    name: ClassVar[str]
+    parameters: ClassVar[Mapping[str, Parameter]]
+    turns: ClassVar[bool] = True
+    """Whether it turns round with the rate."""
+
+    @staticmethod
+    def by_position(values: Values, q: Any) -> Any:
+        """Effort that depends on the position alone."""
+        del values, q
+        return 0.0
+
+    @staticmethod
+    def potential(values: Values, q: Any) -> Any:
+        """Energy of the same, J: its derivative by q is :meth:`by_position`."""
+        del values, q
+        return 0.0
+
+    @staticmethod
+    def dry(values: Values, q: Any, speed: Any) -> Any:
+        """Effort against the motion, zero or more.
+
+        :param speed: without sign.
+        """
+        del values, q, speed
+        return 0.0
+
+    @staticmethod
+    def share(values: Values, q: Any, speed: Any) -> Any:
+        """Effort against the motion, as part of the load's magnitude, less than one."""
+        del values, q, speed
+        return 0.0
+
+
+class ViscousCoulomb(FrictionLaw):
+    """Viscous friction, Coulomb friction and a constant effort: of every drive, zero by default.
+
+    The plant integrates the viscous part exactly, so the dynamics take this law by its parameters.
+    """
+
+    name = "coulomb"
+    parameters: ClassVar = {
+        "viscous": Parameter("{effort} per {joint}/s"),
+        "coulomb": Parameter("{effort}"),
+        "offset": Parameter("{effort}", at_least=None),
+    }
+
+
+class Stribeck(FrictionLaw):
+    """Breakaway friction above Coulomb's, which falls with speed: F exp(-(v / vs)^2).
+
+    Bo and Pavelescu, 1982; Armstrong-Helouvry, Dupont, Canudas de Wit, 1994, eq. 5.
+    """
+
+    name = "stribeck"
+    parameters: ClassVar = {
+        "stribeck": Parameter("{effort}"),
+        "stribeck_speed": Parameter("{joint}/s", linear=False),
+    }
+
+    @staticmethod
+    def dry(values: Values, q: Any, speed: Any) -> Any:
+        """Zero or more."""
+        del q
+        ratio = speed / maximum(values["stribeck_speed"], LEAST)
+        return values["stribeck"] * decay(ratio * ratio)
+
+
+class LoadDependent(FrictionLaw):
+    """Coulomb friction that grows with the load, of gears and screws."""
+
+    name = "load-dependent"
+    parameters: ClassVar = {"load_dependent": Parameter("1", at_most=0.9)}
+
+    @staticmethod
+    def share(values: Values, q: Any, speed: Any) -> Any:
+        """Less than one: a drive that its load cannot move back is none."""
+        del q, speed
+        return values["load_dependent"]
+
+
+class Periodic(FrictionLaw):
+    """An effort of one harmonic of the position: cogging of a motor, ripple of a gear.
+
+    It stores energy and takes none.
+    """
+
+    name = "periodic"
+    turns = False
+    parameters: ClassVar = {
+        "cogging_cos": Parameter("{effort}", at_least=None),
+        "cogging_sin": Parameter("{effort}", at_least=None),
+        "cogging_period": Parameter("{joint}", linear=False),
+    }
+
+    @staticmethod
+    def by_position(values: Values, q: Any) -> Any:
+        """C cos(2 pi q / p) + S sin(2 pi q / p)."""
+        angle = q * (math.tau / maximum(values["cogging_period"], LEAST))
+        return values["cogging_cos"] * cos(angle) + values["cogging_sin"] * sin(angle)
+
+    @staticmethod
+    def potential(values: Values, q: Any) -> Any:
+        """Zero on average."""
+        wave = math.tau / maximum(values["cogging_period"], LEAST)
+        angle = q * wave
+        return (values["cogging_cos"] * sin(angle) - values["cogging_sin"] * cos(angle)) / wave
+
+
+BASIC: Final = ViscousCoulomb
+"""The law that every drive has."""
+LAWS: Final[Mapping[str, type[FrictionLaw]]] = {
+    law.name: law for law in FrictionLaw.__subclasses__() if law is not BASIC
+}
+"""The other laws by name."""
+
+
+def decay(x: Any) -> Any:
+    """exp(-x) for x >= 0, of numbers or expressions, to 4e-12 of itself; constant from 64 on.
+
+    Of operations that all back ends have, so that all compute the same.
+    """
+    z = minimum(x, 64.0) * (-(0.5**HALVINGS))
+    square = z * z
+    even = PADE[0] + square * (PADE[2] + square * PADE[4])
+    odd = z * (PADE[1] + square * (PADE[3] + square * PADE[5]))
+    result = (even + odd) / (even - odd)
+    for _ in range(HALVINGS):
+        result = result * result
+    return result
+
+
+def law_names(friction: Any, opened: Sequence[str] = ()) -> tuple[str, ...]:
+    """Laws beside the basic one that a friction section states, or that are open to a fit."""
+    return tuple(
+        name
+        for name, law in LAWS.items()
+        if name in opened
+        or any(
+            np.any(references(getattr(friction, key)))
+            for key, one in law.parameters.items()
+            if one.linear
+        )
+    )
+
+
+def keys_of(names: Sequence[str]) -> dict[str, Parameter]:
+    """Parameters of laws by key, in order."""
+    return {key: one for name in names for key, one in LAWS[name].parameters.items()}
+
+
+def linear_keys(names: Sequence[str]) -> tuple[str, ...]:
+    """Parameters that efforts are linear in, of the basic law and of others."""
+    every = {**BASIC.parameters, **keys_of(names)}
+    return tuple(key for key, one in every.items() if one.linear)
+
+
+def turning_keys() -> frozenset[str]:
+    """Parameters whose efforts jump where a joint turns round."""
+    own = (key for law in LAWS.values() if law.turns for key in law.parameters)
+    return frozenset({"coulomb", *own})
+
+
+def all_keys() -> dict[str, Parameter]:
+    """Every parameter of a drive's friction, the basic law's first."""
+    return {**BASIC.parameters, **keys_of(tuple(LAWS))}
+
+
+def check_laws(friction: Any, path: str) -> None:
+    """Reject a law without one of its other parameters.
+
+    :raises ParameterError: by the field.
+    """
+    for law in LAWS.values():
+        linear = [key for key, one in law.parameters.items() if one.linear]
+        used = np.any([references(getattr(friction, key)) != 0.0 for key in linear], axis=0)
+        for key, one in law.parameters.items():
+            missing = used & ~(references(getattr(friction, key)) > 0.0)
+            if not one.linear and np.any(missing):
+                raise ParameterError(
+                    f"{path}.{key}", 0.0, f"above zero where {' or '.join(linear)} is given"
+                )
+
+
+def taken(names: Sequence[str], values: Values, q: Any, rate: Any, load: Any) -> Any:
+    """Effort that laws take of a drive beside the basic one.
+
+    :param names: of the laws; others as of :class:`FrictionLaw`, numbers, expressions or arrays.
+    """
+    speed, way = absolute(rate), sign(rate)
+    at_place, dry, share = parts(names, values, q, speed)
+    return at_place + (dry + share * absolute(load)) * way
+
+
+def parts(names: Sequence[str], values: Values, q: Any, speed: Any) -> tuple[Any, Any, Any]:
+    """Sums over laws: by position, dry, and the share of the load's magnitude."""
+    laws = [LAWS[name] for name in names]
+    at_place: Any = sum((law.by_position(values, q) for law in laws), 0.0)
+    dry: Any = sum((law.dry(values, q, speed) for law in laws), 0.0)
+    share: Any = sum((law.share(values, q, speed) for law in laws), 0.0)
+    return at_place, dry, share
+
+
+def potential(names: Sequence[str], values: Values, q: Any) -> Any:
+    """Energy of the effort by position, a drive."""
+    return sum((LAWS[name].potential(values, q) for name in names), 0.0)
+
+
+def friction_values(names: Sequence[str], friction: Any) -> dict[str, Array]:
+    """Parameters of laws by key, of a friction section."""
+    return {key: np.asarray(getattr(friction, key), np.float64) for key in keys_of(names)}
+
+
+def load_of(driving: Any, share: Any, way: Any) -> Any:
+    """The load L of L + share |L| way = driving, where the share is less than one."""
+    return driving / (1.0 + share * way * sign(driving))
+
+
+def bounds(held: Any, dry: Any, share: Any) -> tuple[Any, Any]:
+    """Least and greatest friction f that a joint can have: |f| <= dry + share |held - f|.
+
+    :param held: effort of the drive less what depends on its position and its rate.
+    """
+    low, high = (held - load_of(held - way * dry, share, way) for way in (-1.0, 1.0))
+    return low, high

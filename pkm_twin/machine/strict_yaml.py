@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plain YAML and nothing else: no tags, aliases, merges or duplicate keys."""
+
+from __future__ import annotations
+
+import re
+import stat
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from pkm_twin.errors import FileError, ParameterError
+
+MAX_FILE_SIZE: Final = 256 * 1024
+"""Largest parameter file that is read, bytes; the shipped ones are below 4 kB."""
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Plain YAML only: no tags, aliases, merges or duplicate keys, no integer beyond all floats.
+
+    Numbers are decimal: 1_0, 1:30 and 010 are numbers in YAML 1.1 (10, 90, 8), and slips here.
+    """
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("aliases are not allowed in parameter files")
+        event = self.peek_event()  # type: ignore[no-untyped-call]
+        if getattr(event, "tag", None) is not None:
+            raise yaml.YAMLError("tags are not allowed in parameter files")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        if any(key.tag == "tag:yaml.org,2002:merge" for key, _ in node.value):
+            raise yaml.YAMLError("merge keys are not allowed in parameter files")
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        if len(mapping) < len(node.value):
+            seen = set()
+            for key, _ in node.value:
+                name = self.construct_object(key, deep=True)
+                if name in seen:
+                    raise yaml.YAMLError(f"key {name!r} stands twice")
+                seen.add(name)
+        return mapping
+
+    def construct_yaml_int(self, node: Any) -> int:
+        if not re.fullmatch(r"[-+]?(0|[1-9][0-9]*)", node.value):
+            raise yaml.YAMLError(f"{node.value}: write a decimal number, or text in quotes")
+        value: int = super().construct_yaml_int(node)
+        if value.bit_length() > 1023:
+            raise yaml.YAMLError("an integer too large for a float")
+        return value
+
+    def construct_yaml_float(self, node: Any) -> float:
+        if "_" in node.value or ":" in node.value:
+            raise yaml.YAMLError(f"{node.value}: write a decimal number, or text in quotes")
+        return float(super().construct_yaml_float(node))
+
+
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_yaml_int)
+_StrictLoader.add_constructor("tag:yaml.org,2002:float", _StrictLoader.construct_yaml_float)
+# YAML 1.1 reads 1e-10 and 5.0e6 as strings; everybody means the numbers.
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
+    list("-+.0123456789"),
+)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a parameter file.
+
+    :raises ParameterError: not readable, too large, not plain YAML, or not a mapping.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise OSError("not a file")
+        with path.open("rb") as file:
+            content = file.read(MAX_FILE_SIZE + 1)
+        if len(content) > MAX_FILE_SIZE:
+            raise ParameterError(
+                str(path), f"{path.stat().st_size} bytes", f"at most {MAX_FILE_SIZE} bytes"
+            )
+        text = content.decode("utf-8")
+    except ParameterError:
+        raise
+    except (OSError, ValueError) as error:
+        raise FileError(path, error, "plain YAML") from None
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, name: str) -> dict[str, Any]:
+    """What a parameter file of this text says.
+
+    :param name: the file's.
+    :raises ParameterError: not plain YAML, or not a mapping.
+    """
+    try:
+        data = yaml.load(text, Loader=_StrictLoader)  # noqa: S506
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        if isinstance(error, ParameterError):
+            raise
+        raise FileError(name, error, "plain YAML") from None
+    if not isinstance(data, dict):
+        raise ParameterError(name, type(data).__name__, "a mapping of keys to values")
+    return data

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linear Delta as 3D printers have it: three towers, a rod pair from each carriage, a platform.
+
+Its numbers are those of a printer's firmware (Klipper, Marlin, RepRapFirmware). Frame: origin on
+the bed between the towers, z up. Pose: nozzle x, y, z (m). Joint: height of a carriage's rod ends
+above those of the platform with the nozzle on the bed (m). ``radius`` is the horizontal length of a
+rod pair with the nozzle at the centre: the tower's less the platform's and the carriage's offsets.
+
+Branch: the nozzle below the carriages.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.codegen.expressions import cos, plain, sin, sqrt
+from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.pose import COORDINATES, Coordinate
+from pkm_twin.machine import schema
+from pkm_twin.machine.graph import BASE, Body, Graph, Joint, Rod, array
+from pkm_twin.machine.members import disc
+from pkm_twin.machine.pose_grid import PoseGrid
+from pkm_twin.machine.sections import check_azimuths, length, mass
+from pkm_twin.machine.shared import Shared, point_mass, shared_number
+from pkm_twin.robot.robot import Robot
+
+Array = NDArray[np.float64]
+
+LIMBS: Final = ("a", "b", "c")
+UP: Final = array([0.0, 0.0, 1.0])
+PLATFORM: Final = "platform"
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Lengths (m), tower angles about z from x, and the towers' leans (rad).
+
+    ``leans``: of each tower outwards, then sideways (counter-clockwise), at its height of home.
+    """
+
+    radius: float = length()
+    angles: Array = schema.vector(3, unit="rad")
+    arm_lengths: Array = schema.vector(3, above=0.0, unit="m")
+    leans: Array | None = schema.vector(6, unit="rad", default=None)
+
+    def verify(self, path: str) -> None:
+        """Towers apart, rods longer than the radius."""
+        check_azimuths(self.angles, f"{path}.angles")
+        for i, arm in enumerate(self.arm_lengths):
+            if not arm > self.radius:
+                raise ParameterError(f"{path}.arm_lengths[{i}]", float(arm), "above the radius")
+
+
+@dataclass(frozen=True, eq=False)
+class Inertia:
+    """Masses, kg: of the platform, a carriage, a rod pair; the rotors' reflected to a carriage."""
+
+    platform_mass: float = mass()
+    carriage_mass: float = mass()
+    rod_mass: float = mass(default=0.0)
+    rotor_inertia: float = schema.number(at_least=0.0, unit="kg", default=0.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinearDelta(Robot):
+    """A linear Delta of a printer."""
+
+    mechanism: str = schema.choice("linear_delta")
+    geometry: Geometry = schema.section(Geometry)
+    inertia: Inertia = schema.section(Inertia)
+    joints: tuple[str, ...] = schema.names(3, default=["stepper_a", "stepper_b", "stepper_c"])
+
+    mobility: ClassVar[str] = "3: translations x, y, z"
+    coordinates: ClassVar[tuple[Coordinate, ...]] = tuple(COORDINATES[c] for c in "xyz")
+    limb_names: ClassVar[tuple[str, ...]] = tuple(f"tower {limb}" for limb in LIMBS)
+    description: ClassVar[str] = "linear Delta, three towers with rod pairs"
+
+    @property
+    def size(self) -> float:
+        """The radius, m: no angle moves the nozzle by more."""
+        return self.geometry.radius
+
+    @cached_property
+    def _towers(self) -> list[tuple[Any, Any, Any]]:
+        """Outwards, the rods' upper end with the nozzle at the origin, and the tower's axis."""
+        g, found = self.geometry, []
+        for i, angle in enumerate(g.angles):
+            out = plain([cos(angle), sin(angle), 0.0 * angle])
+            rise = sqrt(g.arm_lengths[i] ** 2 - g.radius**2)
+            axis: Any = UP
+            if g.leans is not None:
+                along = plain([-sin(angle), cos(angle), 0.0 * angle])
+                axis = g.leans[2 * i] * out + g.leans[2 * i + 1] * along + UP
+                axis = axis / sqrt(axis @ axis)
+            found.append((out, g.radius * out + rise * UP, axis))
+        return found
+
+    def grid(self) -> PoseGrid:
+        """Places about the vertical axis."""
+        return PoseGrid("cylinder", self.pose_names, "z", ("x", "y"))
+
+    def make_graph(self) -> Graph:
+        """Carriages on their towers, rods to the nozzle, a platform that does not turn."""
+        m = self.inertia
+        rotor = self.reflected_rotor(m.rotor_inertia, slides=True)
+        bodies: dict[str, Body] = {}
+        joints: dict[str, Joint] = {}
+        rods: dict[str, Rod] = {}
+        for i, limb in enumerate(LIMBS):
+            out, top, axis = self._towers[i]
+            carriage = f"carriage {limb}"
+            bodies[carriage] = Body(carriage, m.carriage_mass, array(top), np.zeros((3, 3)))
+            joints[self.joints[i]] = Joint(
+                self.joints[i], "prismatic", BASE, carriage, array(top), array([axis]),
+                actuated=True, home=top[2], rotor_inertia=rotor,
+            )  # fmt: skip
+            rods[f"rods {limb}"] = Rod(
+                f"rods {limb}", carriage, PLATFORM, array([top, np.zeros(3)]), m.rod_mass,
+                array(np.cross(UP, out)),
+            )  # fmt: skip
+        turning = disc(m.platform_mass, 0.3 * self.geometry.radius)
+        bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(np.zeros(3)), array(turning))
+        # What the rod pairs hold is taken as given, so that three slides carry the platform.
+        joints["translation"] = Joint(
+            "translation", "translation", BASE, PLATFORM, array(np.zeros(3)), given=True
+        )
+        return Graph(bodies, joints, rods, PLATFORM, array(np.zeros(3)))
+
+    def shared_inertia(self) -> tuple[Shared, ...]:
+        """One carriage, one rod pair, one platform; the towers are alike in this file."""
+        m, graph = self.inertia, self.graph
+        carriages = {f"carriage {limb}" for limb in LIMBS}
+        return (
+            shared_number(
+                "inertia", "platform.mass", "kg", m.platform_mass, m.platform_mass,
+                ("inertia", "platform_mass"), bodies={PLATFORM: point_mass(graph.origin)},
+            ),
+            shared_number(
+                "inertia", "carriage.mass", "kg", m.carriage_mass, m.carriage_mass,
+                ("inertia", "carriage_mass"),
+                bodies={name: point_mass(graph.bodies[name].com) for name in sorted(carriages)},
+            ),
+            shared_number(
+                "inertia", "rod.mass", "kg", m.rod_mass, m.platform_mass, ("inertia", "rod_mass"),
+                others=[f"{name}.mass" for name in graph.rods],
+            ),
+        )  # fmt: skip

@@ -1,0 +1,450 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every robot has of its file: parameters, the graph that follows, names and units.
+
+A mechanism is a schema, a function from its parameters to a graph, and, where they exist, closed
+forms of the start and of the inverse with the branch rules.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pkm_twin.codegen.expressions import Numbers, Objects
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.kinematics.motion import Motion
+from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.machine import schema
+from pkm_twin.machine.friction import law_names
+from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.inertia import Coefficients
+from pkm_twin.machine.joint_map import JointMap, JointMapEntry
+from pkm_twin.machine.members import Beam, Structure
+from pkm_twin.machine.places import (
+    check_number,
+    full_keys,
+    given,
+    merged,
+    number_in,
+    numbers_of,
+    placed,
+)
+from pkm_twin.machine.pose_grid import PoseGrid
+from pkm_twin.machine.reach import PassiveLimit, position_box
+from pkm_twin.machine.sections import DriveSpec, JointLimits, Payload, friction_of, limits_of
+from pkm_twin.machine.uncertainty import (
+    UncertaintyEntry,
+    causes_of,
+)
+
+Array = NDArray[np.float64]
+R = TypeVar("R", bound="Mechanism")
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """A mechanism's closed form of q by pose, as expressions.
+
+    ``q``: shape (n,), finite for every finite pose. ``misses``: by how much each limb falls short,
+    m, above zero where it does. ``measure``: the singularity's, above SINGULARITY_BOUND on the side
+    of the home pose; None where every pose that is reached is good.
+    """
+
+    q: Sequence[Any]
+    misses: Sequence[Any]
+    measure: Any | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Mechanism:
+    """What a robot file says of a machine of n actuated joints and m pose coordinates.
+
+    Frozen; :meth:`changed` gives a copy with other parameters.
+    """
+
+    mechanism: str
+    name: str = ""
+    """The name that the robot was loaded by."""
+    home_choice: str = ""
+    """How the home was chosen, of a file that leaves it open."""
+    payload: Payload = schema.section(Payload, default={})
+    friction: Coefficients = schema.section(friction_of(3), default={})
+    gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])
+    limits: JointLimits = schema.section(limits_of(3), default={})
+    drive: DriveSpec | None = schema.section(DriveSpec, default=None)
+    """Rotor and gear of every actuated joint, in place of ``inertia.rotor_inertia``."""
+    joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
+    uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
+    element_compliance: Mapping[str, float] = schema.numbers(at_least=1e-6, at_most=1e6, default={})
+    """Factors on the compliance of elastic elements, by name; 1 where left out."""
+    modal_damping: Array = schema.many(above=0.0, at_most=0.99, default=[])
+    """Damping ratios of the natural modes from the lowest on; the last is that of all others."""
+    home_joint: float | None = None
+    """Value of every actuated joint at home, where a mechanism chooses it: kept by copies, so that
+    other limits do not move the home."""
+    open_laws: tuple[str, ...] = ()
+    """Friction laws that a fit may find, although the file's parameters of them are zero."""
+
+    coordinates: ClassVar[tuple[Coordinate, ...]]
+    changeable: ClassVar[tuple[str, ...]] = (
+        "payload", "friction", "gravity", "limits", "element_compliance", "modal_damping",
+    )  # fmt: skip
+    has_start: ClassVar[bool] = False
+    has_inverse: ClassVar[bool] = False
+    has_branch: ClassVar[bool] = False
+
+    @classmethod
+    def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
+        """A robot of a parameter file's data.
+
+        :raises ParameterError: by the field.
+        """
+        robot = schema.build(cls, data)
+        robot = dataclasses.replace(robot, name=name, home_joint=robot.chosen_home())
+        _ = robot.controller
+        _ = robot.causes
+        robot.check_elements()
+        return robot
+
+    @property
+    def description(self) -> str:
+        """What machine it is, in words."""
+        raise NotImplementedError
+
+    @property
+    def mobility(self) -> str:
+        """Number and kind of the platform's freedoms, in words."""
+        raise NotImplementedError
+
+    @property
+    def size(self) -> float:
+        """The platform's radius, m: what makes a length of an angle of it."""
+        raise NotImplementedError
+
+    @property
+    def limb_names(self) -> tuple[str, ...]:
+        """Names of the limbs, one an actuated joint."""
+        raise NotImplementedError
+
+    def chosen_home(self) -> float | None:
+        """Value of every actuated joint at home, of a mechanism whose file does not give it.
+
+        The middle of the range that the limits of all joints share, where the mechanism can be
+        assembled there; else the mechanism's own choice.
+        """
+        return None
+
+    def make_graph(self) -> Graph:
+        """Bodies, joints and rods at home."""
+        raise NotImplementedError
+
+    def start(self, q: Objects) -> Mapping[str, Sequence[Any]]:
+        """Values of passive tree joints by q in closed form, where ``has_start``.
+
+        By joint, from its inner to its outer body, beside those at home.
+        """
+        raise NotImplementedError
+
+    def solved(self, pose: Objects) -> Inverse:
+        """Closed form of the inverse, where ``has_inverse``."""
+        raise NotImplementedError
+
+    def branch(self, motion: Motion) -> Sequence[Any]:
+        """Numbers that are above zero in the branch of ``forward``, where ``has_branch``."""
+        raise NotImplementedError
+
+    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
+        """Limb and miss (m) of joint positions without an assembly, shape (n,); None: unknown.
+
+        :param reached: part of the straight way from home up to which there is one.
+        """
+        del q, reached
+        return None
+
+    @cached_property
+    def beams(self) -> tuple[Beam, ...]:
+        """The bars that limb interference and elasticity are about; none: not known."""
+        return ()
+
+    def limit_angles(self, pose: ArrayLike) -> Array | None:
+        """Angles that ``limits.joint_angle`` bounds, shape (..., k), rad; None where it is none."""
+        del pose
+        return None
+
+    @property
+    def passive_limits(self) -> tuple[PassiveLimit, ...]:
+        """Ranges of passive joints that bound the workspace; none: the file states none."""
+        return ()
+
+    def passive_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """Passive limits of the file, at joints and rods: plain data, by kind and name."""
+        return {}
+
+    def structure(self) -> Structure:
+        """Elastic beams and joints.
+
+        :raises ParameterError: the robot's file lacks a section that elasticity needs.
+        """
+        raise ParameterError("members", None, "a section with the elastic members")
+
+    def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
+        """What its file tells of elasticity at bodies, joints and rods: plain data, kind and name.
+
+        Empty where the file has other words for it, which a file of those has not.
+        """
+        return {}
+
+    @property
+    def without_home(self) -> frozenset[str]:
+        """Joints of which the file should say where they count from, and does not."""
+        return frozenset()
+
+    @property
+    def drives(self) -> tuple[DriveSpec | None, ...]:
+        """Rotor and gear of each actuated joint, None where the file does not give them."""
+        return (self.drive,) * self.joints_count
+
+    def reflected_rotor(self, given: float, slides: bool) -> float:
+        """Rotor inertia at the joints, kg m2 or kg: of the file's ``drive``, else as given.
+
+        :raises ParameterError: both are given, or a gear for another type of joint.
+        """
+        if self.drive is None:
+            return given
+        if given:
+            raise ParameterError(
+                "inertia.rotor_inertia", given, "0, because the section drive has the rotor"
+            )
+        return self.drive.reflected(slides, "drive")
+
+    @cached_property
+    def graph(self) -> Graph:
+        """Bodies, joints and rods at home."""
+        return self.make_graph()
+
+    @cached_property
+    def laws(self) -> tuple[str, ...]:
+        """Friction laws of the drives beside the basic one, see ``machine.friction``."""
+        return law_names(self.friction, self.open_laws)
+
+    def with_laws(self, graph: Graph) -> Graph:
+        """A graph of this robot with its friction laws: what programs of efforts are made from."""
+        return dataclasses.replace(graph, laws=self.laws) if self.laws else graph
+
+    @cached_property
+    def causes(self) -> Mapping[str, Mapping[str, float]]:
+        """By cause of doubt: by path of a number, what one standard deviation adds to it."""
+        numbers = numbers_of(self.parameter_sections(), self.parameter_units())
+        return causes_of(self.uncertainty, numbers)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy in another process is made from: all but what is derived and kept."""
+        derived = {
+            name
+            for part in type(self).__mro__
+            for name, value in vars(part).items()
+            if isinstance(value, cached_property)
+        }
+        return {name: value for name, value in vars(self).items() if name not in derived}
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the actuated joints, in the order of q."""
+        return self.graph.actuated
+
+    @cached_property
+    def joint_units(self) -> tuple[str, ...]:
+        """Units of q, ``rad`` or ``m``."""
+        graph = self.graph
+        return tuple("m" if graph.joints[name].slides else "rad" for name in graph.actuated)
+
+    @property
+    def effort_units(self) -> tuple[str, ...]:
+        """Units of the efforts, ``N m`` or ``N``."""
+        return tuple("N" if unit == "m" else "N m" for unit in self.joint_units)
+
+    @property
+    def joint_unit(self) -> str:
+        """Unit of q where the joints are of one kind, else ``rad or m``."""
+        return _common(self.joint_units)
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of the efforts where the joints are of one kind, else ``N m or N``."""
+        return _common(self.effort_units)
+
+    def parameter_sections(self) -> dict[str, Any]:
+        """The parameters by section, as plain data."""
+        fields = (f.name for f in dataclasses.fields(self) if "check" in f.metadata)
+        return {name: schema.plain(getattr(self, name)) for name in fields}
+
+    def parameter_units(self) -> dict[str, Any]:
+        """Units of the same, by section; empty where a parameter has none."""
+        words = {"joint": self.joint_unit, "effort": self.effort_unit}
+        return schema.units(type(self), self.parameter_sections(), words)
+
+    @cached_property
+    def controller(self) -> JointMap:
+        """Between the controller's joints and the model's.
+
+        :raises ParameterError: a map of joints that there are not.
+        """
+        return JointMap.of(self.joint_names, self.joint_map)
+
+    @cached_property
+    def elastic(self) -> Structure:
+        """Elastic beams and joints with the elements' factors; errors as :meth:`structure`."""
+        return self.structure().scaled(self.element_compliance)
+
+    @property
+    def element_names(self) -> tuple[str, ...]:
+        """Valid names in ``element_compliance``, bars first; errors as :meth:`structure`.
+
+        Results of energies and factors have their own order, in their attribute ``elements``.
+        """
+        return self.structure().elements
+
+    def check_elements(self) -> None:
+        """Refuse factors of elements that there are not.
+
+        :raises ParameterError: by the name, or nothing is elastic.
+        """
+        for name in self.element_compliance:
+            if name not in self.element_names:
+                raise UnknownNameError(f"element_compliance.{name}", name, self.element_names)
+
+    @cached_property
+    def joints_count(self) -> int:
+        """How many joints are actuated, n."""
+        return len(self.joint_names)
+
+    @property
+    def pose_names(self) -> tuple[str, ...]:
+        """Names of the pose coordinates."""
+        return tuple(c.name for c in self.coordinates)
+
+    @property
+    def pose_units(self) -> tuple[str, ...]:
+        """Their units, ``m`` or ``rad``."""
+        return tuple(c.unit for c in self.coordinates)
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Bodies and rods, and the payload last."""
+        return (*self.graph.bodies, *self.graph.rods, "payload")
+
+    @property
+    def closed_key(self) -> str:
+        """Text of what closed forms and branch rules hang on and no number tells."""
+        return ""
+
+    @property
+    def closed_numbers(self) -> Sequence[float]:
+        """Numbers of the geometry that closed forms hang on."""
+        return ()
+
+    def on(self: R, numbers: Numbers) -> R:
+        """The robot for its closed forms alone, on other numbers or expressions of them.
+
+        :param numbers: as :attr:`closed_numbers`.
+        """
+        del numbers
+        return self
+
+    def numbered(self: R, values: Mapping[str, Any]) -> R:
+        """A copy with other numbers or expressions at dotted paths of its file; nothing is checked.
+
+        :raises ParameterError: a path that there is not.
+        """
+        made = placed(self, {tuple(full_keys(path)): value for path, value in values.items()})
+        return self._with(**{f.name: getattr(made, f.name) for f in dataclasses.fields(self)})
+
+    def number(self, path: str) -> float:
+        """The number of the robot's file at a dotted path, as :meth:`numbered` takes it.
+
+        :raises ParameterError: a path that there is not.
+        """
+        keys = full_keys(path)
+        sections = {f.name for f in dataclasses.fields(self) if "check" in f.metadata}
+        known = keys and keys[0] in sections
+        return number_in(
+            schema.plain(getattr(self, str(keys[0]))) if known else None, keys[1:], path
+        )
+
+    def check_number(self, path: str) -> None:
+        """Judge a number of :meth:`numbered` as a file's is.
+
+        :raises ParameterError: by the path.
+        """
+        check_number(self, full_keys(path), path)
+
+    def _with(self: R, **values: Any) -> R:
+        """A copy with other fields, or other values that are derived; nothing is checked."""
+        made = object.__new__(type(self))
+        vars(made).update(self.__getstate__() | values)
+        return made
+
+    @cached_property
+    def pose_scales(self) -> Array:
+        """What makes lengths of pose coordinates, shape (m,): 1, or the platform's radius."""
+        return np.array([1.0 if unit == "m" else self.size for unit in self.pose_units])
+
+    @cached_property
+    def joint_scales(self) -> Array:
+        """The same of q, shape (n,); all 1 where the joints are of one kind."""
+        mixed = len(set(self.joint_units)) > 1
+        return np.array([self.size if mixed and u == "rad" else 1.0 for u in self.joint_units])
+
+    def grid(self) -> PoseGrid:
+        """The grid of poses of a workspace map; a box for a machine without an axis."""
+        return PoseGrid("box", self.pose_names)
+
+    def search_box(self) -> Array:
+        """A box that contains all poses of the workspace, shape (m, 2), m and rad.
+
+        :raises ParameterError: a limit that would bound the workspace is missing.
+        """
+        place = position_box(self.graph, self.limits.position)
+        rows = []
+        for c in self.coordinates:
+            if c.axis is not None:
+                rows.append(place[c.axis])
+            else:
+                far = np.pi if len(c.entries) == 2 else np.pi / 2
+                rows.append(np.array([-far, far]))
+        return np.array(rows)
+
+    def changed(self: R, **sections: Mapping[str, object] | object) -> R:
+        """A copy with new values, e.g. ``payload={"mass": 0.2}, geometry={"arm_length": 0.3}``.
+
+        All values are checked as in a file; one invalid value rejects all. A change of geometry,
+        masses or members is like a new file: the home is chosen again.
+
+        :raises ParameterError: a value out of range, or an impossible machine.
+        """
+        if not set(sections) <= set(self.changeable):
+            known = self.parameter_sections()
+            for key in sections:
+                if key not in known:
+                    raise UnknownNameError(key, key, known)
+            return type(self).from_data(merged(given(known), sections), self.name)
+        new: dict[str, Any] = {}
+        for key, value in sections.items():
+            if isinstance(value, Mapping) and not isinstance(getattr(self, key), Mapping):
+                new[key] = schema.replace(getattr(self, key), value, key)
+            else:
+                fields = {f.name: f for f in dataclasses.fields(self)}
+                new[key] = fields[key].metadata["check"](key, value)
+        made = dataclasses.replace(self, **new)
+        made.check_elements()
+        return made
+
+
+def _common(units: Sequence[str]) -> str:
+    return " or ".join(sorted(set(units), reverse=True))

@@ -1,0 +1,473 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every robot computes: kinematics by the engine of its graph, masses as run-time inputs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pkm_twin.codegen.code import NOT_FINITE
+from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.program import Program
+from pkm_twin.errors import SingularityError, UnreachableError
+from pkm_twin.kinematics.engine import Engine, engine_of
+from pkm_twin.kinematics.passive import (
+    passive_names,
+    passive_program,
+    passive_rates_program,
+)
+from pkm_twin.kinematics.scheme import Closed
+from pkm_twin.kinematics.singularity import singularity_kernel
+from pkm_twin.kinematics.traced import Traced
+from pkm_twin.machine import schema
+from pkm_twin.machine.friction import linear_keys
+from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.inertia import Layout
+from pkm_twin.machine.shared import (
+    Shared,
+    behind_gear,
+    drive_units,
+    friction_number,
+    shared_number,
+    shared_payload,
+)
+from pkm_twin.robot.mechanism import Mechanism
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SINGULARITY_BOUND: Final = 1e-9
+"""Least singularity index (0 singular, 1 best) at which a Jacobian is inverted."""
+SAME_POSE: Final = 1e-7
+"""Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
+assembly is farther away unless a singularity is nearer than that."""
+BEYOND: Final = 3.0
+"""Code of a pose beyond a singularity, after those of programs."""
+
+_NONE: Final = np.zeros(0)
+
+Run = Callable[..., tuple[list[Array], Array | None]]
+
+
+class ControlLoop(Protocol):
+    """Arrays that stay where they are, and a call that fills ``tau`` and returns a status."""
+
+    q: Array
+    qd: Array
+    qdd: Array
+    wrench: Array
+    tau: Array
+
+    def __call__(self) -> int:
+        """0 all samples are good, 1 one has no assembly, 2 one is not finite."""
+
+
+def _alone(kernel: Kernel, *inputs: ArrayLike) -> tuple[list[Array], Array | None]:
+    return kernel(_NONE, *inputs)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Robot(Mechanism):
+    """A parallel kinematic machine of n actuated joints and m pose coordinates.
+
+    Frozen; :meth:`changed` gives a copy with other parameters.
+    """
+
+    def shared_inertia(self) -> tuple[Shared, ...]:
+        """What the file says of masses, as linear parameters.
+
+        :raises ParameterError: the robot's file gives no masses.
+        """
+        raise NotImplementedError
+
+    def shared_drives(self) -> tuple[Shared, ...]:
+        """Friction of each actuated joint and the rotors, as linear parameters of the file."""
+        graph, friction = self.graph, self.friction
+        result = []
+        for k, joint in enumerate(graph.actuated):
+            for what in linear_keys(self.laws):
+                value = float(getattr(friction, what)[k])
+                result.append(friction_number(graph, joint, what, value, ("friction", what, k)))
+        first, rotors = graph.actuated[0], [f"{j}.rotor_inertia" for j in graph.actuated]
+        drive = self.drive
+        rotor = shared_number(
+            "rotor", "rotor_inertia", drive_units(graph, first)["rotor_inertia"],
+            graph.joints[first].rotor_inertia, math.nan,
+            ("inertia", "rotor_inertia") if drive is None else ("drive", "inertia"), others=rotors,
+        )  # fmt: skip
+        if drive is not None:
+            rotor = dataclasses.replace(rotor, keys=behind_gear(rotor, drive.turns))
+        return (*result, rotor)
+
+    def shared_parameters(self) -> tuple[Shared, ...]:
+        """All that a fit of the robot's file may change: drives, payload, bodies and rods.
+
+        :raises ParameterError: the robot's file gives no masses.
+        """
+        # The engine's own graph may be that of a machine with other masses.
+        self.massive()
+        graph, load = self.graph, self.payload
+        masses = [body.mass for body in graph.bodies.values()]
+        heavy = max(graph.bodies[graph.platform].mass, 0.1 * sum(masses))
+        payload = shared_payload(graph, load.mass, load.com, load.inertia, heavy, 0.3 * graph.size)
+        return (*self.shared_drives(), payload, *self.shared_inertia())
+
+    @cached_property
+    def engine(self) -> Engine:
+        """The engine of the robot's geometry, shared by all robots that have the same."""
+        return self._engine_on(self.graph)
+
+    def _engine_on(self, graph: Graph) -> Engine:
+        start = (lambda numbers, q: self.on(numbers).start(q)) if self.has_start else None
+        closed = Closed(np.array(self.closed_numbers, np.float64), start)
+        branch = self.branch if self.has_branch else None
+        mark = f"{self.mechanism} {self.closed_key}"
+        return engine_of(graph, self.coordinates, closed, branch, mark)
+
+    @cached_property
+    def _massive(self) -> Engine:
+        return self._engine_on(self.with_laws(self.graph)) if self.laws else self.engine
+
+    @cached_property
+    def calls(self) -> dict[str, Any]:
+        """Functions for one sample, made once a robot, by name."""
+        return {}
+
+    def call_one(
+        self, name: str, kernel: Callable[[], Kernel], p: Array, *inputs: Any
+    ) -> Array | None:
+        """First output of one good sample, as fast as can be; None where it takes a batch's way."""
+        call = self.calls.get(name)
+        if call is None:
+            call = self.calls[name] = kernel().first_of_one(p)
+        try:
+            result: Array | None = call(*inputs)
+        except (TypeError, ValueError):
+            # A batch, a list, numbers of another kind, or a wrong length.
+            return None
+        return result
+
+    @cached_property
+    def inertial(self) -> Array:
+        """Run-time inputs of the dynamics, payload included, see ``machine.inertia``."""
+        load = self.payload
+        return schema.frozen(
+            self.own_inertial + self._layout.payload(load.mass, load.com, load.inertia)
+        )
+
+    @cached_property
+    def own_inertial(self) -> Array:
+        """The same without the payload."""
+        return schema.frozen(self._layout.pack(self.graph, self.gravity, self.friction))
+
+    @property
+    def _layout(self) -> Layout:
+        return Layout(self._massive.tree)
+
+    def massive(self) -> Engine:
+        """The engine of a robot with masses; its programs have the friction laws.
+
+        :raises ParameterError: the robot's file gives none.
+        """
+        return self._massive
+
+    def inverse(self, pose: ArrayLike) -> Array:
+        """Joint positions q (..., n) of poses (..., m); ``forward(q)`` is the pose.
+
+        :raises UnreachableError: naming limb, sample and miss.
+        :raises SingularityError: a pose beyond a singularity, or in one.
+        """
+        q, codes = self.judged_inverse(pose, _alone)
+        if codes is not None:
+            self._refuse_pose(codes, pose)
+        return q
+
+    def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
+        """Joint positions (..., n), NaN for an invalid pose; and which poses are valid, (...)."""
+        q, codes = self.judged_inverse(pose, _alone)
+        good = np.ones(q.shape[:-1], bool) if codes is None else np.asarray(codes[..., 0] == 0.0)
+        return np.where(good[..., None], q, np.nan), good
+
+    @cached_property
+    def inverse_kernel(self) -> Kernel:
+        """Pose to joints of some assembly, in closed form where there is one."""
+        if not self.has_inverse:
+            return self.engine.inverse
+
+        def write(t: Traced) -> Program:
+            m = len(self.coordinates)
+            result = self.on(t.closed).solved(t.tape.inputs("pose", m))
+            measure = 1.0 if result.measure is None else result.measure
+            outputs = {"q": t.lift(result.q), "faults": t.lift([*result.misses, measure])}
+            return Program({"pose": m}, 0, outputs)
+
+        return self.engine.kernel("closed inverse", write)
+
+    def judged_inverse(self, pose: ArrayLike, run: Run) -> tuple[Array, Array | None]:
+        """Joints; and None or codes (1 unreachable, 2 not finite, BEYOND), limb, amount.
+
+        The joints of a pose may belong to another assembly too: ``forward`` decides.
+
+        :param run: evaluates a kernel on inputs, to outputs and status.
+        """
+        q, codes = self._candidates(pose, run)
+        tried = q
+        if codes is not None:
+            tried = np.where(codes[..., :1] == 0.0, q, self.graph.home)
+        (found, _, _), _ = run(self.engine.forward, tried)
+        # What is infinite or NaN is no pose.
+        with np.errstate(invalid="ignore"):
+            apart = found - np.asarray(pose, np.float64)
+            if self._turn_mask.any():
+                turned = np.remainder(apart + math.pi, math.tau) - math.pi
+                apart = np.where(self._turn_mask, turned, apart)
+            same = (np.abs(apart) * self._pose_units <= SAME_POSE).all(-1)
+        if codes is None:
+            if same.all():
+                return q, None
+            codes = np.zeros((*q.shape[:-1], 3))
+        other = (codes[..., 0] == 0.0) & ~same
+        codes[other] = BEYOND, 0.0, 0.0
+        return q, codes
+
+    @cached_property
+    def _turn_mask(self) -> Mask:
+        """Which pose coordinates are turns, that a full one does not change, shape (m,)."""
+        return np.array([len(c.entries) == 2 for c in self.coordinates])
+
+    @cached_property
+    def _pose_units(self) -> Array:
+        """What makes pose coordinates of unit one, shape (m,)."""
+        return np.array([1.0 if c.entries else 1.0 / self.graph.size for c in self.coordinates])
+
+    def _candidates(self, pose: ArrayLike, run: Run) -> tuple[Array, Array | None]:
+        """Joints that reach the pose in some assembly; and codes as :meth:`judged_inverse`."""
+        outputs, status = run(self.inverse_kernel, pose)
+        q = outputs[0]
+        if len(outputs) == 1:
+            if status is None:
+                return q, None
+            extra = np.zeros((*status.shape[:-1], 1))
+            return q, np.concatenate([status[..., :1], extra, status[..., 1:]], -1)
+        faults = outputs[1]
+        with np.errstate(invalid="ignore"):
+            missed = faults[..., :-1] > 0.0
+            singular = ~(faults[..., -1] > SINGULARITY_BOUND)
+        if status is None and not missed.any() and not singular.any():
+            return q, None
+        limb = missed.argmax(-1)
+        amount = np.take_along_axis(faults[..., :-1], limb[..., None], -1)[..., 0]
+        code = np.where(missed.any(-1), 1.0, np.where(singular, BEYOND, 0.0))
+        amount = np.where(code == BEYOND, faults[..., -1], amount)
+        if status is not None:
+            code = np.where(status[..., 0] != 0.0, status[..., 0], code)
+        return q, np.stack([code, limb.astype(float), amount], -1)
+
+    def _refuse_pose(self, codes: Array, pose: ArrayLike) -> None:
+        index = _first(codes[..., 0])
+        if index is None:
+            return
+        code, limb, amount = codes[index].tolist()
+        one = np.broadcast_to(np.asarray(pose, float), (*codes.shape[:-1], len(self.coordinates)))
+        if code == NOT_FINITE or not np.isfinite(one[index]).all():
+            raise _not_finite("pose", index)
+        if code == BEYOND:
+            raise SingularityError("pose", index, max(amount, 0.0), SINGULARITY_BOUND, beyond=True)
+        if self.has_inverse:
+            raise UnreachableError("pose", self.limb_names[int(limb)], index, amount)
+        part, miss, met = self.engine.shortest_pose(one[index])
+        if met:
+            raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, amount)
+        raise UnreachableError("pose", part, index, miss, amount)
+
+    def forward(self, q: ArrayLike) -> Array:
+        """Pose of joint positions q, shape (..., m), in the mechanism's documented assembly.
+
+        :raises UnreachableError: naming limb, sample and miss.
+        :raises SingularityError: a singularity on the way from home.
+        """
+        pose = self.call_one("forward", self._forward_kernel, _NONE, q)
+        return self._placed(q)[0] if pose is None else pose
+
+    def _forward_kernel(self) -> Kernel:
+        return self.engine.forward
+
+    def try_forward(self, q: ArrayLike) -> tuple[Array, Mask]:
+        """Poses (..., m), NaN where there is no assembly; and which q are valid, (...)."""
+        (pose, _, _), status = self.engine.forward(_NONE, q)
+        good = np.ones(pose.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+        return pose, np.asarray(good)
+
+    def platform(self, q: ArrayLike) -> tuple[Array, Array]:
+        """Position (..., 3) of the platform's reference point, and its rotation (..., 3, 3).
+
+        Base axes; the rotation is relative to home. Errors as :meth:`forward`.
+        """
+        _, position, rotation = self._placed(q)
+        return position, rotation.reshape(*rotation.shape[:-1], 3, 3)
+
+    def _placed(self, q: ArrayLike) -> list[Array]:
+        outputs, status = self.engine.forward(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        return outputs
+
+    def placements(self, q: ArrayLike) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Rotation from home (..., 3, 3) and position of the frame's origin (..., 3) of each body.
+
+        ``engine.tree.at`` has the origins at home. Errors as :meth:`forward`.
+        """
+        (flat,), status = self.engine.placement(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        rows = flat.reshape(*flat.shape[:-1], len(self.graph.bodies), 12)
+        rotations, origins = {}, {}
+        for k, name in enumerate(self.graph.bodies):
+            rotations[name] = rows[..., k, :9].reshape(*flat.shape[:-1], 3, 3)
+            origins[name] = rows[..., k, 9:]
+        return rotations, origins
+
+    def rotation(self, pose: ArrayLike) -> Array:
+        """Platform axes as columns in base axes, shape (..., 3, 3), of a pose.
+
+        Errors as :meth:`inverse`.
+        """
+        return self.platform(self.inverse(pose))[1]
+
+    def home(self) -> Array:
+        """The home pose (not joint positions), shape (m,): the pose in which the graph is given."""
+        return self.engine.home_pose.copy()
+
+    def jacobian(self, q: ArrayLike) -> Array:
+        """Pose rates per joint rate, shape (..., m, n)."""
+        return self._jacobians(q)[0]
+
+    def platform_jacobian(self, q: ArrayLike) -> Array:
+        """Platform twist (v at its reference point, omega; base axes) per rate, (..., 6, n)."""
+        return self._jacobians(q)[1]
+
+    def _jacobians(self, q: ArrayLike) -> list[Array]:
+        (rates, twist), status = self.engine.jacobian(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        n = self.joints_count
+        return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in (rates, twist)]
+
+    def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
+        """Pose rates per joint rate (..., m, n), NaN where there is no assembly; which are good."""
+        (rates, _), status = self.engine.jacobian(_NONE, q)
+        good = np.ones(rates.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+        n = self.joints_count
+        return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), np.asarray(good)
+
+    def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
+        """Second derivative of the pose in time, shape (..., m)."""
+        (second,), status = self.engine.acceleration(_NONE, q, qd, qdd)
+        if status is not None:
+            self.refuse_joints(status, q, (q, qd, qdd))
+        return second
+
+    def singularity(self, q: ArrayLike) -> Array:
+        """The singularity index of joint positions: 0 in a singularity, 1 at best, shape (...).
+
+        It includes singularities of any kind: the platform or another body can move with locked
+        actuators (constraint singularities included), or joints can move without the platform (the
+        edge of the workspace); see ``kinematics.singularity``. It is dimensionless and independent
+        of the machine's scale. Errors as :meth:`forward`.
+        """
+        one = self.call_one("singularity", self.singularity_kernel, _NONE, q)
+        if one is not None:
+            return np.asarray(one[0])
+        (measure,), status = self.singularity_kernel()(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        return np.asarray(measure[..., 0], np.float64)
+
+    def singularity_kernel(self) -> Kernel:
+        """The same as a program, q to the measure (1)."""
+        return singularity_kernel(self.engine)
+
+    def try_singularity(self, q: ArrayLike) -> tuple[Array, Mask]:
+        """The measure (...), 0 where there is no assembly; which joint states have one."""
+        (measure,), status = self.singularity_kernel()(_NONE, q)
+        good = np.ones(measure.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+        return np.where(good, measure[..., 0], 0.0), np.asarray(good)
+
+    def torque_loop(self, samples: int = 1) -> ControlLoop:
+        """Inverse dynamics for a control loop, with preallocated arrays.
+
+        Write ``q, qd, qdd, wrench``, call it, and read ``tau`` and the returned status; see
+        :class:`delta_dynamics.loop.TorqueLoop`.
+        """
+        made: ControlLoop = import_module("delta_dynamics.loop").TorqueLoop(self, samples)
+        return made
+
+    @cached_property
+    def passive_joints(self) -> tuple[str, ...]:
+        """Names of the passive joints' values, one per revolute or prismatic axis."""
+        return passive_names(self.engine)
+
+    def passive(self, q: ArrayLike) -> Array:
+        """Values of the passive joints, shape (..., k), rad or m, in a URDF's convention."""
+        (flat,), status = self.engine.kernel("passive", passive_program)(_NONE, q)
+        if status is not None:
+            self.refuse_joints(status, q)
+        return flat
+
+    def passive_rates(self, q: ArrayLike, qd: ArrayLike) -> Array:
+        """Rates of the passive joints, shape (..., k), rad/s or m/s, as :meth:`passive` has them.
+
+        :param qd: joint rates, shape (..., n), rad/s or m/s.
+        """
+        (flat,), status = self.engine.kernel("passive rates", passive_rates_program)(_NONE, q, qd)
+        if status is not None:
+            self.refuse_joints(status, q, (q, qd))
+        return flat
+
+    def refuse_joints(self, status: Array, q: ArrayLike, inputs: Sequence[ArrayLike] = ()) -> None:
+        """Raise the typed error of the first rejected sample, if there is one.
+
+        :param status: of a kernel, shape (..., 2).
+        :param inputs: everything that the kernel was given.
+        """
+        index = _first(status[..., 0])
+        if index is None:
+            return
+        batch = status.shape[:-1]
+        for value in (q, *inputs):
+            array = np.asarray(value, float)
+            if not np.isfinite(np.broadcast_to(array, (*batch, array.shape[-1]))[index]).all():
+                raise _not_finite("joint state", index)
+        code, reached = status[index].tolist()
+        if code == NOT_FINITE:
+            raise _not_finite("joint state", index)
+        place = np.asarray(q, float)
+        sample = np.broadcast_to(place, (*batch, place.shape[-1]))[index]
+        limb = self.unreachable_limb(sample, reached)
+        if limb is not None:
+            raise UnreachableError("joint state", self.limb_names[limb[0]], index, limb[1])
+        part, miss, measure = self.engine.ending(sample, reached)
+        if measure is not None:
+            raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached)
+        raise UnreachableError("joint state", part, index, miss, reached)
+
+
+def _first(codes: Array) -> tuple[int, ...] | None:
+    """Index of the first sample whose code is not zero."""
+    if codes.ndim == 0:
+        return () if codes != 0.0 else None
+    bad = codes != 0.0
+    return tuple(int(i) for i in np.argwhere(bad)[0]) if bad.any() else None
+
+
+def _not_finite(what: str, index: tuple[int, ...]) -> ValueError:
+    where = f" at sample {index}" if index else ""
+    return ValueError(f"{what}{where} is not finite, or leads to a result that is not")
