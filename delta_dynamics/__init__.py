@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rigid-body dynamics of parallel kinematic machines."""
 
-from delta_dynamics.base_parameters import BaseParameters, base_parameters
+from importlib import import_module
+from typing import Any
+
 from delta_dynamics.contact import Contact, ContactMonitor
 from delta_dynamics.derivatives import TorqueDerivatives, torque_derivatives, torque_gradient
 from delta_dynamics.elastic_reactions import elastic_reactions
+from delta_dynamics.isolation import ContactPlace
 from delta_dynamics.isotropy import (
     Extremes,
     JointMotion,
@@ -41,6 +44,7 @@ __all__ = [
     "BaseParameters",
     "Contact",
     "ContactMonitor",
+    "ContactPlace",
     "Energy",
     "Extremes",
     "JointMotion",
@@ -77,3 +81,13 @@ __all__ = [
     "torque_deviation",
     "torque_gradient",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Names of identification, which imports this package: loaded when they are asked for."""
+    if name not in ("BaseParameters", "base_parameters"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(
+        import_module("pkm_twin.identification.base_parameters"), name
+    )
+    return value

@@ -22,7 +22,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics.feedforward import SLICE
 from pkm_twin.errors import MessageError
-from pkm_twin.ros import node as health
+from pkm_twin.ros.node import TwinNode
+from pkm_twin.ros.turns import Task
 
 Efforts = Callable[[Any], Generator[None, None, "np.ndarray[Any, Any]"]]
 Place = Callable[[], "Mapping[str, float] | None"]
@@ -74,7 +75,7 @@ class EffortAction:
     """
 
     def __init__(
-        self, node: health.TwinNode, controller: str, efforts: Efforts, place: Place, hold: bool
+        self, node: TwinNode, controller: str, efforts: Efforts, place: Place, hold: bool
     ) -> None:
         """Serve ``~/follow_joint_trajectory``.
 
@@ -176,7 +177,7 @@ class EffortAction:
         def refused(error: MessageError) -> None:
             self._abort(goal, f"delta_dynamics rejected the trajectory, {error.reason}: {error}")
 
-        def steps() -> health.Task:
+        def steps() -> Task:
             try:
                 yield from self._fill(goal)
             except MessageError as error:
@@ -188,7 +189,7 @@ class EffortAction:
         except MessageError as error:
             refused(error)
 
-    def _fill(self, goal: _Goal) -> health.Task:
+    def _fill(self, goal: _Goal) -> Task:
         trajectory = goal.handle.request.trajectory
         efforts = yield from self._efforts(trajectory)
         for k, (point, effort) in enumerate(zip(trajectory.points, efforts.tolist(), strict=True)):

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forces within bounds that resist motions, and what finds them.
-
-May import: numpy; never rclpy.
-"""
+"""Forces within bounds that resist motions, and what finds them."""
 
 from __future__ import annotations
 

@@ -7,8 +7,6 @@ max_a |y' G_a y| >= y' (sum u_a G_a) y >= t y' y in the whole cone (the Bernstei
 quadratic over a simplex). Which weights do is a small linear program, solved for thousands of cones
 at once by an interior point method (Mehrotra, SIAM J. Optim. 2(4), 1992); whatever it gives is
 checked by the entries themselves. A cone that none do for is halved across its longest edge.
-
-May import: numpy, pkm_twin's errors, the standard library.
 """
 
 from __future__ import annotations

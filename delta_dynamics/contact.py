@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether something pushes: external efforts beyond what model and noise leave open.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
-"""
+"""Whether something pushes: external efforts beyond what model and noise leave open."""
 
 from __future__ import annotations
 
@@ -13,9 +10,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from delta_dynamics.isolation import ContactLocator, ContactPlace
 from delta_dynamics.noise import AVERAGED, Noise
 from delta_dynamics.observer import MomentumObserver, platform_wrench
-from delta_dynamics.rest import friction_reach, moving_rates
+from delta_dynamics.rest import LoadShare, friction_reach, moving_rates
 from delta_dynamics.uncertainty import (
     EffortParts,
     effort_parts,
@@ -25,8 +23,8 @@ from delta_dynamics.uncertainty import (
 )
 from delta_dynamics.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import later, one_vector
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import RELEASE, DriveWatch
 from pkm_twin.streams.rest import RestWatch
 
@@ -40,7 +38,8 @@ CLIPPED: Final = 9.0
 """A square counts as noise up to so many times the average: a push is none."""
 SHARE: Final = 1e-3
 """Least standard deviation of an effort, as a share of the greatest that the stream has shown."""
-
+PLACED: Final = 0.004
+"""Time between two estimates of a contact's place, s."""
 MOST_DRAG: Final = 0.2
 """Friction that may be learnt, as a share of the greatest effort of the motion."""
 
@@ -50,7 +49,8 @@ class Contact:
     """External efforts and their bound, shape (n,), N m or N; the wrench (6,) that explains them.
 
     ``touching``: whether an effort exceeds its bound. ``idle``: the drives are off or braked, so
-    the efforts contain no information; ``touching`` then keeps its last value.
+    the efforts contain no information; ``touching`` then keeps its last value. ``place``: the body
+    and the place on it while ``touching``.
     """
 
     external: Array
@@ -58,6 +58,7 @@ class Contact:
     wrench: Array
     touching: bool
     idle: bool = False
+    place: ContactPlace | None = None
 
 
 class Drag:
@@ -105,6 +106,7 @@ class ContactMonitor:
             raise ValueError(f"sigmas is {sigmas:g}; expected more than 0")
         self.sigmas = sigmas
         self.observer = MomentumObserver(robot, bandwidth)
+        self._locator: ContactLocator | None = None
         self.change_robot(robot)
         self.reset()
 
@@ -115,15 +117,18 @@ class ContactMonitor:
         self.drives = DriveWatch()
         self._rest = RestWatch(0.0)
         self._noise = self._kept = Noise(np.zeros(n), LEARNING, CLIPPED)
-        self._unsure, self._slack, self._impulse = np.zeros((3, n))
+        self._unsure, self._slack, self._impulse, self._friction = np.zeros((4, n))
         self._greatest = usual_effort(self.robot)
         self._last: float | None = None
         self._touching, self._since = False, 0.0
+        self._place: ContactPlace | None = None
+        self._placed = 0.0
         self._drag = Drag(n)
 
     def change_robot(self, robot: Robot) -> None:
         """Use a robot with another payload, gravity or friction."""
-        self.robot = self.observer.robot = robot
+        self._share = LoadShare(robot)
+        self.robot = self.observer.robot = robot = self._share.robot
         self.stated = states_efforts(robot)
         """Whether the robot's file says how sure its efforts are."""
         self._reach = friction_reach(robot)
@@ -149,7 +154,8 @@ class ContactMonitor:
         if doubt is None:
             doubt = self._rest.push(round(time * SECOND), q, qd, qd)
         still = np.abs(qd) <= doubt
-        sure = moving_rates(qd, still, self._reach)
+        sure = moving_rates(qd, still, self._reach + self._share.share)
+        effort, holds = self._share.taken_out(q, sure, effort)
         parts = effort_parts(self.robot, q, sure, qdd, wrench)
         self._last = time
         self._greatest = np.maximum(self._greatest, np.abs(parts.whole))
@@ -172,14 +178,16 @@ class ContactMonitor:
                 self._touching = False
             return self._verdict(q, external, idle)
         drag = self._drag.learn(step, external, np.where(still, 0.0, qd))
-        friction = np.minimum(drag, MOST_DRAG * self._greatest) + np.where(still, self._reach, 0.0)
+        friction = np.minimum(drag, MOST_DRAG * self._greatest) + np.where(
+            still, self._reach + holds, 0.0
+        )
         self._follow(step, self._deviation(parts, q, sure, qdd, wrench), friction, doubt)
         self._noise.advance(step)
         left = np.maximum(np.abs(external) - self._slack - self._impulse, 0.0)
         if self._noise.settled:
             touching = bool((np.abs(external) > self._bound()).any())
-            if touching and not self._touching:
-                self._since = time
+            if touching:
+                self._locate(time, step, q, qd, external, begins=not self._touching)
             self._touching = touching
             verdict = self._verdict(q, external, idle)
         else:
@@ -187,6 +195,20 @@ class ContactMonitor:
         if not self._touching:
             self._noise.learn(left, (SHARE * self._greatest) ** 2)
         return verdict
+
+    def _locate(
+        self, time: float, step: float, q: Array, qd: Array, external: Array, *, begins: bool
+    ) -> None:
+        """Follow a contact: the body that it strikes."""
+        if self._locator is None:
+            self._locator = ContactLocator(self.robot)
+        if begins:
+            self._since = time
+            self._locator.reset()
+        deviation = np.hypot(self._spread(), 0.5 * (self._friction + self._impulse))
+        self._locator.push(step, q, qd, external, deviation)
+        if begins or time - self._placed >= PLACED:
+            self._place, self._placed = self._locator.place(), time
 
     def _deviation(self, parts: EffortParts, *motion: Any) -> Array:
         """Standard deviation of the model's efforts, shape (n,)."""
@@ -196,16 +218,19 @@ class ContactMonitor:
 
     def _follow(self, step: float, deviation: Array, friction: Array, doubt: Array) -> None:
         """What is unsure of the efforts, and of the momentum, as it is in the estimate."""
-        part = self.observer.bandwidth * step
+        part, self._friction = self.observer.bandwidth * step, friction
         self._impulse = self.observer.bandwidth * np.abs(self.observer.mass) @ doubt
         slack = friction + self.observer.jump + self._impulse
         self._unsure = (self._unsure + part * deviation) / (1.0 + part)
         self._slack = (self._slack + part * slack) / (1.0 + part)
 
+    def _spread(self) -> Array:
+        return np.asarray(np.sqrt(self._unsure**2 + self._noise.variance), np.float64)
+
     def _bound(self) -> Array:
-        spread = np.sqrt(self._unsure**2 + self._noise.variance)
-        return np.asarray(self.sigmas * spread + self._slack + self._impulse, np.float64)
+        return np.asarray(self.sigmas * self._spread() + self._slack + self._impulse, np.float64)
 
     def _verdict(self, q: Array, external: Array, idle: bool) -> Contact:
         wrench = platform_wrench(self.robot, q, external)
-        return Contact(external, self._bound(), wrench, self._touching, idle)
+        place = self._place if self._touching and not idle else None
+        return Contact(external, self._bound(), wrench, self._touching, idle, place)

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact derivatives of the torques: by the motion, and by any number of the robot's file.
-
-May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
-"""
+"""Exact derivatives of the torques: by the motion, and by any number of the robot's file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -18,10 +16,10 @@ from pkm_twin.codegen.arrays import doubles, vectors
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.gradients import gradient_program
-from pkm_twin.kinematics.numbers import cause_slopes, file_numbers, geometry_and_masses
-from pkm_twin.machine.robot import Robot
+from pkm_twin.kinematics.traced import Traced
+from pkm_twin.robot.numbers import cause_slopes, file_numbers, geometry_and_masses
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -69,11 +67,12 @@ def torque_gradient(
     :param weights: shape (..., n). Others and errors as of :func:`torque_derivatives`.
     :returns: ``q``, ``qd``, ``qdd`` of shape (..., n), and ``by`` of shape (...).
     """
-    return _derivatives(robot, (q, qd, qdd), wrench, weights, by, rows=False)
+    chosen = vectors(weights, robot.joints_count, "weights")
+    return _derivatives(robot, (q, qd, qdd), wrench, chosen, by, rows=False)
 
 
 def _derivatives(
-    robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: ArrayLike,
+    robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array,
     by: Sequence[str], *, rows: bool,
 ) -> TorqueDerivatives:  # fmt: skip
     inputs = _inputs(robot, motion, wrench, weights, rows=rows)
@@ -88,19 +87,31 @@ def torque_effects(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None
 ) -> Array:
     """What one standard deviation of each of the file's causes changes, shape (..., n, causes)."""
-    inputs = _inputs(robot, (q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
-    return _by_numbers_table(robot, inputs) @ cause_slopes(robot, geometry_and_masses)
+    kept = robot.calls.get("torque effects")
+    if kept is None:
+        causes = cause_slopes(robot, geometry_and_masses)
+        kernel = robot.massive().kernel(
+            f"torque gradient by {causes.chosen}", partial(_by_chosen, causes.chosen), free=True
+        )
+        kept = robot.calls["torque effects"] = kernel, causes.slopes, np.eye(robot.joints_count)
+    kernel, slopes, weights = kept
+    inputs = _inputs(robot, (q, qd, qdd), wrench, weights, rows=True)
+    (table,), status = kernel(robot.inertial, *inputs)
+    if status is not None:
+        robot.refuse_joints(status, inputs[0], inputs)
+    return np.asarray(table @ slopes, np.float64)
 
 
 def _inputs(
-    robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: ArrayLike, *,
+    robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *,
     rows: bool,
 ) -> list[Array]:  # fmt: skip
     load = np.zeros(6) if wrench is None else wrench
     inputs = [doubles(value) for value in (*motion, load)]
     if rows:
-        inputs = [array[..., None, :] for array in inputs]
-    return [*inputs, vectors(weights, robot.joints_count, "weights")]
+        # One sample without the axis is the quick way of a small batch.
+        inputs = [array if array.ndim == 1 else array[..., None, :] for array in inputs]
+    return [*inputs, weights]
 
 
 def _by_paths(robot: Robot, inputs: Sequence[Array], by: Sequence[str]) -> dict[str, Array]:
@@ -154,3 +165,9 @@ def _by_numbers(t: Traced) -> Program:
     program = torque_program(t)
     masses = t.tape.inputs(PARAMETERS, program.parameters)
     return gradient_program(t, program, {"geometry": t.geometry, "masses": masses})
+
+
+def _by_chosen(chosen: Sequence[int], t: Traced) -> Program:
+    program = torque_program(t)
+    numbers = [*t.geometry, *t.tape.inputs(PARAMETERS, program.parameters)]
+    return gradient_program(t, program, {"numbers": [numbers[k] for k in chosen]})

@@ -4,8 +4,6 @@
 Of all reactions that balance the bodies the true ones have the least complementary energy of
 members and elastic joints (Menabrea), actuators locked. Along a member the section's load is taken
 between those of its ends, which is exact where its own inertia does not bend it.
-
-May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import reaction_directions
 from pkm_twin.machine.graph import BASE, Joint
 from pkm_twin.machine.members import Beam, Section
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

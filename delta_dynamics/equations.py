@@ -2,8 +2,6 @@
 """The equations of motion in the actuated joints, all terms of one state at once.
 
 What a simulation asks for several thousand times a second: one program, one solved closure.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
 """
 
 from __future__ import annotations
@@ -17,9 +15,9 @@ from numpy.typing import NDArray
 from delta_dynamics.virtual_work import Forces, begun, mass_entries, potential
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.engine import Traced
+from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import loaded_joints
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -92,7 +90,7 @@ def motion_kernel(robot: Robot) -> Kernel:
 def _motion(t: Traced) -> Program:
     layout, parts = begun(t)
     bodies, rods, gravity, *_, passive = parts
-    n, graph, motion = t.joints, t.engine.graph, t.motion
+    n, graph, motion = t.joints, t.scheme.graph, t.motion
     qd = t.tape.inputs("qd", n)
     t.set_rates(qd)
     t.set_accelerations(np.zeros(n), gravity)
@@ -104,7 +102,7 @@ def _motion(t: Traced) -> Program:
         forces.pair(joint, passive[3 * k + 2] * second)
         drift.append(second)
     unknown, driven = forces.generalised()
-    bias = driven - t.jq[t.engine.kept].T @ t.lu.solve_transposed(unknown)
+    bias = driven - t.jq[t.scheme.kept].T @ t.lu.solve_transposed(unknown)
     height = potential(t, bodies, rods, gravity)
     twists: list[Any] = []
     rows: list[Any] = []

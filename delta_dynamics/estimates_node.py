@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the measured efforts tell beside the torques: the load, and who pushes.
+"""What measured efforts show in addition to the torques: the load, contacts and their place.
 
 Only the node ``delta_dynamics`` imports this module.
 """
@@ -10,19 +10,20 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import InertiaStamped, WrenchStamped
+from geometry_msgs.msg import InertiaStamped, PointStamped, WrenchStamped
 from rclpy.time import Time
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
 from delta_dynamics.contact import SIGMAS, Contact, ContactMonitor
 from delta_dynamics.feedforward import Torques
+from delta_dynamics.isolation import ContactLocator, ContactPlace
 from delta_dynamics.payload import PayloadEstimator
 from delta_dynamics.uncertainty import FRICTION, MASSES
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros import node as health
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.node import TwinNode
 
 PAYLOAD_PERIOD = 4_000_000
 """Between two samples that the payload is estimated from, ns: errors last longer."""
@@ -33,7 +34,7 @@ GAP = 0.1
 class Estimates:
     """``~/payload``, ``~/external_wrench`` and ``~/contact`` of a stream that measures efforts."""
 
-    def __init__(self, node: health.TwinNode, robot: Callable[[], Robot], frames: tuple[str, str]):
+    def __init__(self, node: TwinNode, robot: Callable[[], Robot], frames: tuple[str, str]):
         """Declare the parameters and create the topics that they ask for.
 
         :param robot: the robot as it is now.
@@ -42,6 +43,7 @@ class Estimates:
         self._node, self._robot, self._frames = node, robot, frames
         self.touching = False
         self.contacts = 0
+        self._place: ContactPlace | None = None
         self._last = 0
         self._due = 0
         known = robot()
@@ -59,6 +61,10 @@ class Estimates:
                 load.push(float(k), *motion, still)
             if self._contact is not None:
                 contact.push(float(k), motion, still)
+        if self._contact is not None:
+            locator = ContactLocator(robot)
+            locator.push(1e-3, motion[0], still, still + 1.0, still + 0.1)
+            locator.place()
 
     def _create_payload(self, robot: Robot) -> PayloadEstimator | None:
         node = self._node
@@ -104,6 +110,8 @@ class Estimates:
         self._wrench = node.create_guarded_publisher(WrenchStamped, "~/external_wrench")
         self._effort = JointPublisher(node, robot, "~/external_effort")
         self._event = node.create_guarded_publisher(Bool, "~/contact", latched=True)
+        self._body = node.create_guarded_publisher(String, "~/contact_body", latched=True)
+        self._point = node.create_guarded_publisher(PointStamped, "~/contact_point")
         return ContactMonitor(robot, bandwidth, sigmas)
 
     def warning(self) -> str:
@@ -163,14 +171,18 @@ class Estimates:
             values["drives off or braked"] = self.idle
         if self._contact is not None:
             values |= {"contact": self.touching, "contacts": self.contacts}
-            values["model uncertainty"] = "the file's" if self._contact.stated else "default"
+            if self._place is not None:
+                one = self._place
+                values["struck"] = f"{one.where}, confidence {one.confidence:.2f}"
+                values["struck body"] = f"{one.body}, {one.deviation:.2g} m along it"
+            values["model uncertainty"] = "robot file" if self._contact.stated else "default"
         if self._payload is not None:
             found = self._payload.estimate()
             value = f"{found.mass:.4g} +- {found.mass_deviation:.2g}"
             if found.asked < 0.0:
                 value += f", bounded to zero: the efforts give {found.asked:.4g}"
             values["payload estimate (kg)"] = value
-            values["payload changes seen"] = found.resets
+            values["payload changes detected"] = found.resets
         return values
 
     def _take_contact(self, core: ContactMonitor, torques: Torques, effort: Any) -> None:
@@ -185,6 +197,20 @@ class Estimates:
             self.touching = found.touching
             self.contacts += found.touching
             self._event.publish(Bool(data=found.touching))
+        if found.place is not self._place:
+            self._publish_place(torques.stamp, found.place)
+
+    def _publish_place(self, stamp: int, place: ContactPlace | None) -> None:
+        before, self._place = self._place, place
+        where = "" if place is None else place.where
+        if where != ("" if before is None else before.where):
+            self._body.publish(String(data=where))
+        if place is not None:
+            message = PointStamped()
+            message.header.stamp = Time(nanoseconds=stamp).to_msg()
+            message.header.frame_id = self._frames[0]
+            message.point.x, message.point.y, message.point.z = place.point.tolist()
+            self._point.publish(message)
 
     def _publish_contact(self, stamp: int, found: Contact) -> None:
         message = WrenchStamped()

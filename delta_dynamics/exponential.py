@@ -4,8 +4,6 @@
 The exponential method of order four of Cox and Matthews (2002, Exponential time differencing for
 stiff systems) for q' = v, v' = n(q, v) - d v with d >= 0; without damping it is the classical
 method for second-order equations.
-
-May import: numpy; never rclpy.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The feedforward node's core: messages in, checked efforts out. Pure: time is an argument.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
-"""
+"""The feedforward node's core: messages in, checked efforts out. Pure: time is an argument."""
 
 from __future__ import annotations
 
@@ -19,16 +16,15 @@ from delta_dynamics.rest import friction_reach, moving_rates
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import (
-    SECOND,
+from pkm_twin.messages.reading import (
     ExtraJoints,
     JointReader,
     JointSample,
-    StampRules,
     Trajectory,
     as_message_error,
 )
+from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow

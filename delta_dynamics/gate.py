@@ -3,8 +3,6 @@
 
 A command of plain numbers has no stamp, so a controller that takes it cannot tell a live torque
 from the last word of a dead process. This is the last place that can. Pure: times are arguments.
-
-May import: numpy, pkm_twin's core, delta_dynamics' model, the standard library.
 """
 
 from __future__ import annotations
@@ -18,8 +16,9 @@ from numpy.typing import NDArray
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, JointReader, StampRules
+from pkm_twin.messages.reading import JointReader
+from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.wrench import counting
 

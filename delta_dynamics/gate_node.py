@@ -17,12 +17,13 @@ from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros import node as health
+from pkm_twin.messages.intake import JointStateDecoder
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
+from pkm_twin.ros import health
 from pkm_twin.ros.changes import follow_changes
-from pkm_twin.ros.intake import JointStateDecoder
 from pkm_twin.ros.joints import CommandPublisher, JointPublisher
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 
 PAYLOAD = {
@@ -37,7 +38,7 @@ LAST_WORD = 0.5
 """How long the end waits for the controller to acknowledge the last command, s."""
 
 
-class CommandGate(health.TwinNode):
+class CommandGate(TwinNode):
     """Forwards live torques, and sends zeros or gravity from the start until they come.
 
     A process of its own: it outlives the node whose torques it forwards.
@@ -198,7 +199,7 @@ class CommandGate(health.TwinNode):
                 text = f"{name} of the robot; default: the robot file's"
                 values[name] = self.declare(name, default, text, unit=unit)
         # Not every robot's file has a place for what is not given.
-        given = {k: v for k, v in values.items() if k in self._parameter_overrides}
+        given = {k: v for k, v in values.items() if k in self.given}
         robot = _changed(robot, given)
         if settings.on_stop == "gravity":
             # Refused here where the robot has no masses; and compiled before it is needed.

@@ -10,8 +10,6 @@ A payload counts as part of the platform. Directions are unit vectors of pose ra
 units (m/s beside rad/s for the 3-PRRU), as in the paper; eta's extremes do not depend on
 that choice. Xddot = 0 is meant in the pose's own coordinates, so F_max does depend on them:
 turned by a third of a turn, the same motion has another Xddot in alpha and beta.
-
-May import: numpy, scipy, pkm_twin's core, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ from delta_dynamics.virtual_work import body_mass_matrix, mass_matrix
 from pkm_twin.codegen.arrays import doubles, finite, vectors
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.pose_grid import zero_torsion
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -3,8 +3,6 @@
 
 Of up to three coordinates every point where a minimum can be is known in closed form. Of more, what
 descents find is proven, or bettered, by a search of all directions (:mod:`.cones`).
-
-May import: numpy, scipy, this package, the standard library.
 """
 
 from __future__ import annotations

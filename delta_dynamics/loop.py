@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques in a control loop: arrays that stay where they are, and a call that fills them.
-
-May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
-"""
+"""Torques in a control loop: arrays that stay where they are, and a call that fills them."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from numpy.typing import NDArray
 
 from delta_dynamics.virtual_work import torques
 from pkm_twin.codegen.kernels import BoundCall
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

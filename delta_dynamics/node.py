@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import time
 from collections.abc import Iterator
@@ -19,68 +18,40 @@ from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
+from delta_dynamics.parameters_node import (
+    CHANGES,
+    SETTINGS,
+    changed,
+    declare_changes,
+    declare_settings,
+    prepared,
+)
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.sections import MAX_MASS
-from pkm_twin.ros import node as health
+from pkm_twin.messages.intake import JointStateDecoder, RawTrajectory
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
+from pkm_twin.ros import health
 from pkm_twin.ros.changes import follow_changes
-from pkm_twin.ros.intake import JointStateDecoder, RawTrajectory
 from pkm_twin.ros.joints import CommandPublisher, JointPublisher
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
+from pkm_twin.ros.turns import Task
 from pkm_twin.ros.wrench import SECONDS, declare_mounts, declare_wrench
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.wrench import WrenchReader
 
 LAST_WORD: Final = 0.5
 """How long the end waits for the controller to acknowledge the last command, s."""
-CHANGES = {
-    "payload.mass": ("payload", "mass"),
-    "payload.com": ("payload", "com"),
-    "payload.inertia": ("payload", "inertia"),
-    "friction.viscous": ("friction", "viscous"),
-    "friction.coulomb": ("friction", "coulomb"),
-    "friction.offset": ("friction", "offset"),
-    "gravity": ("gravity", ""),
-    "effort_limits": ("limits", "effort"),
-}
-"""Parameters of the robot that may change while the node runs, and its section and key."""
-UNITS = {
-    "payload.mass": "kg",
-    "payload.com": "m, from the platform's reference point",
-    "payload.inertia": "kg m2 about the com, 3 or 9 numbers",
-    "friction.viscous": "N m s or N s/m, one per joint",
-    "friction.coulomb": "N m or N, one per joint",
-    "friction.offset": "N m or N, one per joint",
-    "gravity": "m/s2",
-    "effort_limits": "N m or N, one per joint",
-}
-SETTINGS = {
-    "acceleration": "differentiate",
-    "differentiator.order": "order",
-    "differentiator.window": "window",
-    "limit_policy": "limit_policy",
-    "stale_after": "stale_after",
-    "future_tolerance": "future_tolerance",
-    "accept_zero_stamp": "accept_zero_stamp",
-    "trip_count": "trip_count",
-    "recovery_count": "recovery_count",
-    "extra_joints": "extra_joints",
-    "on_stop": "on_stop",
-    "singularity_warn": "singularity_warn",
-    "singularity_stop": "singularity_stop",
-}
-"""Parameters of the node that may, and their settings."""
 
 
-class DeltaDynamics(health.TwinNode):
+class DeltaDynamics(TwinNode):
     """Feedforward torques from the virtual-work model of any robot with masses."""
 
     def __init__(self) -> None:
-        super().__init__("delta_dynamics", executor="events")
+        super().__init__("delta_dynamics")
         robot = load(
             self.declare(
                 "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
@@ -88,14 +59,14 @@ class DeltaDynamics(health.TwinNode):
         )
         # Before there is a topic to be found by: the first start compiles for many seconds.
         warm_up(robot)
-        robot = _changed(robot, self._declare_changes(robot))
-        settings = self._declare_settings()
+        robot = changed(robot, declare_changes(self, robot))
+        settings = declare_settings(self)
         self._base_frame = self.declare(
             "base_frame", "base_link", "name of the fixed frame", read_only=True
         )
         self._feedforward = Feedforward(robot, settings, self._create_wrenches(settings))
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
-        if commands and "on_stop" not in self._parameter_overrides:
+        if commands and "on_stop" not in self.given:
             # A controller of plain commands holds the last one for ever.
             raise ParameterError(
                 "on_stop",
@@ -131,7 +102,12 @@ class DeltaDynamics(health.TwinNode):
             expires=lambda: self._feedforward.settings.stale_after,
         )
         self._action = self._create_action()
-        follow_changes(self, [*CHANGES, *SETTINGS], self._prepare, self._take)
+        follow_changes(
+            self,
+            [*CHANGES, *SETTINGS],
+            lambda values: prepared(values, self._feedforward.robot, self._feedforward.settings),
+            self._take,
+        )
         self._last_heard = 0
         self._measured: Any = None
         """The newest joint state that was taken."""
@@ -210,10 +186,10 @@ class DeltaDynamics(health.TwinNode):
             "payload mass": core.robot.payload.mass,
             "joint states answered": core.stream.accepted,
             "trajectories answered": core.trajectories.accepted,
-            "effort limit passed": core.saturations,
+            "effort limit exceeded": core.saturations,
             "older stamps dropped": core.dropped,
             "close to a singularity": core.near_singularities,
-            "distance to singularity": "" if measure is None else f"{measure:.4f}",
+            "singularity index": "" if measure is None else f"{measure:.4f}",
             "acceleration delay (samples)": core.differentiator_delay,
         }
         values |= {f"joint states rejected: {k}": v for k, v in core.stream.rejected.items()}
@@ -226,7 +202,7 @@ class DeltaDynamics(health.TwinNode):
             level, message = health.WARN, "contact detected: an external effort is beyond its bound"
         if core.wrenches is not None:
             taken = core.wrenches.stream
-            values["wrenches taken"] = taken.accepted
+            values["wrenches accepted"] = taken.accepted
             values["joint states without a wrench"] = core.wrenches.without
             values |= {f"wrenches rejected: {k}": v for k, v in taken.rejected.items()}
             if level == health.OK and core.wrenches.last_reject:
@@ -342,95 +318,6 @@ class DeltaDynamics(health.TwinNode):
             for name in reactions(robot, robot.inverse(robot.home()), *rest).names
         }
 
-    def _declare_changes(self, robot: Robot) -> dict[str, Any]:
-        """What is given beside the robot's file."""
-        changes = {}
-        for name, (section, key) in CHANGES.items():
-            value = getattr(robot, section)
-            value = getattr(value, key) if key else value
-            if value is None:
-                value = np.full(len(robot.joint_names), np.inf)
-            default = value.ravel().tolist() if isinstance(value, np.ndarray) else value
-            bounds: dict[str, Any] = {}
-            if name == "payload.mass":
-                bounds = {"low": 0.0, "high": MAX_MASS}
-            given = self.declare(
-                name,
-                default,
-                f"{name} of the robot; default: the robot file's",
-                unit=UNITS[name],
-                **bounds,
-            )
-            if name in self._parameter_overrides:
-                changes[name] = given
-        return changes
-
-    def _declare_settings(self) -> Settings:
-        d = Settings()
-        acceleration = self.declare(
-            "acceleration",
-            "trajectory",
-            "for messages without velocities or accelerations: trajectory rejects them, "
-            "differentiate computes them",
-            choices=("trajectory", "differentiate"),
-        )
-        counts: dict[str, Any] = {"low": 1, "high": 10**6}
-        measure: dict[str, Any] = {"low": 0.0, "high": 1.0}
-        seconds: dict[str, Any] = {"unit": "s", "high": 3600.0}
-        return Settings(
-            differentiate=acceleration == "differentiate",
-            order=self.declare(
-                "differentiator.order", d.order, "polynomial degree of the velocity",
-                low=1, high=4,
-            ),
-            window=self.declare(
-                "differentiator.window", d.window, "samples in the window", low=3, high=1000
-            ),
-            limit_policy=self.declare(
-                "limit_policy", d.limit_policy, "efforts beyond effort_limits: warn publishes, "
-                "reject rejects, clamp limits them",
-                choices=("warn", "reject", "clamp"),
-            ),
-            stale_after=self.declare(
-                "stale_after", d.stale_after, "largest age of a joint state, and longest gap "
-                "before "
-                "the stream stops", low=1e-3, **seconds,
-            ),
-            future_tolerance=self.declare(
-                "future_tolerance", d.future_tolerance, "how far time stamps may be ahead of the "
-                "clock",
-                low=0.0, **seconds,
-            ),
-            accept_zero_stamp=self.declare(
-                "accept_zero_stamp", d.accept_zero_stamp, "accept a zero stamp, as the arrival time"
-            ),
-            trip_count=self.declare(
-                "trip_count", d.trip_count, "rejected joint states in a row that stop the "
-                "stream", **counts
-            ),
-            recovery_count=self.declare(
-                "recovery_count", d.recovery_count, "accepted joint states in a row that restart "
-                "it", **counts
-            ),
-            extra_joints=self.declare(
-                "extra_joints", d.extra_joints, "joints of a trajectory that the model does not "
-                "have: reject the trajectory, or give them zero effort",
-                choices=("refuse", "zero"),
-            ),
-            on_stop=self.declare(
-                "on_stop", d.on_stop, "command sent once when the stream stops",
-                choices=("nothing", "zeros", "gravity"),
-            ),
-            singularity_warn=self.declare(
-                "singularity_warn", d.singularity_warn, "warn below this singularity "
-                "index", **measure
-            ),
-            singularity_stop=self.declare(
-                "singularity_stop", d.singularity_stop, "stop below this singularity "
-                "index", **measure
-            ),
-        )  # fmt: skip
-
     @contextmanager
     def _telling_stop(self) -> Iterator[None]:
         """Where the core stops the stream in here: log it, and send what ``on_stop`` says."""
@@ -449,7 +336,7 @@ class DeltaDynamics(health.TwinNode):
             self._feedforward.refuse_trajectory(error)
             raise
 
-    def _answer_trajectory(self, data: bytes) -> health.Task:
+    def _answer_trajectory(self, data: bytes) -> Task:
         """In steps, so that the stream is answered meanwhile."""
         try:
             raw = RawTrajectory.of(data)
@@ -547,17 +434,6 @@ class DeltaDynamics(health.TwinNode):
         if self._commands is not None:
             self._commands.publish(effort)
 
-    def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
-        core = self._feedforward
-        robot = {k: v for k, v in values.items() if k in CHANGES}
-        settings = {SETTINGS[k]: v for k, v in values.items() if k in SETTINGS}
-        if "differentiate" in settings:
-            settings["differentiate"] = settings["differentiate"] == "differentiate"
-        return (
-            _changed(core.robot, robot) if robot else core.robot,
-            dataclasses.replace(core.settings, **settings),
-        )
-
     def _take(self, prepared: tuple[Robot, Settings]) -> None:
         robot, settings = prepared
         core = self._feedforward
@@ -568,20 +444,6 @@ class DeltaDynamics(health.TwinNode):
         core.change_settings(settings)
         if settings.stale_after != before.stale_after:
             self._watch_every(settings.stale_after)
-
-
-def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
-    sections: dict[str, Any] = {}
-    for name, value in values.items():
-        section, key = CHANGES[name]
-        plain = list(value) if hasattr(value, "__len__") else value
-        if name == "payload.inertia" and len(plain) == 9:
-            plain = [plain[0:3], plain[3:6], plain[6:9]]
-        if key:
-            sections.setdefault(section, {})[key] = plain
-        else:
-            sections[section] = plain
-    return robot.changed(**sections)
 
 
 NODE = DeltaDynamics

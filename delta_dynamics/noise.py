@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much what should be zero scatters, learnt while it comes.
-
-May import: numpy, the standard library.
-"""
+"""How much what should be zero scatters, learnt while it comes."""
 
 from __future__ import annotations
 

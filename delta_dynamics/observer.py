@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wrench of the surroundings from joint states and efforts, without accelerations.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
-"""
+"""The wrench of the surroundings from joint states and efforts, without accelerations."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.codegen.arrays import finite, later, one_vector, vectors
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the platform carries, from the efforts that the model does not explain, sample by sample.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
-"""
+"""What the platform carries, from the efforts that the model does not explain, sample by sample."""
 
 from __future__ import annotations
 
@@ -16,11 +13,11 @@ from numpy.typing import NDArray
 
 from delta_dynamics.noise import Noise
 from delta_dynamics.regressor import PAYLOAD, parameter_names, regressor
-from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
+from delta_dynamics.rest import LoadShare, beyond_friction, friction_reach, moving_rates
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import later, one_vector
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import DriveWatch
 from pkm_twin.streams.rest import RestWatch
 
@@ -80,7 +77,8 @@ class PayloadEstimator:
         :param mass_range: deviation that a load's mass has before anything is known, kg.
         :param reach: the same of its centre, m.
         """
-        self.robot = robot
+        self._share = LoadShare(robot)
+        self.robot = robot = self._share.robot
         names = parameter_names(robot)
         self._columns = [names.index(f"{PAYLOAD}.{what}") for what in FOUND]
         load = robot.payload
@@ -153,26 +151,28 @@ class PayloadEstimator:
         if not self.drives.repeated:
             self._keep()
         step = time - last
-        sure = moving_rates(qd, still, self._reach)
+        sure = moving_rates(qd, still, self._reach + self._share.share)
+        effort, holds = self._share.taken_out(q, sure, effort)
+        reach = self._reach + holds
         columns = regressor(self.robot, q, sure, qdd)[:, self._columns]
         computed = inverse_dynamics(self.robot, q, sure, qdd, wrench)
         target = effort - computed + columns @ self._own
-        left = beyond_friction(target - columns @ self._solution(), still, self._reach)
+        left = beyond_friction(target - columns @ self._solution(), still, reach)
         if self._jumped(left, step):
             self.reset()
             self._last = time
             return self.estimate()
         fade = math.exp(-step / MEMORY)
-        rubs = still & (self._reach > 0.0)
+        rubs = still & (reach > 0.0)
         share = np.where(rubs, min(1.0, step / MEMORY), min(1.0, step / CORRELATION))
-        variance = self._noise.variance + np.where(rubs, self._reach**2, 0.0)
+        variance = self._noise.variance + np.where(rubs, reach**2, 0.0)
         rows = columns * (share / variance)[:, None]
         prior = np.diag(self._prior**-2.0)
         # What fades away gives place to what is known of any load.
         self._information = fade * self._information + (1 - fade) * prior + rows.T @ columns
         self._weighted = fade * self._weighted + (1 - fade) * prior @ self._own + rows.T @ target
         self._noise.advance(step)
-        left = beyond_friction(target - columns @ self._solution(), still, self._reach)
+        left = beyond_friction(target - columns @ self._solution(), still, reach)
         self._noise.learn(left, self._least**2)
         return self.estimate()
 

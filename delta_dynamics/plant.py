@@ -2,8 +2,6 @@
 """A machine that moves: its rigid bodies under efforts, with friction and stops.
 
 In the actuated joints' coordinates, so that no loop can drift open. Pure: time is a step.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 from delta_dynamics.equations import Terms
 from delta_dynamics.resistance import Law, Resistance
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

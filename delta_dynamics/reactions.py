@@ -3,29 +3,35 @@
 
 Every body's force and moment balance, A lambda = b, over what the joints can transmit; the
 actuators' efforts come out as components of lambda, independently of virtual work.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from delta_dynamics.transmission import (
+    Transmitter,
+    _columns,
+    moments,
+    needs,
+    transmission,
+    transmitters,
+)
 from delta_dynamics.virtual_work import Forces
-from pkm_twin.codegen.arrays import finite, vectors
+from pkm_twin.codegen.arrays import finite
 from pkm_twin.codegen.expressions import PARAMETERS
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
-from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.motion import cross, reaction_directions
-from pkm_twin.machine.graph import BASE, Graph, Joint, Rod
+from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import Layout
-from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -135,7 +141,7 @@ class Balance:
     by the unknowns, shape (..., joints, 6, unknowns). ``size``: of the machine, m, (...).
     """
 
-    joints: tuple[_Joint, ...]
+    joints: tuple[Transmitter, ...]
     components: tuple[str, ...]
     points: Array
     spread: Array
@@ -182,18 +188,24 @@ def balance(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Balance:
     """The balances of a motion, solved; arguments and errors as :func:`reactions`."""
-    engine = robot.massive()
-    load = np.zeros(6) if wrench is None else vectors(wrench, 6, "the wrench")
-    (bodies, rods, places, platform), status = engine.kernel("loads", _loads)(
-        robot.inertial, q, qd, qdd
-    )
+    load = np.zeros(6) if wrench is None else wrench
+    loads, status = loads_kernel(robot)(robot.inertial, q, qd, qdd, load)
     if status is not None:
-        robot.refuse_joints(status, q, (q, qd, qdd))
-    batch = np.broadcast_shapes(bodies.shape[:-1], load.shape[:-1])
-    bodies, rods, places, platform = (
-        np.broadcast_to(part, (*batch, part.shape[-1])) for part in (bodies, rods, places, platform)
-    )
-    joints = _joints(engine.graph, rods, places)
+        robot.refuse_joints(status, q, (q, qd, qdd, load))
+    found = balanced(robot, loads)
+    finite(found.value, "the motion or the wrench")
+    return found
+
+
+def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Balance:
+    """The balances of what :func:`loads_kernel` computes, also of variants of the robot.
+
+    :param strict: raise where there is no equilibrium; else ``residual`` is not below
+        ``BALANCE_BOUND`` there.
+    """
+    engine = robot.massive()
+    bodies, rods, places = loads
+    joints = transmitters(engine.graph, rods, places)
     names = tuple(dict.fromkeys(name for joint in joints for name in joint.components))
     points = np.stack([joint.point for joint in joints], -2)
     centred = points - points.mean(-2, keepdims=True)
@@ -201,16 +213,13 @@ def balance(
     # Of joints that are all in one point the machine's own size is left.
     size = np.where(size > SMALL * engine.graph.size, size, engine.graph.size)
 
-    origin, needed = _needs(engine.graph, list(engine.tree.links), bodies, rods)
-    moving = engine.graph.platform
-    needed[moving][..., :3] -= load[..., :3]
-    needed[moving][..., 3:] -= load[..., 3:] + np.cross(platform - origin[moving], load[..., :3])
-    a = _transmission(joints, names, origin, batch)
+    origin, needed = needs(engine.graph, list(engine.tree.links), bodies, rods)
+    batch = bodies.shape[:-1]
+    a = transmission(joints, names, origin, batch)
     b = np.concatenate([needed[body] for body in origin], -1)
-    moment = _moments(joints, names)
+    moment = moments(joints, names)
     with np.errstate(over="ignore", invalid="ignore"):
-        value, null, residual = _solve(a, b, moment, size)
-    finite(value, "the motion or the wrench")
+        value, null, residual = _solve(a, b, moment, size, strict=strict)
 
     spread = np.stack([_columns(joint, names, batch) for joint in joints], -3)
     return Balance(
@@ -218,30 +227,20 @@ def balance(
     )
 
 
-@dataclass(frozen=True)
-class _Joint:
-    """One joint in every sample: what its inner body can transmit to the outer one.
+def loads_kernel(robot: Robot) -> Kernel:
+    """Program of q, qd, qdd and wrench: what bodies and rods need, and where the joints are.
 
-    ``components`` names the columns of ``basis``, shape (..., 6, components): unit forces and
-    unit couples at ``point``, shape (..., 3), m. A component of the same name at two joints is
-    one unknown: a couple that passes through a body without touching its balance. ``actuated`` is
-    the component that the actuator applies, positive as q is.
+    :raises ParameterError: a robot without masses.
     """
-
-    name: str
-    inner: str
-    outer: str
-    point: Array
-    components: tuple[str, ...]
-    basis: Array
-    actuated: str | None = None
+    return robot.massive().kernel("loads", _loads)
 
 
 def _loads(t: Traced) -> Program:
-    """Where bodies, rods and joints are, and what every body needs, without a wrench.
+    """Where bodies, rods and joints are, and what every body needs of its joints.
 
     A body: origin, force, moment about it. A rod: both ends, the forces they need, the direction of
-    its pair. A joint: point, three directions, and the one across a universal joint's axes.
+    its pair. A joint: point, three directions, and the one across a universal joint's axes, or a
+    screw's pitch.
     """
     t.solve()
     layout = Layout(t.tree)
@@ -254,6 +253,7 @@ def _loads(t: Traced) -> Program:
     # Rods stand for themselves here.
     forces.inertia(bodies, np.zeros(len(graph.rods), dtype=object))
     forces.passive(passive)
+    forces.wrench(t.tape.inputs("wrench", 6))
     body_rows: list[Any] = []
     for name in t.tree.links:
         body_rows += [*motion.origin[name], *forces.force[name], *forces.moment[name]]
@@ -276,172 +276,13 @@ def _loads(t: Traced) -> Program:
             first = motion.direction(joint.inner, joint.axes[0])
             joint_rows += cross(motion.direction(joint.outer, joint.axes[1]), first).tolist()
         else:
-            joint_rows += [0.0] * 3
+            joint_rows += [joint.pitch, 0.0, 0.0]
     outputs = {
         "bodies": t.lift(body_rows),
         "rods": t.lift(rod_rows),
         "joints": t.lift(joint_rows),
-        "platform": t.lift(motion.platform()[0]),
     }
-    return Program({"q": n, "qd": n, "qdd": n}, layout.size, outputs, t.equations())
-
-
-def _joints(graph: Graph, rods: Array, places: Array) -> list[_Joint]:
-    """All joints that transmit something, those of the graph first, then the rods' ends."""
-    result = []
-    for k, joint in enumerate(graph.joints.values()):
-        if not joint.given:
-            here = places[..., 15 * k : 15 * k + 15]
-            result.append(_graph_joint(joint, here.reshape(*here.shape[:-1], 5, 3)))
-    for k, rod in enumerate(graph.rods.values()):
-        here = rods[..., 15 * k : 15 * k + 15]
-        result += _rod_joints(rod, here.reshape(*here.shape[:-1], 5, 3))
-    return result
-
-
-def _graph_joint(joint: Joint, vectors: Array) -> _Joint:
-    """Directions across its slides hold forces, those across its turns hold moments.
-
-    A screw's force along its axis comes with the moment that its thread makes of it.
-    """
-    name = joint.label or joint.name
-    freedoms = joint.freedoms
-    pair = len(joint.axes) == 2
-    forces: dict[str, Array] = {}
-    moments: dict[str, Array] = {}
-    threads: dict[str, Array] = {}
-    effort: str | None = None
-    for k, direction in enumerate(reaction_directions(joint)):
-        vector = vectors[..., 1 + k, :]
-        own = [f for f in freedoms if abs(float(f.axis @ direction.vector)) > 0.5]
-        if all(f.turns for f in own):
-            forces[direction.name] = vector
-            screws = [f.slide for f in own if f.slide]
-            if screws:
-                threads[direction.name] = -screws[0] * vector
-        # The directions of two axes stand in their plane, whose normal is held.
-        if not pair and not any(f.turns for f in own):
-            moments[direction.name] = vector
-        if joint.actuated and own:
-            table, what = (moments, "moment") if own[0].turns else (forces, "force")
-            table[direction.name] = vector * np.sign(own[0].axis @ direction.vector)
-            effort = f"{name}: {what} along {direction.name}"
-    if pair:
-        normal = vectors[..., 4, :]
-        moments[joint.normal] = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-    return _joint(
-        name, (joint.inner, joint.outer), vectors[..., 0, :], forces, moments, effort,
-        threads=threads,
-    )  # fmt: skip
-
-
-def _rod_joints(rod: Rod, vectors: Array) -> list[_Joint]:
-    """Ball joints at both ends.
-
-    A parallelogram's two equal thin rods, side by side along t: their end forces add up to one
-    force at each end; the difference of the two axial forces is a couple along e = t x w that
-    passes from the inner to the outer body, the same at both ends, whatever the distance of the
-    rods. The rods' spin about themselves is idle.
-    """
-    start, end, pair = vectors[..., 0, :], vectors[..., 1, :], vectors[..., 4, :]
-    couple: dict[str, Array] = {}
-    if rod.pair is None:
-        forces = {c: np.broadcast_to(np.eye(3)[i], start.shape) for i, c in enumerate("xyz")}
-    else:
-        w = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
-        e = np.cross(pair, w)
-        e /= np.linalg.norm(e, axis=-1, keepdims=True)
-        forces = {"w": w, "e": e, "w x e": np.cross(w, e)}
-        couple = {f"{rod.label or rod.name}: moment along e": e}
-    inner, outer = rod.joint_names
-    return [
-        _joint(inner, (rod.inner, rod.name), start, forces, {}, None, couple),
-        _joint(outer, (rod.name, rod.outer), end, forces, {}, None, couple),
-    ]
-
-
-def _joint(
-    name: str,
-    bodies: tuple[str, str],
-    point: Array,
-    forces: Mapping[str, Array],
-    moments: Mapping[str, Array],
-    effort: str | None,
-    passed: Mapping[str, Array] | None = None,
-    threads: Mapping[str, Array] | None = None,
-) -> _Joint:
-    """A joint from unit directions, shape (..., 3).
-
-    ``passed``: couples shared with another; ``threads``: moments that come with a force.
-    """
-    names = [f"{name}: force along {key}" for key in forces]
-    names += [f"{name}: moment along {key}" for key in moments]
-    couples = [*moments.values(), *(passed or {}).values()]
-    names += list(passed or {})
-    count = len(forces)
-    basis = np.zeros((*point.shape[:-1], 6, len(names)))
-    for k, (key, direction) in enumerate(forces.items()):
-        basis[..., :3, k] = direction
-        basis[..., 3:, k] = (threads or {}).get(key, 0.0)
-    for k, direction in enumerate(couples):
-        basis[..., 3:, count + k] = direction
-    return _Joint(name, *bodies, point, tuple(names), basis, effort)
-
-
-def _needs(
-    graph: Graph, names: Sequence[str], bodies: Array, rods: Array
-) -> tuple[dict[str, Array], dict[str, Array]]:
-    """A point of each body and rod, and the wrench about it that joints have to apply."""
-    origin: dict[str, Array] = {}
-    needed: dict[str, Array] = {}
-    for k, name in enumerate(names):
-        origin[name] = bodies[..., 9 * k : 9 * k + 3]
-        needed[name] = bodies[..., 9 * k + 3 : 9 * k + 9].copy()
-    for k, name in enumerate(graph.rods):
-        start, end, first, second = (rods[..., 15 * k + 3 * i :][..., :3] for i in range(4))
-        origin[name] = (start + end) / 2
-        couple = np.cross((end - start) / 2, second - first)
-        needed[name] = np.concatenate([first + second, couple], -1)
-    return origin, needed
-
-
-def _columns(joint: _Joint, names: tuple[str, ...], batch: tuple[int, ...]) -> Array:
-    """The joint's wrench basis over all unknowns, shape (..., 6, unknowns)."""
-    result = np.zeros((*batch, 6, len(names)))
-    result[..., [names.index(name) for name in joint.components]] = joint.basis
-    return result
-
-
-def _moments(joints: Sequence[_Joint], names: tuple[str, ...]) -> Mask:
-    """Which unknowns are moments, shape (unknowns,)."""
-    result = np.zeros(len(names), bool)
-    for joint in joints:
-        pure = np.logical_not(np.any(joint.basis[..., :3, :], -2))
-        for k, name in enumerate(joint.components):
-            result[names.index(name)] = bool(np.all(pure[..., k]))
-    return result
-
-
-def _transmission(
-    joints: Sequence[_Joint],
-    names: tuple[str, ...],
-    origin: dict[str, Array],
-    batch: tuple[int, ...],
-) -> Array:
-    """Wrench on each body about its own point per unknown, shape (..., 6 bodies, unknowns)."""
-    result = np.zeros((*batch, len(origin), 6, len(names)))
-    order = list(origin)
-    for joint in joints:
-        columns = _columns(joint, names, batch)
-        for body, sign in ((joint.inner, -1.0), (joint.outer, 1.0)):
-            if body == BASE:
-                continue
-            lever = joint.point - origin[body]
-            shifted = np.cross(lever[..., None, :], columns[..., :3, :].swapaxes(-1, -2))
-            on_body = result[..., order.index(body), :, :]
-            on_body += sign * columns
-            on_body[..., 3:, :] += sign * shifted.swapaxes(-1, -2)
-    return result.reshape(*batch, 6 * len(origin), len(names))
+    return Program({"q": n, "qd": n, "qdd": n, "wrench": 6}, layout.size, outputs, t.equations())
 
 
 def _unit(moment: Mask, size: Array) -> Array:
@@ -449,7 +290,9 @@ def _unit(moment: Mask, size: Array) -> Array:
     return np.where(moment, size[..., None], 1.0)
 
 
-def _solve(a: Array, b: Array, moment: Mask, size: Array) -> tuple[Array, Array, Array]:
+def _solve(
+    a: Array, b: Array, moment: Mask, size: Array, *, strict: bool
+) -> tuple[Array, Array, Array]:
     """Least-norm solution, orthonormal null space and relative imbalance.
 
     Moments and lengths are divided by the mechanism's size, so that all numbers are forces. The
@@ -469,7 +312,7 @@ def _solve(a: Array, b: Array, moment: Mask, size: Array) -> tuple[Array, Array,
     left = right - np.einsum("...rk,...k->...r", matrix, value)
     scale = np.maximum(np.abs(right).max(-1), np.finfo(np.float64).tiny)
     residual = np.asarray(np.abs(left).max(-1) / scale, np.float64).reshape(batch)
-    if (residual > BALANCE_BOUND).any():
+    if strict and (residual > BALANCE_BOUND).any():
         index = tuple(int(i) for i in np.argwhere(residual > BALANCE_BOUND)[0])
         s = np.linalg.svd(matrix.reshape(*batch, equations, unknowns)[index], compute_uv=False)
         measure = float(s[-1] / s[0])

@@ -4,8 +4,6 @@
 tau = Y(q, qd, qdd) pi: a column of Y is the efforts that a unit of one parameter needs, by the
 principle of virtual work: its force on the body that has it, times how that body moves with each
 actuated joint.
-
-May import: numpy, pkm_twin's core, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -20,16 +18,20 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics.virtual_work import Forces
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.engine import Traced
+from pkm_twin.kinematics.traced import Traced
+from pkm_twin.machine.friction import friction_values, linear_keys, taken
 from pkm_twin.machine.graph import Joint, Rod
 from pkm_twin.machine.inertia import TEN, loaded_joints, ten_numbers, transport
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.shared import TEN_UNITS, drive_units
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
 DRIVE: Final = ("viscous", "coulomb", "offset", "rotor_inertia")
-"""An actuated joint's parameters; a passive one that is loaded has no offset."""
+"""An actuated joint's parameters; a passive one that is loaded has no offset.
+
+Then come those of its drive's other friction laws that efforts are linear in.
+"""
 PAYLOAD: Final = "payload"
 WRENCH: Final = "wrench"
 """Name of the last column: the share of the given wrench, whose value is 1."""
@@ -65,6 +67,8 @@ def parameter_values(robot: Robot) -> Array:
     for k, name in enumerate(graph.actuated):
         rub = [friction.viscous[k], friction.coulomb[k], friction.offset[k]]
         values += [*rub, graph.joints[name].rotor_inertia]
+    for key in law_keys(robot):
+        values += [*getattr(friction, key)]
     for joint in loaded_joints(graph):
         values += [joint.viscous, joint.coulomb, joint.rotor_inertia]
     return np.array([*values, 1.0])
@@ -75,9 +79,11 @@ def regressor(
 ) -> Array:
     """The regressor Y of the efforts of a motion: Y pi = inverse_dynamics, exactly.
 
-    It depends only on the robot's geometry, gravity and the set of loaded passive joints. pi is
-    :func:`parameter_values`, or other values. The last column is the effort due to the wrench (zero
-    without one); the value of its parameter is 1.
+    It depends only on the robot's geometry, gravity and the set of loaded passive joints, and on
+    the robot's own values where its drives' friction laws are not linear: a Stribeck speed, a
+    cogging's period, and the load that friction grows with. pi is :func:`parameter_values`, or
+    other values. The last column is the effort due to the wrench (zero without one); the value of
+    its parameter is 1.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param qd: joint rates, shape (..., n).
@@ -107,9 +113,38 @@ def regressor(
         other[..., :rods],
         platform @ transport(np.eye(3), lever),
         _drive_columns(rates, changes),
-        other[..., rods:],
     ]
-    return np.concatenate(parts, -1)
+    if not robot.laws:
+        return np.concatenate([*parts, other[..., rods:]], -1)
+    values = parameter_values(robot)
+    passive = other[..., rods:]
+    free = values.copy()
+    basic = sum(part.shape[-1] for part in parts)
+    free[basic - len(DRIVE) * n : basic].reshape(n, -1)[:, :3] = 0.0
+    inner = passive @ free[-passive.shape[-1] :]
+    load = np.concatenate(parts, -1) @ free[:basic] + inner
+    laws = law_columns(robot, np.broadcast_to(np.asarray(q, np.float64), rates.shape), rates, load)
+    return np.concatenate([*parts, laws, passive], -1)
+
+
+def law_keys(robot: Robot) -> tuple[str, ...]:
+    """Parameters of the drives' friction laws that efforts are linear in, less the basic ones."""
+    return tuple(key for key in linear_keys(robot.laws) if key not in DRIVE)
+
+
+def law_columns(robot: Robot, q: Array, qd: Array, load: Array) -> Array:
+    """Efforts by units of :func:`law_keys`, joint by joint for each, shape (..., n, keys n).
+
+    :param load: efforts of the drives without friction, shape (..., n). All shape (..., n).
+    """
+    n, keys = robot.joints_count, law_keys(robot)
+    values = friction_values(robot.laws, robot.friction)
+    columns = np.zeros((*qd.shape, len(keys), n))
+    for i, key in enumerate(keys):
+        unit = values | {other: np.full(n, float(other == key)) for other in keys}
+        own = taken(robot.laws, unit, q, qd, load)
+        columns[..., np.arange(n), i, np.arange(n)] = own
+    return columns.reshape(*qd.shape, -1)
 
 
 def _body_columns(motion: Array, n: int) -> Array:
@@ -165,6 +200,12 @@ def _columns(robot: Robot) -> list[tuple[str, str]]:
     result += [(f"{name}.mass", "kg") for name in graph.rods]
     result += ten(PAYLOAD)
     result += [column for name in graph.actuated for column in joint(name, DRIVE)]
+    result += [
+        column
+        for key in law_keys(robot)
+        for name in graph.actuated
+        for column in joint(name, [key])
+    ]
     passive = tuple(what for what in DRIVE if what != "offset")
     result += [column for j in loaded_joints(graph) for column in joint(j.name, passive)]
     return [*result, (WRENCH, "1")]
@@ -197,16 +238,12 @@ def _regressor(t: Traced) -> Program:
             for speed, omega in twists
         ]
 
-    def pull(forces: Forces) -> None:
-        forces.push(graph.platform, graph.origin, -wrench[:3])
-        forces.moment[graph.platform] = forces.moment[graph.platform] - wrench[3:]
-
     columns = [powers(partial(_rod, rod), rod.inner, rod.outer) for rod in graph.rods.values()]
     for joint in loaded_joints(graph):
         columns += [
             powers(partial(_joint, joint, three), joint.inner, joint.outer) for three in np.eye(3)
         ]
-    columns.append(powers(pull, graph.platform))
+    columns.append(powers(lambda forces: forces.wrench(wrench), graph.platform))
     others = [column[j] for j in range(n) for column in columns]
     sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
     return Program(sizes, 3, {"bodies": t.lift(bodies), "others": t.lift(others)}, t.equations())

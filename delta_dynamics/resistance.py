@@ -2,8 +2,6 @@
 """Which joints of a machine stick, slide or stand at their stops, and what follows for its motion.
 
 Rows are the actuated joints, then the passive ones that have friction or a rotor.
-
-May import: numpy, scipy, pkm_twin's core, this package; never rclpy.
 """
 
 from __future__ import annotations
@@ -19,8 +17,9 @@ from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 from delta_dynamics.complementarity import States, first_fall, independent, resisting
 from delta_dynamics.equations import Equations, Terms
 from delta_dynamics.exponential import Stepper, damped, undamped
+from pkm_twin.machine.friction import bounds, friction_values, parts, potential
 from pkm_twin.machine.inertia import loaded_joints
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -85,17 +84,54 @@ class Resistance:
         self._damped = bool(self._viscous.any() or self._inner.any())
         self._passive = bool(passive)
         self._dry = np.array([*friction.coulomb, *(joint.coulomb for joint in passive)])
+        self._laws, self._numbers = robot.laws, friction_values(robot.laws, robot.friction)
         self._rubs = self._dry > 0.0
+        if self._laws:
+            _, dry, share = parts(self._laws, self._numbers, robot.graph.home, np.zeros(n))
+            self._rubs[:n] |= (dry > 0.0) | (share > 0.0)
         limits = robot.limits.position
         limits = np.tile([-math.inf, math.inf], (n, 1)) if limits is None else limits
         self._low, self._high = limits[:, 0].copy(), limits[:, 1].copy()
         self._equations = Equations(robot)
-        self.at = self._equations.at
         self._drives = np.eye(n)
         self._still = np.zeros(len(self._dry), bool)
         self._states: States = np.zeros(len(self._dry), np.int8)
         """Of a row that slides which way, of one that is still the state of its force."""
         self._law: Law | None = None
+
+    def at(self, q: Array, qd: Array) -> Terms:
+        """Terms of a state, with what the drives' friction laws take by position alone.
+
+        Errors as of :meth:`Equations.at`.
+        """
+        here = self._equations.at(q, qd)
+        if not self._laws:
+            return here
+        at_place = parts(self._laws, self._numbers, q, np.zeros_like(q))[0]
+        energy = float(np.sum(potential(self._laws, self._numbers, q)))
+        return here._replace(bias=here.bias + at_place, potential=here.potential + energy)
+
+    def _bounds(self, here: Terms, given: Array) -> tuple[Array, Array]:
+        """Least and greatest dry friction of all rows at a state, shape (n + k,).
+
+        :param given: efforts of the drives, less their offset, shape (n,).
+        """
+        low, high = -self._dry, self._dry.copy()
+        if self._laws:
+            n = len(given)
+            at_place, dry, share = parts(self._laws, self._numbers, here.q, np.abs(here.qd))
+            held = given - at_place - self._viscous * here.qd
+            low[:n], high[:n] = bounds(held, self._dry[:n] + dry, share)
+        return low, high
+
+    def _pull(self, law: Law, here: Terms) -> Array:
+        """Dry friction of all rows at a state; of what is still as it is, shape (n + k,)."""
+        if not self._laws:
+            return law.pull
+        low, high = self._bounds(here, law.given)
+        pull = law.pull.copy()
+        pull[law.slides] = np.where(law.signs > 0.0, high[law.slides], low[law.slides])
+        return pull
 
     # Rows.
 
@@ -165,7 +201,7 @@ class Resistance:
         resists = still & self._rubs
         resists[:n] |= up | down
         if resists.any():
-            low, high = -self._dry, self._dry.copy()
+            low, high = self._bounds(here, law.given)
             high[:n][up] = math.inf
             low[:n][down] = -math.inf
             self._hold(law, here, np.flatnonzero(resists), low, high)
@@ -203,12 +239,17 @@ class Resistance:
     def _load(self, law: Law, here: Terms, effort: Array, wrench: Array | None) -> None:
         law.given, law.wrench = effort - self._offset, wrench
         law.effort = law.given - law.pull[: len(effort)]
+        if self._laws and len(law.held):
+            # What friction can hold grows with the load.
+            low, high = (one[law.held] for one in self._bounds(here, law.given))
+            law.low = np.where(np.isfinite(law.low), low, law.low)
+            law.high = np.where(np.isfinite(law.high), high, law.high)
         law.first, law.force = self.accelerate(law, here)
 
     def accelerate(self, law: Law, here: Terms) -> tuple[Array, Array]:
         """Accelerations at a state, shape (n,), and the forces that hold, shape (h,)."""
-        n, h = len(law.effort), len(law.held)
-        rest = law.effort - here.bias
+        n, h, pull = len(law.effort), len(law.held), self._pull(law, here)
+        rest = (law.given - pull[:n] if self._laws else law.effort) - here.bias
         if law.wrench is not None:
             rest = rest + law.wrench @ here.twists
         if self._passive:
@@ -266,7 +307,7 @@ class Resistance:
         rest = law.given - here.bias + (0.0 if law.wrench is None else law.wrench @ here.twists)
         rates = inverse @ (here.mass @ here.qd + span * rest)
         up, down = here.q >= self._high, here.q <= self._low
-        low, high = -span * self._dry, span * self._dry
+        low, high = (span * one for one in self._bounds(here, law.given))
         high[:n][up] = math.inf
         low[:n][down] = -math.inf
         resists = self._rubs.copy()
@@ -342,7 +383,8 @@ class Resistance:
     def _rounding(self, here: Terms, law: Law, force: Array, span: float) -> Array:
         """What rounding makes of the signals of :meth:`change`."""
         rows = self.rows(here)[law.slides]
-        own = np.einsum("ij,jk,ik->i", rows, _inverse(here.mass), rows) * self._dry[law.slides]
+        own = np.einsum("ij,jk,ik->i", rows, _inverse(here.mass), rows)
+        own = own * np.abs(self._pull(law, here)[law.slides])
         q = 1e-3 * np.abs(here.q[law.moves])
         force = np.maximum(np.abs(force), np.abs(law.force))
         rates = np.abs(rows) @ np.abs(here.qd) + span * own

@@ -3,8 +3,6 @@
 
 At rest friction is whatever holds the joint, up to the joint's dry friction either way. The model
 gives none there, and what it is compared with may differ by the reach of friction.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
 """
 
 from __future__ import annotations
@@ -16,7 +14,8 @@ from numpy.typing import NDArray
 
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.friction import LoadDependent, friction_values, load_of, parts
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -50,6 +49,37 @@ def friction_reach(robot: Robot) -> Array:
     # Viscous friction doubles with the rates.
     reach = 2.0 * odd(SLOW) - odd(2.0 * SLOW)
     return np.where(reach > SEEN * (1.0 + size), reach, 0.0)
+
+
+class LoadShare:
+    """Takes the friction that grows with the load out of measured efforts.
+
+    What a payload or a contact adds to the load adds to this friction, too: by the known load alone
+    an estimate would be wrong by its share. ``robot``: without that law, which explains the efforts
+    that are left. ``share``: of the load, shape (n,).
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._given = self.robot = robot
+        self.share = np.zeros(robot.joints_count)
+        if LoadDependent.name in robot.laws:
+            self.share = friction_values(robot.laws, robot.friction)["load_dependent"]
+            self.robot = robot.changed(friction={"load_dependent": (0.0 * self.share).tolist()})
+
+    def taken_out(self, q: Array, rates: Array, effort: Array) -> tuple[Array, Array]:
+        """Efforts without this friction, and what it may hold of a joint at rest, (n,) each.
+
+        :param rates: zero at rest.
+        """
+        if self.robot is self._given:
+            return effort, self.share
+        laws, own = self._given.laws, self._given.friction
+        way = np.sign(rates)
+        at_place, dry, share = parts(laws, friction_values(laws, own), q, np.abs(rates))
+        held = effort - own.viscous * rates - own.offset - at_place
+        load = load_of(held - (own.coulomb + dry) * way, share, way)
+        holds = np.where(way == 0.0, share / (1.0 - share) * np.abs(held), 0.0)
+        return effort - share * np.abs(load) * way, holds
 
 
 def moving_rates(qd: Array, still: Flags, reach: Array) -> Array:

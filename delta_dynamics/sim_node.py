@@ -32,12 +32,13 @@ from delta_dynamics.simulation import (
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.variation import KINDS, MAX_SPREAD, Variation, varied
-from pkm_twin.ros import node as health
-from pkm_twin.ros.intake import DoublesTemplate, RawTrajectory
+from pkm_twin.messages.intake import DoublesTemplate, RawTrajectory
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.variation import KINDS, MAX_SPREAD, Variation, varied
+from pkm_twin.ros import health
 from pkm_twin.ros.joints import FIELDS, JointPublisher
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 OWN_CLOCK: Final = "false, because machine_sim has its own clock"
 
 
-class MachineSim(health.TwinNode):
+class MachineSim(TwinNode):
     """A robot's drives and sensors, its motion simulated."""
 
     def __init__(self) -> None:
@@ -134,11 +135,11 @@ class MachineSim(health.TwinNode):
         values: dict[str, object] = {
             "robot": sim.robot.name,
             "time (s)": f"{sim.time:.3f}",
-            "effort commands taken": sim.stream.accepted,
-            "trajectories taken": sim.trajectories.accepted,
-            "effort limit passed": sim.saturations,
+            "effort commands accepted": sim.stream.accepted,
+            "trajectories accepted": sim.trajectories.accepted,
+            "effort limit exceeded": sim.saturations,
             "payload mass": sim.plant.robot.payload.mass,
-            "times behind the clock": self._skipped,
+            "delays skipped": self._skipped,
         }
         values |= {f"effort commands rejected: {k}": v for k, v in sim.stream.rejected.items()}
         values |= {f"trajectories rejected: {k}": v for k, v in sim.trajectories.rejected.items()}

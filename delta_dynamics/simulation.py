@@ -3,8 +3,6 @@
 
 Times are integers in nanoseconds by the machine's own clock, which :meth:`Simulation.advance`
 alone moves. Pure: messages are read by their attributes.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
 """
 
 from __future__ import annotations
@@ -19,15 +17,9 @@ from numpy.typing import NDArray
 from delta_dynamics.plant import Plant
 from delta_dynamics.virtual_work import mass_matrix
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import (
-    MAX_RATE,
-    SECOND,
-    JointReader,
-    StampRules,
-    as_message_error,
-    read_wrench,
-)
+from pkm_twin.messages.reading import MAX_RATE, JointReader, as_message_error, read_wrench
+from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.path import JointPath
 from pkm_twin.streams.wrench import counting

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The actuator efforts by cause: gravity, inertia, velocity, payload, friction, external wrench.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
-"""
+"""The actuator efforts by cause: gravity, inertia, velocity, payload, friction, external wrench."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics.virtual_work import torques
 from pkm_twin.codegen.arrays import vectors
 from pkm_twin.machine.inertia import GRAVITY, Layout
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -50,7 +47,7 @@ def frictionless(
 
     :param weight: False leaves gravity out, too.
     """
-    layout = Layout(robot.engine.tree)
+    layout = Layout(robot.massive().tree)
     p = _without(robot.inertial, layout.friction)
     if not weight:
         p = _without(p, layout.part(GRAVITY))
@@ -76,7 +73,8 @@ def dynamics_terms(
     Each term is the inverse dynamics (virtual work; Delta-CU paper, step 4; 3-PRRU paper, equation
     41) with the other causes set to zero. The terms of payload and friction are differences of the
     efforts with and without them. This is exact because the efforts are linear in gravity, qdd, the
-    masses, the friction coefficients and the wrench.
+    masses, the basic friction's coefficients and the wrench; other friction laws are the difference
+    of all efforts with and without friction.
 
     :param q: joint positions, shape (..., n), rad or m.
     :param qd: joint rates, shape (..., n).
@@ -104,7 +102,7 @@ def dynamics_terms(
             robot.refuse_joints(status, place, (qd, qdd, wrench))
         return tau
 
-    layout = Layout(robot.engine.tree)
+    layout = Layout(robot.massive().tree)
 
     held = _without(robot.inertial, layout.friction)
     empty = _without(robot.own_inertial, layout.friction)
@@ -112,11 +110,16 @@ def dynamics_terms(
     rubbing = _without(robot.own_inertial, layout.part(GRAVITY))
 
     velocity = efforts(weightless, rate, still, none)
+    friction = efforts(rubbing, rate, still, none) - velocity
+    if robot.laws:
+        # It may grow with the load of the motion itself.
+        whole = (efforts(p, rate, change, load) for p in (robot.inertial, held))
+        friction = next(whole) - next(whole)
     return Terms(
         gravity=efforts(empty, still, still, none),
         inertia=efforts(weightless, still, change, none),
         velocity=velocity,
         payload=efforts(held, rate, change, none) - efforts(empty, rate, change, none),
-        friction=efforts(rubbing, rate, still, none) - velocity,
+        friction=friction,
         external=efforts(weightless, still, still, load),
     )

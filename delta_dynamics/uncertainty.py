@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How sure the efforts are, by what the robot's file says of its numbers.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
-"""
+"""How sure the efforts are, by what the robot's file says of its numbers."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.derivatives import torque_effects
 from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -90,4 +87,4 @@ def torque_deviation(
     if not robot.uncertainty:
         return np.zeros_like(inverse_dynamics(robot, q, qd, qdd, wrench))
     effects = torque_effects(robot, q, qd, qdd, wrench)
-    return np.asarray(np.sqrt(np.einsum("...k,...k->...", effects, effects)), np.float64)
+    return np.asarray(np.sqrt((effects * effects).sum(-1)), np.float64)

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid-body dynamics by virtual work, for every machine with masses.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
-"""
+"""Rigid-body dynamics by virtual work, for every machine with masses."""
 
 from __future__ import annotations
 
@@ -15,14 +12,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import vectors
 from pkm_twin.codegen.cholesky import SparseCholesky
-from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, maximum, minimum, sign
+from pkm_twin.codegen.expressions import (
+    PARAMETERS,
+    Numbers,
+    Objects,
+    absolute,
+    maximum,
+    minimum,
+    sign,
+)
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.motion import Motion, cross
+from pkm_twin.kinematics.traced import Traced
+from pkm_twin.machine import friction
 from pkm_twin.machine.graph import BASE, Joint, Rod
-from pkm_twin.machine.inertia import Layout, loaded_joints
-from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.inertia import LAW_VALUES, ROTORS, Layout, loaded_joints
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -262,6 +268,12 @@ class Forces:
             self.force[body] = self.force[body] + force
             self.moment[body] = self.moment[body] + cross(at - m.origin[body], force)
 
+    def wrench(self, six: Objects) -> None:
+        """A wrench on the platform at its reference point: what it bears is not needed."""
+        graph = self.motion.graph
+        self.push(graph.platform, graph.origin, -six[:3])
+        self.moment[graph.platform] = self.moment[graph.platform] - six[3:]
+
     def generalised(self) -> tuple[Objects, Objects]:
         """Down the tree: generalised forces of the unknown rates and of the actuated joints."""
         m, tree = self.motion, self.motion.tree
@@ -306,25 +318,40 @@ def begun(t: Traced) -> tuple[Layout, list[Objects]]:
 
 def _efforts(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[Any]:
     """Efforts for a motion under the input ``wrench``."""
-    bodies, rods, gravity, viscous, coulomb, offset, rotors, passive = parts
+    rotors = parts[ROTORS]
+    loads, basic = _loads(t, parts, qd, qdd), _basic_friction(parts, qd)
+    efforts = [loads[k] + basic[k] + rotors[k] * qdd[k] for k in range(t.joints)]
+    for k, values in enumerate(_laws_of(t, parts)):
+        load = loads[k] + rotors[k] * qdd[k]
+        efforts[k] = efforts[k] + friction.taken(t.graph.laws, values, t.q[k], qd[k], load)
+    return efforts
+
+
+def _basic_friction(parts: list[Objects], qd: Objects) -> list[Any]:
+    """Viscous and Coulomb friction and the constant effort of each drive."""
+    rows = zip(*parts[3:6], qd, strict=True)
+    return [viscous * v + coulomb * sign(v) + offset for viscous, coulomb, offset, v in rows]
+
+
+def _laws_of(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
+    """By drive the parameters of its other friction laws; none where there is no law."""
+    laws = Layout(t.tree).laws(parts[LAW_VALUES])
+    return [{key: v[k] for key, v in laws.items()} for k in range(t.joints if laws else 0)]
+
+
+def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects) -> list[Any]:
+    """Efforts without the drives' friction and rotors."""
+    bodies, rods, gravity, *_, passive = parts
     wrench = t.tape.inputs("wrench", 6)
     t.set_rates(qd)
     t.set_accelerations(qdd, gravity)
     forces = Forces(t.motion)
     forces.inertia(bodies, rods)
     forces.passive(passive)
-    graph = t.graph
-    forces.push(graph.platform, graph.origin, -wrench[:3])
-    forces.moment[graph.platform] = forces.moment[graph.platform] - wrench[3:]
+    forces.wrench(wrench)
     unknown, driven = forces.generalised()
     multipliers = t.lu.solve_transposed(unknown)
-    efforts = driven - t.jq[t.engine.kept].T @ multipliers
-    return [
-        efforts[k]
-        + (viscous[k] * qd[k] + coulomb[k] * sign(qd[k]) + offset[k])
-        + rotors[k] * qdd[k]
-        for k in range(t.joints)
-    ]
+    return list(driven - t.jq[t.scheme.kept].T @ multipliers)
 
 
 def torque_program(t: Traced) -> Program:
@@ -339,7 +366,16 @@ def torque_program(t: Traced) -> Program:
 def _accelerations(t: Traced) -> Program:
     layout, parts = begun(t)
     n = t.joints
-    rest = t.tape.inputs("tau", n) - _efforts(t, parts, t.tape.inputs("qd", n), np.zeros(n))
+    qd, tau = t.tape.inputs("qd", n), t.tape.inputs("tau", n)
+    rest = tau - _efforts(t, parts, qd, np.zeros(n))
+    laws = _laws_of(t, parts)
+    if laws:
+        loads, basic = _loads(t, parts, qd, np.zeros(n)), _basic_friction(parts, qd)
+        for k, values in enumerate(laws):
+            at_place, dry, share = friction.parts(t.graph.laws, values, t.q[k], absolute(qd[k]))
+            way = sign(qd[k])
+            driving = tau[k] - basic[k] - at_place - dry * way
+            rest[k] = friction.load_of(driving, share, way) - loads[k]
     mass = np.reshape(mass_entries(t, parts), (n, n))
     lower = {(i, j): mass[i, j] for i in range(n) for j in range(i + 1)}
     root = SparseCholesky(lower, list(np.diag(mass)))

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 message definitions: the fields of a type, from its text or from the message classes.
-
-May import: the standard library, errors.
-"""
+"""ROS 2 message definitions: the fields of a type, from its text or from the message classes."""
 
 from __future__ import annotations
 

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers of a machine from recordings, and whether the recordings fit the machine at all.
 
+:mod:`~pkm_twin.identification.fit` fits masses, friction and rotors to efforts,
+:mod:`~pkm_twin.identification.elastic_fit` compliances to deflections,
+:mod:`~pkm_twin.identification.calibration` geometry and offsets to poses,
+:mod:`~pkm_twin.identification.partial` the same to single quantities of poses, which
+:mod:`~pkm_twin.identification.plan` chooses;
+:mod:`~pkm_twin.identification.excitation` designs motions that identify.
 :mod:`~pkm_twin.identification.verdict` judges a fit by its residual,
 :mod:`~pkm_twin.identification.plausible` judges a recording before it is fitted,
 :mod:`~pkm_twin.identification.robust` weighs measured poses.
-
-May import: numpy, scipy, pkm_twin's core, the standard library. Nothing of the applications.
 """

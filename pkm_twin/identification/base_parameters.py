@@ -4,8 +4,6 @@
 The base parameters of a closed chain hang on its loops: they are found numerically, by a pivoted
 QR factorisation of the regressor (Gautier, Numerical calculation of the base inertial parameters
 of robots, 1991, doi:10.1002/rob.4620080405).
-
-May import: numpy, scipy, pkm_twin's core, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -26,8 +24,8 @@ from delta_dynamics.regressor import (
     parameter_values,
     regressor,
 )
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.schema import frozen
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

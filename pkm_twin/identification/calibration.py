@@ -15,7 +15,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.calibration_faults import (
+from pkm_twin.design import programs
+from pkm_twin.design.variants import Variants
+from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
+from pkm_twin.identification.calibration_faults import (
     HALF,
     MOVED,
     Fault,
@@ -27,8 +30,15 @@ from pkm_twin.apps.calibration_faults import (
     outliers_of,
     place_fault,
 )
-from pkm_twin.apps.calibration_fit import KNOWN, Parameter, UnsettledError, derivatives, fit
-from pkm_twin.apps.calibration_state import (
+from pkm_twin.identification.calibration_fit import (
+    KNOWN,
+    Parameter,
+    UnsettledError,
+    Whole,
+    derivatives,
+    fit,
+)
+from pkm_twin.identification.calibration_state import (
     BESIDE,
     FRAME,
     TARGET,
@@ -38,17 +48,14 @@ from pkm_twin.apps.calibration_state import (
     place_frame,
     start_of,
 )
-from pkm_twin.apps.transmission import Transmission, numbers
-from pkm_twin.design import programs
-from pkm_twin.design.variants import Variants
-from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
 from pkm_twin.identification.robust import Weighed
+from pkm_twin.identification.transmission import Transmission, numbers
 from pkm_twin.identification.undetermined import undetermined
-from pkm_twin.kinematics.derivatives import geometry_numbers
-from pkm_twin.kinematics.numbers import file_numbers
-from pkm_twin.machine.entries import entries, with_entries
 from pkm_twin.machine.joint_map import JointMap
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.derivatives import geometry_numbers
+from pkm_twin.robot.entries import entries, with_entries
+from pkm_twin.robot.numbers import file_numbers
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -65,30 +72,16 @@ SHOWN: Final = 0.1
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """A calibrated robot and how sure it is."""
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A robot with fitted numbers, and how sure these are."""
 
     robot: Robot
     parameters: tuple[Parameter, ...]
     covariance: Array
-    condition: float
-    """Of the poses' equations in units of the prior deviations, over what was observed."""
-    noise: float
-    noise_angle: float | None
-    """Standard deviations of the measurement that the fit leaves, m an axis and rad an axis."""
-    fitted: tuple[Errors, Errors]
-    held_out: tuple[Errors, Errors]
-    """Before (frame and target of the measurement alone are fitted) and after; no outliers."""
     steps: int
-    outliers: tuple[Outlier, ...] = ()
-    """Poses that do not fit the others, the worst first."""
     faults: tuple[Fault, ...] = ()
     """Why this machine was not in the poses, where they were accepted all the same."""
-    cost: float = 0.0
-    """Squares of the machine's changes over their prior standard deviations, summed."""
-    placed: bool = False
-    """Whether another place of the instrument may explain the poses better."""
     joint_map: JointMap = field(default_factory=lambda: JointMap.of((), {}))
     """With the fitted numbers."""
 
@@ -125,6 +118,26 @@ class Calibration:
                 }
             )
         return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration(Estimate):
+    """A robot that was calibrated with poses."""
+
+    condition: float
+    """Of the poses' equations in units of the prior deviations, over what was observed."""
+    noise: float
+    noise_angle: float | None
+    """Standard deviations of the measurement that the fit leaves, m an axis and rad an axis."""
+    fitted: tuple[Errors, Errors]
+    held_out: tuple[Errors, Errors]
+    """Before (frame and target of the measurement alone are fitted) and after; no outliers."""
+    outliers: tuple[Outlier, ...] = ()
+    """Poses that do not fit the others, the worst first."""
+    cost: float = 0.0
+    """Squares of the machine's changes over their prior standard deviations, summed."""
+    placed: bool = False
+    """Whether another place of the instrument may explain the poses better."""
 
 
 def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ...]:
@@ -188,7 +201,7 @@ def calibrate(
     q = robot.controller.positions(poses.joints)
 
     def listed(extra: Sequence[str]) -> list[Parameter]:
-        return _parameters(robot, q, paths, offsets, transmission, extra, prior)
+        return parameters_of(robot, q, paths, offsets, transmission, extra, prior)
 
     parameters = listed(extra)
 
@@ -237,7 +250,7 @@ def _learnt(poses: Poses) -> NDArray[np.bool_]:
     return np.asarray(np.arange(len(poses.joints)) % HELD_OUT != HELD_OUT - 1)
 
 
-def _parameters(
+def parameters_of(
     robot: Robot, q: Array, paths: Sequence[str], offsets: bool, transmission: Transmission,
     extra: Sequence[str], prior: float,
 ) -> list[Parameter]:  # fmt: skip
@@ -282,7 +295,8 @@ def _calibrated(
 ) -> tuple[Calibration, State]:  # fmt: skip
     """The fit with its faults, and the machine at the poses that are learnt from."""
     rows = _learnt(poses)
-    learnt = poses.part(rows)
+    some = poses.part(rows)
+    learnt = Whole(some.joints, some.position, some.rotation)
     # A pose that is measured again tells no more numbers.
     different = len(np.unique(np.round(learnt.joints / SAME), axis=0))
     equations = different * (3 if poses.rotation is None else 6)
@@ -326,10 +340,11 @@ def _calibrated(
     singular = np.linalg.svd(information[:, good], compute_uv=False)
     condition = float(singular[0] / singular[-1]) if good.any() else np.inf
     result = Calibration(
-        built, tuple(told), covariance, condition, noise.noise[0],
-        noise.noise[1] if len(noise.noise) > 1 else None, fitted_errors, held_errors, steps,
-        outliers, tuple(faults), cost_of(changes),
-        not frame and _looks_placed(robot, after, learnt, noise, information, told),
-        after.instrument.map,
+        robot=built, parameters=tuple(told), covariance=covariance, condition=condition,
+        noise=noise.noise[0], noise_angle=noise.noise[1] if len(noise.noise) > 1 else None,
+        fitted=fitted_errors, held_out=held_errors, steps=steps, outliers=outliers,
+        faults=tuple(faults), cost=cost_of(changes),
+        placed=not frame and _looks_placed(robot, after, learnt, noise, information, told),
+        joint_map=after.instrument.map,
     )  # fmt: skip
     return result, after

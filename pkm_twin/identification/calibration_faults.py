@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses that no machine like the file's was in, and poses that do not fit the others.
-
-May import: numpy, pkm_twin's identification, the calibration's state, the standard library.
-"""
+"""Poses that no machine like the file's was in, and poses that do not fit the others."""
 
 from __future__ import annotations
 
@@ -13,8 +10,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.calibration_state import FRAME, TARGET
 from pkm_twin.errors import ParameterError, one_line
+from pkm_twin.identification.calibration_state import FRAME, TARGET
 from pkm_twin.identification.robust import OUTLIER, Weighed, distances
 
 Array = NDArray[np.float64]

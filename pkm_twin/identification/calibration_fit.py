@@ -1,25 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of a calibration: damped steps of Gauss and Newton's method, robust, the noise with them.
-
-May import: numpy, pkm_twin's identification and machine, the calibration's state and transmissions,
-the standard library.
-"""
+"""The fit of a calibration: damped steps of Gauss and Newton's method, robust weights, noise."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.calibration_state import FRAME, TARGET, Poses, State, moved, value_of
-from pkm_twin.apps.transmission import by_map
 from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.identification.calibration_state import (
+    FRAME,
+    TARGET,
+    Posed,
+    Poses,
+    State,
+    moved,
+    value_of,
+)
 from pkm_twin.identification.robust import Weighed, weighed
-from pkm_twin.machine.robot import Robot
+from pkm_twin.identification.transmission import by_map
 from pkm_twin.machine.rotations import skew
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -54,21 +58,67 @@ class Parameter:
     prior: float
     value: float = np.nan
     deviation: float = np.nan
+    scaled: bool = False
+    """Whether it hangs on a scale that was not measured."""
 
     @property
     def observed(self) -> bool:
         """Whether the poses tell it: they, not the prior, make its deviation."""
-        return self.deviation < KNOWN * self.prior
+        return self.deviation < KNOWN * self.prior and not self.scaled
 
 
 class UnsettledError(ParameterError):
     """A fit that does not settle."""
 
 
+class Measured(Posed, Protocol):
+    """What was measured, as a fit asks for it."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether every pose was measured whole: then the drives' part of the residuals shows."""
+
+    def parts(self, state: State) -> list[Array]:
+        """Residuals, measured less computed, (k, a) each."""
+
+    def slopes(self, robot: Robot, state: State, names: Sequence[str]) -> list[Array]:
+        """Derivatives of what is computed by named parameters, (k, a, p) each."""
+
+    def weighed(
+        self, parts: list[Array], slopes: list[Array], prior: Array, drives: Array | None = None
+    ) -> Any:
+        """Noise and weights, as :class:`pkm_twin.identification.robust.Weighed`.
+
+        :param drives: derivatives by the drives' errors, (k, sum of a, n).
+        """
+
+
+class Whole(Poses):
+    """Poses that were measured whole, or their positions."""
+
+    whole = True
+
+    def parts(self, state: State) -> list[Array]:
+        """Of positions and, where measured, rotations, (k, 3) each."""
+        return state.parts(self)
+
+    def slopes(self, robot: Robot, state: State, names: Sequence[str]) -> list[Array]:
+        """The same by named parameters."""
+        columns = derivatives(robot, state, names)
+        return [columns[:, :3], columns[:, 3:]][: 1 if self.rotation is None else 2]
+
+    def weighed(
+        self, parts: list[Array], slopes: list[Array], prior: Array, drives: Array | None = None
+    ) -> Weighed:
+        """One weight a pose."""
+        del slopes
+        return weighed(parts, len(prior), drives)
+
+
 def fit(
-    robot: Robot, start: State, poses: Poses, parameters: Sequence[Parameter],
+    robot: Robot, start: State, poses: Measured, parameters: Sequence[Parameter],
     progress: Callable[[int], None],
-) -> tuple[State, Array, Array, Array, Weighed, int]:  # fmt: skip
+) -> tuple[State, Array, Array, Array, Any, int]:  # fmt: skip
     """Robust least squares over all parameters, the noise found with them.
 
     :raises ParameterError: it does not settle.
@@ -78,29 +128,28 @@ def fit(
     centre = np.array([p.before for p in parameters])
     prior = np.array([p.prior for p in parameters])
 
-    def right(state: State, values: Array, noise: Weighed) -> Array:
-        return np.concatenate([noise.over(state.parts(poses)), (centre - values) / prior])
+    def right(state: State, values: Array, noise: Any) -> Array:
+        return np.concatenate([noise.over(poses.parts(state)), (centre - values) / prior])
 
     # Errors of drives in metres are not those of drives in radians.
-    alike = len(set(robot.joint_units)) == 1
+    alike = poses.whole and len(set(robot.joint_units)) == 1
     names = [p.name for p in parameters]
     drives = [f"joint_map.{joint}.offset" for joint in robot.joint_names if alike]
     damping, problem, settled, idle = 0.0, f"{STEPS} steps", False, 0
     # By the residuals of the instrument alone first: then the drives' part of them is known.
     for steps in range(1, STEPS + 1):
         progress(1)
-        columns = derivatives(robot, state, [*names, *drives])
+        both = poses.slopes(robot, state, [*names, *drives])
+        columns = [part[..., : len(parameters)] for part in both]
         if settled and drives:
             slopes = state.instrument.map.slopes(state.q)
-            by_drives = columns[..., len(parameters) :] * slopes[:, None]
-            noise = weighed(state.parts(poses), len(parameters), by_drives)
+            by_drives = np.concatenate(both, 1)[..., len(parameters) :] * slopes[:, None]
+            noise = poses.weighed(poses.parts(state), columns, prior, by_drives)
             drives = []
         elif steps <= WEIGHED and (drives or not alike):
-            noise = weighed(state.parts(poses), len(parameters))
+            noise = poses.weighed(poses.parts(state), columns, prior)
         last, settled = not drives, False
-        columns = columns[..., : len(parameters)]
-        halves = [columns[:, :3], columns[:, 3:]][: len(noise.noise)]
-        table = noise.over(halves)
+        table = noise.over(columns)
         left, before = np.vstack([table, np.diag(1.0 / prior)]), right(state, values, noise)
         # In units of the prior no singular value is below one.
         _, sizes, axes = np.linalg.svd(left * prior, full_matrices=False)
@@ -154,7 +203,7 @@ def _move(left: Array, right: Array, damping: Array) -> Array:
 
 
 def _stepped(
-    robot: Robot, state: State, poses: Poses, parameters: Sequence[Parameter], values: Array,
+    robot: Robot, state: State, poses: Measured, parameters: Sequence[Parameter], values: Array,
     move: Array,
 ) -> State:  # fmt: skip
     names = [p.name for p in parameters]

@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine that is being calibrated: its numbers as they are now, and what an instrument sees.
-
-May import: numpy, scipy, pkm_twin's design and machine, the standard library.
-"""
+"""A machine that is being calibrated: its numbers as they are now, and what an instrument sees."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.transmission import centred, changed
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
+from pkm_twin.identification.transmission import centred, changed
 from pkm_twin.machine.joint_map import JointMap
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
@@ -54,6 +51,14 @@ class Poses:
         return Poses(self.joints[rows], self.position[rows], turned)
 
 
+class Posed(Protocol):
+    """Measurements at joint positions (k, n) in the controller's numbers."""
+
+    @property
+    def joints(self) -> Array:
+        """Of the poses."""
+
+
 @dataclass(frozen=True)
 class Errors:
     """Of poses: root mean square and greatest distance, m, and angle, rad (None: not measured)."""
@@ -72,8 +77,10 @@ class Instrument:
     frame: Rotation = field(default_factory=lambda: rotations().identity())
     place: Array = field(default_factory=lambda: np.zeros(3))
     target: Array = field(default_factory=lambda: np.zeros(3))
+    own: dict[str, float] = field(default_factory=dict)
+    """Numbers of single measurements, such as a plane's height, by name."""
 
-    def joints(self, poses: Poses) -> Array:
+    def joints(self, poses: Posed) -> Array:
         """The model's joint positions (k, n) at measured poses."""
         return self.map.positions(poses.joints)
 
@@ -129,7 +136,7 @@ class State:
         return dict(zip(self.machine.paths, self.machine.values[0].tolist(), strict=False))
 
 
-def start_of(robot: Robot, poses: Poses, paths: Sequence[str]) -> State:
+def start_of(robot: Robot, poses: Posed, paths: Sequence[str]) -> State:
     """The robot as it is, with numbers that may change, an instrument at its base.
 
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
@@ -155,11 +162,11 @@ def value_of(state: State, name: str, otherwise: float) -> float:
         return float(tool.place[FRAME.index(name)])
     if name in TARGET:
         return float(tool.target[TARGET.index(name)])
-    return otherwise
+    return tool.own.get(name, otherwise)
 
 
 def moved(
-    robot: Robot, state: State, poses: Poses, values: Mapping[str, float], turn: Array
+    robot: Robot, state: State, poses: Posed, values: Mapping[str, float], turn: Array
 ) -> State:
     """The machine with new numbers.
 
@@ -173,6 +180,7 @@ def moved(
         rotations().from_rotvec(turn) * tool.frame,
         np.array([values.get(n, v) for n, v in zip(FRAME[:3], tool.place, strict=True)]),
         np.array([values.get(n, v) for n, v in zip(TARGET, tool.target, strict=True)]),
+        {name: values.get(name, value) for name, value in tool.own.items()},
     )
     machine, q = state.machine, new.joints(poses)
     if machine.paths:

@@ -15,14 +15,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.estimation import Estimate, estimate
-from delta_dynamics.fit import SURE, Judged, Number, known
-from delta_dynamics.fit_solved import HELD_OUT
-from pkm_twin.apps.elastic_verdict import elastic_verdict, put_right
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.elastic_verdict import elastic_verdict, put_right
+from pkm_twin.identification.estimation import Estimate, estimate
+from pkm_twin.identification.fit import SURE, Judged, Number, known
+from pkm_twin.identification.fit_solved import HELD_OUT
 from pkm_twin.identification.verdict import Verdict
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.shared import above_zero
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.response import ElementResponse, element_response
 
 Array = NDArray[np.float64]

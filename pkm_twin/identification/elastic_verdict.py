@@ -13,10 +13,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.estimation import Estimate
+from pkm_twin.identification.estimation import Estimate
 from pkm_twin.identification.judge import Evidence, judge
 from pkm_twin.identification.verdict import Suspect, Verdict
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.response import ElementResponse
 
 Array = NDArray[np.float64]

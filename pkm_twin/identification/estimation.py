@@ -4,8 +4,6 @@
 Directions that the data tell less of than the prior keep the prior's values; the others are the
 data's alone, without shrinking. Where the result is no possible machine, the nearest that is one,
 by the same measure, takes its place.
-
-May import: numpy, scipy, cvxpy where semidefinite constraints bind, pkm_twin's errors.
 """
 
 from __future__ import annotations

@@ -4,8 +4,6 @@
 Swevers, Ganseman, Tukel, De Schutter, Van Brussel, Optimal robot excitation and identification,
 1997, doi:10.1109/70.631234. The determinant of the information over the base parameters is made
 large, by random steps from the best so far; what leaves a limit is made smaller until it does not.
-
-May import: numpy, pkm_twin's core, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -17,13 +15,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.base_parameters import independent, random_states
-from delta_dynamics.file_parameters import FileParameters
 from delta_dynamics.regressor import regressor
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.kinematics.workspace import reachable
-from pkm_twin.machine.robot import Robot
+from pkm_twin.identification.base_parameters import independent, random_states
+from pkm_twin.identification.file_parameters import FileParameters
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import reachable
 
 Array = NDArray[np.float64]
 
@@ -155,7 +153,7 @@ def excite(
         points a second than it is written with.
     """
     robot, keep = judge.robot, bounds or Bounds()
-    centre, reach = _range(robot, keep.share)
+    centre, reach = position_range(robot, keep.share)
     harmonics = _harmonics(robot, duration, terms, reach, keep)
     whole = _Fine.of(duration, harmonics)
     basis = _resting(harmonics)
@@ -199,7 +197,7 @@ def excite(
     return Excitation(duration, harmonics, centre, final[0], final[1], condition)
 
 
-def _range(robot: Robot, share: float) -> tuple[Array, Array]:
+def position_range(robot: Robot, share: float) -> tuple[Array, Array]:
     """Middle and half width of the joints' positions that are used, shape (n,) each."""
     home, size = robot.graph.home, robot.engine.tree.size
     half = np.array([0.15 * size if unit == "m" else 0.3 for unit in robot.joint_units])
@@ -289,7 +287,7 @@ def _clear_of(
     for _ in range(20):
         blocks = (time[k : k + BLOCK] for k in range(0, len(time), BLOCK))
         if all(
-            _clear(robot, keep, *_series(some, duration, harmonics, centre, pair), margin)
+            clear(robot, keep, *_series(some, duration, harmonics, centre, pair), margin)
             for some in blocks
         ):
             return pair
@@ -297,7 +295,7 @@ def _clear_of(
     return None
 
 
-def _clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array, margin: float) -> bool:
+def clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array, margin: float) -> bool:
     """Assembly, singularity index, workspace and efforts.
 
     :param margin: part of the effort limits up to which these states may go.

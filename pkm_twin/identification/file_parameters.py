@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot's file as linear parameters: what a fit varies, and the regressor's columns of it.
-
-May import: numpy, pkm_twin's core, this package, the standard library.
-"""
+"""A robot's file as linear parameters: what a fit varies, and the regressor's columns of it."""
 
 from __future__ import annotations
 
@@ -17,8 +14,8 @@ from numpy.typing import NDArray
 from delta_dynamics.regressor import TEN, parameter_names
 from delta_dynamics.virtual_work import mass_matrix
 from pkm_twin.machine.inertia import transport
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.shared import KINDS, Kind, Shared
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -28,11 +25,13 @@ class FileParameters:
     """Some of the parameters that a robot's file gives, k of them.
 
     ``groups``: entries of the file, in order. ``mixing``: shape (p, k), the regressor's parameters
-    by these: Y mixing is the columns of these.
+    by these: Y mixing is the columns of these. ``loads``: values of these by which friction that
+    grows with the load is taken, shape (k,); None: the file's.
     """
 
     groups: tuple[Shared, ...]
     mixing: Array
+    loads: Array | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -5,34 +5,37 @@ The last third of every recording is held out: it is judged, not fitted. Efforts
 against positions, by some samples and alike in all joints: a drive that holds its torque for a
 period would else look like friction. How late is fitted beside, for each recording. Two windows of
 the differentiation are fitted; what they differ by counts as uncertainty beside the noise's.
-
-May import: numpy, pkm_twin's core, this package, the standard library.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.estimation import Estimate
-from delta_dynamics.file_parameters import FileParameters, file_parameters
-from delta_dynamics.fit_plausible import recording_fault
-from delta_dynamics.fit_rows import Recorded, Rows, next_window, rows_of
-from delta_dynamics.fit_solved import held_from, solve
-from delta_dynamics.fit_verdict import verdict_of
-from delta_dynamics.samples import Filtering
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
+from pkm_twin.identification.estimation import Estimate
+from pkm_twin.identification.file_parameters import FileParameters, file_parameters
+from pkm_twin.identification.fit_plausible import recording_fault
+from pkm_twin.identification.fit_rows import Recorded, Rows, next_window, rows_of
+from pkm_twin.identification.fit_solved import held_from, solve
+from pkm_twin.identification.fit_verdict import verdict_of
+from pkm_twin.identification.judge import EXACT
+from pkm_twin.identification.samples import Filtering
 from pkm_twin.identification.verdict import Verdict
-from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.friction import LAWS, FrictionLaw
 from pkm_twin.machine.shared import KINDS, Key, Kind, Shared
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Status = Literal["fitted", "combination", "not excited"]
 
+LOADED: Final = frozenset(name for name, law in LAWS.items() if law.share is not FrictionLaw.share)
+"""Laws that grow with the load."""
+LOAD_PASSES: Final = 2
 SURE: Final = 0.2
 """A number that is known this much better than before is fitted."""
 STAYS: Final = 1e-3
@@ -74,7 +77,8 @@ class Number:
 class Judged:
     """Held-out efforts of a recording: ``time`` (k,), s; measured, before and after (k, n).
 
-    ``deviation``: of those after, by what is not known of the parameters, shape (k, n).
+    ``deviation``: of those after, by what is not known of the parameters, shape (k, n). ``noise``:
+    of a sample as if samples were independent, shape (n,).
     """
 
     name: str
@@ -83,6 +87,7 @@ class Judged:
     before: Array
     after: Array
     deviation: Array
+    noise: Array = field(default_factory=lambda: np.ones(1))
 
     def rms(self, which: Array) -> Array:
         """Of measured less predicted, shape (n,)."""
@@ -120,26 +125,41 @@ def fit(
     *,
     accept: bool = False,
     progress: Callable[[int], None] | None = None,
+    trial: Verdict | None = None,
+    possible: bool = False,
 ) -> Fit:
     """Fit some kinds of numbers of a robot's file.
 
     :param what: of ``friction``, ``rotor``, ``payload``, ``inertia``.
     :param accept: fit recordings that this machine cannot have made, too.
     :param progress: called with the number of recordings that are worked on, twice each.
+    :param trial: the verdict of a fit before: this fit only predicts and is not judged again.
+    :param possible: a fit before has found that the machine can have made the recordings.
     :raises PkmTwinError: recordings that are too short, that show nothing, or that this machine
         cannot have made.
     """
     everything, parameters = file_parameters(robot), file_parameters(robot, what)
     chosen = np.concatenate([[g.kind in what] * len(g.names) for g in everything.groups])
-    whole, filtering = [], []
+    whole, filtering, loaded = [], [], set(robot.laws) & LOADED
     for i, recording in enumerate(recordings):
         made, how = _rows(robot, everything, recording)
         whole.append(made)
         filtering.append(how)
         if progress is not None:
             progress(2 * i + 1)
+    for _ in range((LOAD_PASSES if trial is None else 1) if loaded else 0):
+        # Friction by the load of the fitted machine, not of the file's.
+        values = everything.values.copy()
+        values[chosen] = solve(
+            parameters, [made.only(chosen, everything.values) for made in whole]
+        ).estimate.values
+        everything = replace(everything, loads=values)
+        whole = [
+            rows_of(robot, everything, recording, how.window)[0]
+            for recording, how in zip(recordings, filtering, strict=True)
+        ]
     faults = []
-    for recording, made in zip(recordings, whole, strict=True):
+    for recording, made in () if possible else zip(recordings, whole, strict=True):
         fault = recording_fault(robot, everything, recording, made)
         if fault is not None:
             faults.append(f"{recording.name}: {fault}")
@@ -148,17 +168,19 @@ def fit(
     rows = [made.only(chosen, everything.values) for made in whole]
     solved = solve(parameters, rows)
     result, delays = solved.estimate, solved.delays
-    other = []
-    for i, (recording, how) in enumerate(zip(recordings, filtering, strict=True)):
-        other.append(rows_of(robot, everything, recording, next_window(how.window))[0])
-        if progress is not None:
-            progress(2 * i + 2)
-    again = solve(parameters, [made.only(chosen, everything.values) for made in other])
-    result = _less_sure(result, again.estimate.values - result.values)
-    verdict = verdict_of(robot, recordings, everything, chosen, whole, solved)
-    numbers = _numbers(parameters, result, verdict)
-    result = replace(result, covariance=verdict.widened(result.covariance))
-    if not result.directions or all(n.status == "not excited" for n in numbers):
+    if trial is None:
+        other = []
+        for i, (recording, how) in enumerate(zip(recordings, filtering, strict=True)):
+            other.append(rows_of(robot, everything, recording, next_window(how.window))[0])
+            if progress is not None:
+                progress(2 * i + 2)
+        again = solve(parameters, [made.only(chosen, everything.values) for made in other])
+        result = _less_sure(result, again.estimate.values - result.values)
+    verdict = trial or verdict_of(robot, recordings, everything, chosen, whole, solved)
+    numbers = _numbers(parameters, result, verdict) if trial is None else ()
+    if trial is None:
+        result = replace(result, covariance=verdict.widened(result.covariance))
+    if not result.directions or (numbers and all(n.status == "not excited" for n in numbers)):
         raise PkmTwinError(
             f"no excitation: the motion does not identify {', '.join(what)}; pkm-twin excite "
             "designs a motion that does"
@@ -169,7 +191,8 @@ def fit(
         before, after = (end.rest + end.table @ v for v in (parameters.values, result.values))
         spread = np.sqrt(np.sum((end.table @ result.covariance) * end.table, -1).clip(0.0))
         measured = end.target + end.rest
-        judged.append(Judged(recording.name, end.time, measured, before, after, spread))
+        floor = np.maximum(end.signals.noise, EXACT * np.sqrt(np.mean(measured**2, 0)))
+        judged.append(Judged(recording.name, end.time, measured, before, after, spread, floor))
     return Fit(
         robot, parameters, result, numbers, tuple(judged), tuple(filtering),
         sum(made.outliers for made in rows), sum(held_from(made) for made in rows), delays,

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lengths and angles of a robot's file that a fit takes for certain, and what they are off by.
-
-May import: numpy, pkm_twin's core and identification, this package, the standard library.
-"""
+"""Lengths and angles of a robot's file that a fit takes for certain, and what they are off by."""
 
 from __future__ import annotations
 
@@ -15,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics.derivatives import numbers_slopes, torques_by_numbers
-from delta_dynamics.file_parameters import FileParameters
-from delta_dynamics.fit_rows import BLOCK
-from delta_dynamics.fit_signals import Signals
-from delta_dynamics.samples import by_blocks
 from pkm_twin.errors import ParameterError
+from pkm_twin.identification.file_parameters import FileParameters
+from pkm_twin.identification.fit_rows import BLOCK
+from pkm_twin.identification.fit_signals import Signals
+from pkm_twin.identification.samples import by_blocks
 from pkm_twin.identification.verdict import Suspect
-from pkm_twin.machine.entries import entries
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.uncertainty import numbers_below
+from pkm_twin.robot.entries import entries
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -55,7 +52,7 @@ class Lengths:
         causes: list[tuple[Suspect, Mapping[str, float]]] = []
         told = set()
         for name, entry in robot.uncertainty.items():
-            below = {p: v for p, v in numbers_below(robot, name).items() if p in paths}
+            below = {p: v for p, v in numbers_below(name, entry, known).items() if p in paths}
             told |= set(below)
             if not below:
                 continue

@@ -1,25 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings as :mod:`pkm_twin.identification.plausible` asks for them, put right and as they are.
-
-May import: numpy, pkm_twin's core and identification, this package, the standard library.
-"""
+"""Recordings as :mod:`pkm_twin.identification.plausible` needs them, corrected and as they are."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.file_parameters import FileParameters
-from delta_dynamics.fit_rows import Recorded, Rows, calm_table, rows_of
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.file_parameters import FileParameters
+from pkm_twin.identification.fit_rows import Recorded, Rows, calm_table, rows_of
 from pkm_twin.identification.plausible import Problem, Retold, fault_of
+from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.inertia import ten_numbers
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -71,12 +69,15 @@ def recording_fault(
     retold += [(text, put_right(q=r.q * scale)) for text, scale in ANGLES.items()]
     if len(names) > 1:
         retold.append(("positions of all joints have the wrong sign", put_right(q=-r.q)))
-    for name, e in zip(names, eye, strict=True):
+    # A drive that counts the wrong way is mirrored at zero, where it was homed, or anywhere.
+    middles = 0.0 * robot.graph.home, robot.graph.home, r.q.mean(0)
+    for (name, e), middle in product(zip(names, eye, strict=True), middles):
         turned = 1.0 - 2.0 * e
-        text = f"positions of {name} have the wrong sign"
-        retold.append((text, put_right(q=turned * r.q)))
+        q = middle + turned * (r.q - middle)
+        text = f"positions of {name} have the wrong sign (joint_map?)"
+        retold.append((text, put_right(q=q)))
         text = f"positions and efforts of {name} have the wrong sign (joint_map?)"
-        retold.append((text, put_right(q=turned * r.q, effort=turned * r.effort)))
+        retold.append((text, put_right(q=q, effort=turned * r.effort)))
     for i, k in combinations(range(len(names)), 2):
         order = list(range(len(names)))
         order[i], order[k] = k, i
@@ -108,10 +109,11 @@ def problem_of(
     bounds: list[tuple[float, float]] = []
     prior: list[tuple[slice, float, float]] = []
     friction: list[bool] = []
+    turning = turning_keys() | {"viscous"}
     for where, group in zip(everything.slices, everything.groups, strict=True):
         own, value = [table[..., where] for table in tables], float(group.values[0])
         scale, first = float(everything.scales[where][0]), len(bounds)
-        rubs = group.kind == "friction" and not group.name.endswith("offset")
+        rubs = group.kind == "friction" and group.name.rpartition(".")[2] in turning
         bound, known = (0.0, np.inf), (value, scale)
         if group.kind == "inertia":
             own = [(one @ group.values)[..., None] for one in own]

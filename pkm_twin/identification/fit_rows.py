@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording as rows of a least-squares problem: regressor and efforts, filtered alike.
-
-May import: numpy, scipy, pkm_twin's core, this package, the standard library.
-"""
+"""A recording as rows of a least-squares problem: regressor and efforts, filtered alike."""
 
 from __future__ import annotations
 
@@ -13,11 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d  # type: ignore[import-untyped]
 
-from delta_dynamics.estimation import estimate
-from delta_dynamics.file_parameters import FileParameters
-from delta_dynamics.fit_signals import Efforts, Signals, noise_of, signals_of
-from delta_dynamics.regressor import parameter_names, parameter_values, regressor
-from delta_dynamics.samples import (
+from delta_dynamics.regressor import law_columns, law_keys, parameter_values, regressor
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.estimation import estimate
+from pkm_twin.identification.file_parameters import FileParameters
+from pkm_twin.identification.fit_signals import (
+    Efforts,
+    Signals,
+    noise_of,
+    resonances_of,
+    signals_of,
+)
+from pkm_twin.identification.samples import (
     LEAST,
     WINDOWS,
     Filtering,
@@ -27,8 +31,8 @@ from delta_dynamics.samples import (
     rate_noise,
     tracks,
 )
-from pkm_twin.errors import PkmTwinError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.friction import linear_keys
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.rest import SIGMAS
 
 Array = NDArray[np.float64]
@@ -135,11 +139,13 @@ def rows_of(
         np.concatenate([one[k] for one in made]) for k in range(6)
     )
     told = [part.rest + part.table @ first for part in parts]
-    rub = [_friction(robot, parameters, first, track.qd) for track in pieces]
+    rubs = _of_drives(robot, parameters)
+    rub = [part.table[..., rubs] @ first[rubs] for part in parts]
     left = [part.target - part.table @ first for part in parts]
     shaken = _shaken(robot, parameters, r, (max(pieces, key=lambda t: len(t.time)), how), first)
     noise = noise_of(left, shaken, pieces[0].period, how)
-    signals = signals_of(pieces, told, rub, how, noise)
+    rings = resonances_of(left, pieces[0].period, how)
+    signals = signals_of(pieces, told, rub, how, noise, rings)
     period = pieces[0].period
     return Rows(time, table, target, rest, counts, change, outliers, period, signals), how
 
@@ -172,17 +178,6 @@ def calm_table(
         return _columns(robot, parameters, carried, motion, signals.held[rows])[0]
 
     return by_blocks(len(signals.held), BLOCK, block)
-
-
-def _friction(robot: Robot, parameters: FileParameters, values: Array, qd: Array) -> Array:
-    """Of the drives, shape (samples, n)."""
-    pi = parameter_values(robot) + parameters.mixing @ (values - parameters.values)
-    by = dict(zip(parameter_names(robot), pi.tolist(), strict=True))
-    viscous, coulomb, offset = (
-        np.array([by[f"{joint}.{what}"] for joint in robot.joint_names])
-        for what in ("viscous", "coulomb", "offset")
-    )
-    return np.asarray(viscous * qd + coulomb * np.sign(qd) + offset, np.float64)
 
 
 def _shaken(
@@ -259,7 +254,21 @@ def _columns(
     for where, group in zip(parameters.slices, parameters.groups, strict=True):
         if group.kind == "payload":
             own[..., where] *= held[:, None, None]
+    if parameters.loads is not None and robot.laws:
+        rubs = _of_drives(robot, parameters)
+        load = rest + own[..., ~rubs] @ parameters.loads[~rubs]
+        laws = law_columns(robot, motion[0], motion[1], load)
+        names = [f"{joint}.{key}" for key in law_keys(robot) for joint in robot.joint_names]
+        for name, column in zip(names, np.moveaxis(laws, -1, 0), strict=True):
+            own[..., parameters.names.index(name)] = column
     return own, rest
+
+
+def _of_drives(robot: Robot, parameters: FileParameters) -> NDArray[np.bool_]:
+    """Which parameters are friction of the drives."""
+    keys, drives = linear_keys(robot.laws), set(robot.joint_names)
+    pairs = [name.rpartition(".")[::2] for name in parameters.names]
+    return np.array([joint in drives and key in keys for joint, key in pairs])
 
 
 def _piece(

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit's residual is held against: the noise above the motion's band, and common errors.
-
-May import: numpy, scipy, pkm_twin's core and identification, this package, the standard library.
-"""
+"""What a fit's residual is held against: the noise above the motion's band, and common errors."""
 
 from __future__ import annotations
 
@@ -14,9 +11,9 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import NDArray
 
-from delta_dynamics.samples import DEGREE, Filtering, Track, low_pass
+from pkm_twin.identification.samples import DEGREE, Filtering, Track, low_pass
 from pkm_twin.identification.verdict import Suspect
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Efforts = Callable[[Array, Array, Array], Array]
@@ -43,6 +40,18 @@ MOTION: Final = 0.25
 """Part of the filter's cut-off in which nearly all of the motion is."""
 SEGMENT: Final = 256
 """Samples of a spectrum."""
+RESOLVED: Final = 1024
+"""And of one in which resonances are looked for."""
+PASSED: Final = 1.2
+"""Times the filter's cut-off, from where on they are."""
+AROUND: Final = 12
+"""Frequencies on each side that a peak is held against."""
+PEAK: Final = 4.0
+"""Density over its surroundings' from which one may be a peak."""
+LIKELY: Final = -16.0
+"""Logarithm of the probability by chance below which it is."""
+RESONANCE: Final = "drive resonance"
+INTERFERENCE: Final = "interference at one frequency"
 STENCILS: Final = {
     1: (-1 / 60, 3 / 20, -3 / 4, 0.0, 3 / 4, -3 / 20, 1 / 60),
     2: (1 / 90, -3 / 20, 3 / 2, -49 / 18, 3 / 2, -3 / 20, 1 / 90),
@@ -59,7 +68,7 @@ class Signals:
     and second derivative, (k, n) each. ``effort``: what a first fit predicts, and its derivative.
     ``own``: friction of other laws, a unit of each, (k, n, laws). ``wrench``: (k, 6); ``held``:
     (k,). ``noise``: deviation of a row's noise as if rows were independent, (n,). ``band``: the
-    part of the rows' rate that the filter passes.
+    part of the rows' rate that the filter passes. ``resonances``: of the residual above the band.
     """
 
     motion: tuple[Array, Array, Array]
@@ -71,17 +80,34 @@ class Signals:
     held: Array
     noise: Array
     band: float
+    resonances: tuple[Resonance, ...] = ()
+
+
+@dataclass(frozen=True)
+class Resonance:
+    """A peak in the spectrum of a joint's residual: frequency, half width, Hz; rms of the effort.
+
+    ``sigmas``: how clearly it stands above its surroundings. ``line``: no wider than the spectrum
+    resolves, so it may be interference.
+    """
+
+    joint: int
+    frequency: float
+    width: float
+    rms: float
+    sigmas: float
+    line: bool
 
 
 def signals_of(
     tracks: Sequence[Track], told: Sequence[Array], rub: Sequence[Array], how: Filtering,
-    noise: Array,
+    noise: Array, resonances: tuple[Resonance, ...] = (),
 ) -> Signals:  # fmt: skip
     """The signals of a recording's pieces.
 
     :param told: efforts of a first fit, every sample, (samples, n) each. ``rub``: the part of them
         that is friction of the drives.
-        ``noise``: of :func:`noise_of`.
+        ``noise``: of :func:`noise_of`. ``resonances``: of :func:`resonances_of`.
     """
     speed = np.sqrt(np.mean(np.concatenate([t.qd for t in tracks]) ** 2, 0))
     parts = []
@@ -102,7 +128,7 @@ def signals_of(
     return Signals(
         (each[2], each[3], each[4]), (each[5], each[6]), (each[7], each[8], each[9]),
         (each[0], each[1]), np.stack(each[10:], -1), whole[:, -7:-1], whole[:, -1],
-        noise * np.sqrt(rate), passed,
+        noise * np.sqrt(rate), passed, resonances,
     )  # fmt: skip
 
 
@@ -162,9 +188,53 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
     return np.asarray(np.sqrt(loudest + np.mean(passed[inside], 0)), np.float64)
 
 
-def _spectrum(values: Array, rate: float) -> tuple[Array, Array]:
+def resonances_of(
+    residual: Sequence[Array], period: float, how: Filtering
+) -> tuple[Resonance, ...]:
+    """The lowest clear peak above the motion's band of each joint's residual, where there is one.
+
+    :param residual: measured less fitted, every sample, (samples, n) by piece.
+    """
+    whole, rate = max(residual, key=len), 1.0 / period
+    segment = min(RESOLVED, len(whole) // 4)
+    if segment < 64:
+        return ()
+    frequency, density = _spectrum(whole, rate, segment)
+    # Segments overlap by half, with a Hann window: so many independent ones.
+    freedoms = 2.0 * 0.95 * max(1.0, 2.0 * len(whole) / segment - 1.0)
+    begin = UNFILTERED * rate if how.cutoff is None else PASSED * how.cutoff
+    inside = np.flatnonzero((frequency > begin) & (frequency < HIGHEST * rate))
+    if len(inside) < 2 * AROUND:
+        return ()
+    step, found = frequency[1] - frequency[0], []
+    for j in range(whole.shape[1]):
+        own = density[inside, j]
+        ground = scipy.ndimage.median_filter(own, 2 * AROUND + 1, mode="nearest")
+        ratio = own / np.maximum(ground, 1e-300)
+        # The mean of a chi square over its median.
+        chance = scipy.stats.chi2.logsf(0.9 * ratio * freedoms, freedoms) + np.log(len(inside))
+        clear = np.flatnonzero((chance < LIKELY) & (ratio > PEAK))
+        if not len(clear):
+            continue
+        last = clear[0]
+        while last + 1 < len(own) and ratio[last + 1] > PEAK:
+            last += 1
+        peak = clear[0] + int(own[clear[0] : last + 1].argmax())
+        near = slice(max(peak - AROUND // 2, 0), peak + AROUND // 2 + 1)
+        above = np.maximum(own - ground, 0.0)[near]
+        place = frequency[inside][near]
+        centre = float(np.sum(place * above) / np.sum(above))
+        wide = np.flatnonzero(own[near] - ground[near] > 0.5 * above.max())
+        width = 0.5 * step * (wide[-1] - wide[0] + 1)
+        sigmas = float(scipy.stats.norm.isf(np.exp(max(chance[peak], -700.0))))
+        rms = float(np.sqrt(2.0 * step * np.sum(above)))
+        found.append(Resonance(j, centre, float(width), rms, sigmas, bool(width < 1.25 * step)))
+    return tuple(found)
+
+
+def _spectrum(values: Array, rate: float, segment: int = SEGMENT) -> tuple[Array, Array]:
     """Frequencies, and two-sided spectral densities by channel (Welch), (frequencies, n)."""
-    size = min(SEGMENT, len(values))
+    size = min(segment, len(values))
     frequency, density = scipy.signal.welch(values, rate, nperseg=size, axis=0, detrend="linear")
     return np.asarray(frequency, np.float64), np.asarray(0.5 * density, np.float64)
 
@@ -173,9 +243,11 @@ def suspects_of(robot: Robot) -> list[Suspect]:
     """The errors whose columns :func:`columns_of` gives, in their order."""
     names, units, efforts = robot.joint_names, robot.joint_units, robot.effort_units
     lengths = lengths_of(robot)
+    # A law of the robot is fitted.
+    share = None if "load-dependent" in robot.laws else 0.05
     found = [Suspect(GAIN, name, usual=0.05) for name in names]
     found += [Suspect(LATE, name, "s", 2e-3) for name in names]
-    found += [Suspect(LOAD, name, usual=0.05) for name in names]
+    found += [Suspect(LOAD, name, usual=share) for name in names]
     found += [
         Suspect("friction that grows with the square of the speed", name, f"{e} s2/{u}2")
         for name, u, e in zip(names, units, efforts, strict=True)
@@ -195,7 +267,7 @@ def suspects_of(robot: Robot) -> list[Suspect]:
     ]
     found += [
         Suspect(GAIN, "all joints", usual=0.05), Suspect(LATE, "all joints", "s"),
-        Suspect(LOAD, "all joints", usual=0.05), Suspect(SPEED, "all joints"),
+        Suspect(LOAD, "all joints", usual=share), Suspect(SPEED, "all joints"),
     ]  # fmt: skip
     return found
 

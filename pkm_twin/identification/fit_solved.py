@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The least-squares problem of a fit: parameters of all recordings, and a delay of each.
-
-May import: numpy, pkm_twin's core, this package, the standard library.
-"""
+"""The least-squares problem of a fit: parameters of all recordings, and a delay of each."""
 
 from __future__ import annotations
 
@@ -13,9 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.estimation import Estimate, estimate
-from delta_dynamics.file_parameters import FileParameters
-from delta_dynamics.fit_rows import LATE, Rows, prior_scales
+from pkm_twin.identification.estimation import Estimate, estimate
+from pkm_twin.identification.file_parameters import FileParameters
+from pkm_twin.identification.fit_rows import LATE, Rows, prior_scales
 
 Array = NDArray[np.float64]
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verdict on a fit of efforts: its residual against noise and against common errors.
-
-May import: numpy, scipy, pkm_twin's core and identification, this package, the standard library.
-"""
+"""The verdict on a fit of efforts: its residual against noise and against common errors."""
 
 from __future__ import annotations
 
@@ -13,14 +10,22 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from delta_dynamics.file_parameters import FileParameters
-from delta_dynamics.fit_lengths import GEOMETRY, Lengths
-from delta_dynamics.fit_rows import Recorded, Rows, calm_table, efforts_of
-from delta_dynamics.fit_signals import SPEED, columns_of, suspects_of
-from delta_dynamics.fit_solved import Solved
+from pkm_twin.identification.file_parameters import FileParameters
+from pkm_twin.identification.fit_lengths import GEOMETRY, Lengths
+from pkm_twin.identification.fit_rows import Recorded, Rows, calm_table, efforts_of
+from pkm_twin.identification.fit_signals import (
+    INTERFERENCE,
+    RESONANCE,
+    SPEED,
+    Resonance,
+    columns_of,
+    suspects_of,
+)
+from pkm_twin.identification.fit_solved import Solved
 from pkm_twin.identification.judge import SIGMAS, Evidence, judge
-from pkm_twin.identification.verdict import Suspect, Verdict
-from pkm_twin.machine.robot import Robot
+from pkm_twin.identification.verdict import Finding, Suspect, Verdict
+from pkm_twin.machine.friction import turning_keys
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -67,7 +72,26 @@ def verdict_of(
     if (chosen & np.isin(kinds, OF_INERTIA)).any() and not court.inertia_shown():
         answer = "explains partly" if verdict.answer == "explains" else verdict.answer
         verdict = replace(verdict, answer=answer, slow=True)
+    rings = _resonances(robot, rows)
+    if rings:
+        answer = "explains partly" if verdict.answer == "explains" else verdict.answer
+        verdict = replace(verdict, answer=answer, findings=(*verdict.findings, *rings))
     return verdict
+
+
+def _resonances(robot: Robot, rows: Sequence[Rows]) -> tuple[Finding, ...]:
+    """Of each joint the clearest of all recordings: above the band, so that no number changes."""
+    best: dict[int, Resonance] = {}
+    for one in (ring for made in rows for ring in made.signals.resonances):
+        if one.joint not in best or one.sigmas > best[one.joint].sigmas:
+            best[one.joint] = one
+    found = []
+    for j, ring in sorted(best.items()):
+        where = f"{robot.joint_names[j]}, {ring.rms:.2g} {robot.effort_units[j]} rms"
+        other = (Suspect(INTERFERENCE, robot.joint_names[j], "Hz"),) if ring.line else ()
+        suspect = Suspect(RESONANCE, where, "Hz")
+        found.append(Finding(suspect, ring.frequency, ring.width, ring.sigmas, other))
+    return tuple(found)
 
 
 def _simpler(verdict: Verdict, frozen: Verdict) -> Verdict:
@@ -192,5 +216,6 @@ class _Court:
 
 
 def _smooth(everything: FileParameters, values: Array) -> Array:
-    """Without Coulomb friction: its sign has no derivative, and turns where a rate is near zero."""
-    return np.where([name.endswith(".coulomb") for name in everything.names], 0.0, values)
+    """Without dry friction: its sign has no derivative, and turns where a rate is near zero."""
+    dry = turning_keys()
+    return np.where([n.rpartition(".")[2] in dry for n in everything.names], 0.0, values)

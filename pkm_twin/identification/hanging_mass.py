@@ -4,8 +4,6 @@
 At a steady speed the current is that of the load, plus friction up, less friction down: half of the
 difference of both is friction, half of their sum the load, by which the torque constant follows.
 Friction laws are compared by what they leave of runs that they were not fitted to.
-
-May import: numpy, scipy, pkm_twin's errors, the standard library.
 """
 
 from __future__ import annotations

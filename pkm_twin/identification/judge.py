@@ -14,8 +14,6 @@ Errors of usual size that the residual would not show may be there all the same,
 hide behind each other. All of them together have the residual's posterior distribution, with their
 usual sizes as the prior's standard deviations; its second moments widen the standard deviations
 too (consider parameters: Schmidt, 1966).
-
-May import: numpy, the standard library.
 """
 
 from __future__ import annotations

@@ -6,8 +6,6 @@ masses within a factor of two, current sensors off by a part of the load, all of
 possible. What such a machine leaves unexplained is compared with what it leaves of the recording
 put right: signs turned, columns exchanged, another unit, another time. A recording that is
 explained much better by one of these has that fault.
-
-May import: numpy, scipy, the standard library.
 """
 
 from __future__ import annotations
@@ -36,7 +34,9 @@ POOR: Final = 0.3
 NAMED: Final = 0.8
 """A fault is named if without it no more than this part is left."""
 FAR: Final = 0.1
-"""What is left from which other positions and times are tried, which costs more."""
+"""What is left from which other positions and times are tried, which costs more,"""
+BESIDE_NOISE: Final = 0.03
+"""and what is left beside noise where the efforts have a fault: it may not be theirs."""
 RANGE: Final = 2.0
 """How many times as heavy as its file a machine may be, and the inverse."""
 LATEST: Final = 0.05
@@ -191,7 +191,8 @@ def fault_of(
         found = other.judged()
         if found.cost + price < best.cost:
             best, cause = Judged(found.left, found.cost + price), text
-    if best.left > FAR:
+    unclear = bool(cause) and best.left**2 > BESIDE_NOISE**2 + problem.noisy**2
+    if unclear or best.left > FAR:
         for text, make in retold:
             made = make()
             found = best if made is None else made.judged()

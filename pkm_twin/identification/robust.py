@@ -2,8 +2,6 @@
 """Robust weights of measured poses: Huber's, one a pose, so that one wrong pose moves nothing.
 
 A pose's distance is the root mean square of its residual's axes over their noise.
-
-May import: numpy, scipy, the standard library.
 """
 
 from __future__ import annotations

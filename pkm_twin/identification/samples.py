@@ -7,8 +7,6 @@ noise makes of it, and what a polynomial of two degrees more says beside. Then t
 regressor and the efforts go through one zero-phase low-pass filter (Butterworth, forwards and
 backwards): both sides of tau = Y pi stay equal, what the noise has beyond the motion goes
 (Gautier, Khalil, Exciting trajectories ..., 1992; Janot et al., doi:10.1109/TCST.2013.2253321).
-
-May import: numpy, scipy, the standard library.
 """
 
 from __future__ import annotations

@@ -3,8 +3,6 @@
 
 Names of what is fitted: ``joint_map.JOINT.offset``, ``.ratio`` and ``.ratio_change``, and
 ``joint_map.*.ratio``, one factor on all ratios.
-
-May import: numpy, pkm_twin's machine, the standard library.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joint_map import JointMap
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,6 @@
 The directions that a fit leaves as they were span a space. Changes that mean something to whoever
 builds the machine (a limb moved as a whole, a joint moved along its own axis) are looked for in it,
 the particular ones before the general ones; what they leave is named by its greatest numbers.
-
-May import: numpy, pkm_twin's machine, the standard library.
 """
 
 from __future__ import annotations
@@ -17,8 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.machine.entries import keys_of
 from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.places import keys_of
 
 Array = NDArray[np.float64]
 

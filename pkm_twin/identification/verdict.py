@@ -2,8 +2,6 @@
 """Does the model explain the measurements? What a verdict on a fit says.
 
 :mod:`pkm_twin.identification.judge` finds it.
-
-May import: numpy, the standard library.
 """
 
 from __future__ import annotations

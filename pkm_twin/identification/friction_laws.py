@@ -1,0 +1,353 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which friction law the drives have, by what the recordings' held-out parts say.
+
+A law is tried where the fit without it leaves something unexplained. What efforts are not linear in
+(a Stribeck speed, a cogging's period) is searched for, joint by joint, in the fitted parts'
+residual; then everything is fitted again. A law is taken if the held-out residual without it has
+what it predicts there, beyond what noise does, and is smaller with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import PkmTwinError, UnknownNameError
+from pkm_twin.identification.file_parameters import file_parameters
+from pkm_twin.identification.fit import Fit, Number, fit
+from pkm_twin.identification.fit_rows import Recorded, rows_of
+from pkm_twin.identification.fit_signals import RESONANCE
+from pkm_twin.identification.fit_solved import held_from
+from pkm_twin.identification.judge import SIGMAS
+from pkm_twin.identification.samples import Filtering, low_pass, tracks
+from pkm_twin.machine.friction import BASIC, LAWS, taken
+from pkm_twin.machine.shared import KINDS, Kind
+from pkm_twin.robot.robot import Robot
+
+Array = NDArray[np.float64]
+
+AUTO: Final = "auto"
+SPEEDS: Final = np.geomspace(0.01, 1.0, 17)
+"""Stribeck speeds that are tried, over the rms speed."""
+WAVES: Final = 200.0
+"""Most periods in the travel that are tried."""
+CHUNK: Final = 24
+"""Values that are tried at once."""
+GOLDEN: Final = 14
+"""Steps of the search between two of them."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A law that was tried beside those before: residuals of what was held out, over the noise.
+
+    ``sigmas``: how clearly the residual without the law has what the law predicts there, standard
+    deviations of the noise. ``asked``: by the user.
+    """
+
+    law: str
+    taken: bool
+    before: float
+    after: float
+    sigmas: float
+    asked: bool = False
+
+    def __str__(self) -> str:
+        evidence = (
+            f"held-out residual {self.before:.3g} times the noise without, {self.after:.3g} with "
+            f"it, {self.sigmas:.3g} sigma"
+        )
+        if self.asked:
+            return f"friction law {self.law}, as asked: {evidence}"
+        if self.taken:
+            return f"friction law {self.law} taken, the law without it is rejected: {evidence}"
+        return f"friction law {self.law} not taken: {evidence}"
+
+
+@dataclass(frozen=True)
+class Searched:
+    """A parameter that efforts are not linear in, with its standard deviation, (n,) each.
+
+    ``others``: the standard deviations that it causes in the law's other parameters, by key, (n,).
+    The phase of a cogging, for example, follows its period at the far end of the travel.
+    """
+
+    value: Array
+    deviation: Array
+    others: dict[str, Array]
+
+
+def laws_of(words: str) -> tuple[str, ...] | None:
+    """Names of laws with commas between; None: whatever the recordings say.
+
+    :raises UnknownNameError: another word.
+    """
+    names = [word.strip() for word in words.split(",")]
+    for name in names:
+        if name not in (AUTO, BASIC.name, *LAWS):
+            raise UnknownNameError("friction", name, (AUTO, BASIC.name, *LAWS))
+    return None if AUTO in names else tuple(name for name in LAWS if name in names)
+
+
+def fit_with_laws(
+    robot: Robot,
+    recordings: Sequence[Recorded],
+    what: Sequence[Kind] = KINDS,
+    laws: Sequence[str] | None = None,
+    **options: Any,
+) -> tuple[Fit, tuple[Choice, ...]]:
+    """A fit with the friction laws that the recordings show beside the file's.
+
+    :param laws: names; None: those that the held-out parts say.
+    :param options: and errors as of :func:`~pkm_twin.identification.fit.fit`.
+    """
+    best = fit(robot, recordings, what, **options)
+    choices: list[Choice] = []
+    more: list[Number] = []
+    wider: dict[tuple[str | int, ...], float] = {}
+    if "friction" not in what:
+        return best, ()
+    asked = [name for name in laws or () if name not in robot.laws]
+    while asked if laws is not None else _unexplained(best):
+        names = asked[:1] or [name for name in LAWS if name not in best.robot.laws]
+        tried = []
+        for name in names:
+            try:
+                found, opened = _opened(best, recordings, what, name)
+                one = fit(opened, recordings, what, **options, trial=best.verdict, possible=True)
+            except PkmTwinError:
+                if asked:
+                    raise
+                continue
+            tried.append((_compared(name, best, one), found, opened))
+        if not tried:
+            break
+        choice, found, opened = max(tried, key=lambda one: (one[0].taken, -one[0].after))
+        if asked:
+            choice = replace(choice, taken=True, asked=True)
+            asked = asked[1:]
+        choices.append(choice)
+        if not choice.taken:
+            break
+        result = fit(opened, recordings, what, **options, possible=True)
+        result = replace(result, accepted=best.accepted)
+        more += _searched(best.robot, result, choice.law, found)
+        wider |= _widened(result, found)
+        own = (
+            replace(n, deviation=float(np.hypot(n.deviation, wider.get(n.key, 0.0))))
+            for n in result.numbers
+        )
+        best = replace(result, numbers=(*own, *more))
+    return best, tuple(choices)
+
+
+def _unexplained(result: Fit) -> bool:
+    """Whether another law may be what is missing; never of recordings that cannot be its."""
+    if result.accepted:
+        return False
+    verdict = result.verdict
+    kinds = {one.suspect.kind for one in verdict.findings}
+    return bool(kinds - {RESONANCE}) or any(
+        channel.left_ratio > 1.0 for channel in verdict.channels
+    )
+
+
+def _compared(name: str, before: Fit, after: Fit) -> Choice:
+    """Two fits by what was held out."""
+    sums = np.zeros(5)
+    band = np.array([max(channel.noise, 1e-300) for channel in before.verdict.channels])
+    for one, other in zip(before.judged, after.judged, strict=True):
+        old, change = one.measured - one.after, other.after - one.after
+        sums += (
+            np.sum((old / band) ** 2), np.sum(((old - change) / band) ** 2), old.size,
+            np.sum(old * change / one.noise**2), np.sum((change / one.noise) ** 2),
+        )  # fmt: skip
+    before_rms, after_rms = np.sqrt(sums[:2] / sums[2])
+    sigmas = sums[3] / np.sqrt(max(sums[4], 1e-300))
+    good = sigmas > SIGMAS and after_rms < before_rms
+    return Choice(name, bool(good), float(before_rms), float(after_rms), float(sigmas))
+
+
+def _opened(
+    before: Fit, recordings: Sequence[Recorded], what: Sequence[Kind], name: str
+) -> tuple[dict[str, Searched], Robot]:
+    """The robot with one law more, and what was found of its parameters that are not linear.
+
+    :raises PkmTwinError: the motion does not show it.
+    """
+    robot = before.robot
+    found = _Search(before, recordings, what, name).found()
+    if found:
+        robot = robot.changed(friction={key: one.value.tolist() for key, one in found.items()})
+    return found, replace(robot, open_laws=(*robot.open_laws, name))
+
+
+def _searched(robot: Robot, result: Fit, name: str, found: dict[str, Searched]) -> list[Number]:
+    """What was found of a law's parameters that are not linear, as numbers of the file.
+
+    :param robot: before.
+    """
+    law, more = LAWS[name], []
+    (first, *_) = (key for key, parameter in law.parameters.items() if parameter.linear)
+    for key, one in found.items():
+        value, deviation = one.value, one.deviation
+        for number in (n for n in result.numbers if first in n.key):
+            path = tuple(key if part == first else part for part in number.key)
+            k = _joint_of(result.robot, number.key)
+            unit = law.parameters[key].in_units(slides=robot.joint_units[k] == "m")
+            old = float(np.asarray(getattr(robot.friction, key))[k])
+            if result.verdict.deviations == "withheld":
+                deviation = np.full(len(value), np.nan)
+            more.append(
+                Number(path, unit, old, float(value[k]), float(deviation[k]), 0.0, "fitted")
+            )
+    return more
+
+
+def _widened(result: Fit, found: dict[str, Searched]) -> dict[tuple[str | int, ...], float]:
+    """By number what the uncertainty of the searched parameters adds to its standard deviation."""
+    return {
+        number.key: float(values[_joint_of(result.robot, number.key)])
+        for one in found.values()
+        for word, values in one.others.items()
+        for number in result.numbers
+        if word in number.key
+    }
+
+
+def _joint_of(robot: Robot, key: tuple[str | int, ...]) -> int:
+    """The actuated joint of a number of friction: by its group, in order."""
+    groups = [g for g in robot.shared_drives() if g.kind == "friction"]
+    for group in groups:
+        if key in group.keys(group.values):
+            joint = group.name.rpartition(".")[0]
+            return robot.joint_names.index(joint)
+    raise KeyError(key)
+
+
+class _Search:
+    """The parameters of a law that efforts are not linear in, by the residual of a fit without."""
+
+    def __init__(
+        self, before: Fit, recordings: Sequence[Recorded], what: Sequence[Kind], name: str
+    ) -> None:
+        self.robot, self.law = before.robot, LAWS[name]
+        self._name = name
+        self._pieces: list[tuple[Any, Filtering, int]] = []
+        parameters = file_parameters(self.robot, what)
+        values, left, weight = before.estimate.values, [], []
+        for recording, how, delay in zip(recordings, before.filtering, before.delays, strict=True):
+            rows, _ = rows_of(self.robot, parameters, recording, how.window)
+            end = held_from(rows)
+            left.append((rows.target - rows.table @ values + delay * rows.change)[:end])
+            weight.append((rows.counts / np.maximum(rows.signals.noise, 1e-300))[:end])
+            size = len(recording.time)
+            none, held = np.zeros((size, 6)), np.ones(size)
+            own, _ = tracks(recording.time, recording.q, recording.effort, none, held, how.window)
+            self._pieces.append((own, how, end))
+        self._weight = np.concatenate(weight)
+        self._left = np.concatenate(left) * self._weight
+        rates = self._filtered(lambda t: np.stack([t.qd, np.sign(t.qd), 1.0 + 0.0 * t.qd], -1))
+        basic: Array = rates * self._weight[..., None]
+        self._basic = [np.linalg.qr(basic[:, j])[0] for j in range(self.robot.joints_count)]
+        pieces = [t for own, _, _ in self._pieces for t in own]
+        q, qd = (np.concatenate([getattr(t, word) for t in pieces]) for word in ("q", "qd"))
+        self._speed, self._travel = np.sqrt(np.mean(qd**2, 0)), np.ptp(q, axis=0)
+        cutoffs = [how.cutoff for _, how, _ in self._pieces if how.cutoff is not None]
+        fastest = self._travel * min(cutoffs, default=np.inf) / np.maximum(self._speed, 1e-300)
+        self._waves = np.minimum(WAVES, fastest)
+
+    def _filtered(self, columns: Any) -> Array:
+        """Columns of tracks, (samples, n, c), at the fitted rows."""
+        made = []
+        for own, how, end in self._pieces:
+            parts = []
+            for track in own:
+                values = columns(track)
+                flat = values.reshape(len(values), -1)
+                parts.append(low_pass(flat, track.period, how).reshape(-1, *values.shape[1:]))
+            made.append(np.concatenate(parts)[:end])
+        return np.concatenate(made)
+
+    def found(self) -> dict[str, Searched]:
+        """By key what was found; nothing where all is linear.
+
+        :raises PkmTwinError: the residual shows no value.
+        """
+        keys = [key for key, one in self.law.parameters.items() if not one.linear]
+        if not keys:
+            return {}
+        (key,) = keys
+        grid = self._grid(key)
+        gains = np.concatenate(
+            [self._gains(key, grid[a : a + CHUNK])[0] for a in range(0, len(grid), CHUNK)]
+        )
+        best = gains.argmax(0)
+        joints = np.arange(gains.shape[1])
+        if not (gains[best, joints] > 0.0).any():
+            raise PkmTwinError(f"no sign of {self.law.name} friction")
+        low = np.log(grid[np.maximum(best - 1, 0), joints])
+        high = np.log(grid[np.minimum(best + 1, len(grid) - 1), joints])
+        low, high = np.minimum(low, high), np.maximum(low, high)
+        part = (np.sqrt(5.0) - 1.0) / 2.0
+        for _ in range(GOLDEN):
+            pair = np.stack([high - part * (high - low), low + part * (high - low)])
+            left, right = self._gains(key, np.exp(pair))[0]
+            high = np.where(left > right, pair[1], high)
+            low = np.where(left > right, low, pair[0])
+        middle = 0.5 * (low + high)
+        step = np.full(len(middle), 0.02)
+        if not self.law.parameters[key].unit.endswith("/s"):
+            # A small part of a period over the travel.
+            step = np.minimum(step, 0.15 * np.exp(middle) / np.maximum(self._travel, 1e-12))
+        gains, sizes = self._gains(key, np.exp(middle + step * np.array([[0.0], [1.0], [-1.0]])))
+        here, up, down = gains
+        bend = np.maximum(2.0 * here - up - down, 1e-300) / step**2
+        value = np.exp(middle)
+        relative = np.minimum(np.sqrt(2.0 / bend), 10.0)
+        slopes = np.abs(sizes[1] - sizes[2]) * (relative / (2.0 * step))[:, None]
+        words = [word for word, one in self.law.parameters.items() if one.linear]
+        return {key: Searched(value, value * relative, dict(zip(words, slopes.T, strict=True)))}
+
+    def _grid(self, key: str) -> Array:
+        """Values to try, (values, n)."""
+        if self.law.parameters[key].unit.endswith("/s"):
+            return np.asarray(SPEEDS[:, None] * np.maximum(self._speed, 1e-12))
+        waves = np.linspace(1.0, max(float(self._waves.max()), 2.0), 4 * int(WAVES))
+        return np.asarray(np.maximum(self._travel, 1e-12) / waves[:, None])
+
+    def _gains(self, key: str, grid: Array) -> tuple[Array, Array]:
+        """What values (g, n) of a parameter explain of the residual: fall of chi square, (g, n).
+
+        And the other parameters of the law with each, (g, n, others).
+        """
+        n, linear = self.robot.joints_count, [
+            (word, one) for word, one in self.law.parameters.items() if one.linear
+        ]  # fmt: skip
+
+        def columns(track: Any) -> Array:
+            made = []
+            for values in grid:
+                for word, _ in linear:
+                    given = {key: values} | {k: np.full(n, float(k == word)) for k, _ in linear}
+                    made.append(taken([self._name], given, track.q, track.qd, 0.0 * track.q))
+            return np.stack(made, -1)
+
+        table = self._filtered(columns) * self._weight[..., None]
+        table = table.reshape(*table.shape[:2], len(grid), len(linear))
+        gains, sizes = np.zeros((len(grid), n)), np.zeros((len(grid), n, len(linear)))
+        for j in range(n):
+            basis, left = self._basic[j], self._left[:, j]
+            left = left - basis @ (basis.T @ left)
+            for g in range(len(grid)):
+                own = table[:, j, g] - basis @ (basis.T @ table[:, j, g])
+                size, *_ = np.linalg.lstsq(own, left, rcond=1e-9)
+                good = all(one.at_least is None or s >= 0.0
+                           for s, (_, one) in zip(size, linear, strict=True))  # fmt: skip
+                sizes[g, j] = size
+                gains[g, j] = float(left @ (own @ size)) if good else 0.0
+        return gains, sizes

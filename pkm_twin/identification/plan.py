@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which poses to measure next, and how well a machine will then be known (D-optimal, greedy)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.identification.calibration import Estimate, geometric
+from pkm_twin.identification.calibration_fit import derivatives
+from pkm_twin.identification.calibration_state import State
+from pkm_twin.identification.measurements import KINDS, Kind, Partial, Readings, spans_of
+from pkm_twin.identification.partial import placed, unknowns
+from pkm_twin.machine.rotations import skew
+from pkm_twin.robot.robot import Robot
+
+Array = NDArray[np.float64]
+
+CANDIDATES: Final = 300
+DRAWN: Final = 20
+"""Times as many are drawn, at most, where few can be reached."""
+MOST: Final = 150
+"""Measurements of a plan."""
+USUAL: Final = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Poses to measure, in order, and deviations before the first and after each, (count + 1,).
+
+    ``joints``: (count, n) in the controller's numbers; ``second``: of a pair's other pose;
+    ``poses``: (count, m). ``position``: standard deviation of the platform's position on the worst
+    axis, m, root mean square over the workspace, apart from a rigid motion of it; ``quantity``: of
+    what is measured, by kind; ``scale``: of distances, relative. ``known``: what will be known of
+    the numbers.
+    """
+
+    joints: Array
+    second: Array | None
+    poses: Array
+    position: Array
+    quantity: Mapping[str, Array]
+    scale: Array
+    known: Estimate
+
+    def needed(self, accuracy: float) -> int | None:
+        """Measurements after which the position is known so well, m; None: not by this plan."""
+        found = np.flatnonzero(self.position <= accuracy)
+        return int(found[0]) if len(found) else None
+
+
+def plan(
+    robot: Robot,
+    kinds: Sequence[Kind],
+    only: Sequence[str] = (),
+    *,
+    measured: Partial | None = None,
+    within: Mapping[str, tuple[float, float]] | None = None,
+    count: int | None = None,
+    accuracy: float | None = None,
+    noise: Mapping[str, float] | None = None,
+    **options: Any,
+) -> Plan:
+    """Choose poses one after the other so that each tells most of the numbers.
+
+    :param only: numbers to fit, or their beginnings; default: all of the geometry.
+    :param measured: what was measured already; its poses then bound the workspace.
+    :param within: least and greatest value by pose coordinate, m or rad.
+    :param accuracy: of the platform's position, m: as many as it needs; ``count``: so many.
+    :param options: as of :func:`pkm_twin.identification.partial.unknowns`.
+    :raises ParameterError: no workspace is known, or two families of poses (pairs and single ones).
+    """
+    pair = {kind.pair for kind in kinds}
+    if len(pair) > 1:
+        raise ParameterError("--measure", "distance", "distance alone, or other kinds, in a plan")
+    q = _candidates(robot, measured, dict(within or {}), kinds)
+    paths = geometric(robot, q, only)
+    joints = np.asarray(robot.controller.controller_positions(q))
+    first = np.arange(len(q))
+    second = np.roll(first, len(q) // 2) if pair == {True} else None
+    noise = dict(noise or {})
+    all_poses = Partial(
+        joints, tuple(Readings(k, first, second, _guess(k, robot, q), first) for k in kinds), noise
+    )
+    parameters = unknowns(robot, all_poses, paths, **options)
+    names = [p.name for p in parameters]
+    prior = np.array([p.prior for p in parameters])
+    fitted = [name for name in names if name in paths]
+    state = placed(robot, all_poses, fitted)
+    covariance: Array = np.eye(len(names))
+    if measured is not None:
+        there = placed(robot, measured, fitted)
+        state.instrument.own |= {k: v for k, v in there.instrument.own.items() if k in names}
+        table = _rows(measured, robot, there, names, prior)
+        covariance = np.asarray(np.linalg.inv(covariance + table.T @ table), np.float64)
+    rows = np.stack(
+        [
+            part[:, 0] * prior / noise.get(kind.name, kind.noise)
+            for kind, part in zip(kinds, all_poses.slopes(robot, state, names), strict=True)
+        ],
+        1,
+    )
+    mine = [k for k, name in enumerate(names) if name not in all_poses.own]
+    places = np.zeros((len(q), 3, len(names)))
+    places[..., mine] = derivatives(robot, state, [names[k] for k in mine])[:, :3] * prior[mine]
+    # A motion of the whole workspace is where the instrument stands, not an error of the machine.
+    rigid = np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(q), 3, 3)), -skew(state.platform[0])], -1
+    ).reshape(-1, 6)
+    flat = places.reshape(len(rigid), -1)
+    places = (flat - rigid @ np.linalg.lstsq(rigid, flat, rcond=1e-9)[0]).reshape(places.shape)
+    span = _span(all_poses, robot, state, names, prior)
+    order: list[int] = []
+    told: list[tuple[float, float, Array]] = []
+    most = min(count or (MOST if accuracy else USUAL), MOST, len(q))
+    while True:
+        axes = np.sqrt(np.mean(_variances(places, covariance), 0))
+        seen = np.sqrt(np.mean(_variances(rows, covariance), 0))
+        told.append((float(axes.max()), float(np.sqrt(span @ covariance @ span)), seen))
+        if len(order) == most or (accuracy and not count and told[-1][0] <= accuracy):
+            break
+        moved = rows @ covariance
+        inner = moved @ np.swapaxes(rows, 1, 2) + np.eye(rows.shape[1])
+        gain = np.linalg.slogdet(inner)[1]
+        gain[order] = -1.0
+        best = int(np.argmax(gain))
+        order.append(best)
+        taken = moved[best]
+        covariance = covariance - taken.T @ np.linalg.solve(inner[best], taken)
+    position, scale, seen_all = zip(*told, strict=True)
+    quantity = {
+        kind.name: np.array(seen_all)[:, k] * noise.get(kind.name, kind.noise)
+        for k, kind in enumerate(kinds)
+    }
+    deviations = prior * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    known = tuple(
+        replace(p, value=p.before, deviation=float(d))
+        for p, d in zip(parameters, deviations, strict=True)
+    )
+    return Plan(
+        joints=joints[order], second=None if second is None else joints[second[order]],
+        poses=robot.forward(q[order]), position=np.array(position), quantity=quantity,
+        scale=np.array(scale),
+        known=Estimate(
+            robot=robot, parameters=known, covariance=covariance * np.outer(prior, prior), steps=0
+        ),
+    )  # fmt: skip
+
+
+def _variances(rows: Array, covariance: Array) -> Array:
+    return np.asarray(np.sum((rows @ covariance) * rows, -1), np.float64)
+
+
+def _rows(
+    measured: Partial, robot: Robot, state: State, names: Sequence[str], prior: Array
+) -> Array:
+    """Derivatives of all measurements over their noise, in units of the priors."""
+    parts = zip(measured.readings, measured.slopes(robot, state, names), strict=True)
+    return np.concatenate(
+        [
+            part[:, 0] * prior / measured.noise.get(one.kind.name, one.kind.noise)
+            for one, part in parts
+        ]
+    )
+
+
+def _span(poses: Partial, robot: Robot, state: State, names: Sequence[str], prior: Array) -> Array:
+    readings = spans_of(state)
+    if readings is None:
+        return np.zeros(len(names))
+    part = replace(poses, readings=(*poses.readings, readings)).slopes(robot, state, names)[-1]
+    return np.asarray(part[0, 0] * prior, np.float64)
+
+
+def _guess(kind: Kind, robot: Robot, q: Array) -> Array:
+    """Values with which a kind's own numbers get a likely place: a ball below the poses."""
+    if kind.name != "radius":
+        return np.zeros(len(q))
+    position = robot.platform(q)[0]
+    below = position.mean(0) - [0.0, 0.0, float(np.ptp(position, axis=0).max())]
+    return np.asarray(np.linalg.norm(position - below, axis=1), np.float64)
+
+
+def _candidates(
+    robot: Robot, measured: Partial | None, within: dict[str, tuple[float, float]],
+    kinds: Sequence[Kind],
+) -> Array:  # fmt: skip
+    """Joint states (k, n) from which poses are chosen.
+
+    :raises ParameterError: the workspace is not known, or none of it can be reached.
+    """
+    rng = np.random.default_rng(0)
+    box = np.full((len(robot.pose_names), 2), np.nan)
+    limits = robot.limits.position
+    if measured is not None:
+        poses = robot.forward(robot.controller.positions(measured.joints))
+        box = np.stack([poses.min(0), poses.max(0)], -1)
+    elif limits is not None and np.isfinite(limits).all():
+        drawn = rng.uniform(limits[:, 0], limits[:, 1], (DRAWN * CANDIDATES, len(limits)))
+        poses, good = robot.try_forward(drawn)
+        if good.any():
+            box = np.stack([poses[good].min(0), poses[good].max(0)], -1)
+    names = list(robot.pose_names)
+    if KINDS["plane"] in kinds and measured is None and "z" in names:
+        box[names.index("z")] = robot.home()[names.index("z")]
+    for name, ends in within.items():
+        if name not in names:
+            raise ParameterError("--within", name, f"one of {', '.join(names)}")
+        box[names.index(name)] = ends
+    if not np.isfinite(box).all():
+        missing = names[int(np.flatnonzero(~np.isfinite(box).all(1))[0])]
+        raise ParameterError(
+            "--within", None,
+            f"the range of {missing}, as {missing}=-0.1:0.1: the file has no joint limits",
+        )  # fmt: skip
+    poses = rng.uniform(box[:, 0], box[:, 1], (DRAWN * CANDIDATES, len(box)))
+    q, good = robot.try_inverse(poses)
+    if limits is not None:
+        with np.errstate(invalid="ignore"):
+            good = good & ((q >= limits[:, 0]) & (q <= limits[:, 1])).all(-1)
+    if good.sum() < len(names):
+        raise ParameterError("--within", dict(within) or None, "poses that the machine reaches")
+    return np.asarray(q[good][:CANDIDATES], np.float64)
