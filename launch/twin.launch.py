@@ -63,7 +63,7 @@ ARGUMENTS = {
     "use_wrench": ("", "parameter of delta_dynamics: true includes the measured wrench"),
     "wrench_frame": ("", "frame id of the measured wrench"),
     "use_sim_time": ("false", "use simulated time, for a bag replayed with --clock"),
-    "executor": ("", "of all nodes: single or events; default: each node's own, composed: events"),
+    "executor": ("events", "parameter of all nodes: events or single"),
     "composed": ("false", "run all nodes except command_gate in one process, which saves time"),
     "respawn": ("true", "restart a node that has ended; command_gate is always restarted"),
     "log_level": ("info", "log level: debug, info, warn, error or fatal"),
@@ -211,9 +211,7 @@ def _parameters(name: str, given: dict[str, str]) -> dict[str, object]:
     chosen: dict[str, object] = {key: given[key] for key in PARAMETERS[name] if given[key]}
     if given["robot"]:
         chosen["mechanism"] = given["robot"]
-    executor = given["executor"] or ("events" if _flag(given, "composed") else "")
-    if executor:
-        chosen["executor"] = executor
+    chosen["executor"] = given["executor"]
     if "use_wrench" in chosen:
         chosen["use_wrench"] = _flag(given, "use_wrench")
     return {**chosen, "use_sim_time": _flag(given, "use_sim_time")}

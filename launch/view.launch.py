@@ -17,7 +17,7 @@ from launch_ros.actions import Node
 
 from launch import LaunchDescription
 from pkm_twin import load
-from pkm_twin.machine.robot_urdf import robot_urdf
+from pkm_twin.robot.robot_urdf import robot_urdf
 
 HERE = Path(__file__).parent
 LAYOUT = "view/machine.rviz"

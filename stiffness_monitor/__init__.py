@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Elastostatics of parallel kinematic machines: compliance, strain energy, workspace."""
 
-from pkm_twin.kinematics.clearance import clearance
-from pkm_twin.kinematics.workspace import (
+from pkm_twin.robot.clearance import clearance
+from pkm_twin.robot.workspace import (
     RegularWorkspace,
     reachable,
     regular_workspace,
 )
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
+from stiffness_monitor.chatter import Lobes, Milling, stability_lobes, stable_depth
 from stiffness_monitor.compliance import (
     PlatformResponse,
     StrainEnergy,
@@ -20,12 +21,15 @@ from stiffness_monitor.correction import Correction, setpoint_correction
 from stiffness_monitor.derivatives import compliance_derivatives
 from stiffness_monitor.response import ElementResponse, element_response
 from stiffness_monitor.uncertainty import compliance_deviation, deflection_deviation
+from stiffness_monitor.vibration import frequency_response, tool_modes
 
 __all__ = [
     "AlarmSettings",
     "Correction",
     "Departure",
     "ElementResponse",
+    "Lobes",
+    "Milling",
     "PlatformResponse",
     "RegularWorkspace",
     "StiffnessAlarm",
@@ -36,10 +40,14 @@ __all__ = [
     "compliance_deviation",
     "deflection_deviation",
     "element_response",
+    "frequency_response",
     "platform_response",
     "reachable",
     "regular_workspace",
     "setpoint_correction",
+    "stability_lobes",
+    "stable_depth",
     "stiffness",
     "strain_energy",
+    "tool_modes",
 ]

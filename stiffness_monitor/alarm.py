@@ -8,8 +8,6 @@ factors explain a window of samples: always one more, the one that leaves the le
 It has departed where its factor is farther from 1 than a number of deviations, of the measured
 noise and of what the file's uncertainty says of that element. Elements that would explain the same
 nearly as well are named with it.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
 """
 
 from __future__ import annotations
@@ -25,9 +23,9 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import one_vector
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.uncertainty import STEP, Factor
-from stiffness_monitor.compliance import compliance, strain_energy
+from pkm_twin.robot.robot import Robot
+from stiffness_monitor.compliance import strain_energy
+from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from stiffness_monitor.response import element_response
 
 Array = NDArray[np.float64]
@@ -201,8 +199,7 @@ class StiffnessAlarm:
     def _prepare(self, pose: Array) -> None:
         """What the elements are, and how sure the file is of each."""
         response = element_response(self.robot, pose)
-        self._causes = _elastic_causes(self.robot, pose)
-        self._doubts = _doubts(self.robot, self._causes, pose, response.names)
+        self._doubts = _doubts(self.robot, pose, len(response.names))
         self.names, self._owner = response.names, response.owner
 
     @property
@@ -224,11 +221,11 @@ class StiffnessAlarm:
         if not self.names:
             self._prepare(pose)
         response = element_response(self.robot, pose)
-        effects = [factor.effect(lambda r: compliance(r, pose)) @ wrench for factor in self._causes]
+        effects = np.einsum("ijk,j->ik", compliance_effects(self.robot, pose), wrench)
         self._samples.append(
             _Sample(
                 time, response.compliance @ wrench, response.reach, response.rest,
-                response.reach.T @ wrench, np.array(effects).reshape(-1, 6).T, deflection,
+                response.reach.T @ wrench, effects, deflection,
             )
         )  # fmt: skip
         while time - self._samples[0].time > self.settings.window:
@@ -378,27 +375,14 @@ def _noise(residual: Array, table: Array, least: Array) -> tuple[Array, float]:
     return size, (1.0 + alike) / (1.0 - alike)
 
 
-def _elastic_causes(robot: Robot, pose: Array) -> tuple[Factor, ...]:
-    """The causes of doubt that change the compliance."""
-    size = np.abs(compliance(robot, pose)).max()
-    return tuple(
-        factor
-        for factor in robot.factors
-        if np.abs(factor.effect(lambda r: compliance(r, pose))).max() > 1e-9 * size
-    )
-
-
-def _doubts(robot: Robot, causes: Sequence[Factor], pose: Array, names: Sequence[str]) -> Array:
+def _doubts(robot: Robot, pose: Array, count: int) -> Array:
     """Relative deviation of each element's compliance by the causes, (elements,).
 
     Of its energy under six unit loads at one pose.
     """
+    if not robot.causes:
+        return np.zeros(count)
     loads = np.diag(np.repeat([1.0, 1.0 / robot.size], 3))
-
-    def energies(one: Robot) -> Array:
-        return np.asarray(strain_energy(one, pose, loads).energies.sum(0), np.float64)
-
-    own = energies(robot)
-    changes = [(energies(f.high) - energies(f.low)) / (2.0 * STEP) for f in causes]
-    squares = np.sum(np.square(changes), 0) if changes else np.zeros(len(names))
-    return np.asarray(np.sqrt(squares) / np.maximum(own, 1e-300), np.float64)
+    own = strain_energy(robot, pose, loads).energies.sum(0)
+    changes = np.linalg.norm(energy_effects(robot, pose, loads).sum(0), axis=-1)
+    return np.asarray(changes / np.maximum(own, 1e-300), np.float64)

@@ -15,9 +15,11 @@ from rclpy.time import Time
 from std_srvs.srv import Trigger
 
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros import node as health
-from pkm_twin.ros.messages import StampRules
+from pkm_twin.messages.stamps import StampRules
+from pkm_twin.robot.robot import Robot
+from pkm_twin.ros import health
+from pkm_twin.ros.node import TwinNode
+from pkm_twin.ros.turns import Task
 from stiffness_monitor.alarm import AlarmSettings, Departure
 from stiffness_monitor.monitor import Answer
 from stiffness_monitor.watch import StiffnessWatch
@@ -29,7 +31,7 @@ class StiffnessAlarmTopics:
     """``measured_deflection`` beside the wrenches; ``~/stiffness_alarm`` says what has departed."""
 
     def __init__(
-        self, node: health.TwinNode, robot: Robot, rules: StampRules, frames: tuple[str, str]
+        self, node: TwinNode, robot: Robot, rules: StampRules, frames: tuple[str, str]
     ) -> None:
         """Declare the parameters and create the topics that they ask for.
 
@@ -135,7 +137,7 @@ class StiffnessAlarmTopics:
         if core is None or not (core.taken.accepted or core.taken.rejected):
             return {}
         values: dict[str, object] = {
-            "deflections taken": core.taken.accepted,
+            "deflections accepted": core.taken.accepted,
             "deflections in the window": core.count,
         }
         return values | {f"deflections rejected: {k}": v for k, v in core.taken.rejected.items()}
@@ -151,7 +153,7 @@ class StiffnessAlarmTopics:
         if work is not None:
             self._node.defer("measured_deflection", self._answer(core, work))
 
-    def _answer(self, core: StiffnessWatch, work: Generator[None, None, bool]) -> health.Task:
+    def _answer(self, core: StiffnessWatch, work: Generator[None, None, bool]) -> Task:
         if (yield from work):
             self._publish(core)
 

@@ -5,8 +5,6 @@ A member's inner nodes can be replaced by its lowest modes with held ends, besid
 of its ends (Craig and Bampton 1968): statics stay exact, and a pose costs much less.
 
 Displacements of a node are in the order x y z rx ry rz (m, rad). SI units.
-
-May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
 """
 
 from __future__ import annotations

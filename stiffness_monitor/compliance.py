@@ -3,8 +3,6 @@
 
 Finite elements of its frame (:mod:`stiffness_monitor.structure`), actuators locked. One beam a
 member is exact, because loads act at members' ends.
-
-May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -18,9 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import doubles, vectors
-from pkm_twin.codegen.kernels import NOT_FINITE, Kernel
+from pkm_twin.codegen.code import NOT_FINITE
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import SingularityError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.programs import NONE, PARTS, elastic_of
 
 Array = NDArray[np.float64]

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where to push: joint offsets that cancel what a wrench does to the tool point.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
-"""
+"""Where to push: joint offsets that cancel what a wrench does to the tool point."""
 
 from __future__ import annotations
 
@@ -13,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import doubles, finite, vectors
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.rotations import skew
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -12,22 +12,29 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from pkm_twin.errors import MessageError, ParameterError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros import node as health
+from pkm_twin.messages.reading import JointReader
+from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher
-from pkm_twin.ros.messages import SECOND, JointReader, StampRules
+from pkm_twin.ros.node import TwinNode
 from pkm_twin.streams.wrench import counting
 from stiffness_monitor.correction import setpoint_correction
 from stiffness_monitor.monitor import Answer
 
 MAX_BOUND = 1.0
 """Largest bound of an offset, rad or m."""
+WAITING = 64
+"""Most set points and torques that wait for the other of their stamp."""
 
 
 class SetpointCorrection:
-    """``~/setpoint_offset`` of every wrench; ``setpoint`` with it is ``~/corrected_setpoint``."""
+    """``~/setpoint_offset`` of every wrench; ``setpoint`` with it is ``~/corrected_setpoint``.
 
-    def __init__(self, node: health.TwinNode, robot: Robot, rules: StampRules, decode: Any) -> None:
+    With ``pair_torques``, that and the ``torques`` of the same stamp are one message,
+    ``~/setpoint_with_torques``.
+    """
+
+    def __init__(self, node: TwinNode, robot: Robot, rules: StampRules, decode: Any) -> None:
         """Declare the parameters and create the topics that they ask for.
 
         :param rules: what the stamps of set points have to keep to.
@@ -75,7 +82,18 @@ class SetpointCorrection:
             high=3600.0,
             read_only=True,
         )
-        self.wanted = bool(wanted)
+        paired = node.declare(
+            "pair_torques",
+            False,
+            "also publish ~/setpoint_with_torques: the corrected set point, and the torques of the "
+            "same stamp",
+            read_only=True,
+        )
+        self._waiting: dict[int, tuple[str, Any]] = {}
+        self.unpaired = 0
+        self.wanted, self._paired = bool(wanted), bool(paired)
+        if paired and not wanted:
+            raise ParameterError("pair_torques", True, "false, unless correct_setpoint is true")
         if not wanted:
             return
         q = robot.inverse(robot.home())
@@ -84,10 +102,15 @@ class SetpointCorrection:
         self._offsets = JointPublisher(node, robot, "~/setpoint_offset", fields)
         self._corrected = JointPublisher(node, robot, "~/corrected_setpoint", fields)
         node.create_guarded_subscription(JointState, "setpoint", self._on_setpoint, raw=True)
+        if paired:
+            both = ("position", "effort")
+            self._both = JointPublisher(node, robot, "~/setpoint_with_torques", both)
+            node.create_guarded_subscription(JointState, "torques", self._on_torques, raw=True)
 
     def reset(self) -> None:
         """Forget the last wrench, as when the clock jumps."""
         self._offset = None
+        self._waiting.clear()
 
     def change_rules(self, rules: StampRules) -> None:
         """Judge stamps by other rules from the next set point on."""
@@ -117,6 +140,8 @@ class SetpointCorrection:
             "corrections at their bound": self.bounded,
             "set points corrected": self.setpoints.accepted,
         }
+        if self._paired:
+            values["set points and torques without a pair"] = self.unpaired
         return values | {f"set points rejected: {k}": v for k, v in self.setpoints.rejected.items()}
 
     def _on_setpoint(self, data: bytes) -> None:
@@ -138,5 +163,23 @@ class SetpointCorrection:
                 "no wrench",
                 f"the last wrench is {age:.3f} s old, allowed {self._age:g} s",
             )
-        own = self._robot.controller
-        self._corrected.publish(sample.stamp, own.controller_positions(sample.q + offset))
+        corrected = self._robot.controller.controller_positions(sample.q + offset)
+        self._corrected.publish(sample.stamp, corrected)
+        if self._paired:
+            self._pair(sample.stamp, "position", corrected)
+
+    def _on_torques(self, data: bytes) -> None:
+        sample = self._reader.efforts(self._decode(data), self._node.now(), self._rules)
+        self._pair(sample.stamp, "effort", sample.given)
+
+    def _pair(self, stamp: int, what: str, numbers: Any) -> None:
+        """Publish both of a stamp, or keep one until the other arrives; the newest counts."""
+        other = self._waiting.pop(stamp, None)
+        if other is not None and other[0] != what:
+            pair = dict([other, (what, numbers)])
+            self._both.publish(stamp, pair["position"], pair["effort"])
+            return
+        self._waiting[stamp] = (what, numbers)
+        if len(self._waiting) > WAITING:
+            self._waiting.pop(next(iter(self._waiting)))
+            self.unpaired += 1

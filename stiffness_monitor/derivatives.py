@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exact derivatives of the platform's compliance: by the joints, and by numbers of the file.
-
-May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
-"""
+"""Exact derivatives of the platform's compliance: by the joints, and by numbers of the file."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,17 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.derivatives import Derivatives, geometry_numbers, pose_by_geometry
 from pkm_twin.kinematics.gradients import gradient_program
-from pkm_twin.kinematics.numbers import cause_slopes, file_numbers
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.derivatives import Derivatives, geometry_numbers, pose_by_geometry
+from pkm_twin.robot.numbers import cause_slopes, file_numbers
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import compliance
 from stiffness_monitor.numbers import numbers_of
 from stiffness_monitor.programs import NONE, Elastic, Solved, elastic_of
 
 Array = NDArray[np.float64]
 
-ENTRIES = 36
+Write = Callable[[Solved], Program]
+Chosen = tuple[int, ...] | None
 
 
 def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
@@ -37,7 +37,7 @@ def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()
     :returns: ``state`` by the pose, shape (..., 6, 6, m), and ``by[path]`` (..., 6, 6).
     :raises ParameterError: a path that there is not. Other errors as of ``compliance``.
     """
-    by_q, by_numbers = _tables(robot, pose)
+    by_q, by_numbers = _tables(robot, pose, _entries)
     found: dict[str, Array] = {}
     if by:
         slopes = file_numbers(robot, tuple(by), elastic_numbers).slopes
@@ -51,18 +51,40 @@ def compliance_effects(robot: Robot, pose: ArrayLike) -> Array:
     """What one standard deviation of each of the file's causes changes, (..., 6, 6, causes)."""
     if not robot.causes:
         return np.zeros((*compliance(robot, pose).shape, 0))
-    return _square(_tables(robot, pose)[1] @ cause_slopes(robot, elastic_numbers))
+    return _square(_effects(robot, pose, _entries))
 
 
-def _tables(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
-    """Of C's entries by q, and by geometry and elasticity with the pose held, (..., 36, k)."""
+def energy_effects(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> Array:
+    """The same of strain energies under wrenches (..., 6), shape (..., elements, causes)."""
+    return _effects(robot, pose, _energies, np.asarray(wrench, np.float64)[..., None, :])
+
+
+def _effects(robot: Robot, pose: ArrayLike, write: Write, *loads: Array) -> Array:
+    causes = cause_slopes(robot, elastic_numbers)
+    table = _tables(robot, pose, write, causes.chosen, *loads)[1] @ causes.slopes
+    return np.asarray(table, np.float64)
+
+
+def _tables(
+    robot: Robot, pose: ArrayLike, write: Write, chosen: Chosen = None, *loads: Array
+) -> tuple[Array, Array]:
+    """Of a program's outputs by q, and by geometry and elasticity with the pose held.
+
+    :param chosen: places of the numbers that are needed; without geometry q is left out.
+    :returns: shape (..., outputs, k) each.
+    """
     compliance(robot, pose)  # its errors
     q = robot.inverse(pose)
-    (by_q, by_numbers), _ = compliance_gradient(elastic_of(robot))(
-        NONE, q[..., None, :], np.eye(ENTRIES)
-    )
-    moved = pose_by_geometry(robot, q)
-    by_numbers[..., : moved.shape[-1]] -= by_q @ np.linalg.solve(robot.jacobian(q), moved)
+    kernel = _gradient_of(elastic_of(robot), write, chosen)
+    weights = np.eye(kernel.sizes[0][-1])
+    (by_q, by_numbers), _ = kernel(NONE, q[..., None, :], *loads, weights)
+    if by_q.shape[-1]:
+        moved = pose_by_geometry(robot, q)
+        geometry = np.arange(moved.shape[-1])
+        if chosen is not None:
+            geometry = np.array([k for k in chosen if k < len(geometry)], int)
+        changes = np.linalg.solve(robot.jacobian(q), moved[..., geometry])
+        by_numbers[..., : len(geometry)] -= by_q @ changes
     return by_q, by_numbers
 
 
@@ -71,17 +93,35 @@ def _square(table: Array) -> Array:
 
 
 def elastic_numbers(robot: Robot) -> list[Any]:
-    """Geometry, then what elasticity takes beside it, of numbers or expressions."""
+    """Geometry, then the further inputs of elasticity: numbers or expressions."""
     return [*geometry_numbers(robot), *numbers_of(robot.elastic)]
 
 
 def compliance_gradient(elastic: Elastic) -> Kernel:
     """Program of sums of C's entries: q and weights (36) to derivatives by q and all numbers."""
-    return elastic.kernel("platform compliance gradient", _gradient, free=True)
+    return _gradient_of(elastic, _entries, None)
 
 
-def _gradient(s: Solved) -> Program:
+def _gradient_of(elastic: Elastic, write: Write, chosen: Chosen) -> Kernel:
+    name = f"gradient{write.__name__} by {chosen}"
+    return elastic.kernel(name, partial(_gradient, write, chosen), free=True)
+
+
+def _entries(s: Solved) -> Program:
     s.factorise()
-    program = s.program({}, {"compliance": s.compliance.ravel()})
-    t = s.t
-    return gradient_program(t, program, {"q": list(t.q), "numbers": [*t.geometry, *t.more]})
+    return s.program({}, {"compliance": s.compliance.ravel()})
+
+
+def _energies(s: Solved) -> Program:
+    s.factorise()
+    s.load(s.t.tape.inputs("wrench", 6))
+    return s.program({"wrench": 6}, {"energies": s.energies()})
+
+
+def _gradient(write: Write, chosen: Chosen, s: Solved) -> Program:
+    program, t = write(s), s.t
+    numbers, q = [*t.geometry, *t.more], list(t.q)
+    if chosen is not None:
+        numbers = [numbers[k] for k in chosen]
+        q = q if min(chosen, default=math.inf) < len(t.geometry) else []
+    return gradient_program(t, program, {"q": q, "numbers": numbers})

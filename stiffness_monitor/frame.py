@@ -10,8 +10,6 @@ stretch, twist, and in both planes a bend to a circle and one to an S. Each has 
 d (b . x)^2 / 2.
 
 Displacements are in the order x y z rx ry rz (m, rad). SI units.
-
-May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
 """
 
 from __future__ import annotations

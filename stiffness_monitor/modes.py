@@ -3,8 +3,6 @@
 
 The robot is linear about the pose: elastic beams, joints with free and elastic directions, a rigid
 platform (Delta-CU paper, modal analysis). K x = (2 pi f)^2 M x.
-
-May import: numpy, scipy, pkm_twin's core, this package, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky, eigh, solve_triangular  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.machine.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 from stiffness_monitor.beams import System, assemble
 from stiffness_monitor.structure import structural_model
 
@@ -75,8 +73,8 @@ def natural_frequencies(
     q = _joints(robot, pose)
     result = np.empty((*q.shape[:-1], count))
     for index in np.ndindex(*q.shape[:-1]):
-        system = _system(robot, q[index], elements)
-        result[index] = _solve(system, count, index, vectors=False)[0]
+        system = frame_system(robot, q[index], elements)
+        result[index] = solve_modes(system, count, index, vectors=False)[0]
     return result
 
 
@@ -98,8 +96,8 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     if not np.prod(batch, dtype=int):
         raise ValueError("modes: no poses given")
     for index in np.ndindex(*batch):
-        system = _system(robot, q[index], elements)
-        values, vectors = _solve(system, count, index, vectors=True)
+        system = frame_system(robot, q[index], elements)
+        values, vectors = solve_modes(system, count, index, vectors=True)
         frequencies.append(values)
         positions.append(system.positions)
         for vector in vectors.T:
@@ -142,13 +140,18 @@ def _joints(robot: Robot, pose: ArrayLike) -> Array:
     return robot.inverse(pose)
 
 
-def _system(robot: Robot, q: Array, elements: int) -> System:
+def frame_system(robot: Robot, q: Array, elements: int) -> System:
+    """The frame in a pose by its joint positions (n,).
+
+    :raises ParameterError: a robot without masses or elastic members, or no elements.
+    """
+    robot.massive()
     if elements < 1:
         raise ParameterError("elements", elements, "1 or more")
     return assemble(structural_model(robot, q), elements, KEPT)
 
 
-def _stiffness_root(system: System, index: tuple[int, ...]) -> Array:
+def stiffness_root(system: System, index: tuple[int, ...]) -> Array:
     """Lower Cholesky factor of the stiffness; not positive definite is a mechanism.
 
     :raises SingularityError: by the sample's index.
@@ -164,7 +167,7 @@ def _stiffness_root(system: System, index: tuple[int, ...]) -> Array:
     return root
 
 
-def _solve(
+def solve_modes(
     system: System, count: int, index: tuple[int, ...], *, vectors: bool
 ) -> tuple[Array, Array]:
     """Frequencies (count,), Hz, and vectors (n, count) of unit generalised mass.
@@ -175,7 +178,7 @@ def _solve(
     size = len(system.mass)
     if not 1 <= count <= size:
         raise ValueError(f"count is {count}; the frame has {size} modes")
-    root = _stiffness_root(system, index)
+    root = stiffness_root(system, index)
     half = solve_triangular(root, system.mass, lower=True, check_finite=False)
     matrix = solve_triangular(root, half.T, lower=True, check_finite=False)
     chosen = (size - count, size - 1)

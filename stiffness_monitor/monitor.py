@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stiffness node's core: messages in, compliance and strain energy out. Pure.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
-"""
+"""The stiffness node's core: messages in, compliance and strain energy out. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
-from pkm_twin.ros.messages import SECOND, WrenchSample, as_message_error
+from pkm_twin.messages.reading import WrenchSample, as_message_error
+from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.pairing import PairingCore
 from pkm_twin.streams.wrench import Mount, Recent, WrenchSettings

@@ -23,15 +23,16 @@ from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, PkmTwinError
-from pkm_twin.ros import node as health
+from pkm_twin.messages.intake import JointStateDecoder
+from pkm_twin.ros import health
 from pkm_twin.ros.changes import follow_changes
-from pkm_twin.ros.intake import JointStateDecoder
+from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import (
-    SECONDS,
     WRENCH_CHANGES,
     changed,
     declare_mounts,
+    declare_stamps,
     declare_wrench,
 )
 from pkm_twin.streams.pace import Pace
@@ -48,11 +49,11 @@ ENTRIES: Final = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER, strict=Tru
 """Names of the compliance's entries: of the displacement, and of the force or moment."""
 
 
-class StiffnessMonitor(health.TwinNode):
+class StiffnessMonitor(TwinNode):
     """Live compliance and strain energy of any robot with elastic members."""
 
     def __init__(self) -> None:
-        super().__init__("stiffness_monitor", executor="events")
+        super().__init__("stiffness_monitor")
         robot = load(
             self.declare(
                 "mechanism", "upr_rpu", "robot: a name, or the path of a file", read_only=True
@@ -147,7 +148,7 @@ class StiffnessMonitor(health.TwinNode):
             level, message = health.WARN, self._alarm.warning()
         values: dict[str, object] = {
             "robot": core.robot.name,
-            "joint states taken": core.states.accepted,
+            "joint states accepted": core.states.accepted,
             "wrenches answered": core.wrenches.accepted,
             "older stamps dropped": core.dropped,
         }
@@ -162,26 +163,11 @@ class StiffnessMonitor(health.TwinNode):
         self._alarm.reset()
 
     def _declare_settings(self) -> Settings:
-        d = Settings()
-        return declare_wrench(
-            self,
-            base_frame=self.declare(
-                "base_frame", d.base_frame, "frame id of the base", read_only=True
-            ),
-            max_state_age=self.declare(
-                "max_state_age", d.max_state_age, "largest time between a wrench and the nearest "
-                "joint state",
-                **SECONDS,
-            ),
-            future_tolerance=self.declare(
-                "future_tolerance", d.future_tolerance, "how far time stamps may be ahead of the "
-                "clock",
-                **SECONDS,
-            ),
-            accept_zero_stamp=self.declare(
-                "accept_zero_stamp", d.accept_zero_stamp, "accept a zero stamp, as the arrival time"
-            ),
-        )  # fmt: skip
+        base = self.declare(
+            "base_frame", Settings().base_frame, "frame id of the base", read_only=True
+        )
+        stamps = declare_stamps(self, "a wrench and the nearest joint state")
+        return declare_wrench(self, base_frame=base, **stamps)
 
     def _change_settings(self, settings: Settings) -> None:
         """What the stamps of set points and deflections have to keep to, too."""

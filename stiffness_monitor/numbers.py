@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of a robot's elasticity in a row, and the same structure on expressions of them.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
-"""
+"""The numbers of a robot's elasticity in a row, and the same structure on expressions of them."""
 
 from __future__ import annotations
 

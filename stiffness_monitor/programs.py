@@ -7,8 +7,6 @@ wrench follow without another solution. An element has the energy sum of d (b . 
 
 Points, lengths, moduli, diameters and compliances are run-time inputs; only whether a compliance is
 zero, finite or free is part of a program, and what a machine's structure is made of.
-
-May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -26,9 +24,9 @@ from pkm_twin.codegen.expressions import GEOMETRY, absolute, maximum, minimum, s
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import Order, SparseLU, independent_rows, pivot_order
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.engine import Traced
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.machine.robot import Robot
+from pkm_twin.kinematics.traced import Traced
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.frame import PLATFORM, Column, Frame, Row, bent, combined
 from stiffness_monitor.numbers import numbers_of, pattern_of, structure_on
 from stiffness_monitor.structure import FREE, plan_of, posed
@@ -70,6 +68,7 @@ class Elastic:
         soft = [v[0] for s in self.plan.supports for v in s.compliance if v.__class__ is tuple]
         bodies = [member.body for member in self.plan.members]
         self.names = self.structure.order or tuple(dict.fromkeys([*bodies, *soft]))
+        self._kernels: dict[str, Kernel] = {}
 
     @cached_property
     def followers(self) -> Followers | None:
@@ -80,7 +79,7 @@ class Elastic:
         if not self.plan.closures:
             return None
         engine = self.robot.engine
-        frames = [self._frame(Motion(engine.tree, x, q)) for x, q in engine._samples]
+        frames = [self._frame(Motion(engine.tree, x, q)) for x, q in engine.samples]
         tables = np.array([frame.table() for frame in frames], np.float64)
         # Home can be a singularity of the frame.
         ranks = np.array([len(independent_rows(table[None, :, PLATFORM:])) for table in tables])
@@ -106,11 +105,14 @@ class Elastic:
     def kernel(
         self, name: str, write: Callable[[Solved], Program], *, free: bool = False
     ) -> Kernel:
-        """A program on all numbers of the machine; ``free`` as of :meth:`Engine.kernel`."""
-        numbers = np.array(numbers_of(self.structure), np.float64)
-        return self.robot.engine.kernel_with(
-            numbers, name, lambda t: write(Solved(t, self)), self._key, free=free
-        )
+        """A program on all numbers of the machine, as of :meth:`Engine.kernel`."""
+        known = self._kernels.get(name)
+        if known is None:
+            numbers = np.array(numbers_of(self.structure), np.float64)
+            known = self._kernels[name] = self.robot.engine.kernel_with(
+                numbers, name, lambda t: write(Solved(t, self)), self._key, free=free
+            )
+        return known
 
     @cached_property
     def compliance(self) -> Kernel:
@@ -194,7 +196,7 @@ class Solved:
     def _followers(self, chosen: Followers) -> dict[int, Row]:
         t, assumed, known = self.t, self.t.tape.assumed, self.t.home
         if chosen.sample:
-            known = Motion(t.tree, *self.elastic.robot.engine._samples[chosen.sample])
+            known = Motion(t.tree, *self.elastic.robot.engine.samples[chosen.sample])
             # The state is one of this geometry alone.
             assumed += [(e, e.value) for e in t.tape.inputs(GEOMETRY, len(t.tape.reference))]
         follow, inverse, _ = followed(self.frame, chosen)
@@ -249,6 +251,13 @@ class Solved:
         for k, row in self.follow.items():
             self.x[k] = _dot(row.values(), [self.x[c] for c in row])
 
+    def energies(self) -> list[Any]:
+        """Strain energies of the elements under the load, in their order."""
+        found: dict[str, Any] = dict.fromkeys(self.elastic.names, 0.0)
+        for column, amount in zip(self.columns, self.amounts, strict=True):
+            found[column.element] += 0.5 * column.rigidity * (amount * amount)
+        return list(found.values())
+
     def program(self, inputs: dict[str, int], outputs: dict[str, Any]) -> Program:
         """These outputs of q and further inputs."""
         t = self.t
@@ -290,12 +299,10 @@ def _response(s: Solved) -> Program:
         size = maximum(size, absolute(value))
     # Of unit size, so that squares of tiny and huge loads neither vanish nor overflow.
     s.load(wrench / maximum(size, 1e-300))
-    energies: dict[str, Any] = dict.fromkeys(s.elastic.names, 0.0)
-    for column, amount in zip(s.columns, s.amounts, strict=True):
-        energies[column.element] += 0.5 * column.rigidity * (amount * amount)
-    total, square = sum(energies.values(), 0.0), size * size
-    row = [value / maximum(total, 1e-300) for value in energies.values()]
-    row += [value * square for value in energies.values()]
+    energies = s.energies()
+    total, square = sum(energies, 0.0), size * size
+    row = [value / maximum(total, 1e-300) for value in energies]
+    row += [value * square for value in energies]
     row += [s.x[k] * size for k in range(PLATFORM)]
     return s.program(
         {"wrench": 6}, {"row": [*row, total * square, *s.compliance.ravel(), s.measure]}

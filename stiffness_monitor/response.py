@@ -9,8 +9,6 @@ elements (columns G of their own stiffness on the frame's coordinates) and the p
 (Woodbury), all at s = 1, and dC/ds_e = Z_e' Z_e with the rows e of Z = (I + M S)^-1 A': twice the
 element's strain energy at unit loads, which is Castigliano's theorem. A pose is solved once,
 whatever the factors.
-
-May import: numpy, pkm_twin's core, this package, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import one_vector, vectors
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import platform_response
 from stiffness_monitor.frame import PLATFORM
 from stiffness_monitor.programs import NONE, elastic_of

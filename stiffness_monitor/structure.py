@@ -9,8 +9,6 @@ What hangs on what is decided once, at home: that is the plan. In it a point or 
 of its body and its vector at home, a section is its beam's name, and a compliance is 0, infinite or
 the joint's name and the entry. :func:`posed` puts numbers, or expressions, in their place. A plan
 of a geometry on expressions is that of its known case.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -28,8 +26,8 @@ from pkm_twin.codegen.expressions import maximum, reference, references, sign, s
 from pkm_twin.kinematics.motion import reaction_directions
 from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.members import Beam, Structure
-from pkm_twin.machine.outline import Posture
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.outline import Posture
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Vector = Any

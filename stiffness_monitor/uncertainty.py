@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How sure the platform's compliance is, by what the robot's file says of its numbers.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
-"""
+"""How sure the platform's compliance is, by what the robot's file says of its numbers."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_effects
 
 Array = NDArray[np.float64]

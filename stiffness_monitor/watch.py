@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured deflections beside the wrenches that made them: messages in, departures out. Pure.
-
-May import: numpy, pkm_twin's core, this package; never rclpy.
-"""
+"""Measured deflections beside the wrenches that made them: messages in, departures out. Pure."""
 
 from __future__ import annotations
 
@@ -15,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, StampRules, shown
+from pkm_twin.messages.reading import shown
+from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.deflection import DeflectionSample, in_base_axes, read_deflection
 from pkm_twin.streams.wrench import Recent, check_order, counting
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm

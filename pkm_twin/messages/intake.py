@@ -3,8 +3,6 @@
 
 What comes out has the attributes of the live message, or is arrays at once; what goes in are
 templates with their numbers filled in. Every length is checked before it is used.
-
-May import: numpy, the bags' codec, pkm_twin's core, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.errors import BagError, MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.ros.messages import COLUMNS, Ragged, TrajectoryFields
+from pkm_twin.messages.reading import COLUMNS, Ragged, TrajectoryFields
 
 Array = NDArray[np.float64]
 

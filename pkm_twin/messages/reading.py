@@ -3,7 +3,7 @@
 
 Every function either returns finite, complete, ordered data or raises
 :class:`~pkm_twin.errors.MessageError` with a short stable reason for counting. Times are
-integers in nanoseconds. May import: numpy, pkm_twin's core, the standard library.
+integers in nanoseconds.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.machine.joint_map import ControllerNumbers, JointMap
-from pkm_twin.machine.robot import Robot
+from pkm_twin.messages.stamps import MAX_DURATION, SECOND, StampRules, stamp_of
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
-SECOND: Final = 1_000_000_000
 TINY: Final = sys.float_info.min
 """Smallest normal number: a value below it and not zero is a damaged one, not a measurement."""
 
@@ -34,8 +34,6 @@ MAX_EFFORT: Final = 1e7
 MAX_FORCE: Final = 1e7
 MAX_MOMENT: Final = 1e7
 MAX_POINTS: Final = 100_000
-MAX_DURATION: Final = 1_000_000 * SECOND
-"""Bounds beyond all machines of this kind, for values that no limit of the robot bounds."""
 ROUNDING: Final = 4.0 * sys.float_info.epsilon
 """Of a number that is converted there and back, relative."""
 MAX_SHOWN: Final = 80
@@ -50,36 +48,6 @@ COLUMNS: Final = {
 
 
 ExtraJoints = Literal["refuse", "zero"]
-
-
-@dataclass(frozen=True)
-class StampRules:
-    """What a stamp has to keep to, relative to the node's clock; ns, None where unchecked."""
-
-    accept_zero: bool = False
-    future_tolerance: int = SECOND // 10
-    max_age: int | None = None
-
-    def check(self, stamp: int, now: int) -> int:
-        """The stamp to use: the message's, or the arrival time where zero is accepted."""
-        if stamp == 0:
-            if self.accept_zero:
-                return now
-            raise MessageError("zero stamp", "the stamp is zero; set accept_zero_stamp to allow it")
-        if stamp > now + self.future_tolerance:
-            hint = "; use_sim_time is set and no /clock arrives?" if now == 0 else ""
-            raise MessageError(
-                "future stamp",
-                f"the stamp is {(stamp - now) / SECOND:.3f} s ahead of the clock, "
-                f"allowed {self.future_tolerance / SECOND:g} s{hint}",
-            )
-        if self.max_age is not None and stamp < now - self.max_age:
-            raise MessageError(
-                "stale stamp",
-                f"the stamp is {(now - stamp) / SECOND:.3f} s old, allowed "
-                f"{self.max_age / SECOND:g} s; a replayed bag needs use_sim_time and a /clock",
-            )
-        return stamp
 
 
 _MODEL: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
@@ -472,26 +440,6 @@ def as_message_error(call: Callable[..., Any], *arguments: Any) -> Any:
     except ValueError as error:
         # The input was finite: the model overflowed.
         raise MessageError("non-finite result", str(error)) from error
-
-
-def stamp_of(header: Any) -> int:
-    """A header's stamp in nanoseconds, checked to be a valid time."""
-    return _nanoseconds("stamp", header.stamp)
-
-
-def duration_of(duration: Any) -> int:
-    """A duration in nanoseconds; may be negative."""
-    nanosec = int(duration.nanosec)
-    if not 0 <= nanosec < SECOND:
-        raise MessageError("time", f"nanosec is {nanosec}, allowed 0 to {SECOND - 1}")
-    return int(duration.sec) * SECOND + nanosec
-
-
-def _nanoseconds(what: str, time: Any) -> int:
-    sec, nanosec = time.sec, time.nanosec
-    if sec < 0 or not 0 <= nanosec < SECOND:
-        raise MessageError("time", f"{what} is {sec} s and {nanosec} ns")
-    return int(sec * SECOND + nanosec)
 
 
 def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node's command line may hold beside ROS arguments. May import: the standard library."""
+"""What a node's command line may hold beside ROS arguments."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node for a command, where there is ROS.
-
-May import: pkm_twin's errors, the standard library; rclpy only when it is asked for.
-"""
+"""A node for a command, where there is ROS."""
 
 from __future__ import annotations
 

@@ -16,9 +16,9 @@ from std_msgs.msg import Float64MultiArray
 
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.intake import DoublesTemplate
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.messages.intake import DoublesTemplate
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from pkm_twin.ros.node import TwinNode

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers and shapes as messages, and the publishers of transforms.
 
-Needs message classes, not rclpy. May import: numpy, pkm_twin's core, streams, this package.
+Needs message classes, not rclpy.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pkm_twin.machine import rotations
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.wrench import Mount
 
 if TYPE_CHECKING:

@@ -18,6 +18,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.ros.internals import parameter_overrides
 
 
 class UnknownParametersError(PkmTwinError):
@@ -42,6 +43,17 @@ class ParameterNode(LifecycleNode):
         """Parameters whose changes are taken while the node runs."""
         self._changeable: set[str] = set()
         super().__init__(name)
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """Parameters that the node was started with, by name."""
+        return parameter_overrides(self)
+
+    @property
+    def declared(self) -> dict[str, Parameter]:
+        """All parameters of the node, by name."""
+        found: dict[str, Parameter] = self.get_parameters_by_prefix("")
+        return found
 
     def declare(
         self,
@@ -74,9 +86,9 @@ class ParameterNode(LifecycleNode):
             else:
                 descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
             constraints = f"{low:g} to {high:g} {unit}".strip()
-        given = self._parameter_overrides.get(name)
+        given = self.given.get(name)
         if given is not None:
-            given = self._parameter_overrides[name] = _as_float(given, default)
+            given = self.given[name] = _as_float(given, default)
         try:
             value = self.declare_parameter(name, default, descriptor).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
@@ -106,9 +118,10 @@ class ParameterNode(LifecycleNode):
 
         :raises UnknownParametersError: some were given already; a misspelling, it names each.
         """
-        unknown = [name for name in self._parameter_overrides if name not in self._parameters]
+        declared = self.declared
+        unknown = [name for name in self.given if name not in declared]
         if unknown:
-            raise UnknownParametersError(unknown, self._parameters)
+            raise UnknownParametersError(unknown, declared)
         deaf = sorted(self._changeable - self.followed)
         if deaf:
             # A set of it would be answered as taken.
@@ -119,8 +132,8 @@ class ParameterNode(LifecycleNode):
     def _with_floats(self, changes: list[Parameter]) -> list[Parameter]:
         """Whole numbers for floats where the declaration has floats."""
         return [
-            _as_float(change, self._parameters[change.name].value)
-            if change.name in self._parameters
+            _as_float(change, self.get_parameter(change.name).value)
+            if self.has_parameter(change.name)
             else change
             for change in changes
         ]

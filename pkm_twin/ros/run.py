@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import sys
 import time
@@ -26,6 +27,8 @@ LOOK: Final = 0.5
 """How often the events executor looks whether it has to end, s."""
 PARTING: Final = 1.0
 """How long a node may take to end what others wait for, s: a launcher gives five."""
+TEARDOWN: Final = 3.0
+"""How long rclpy and the middleware may take to end, s: their threads can wait for each other."""
 
 
 class _Executor:
@@ -56,12 +59,17 @@ class _Executor:
                 for node in nodes:
                     node.caught("rclpy", error)
 
+    def close(self) -> None:
+        """No message calls into it any more: for the nodes to end one after the other."""
+        self._executor.shutdown()
+
 
 def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = None) -> int:
     """Run a node, or several in one executor, until SIGINT, SIGTERM or SIGHUP.
 
     Signals are not the middleware's, which would close the topics at once: a signal ends the
     spinning at its next event, and :meth:`TwinNode.farewell` is called while the topics are there.
+    The process has to end after it, within ``TEARDOWN``.
 
     :returns: 0 after a signal, 1 if a node rejects its configuration.
     """
@@ -107,6 +115,10 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
         end = time.monotonic() + PARTING
         if executor is not None:
             executor.spin(lambda: not any([n.parting for n in nodes]) or time.monotonic() > end)
+        # A thread without Python's lock ends what hangs from here on, and says where.
+        faulthandler.dump_traceback_later(TEARDOWN, exit=True)
+        if executor is not None:
+            executor.close()
         for node in nodes:
             node.destroy_node()
         rclpy.get_default_context().try_shutdown()

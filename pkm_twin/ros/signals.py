@@ -3,8 +3,6 @@
 
 A terminal sends Ctrl-C to every process in it and a launcher sends another, so signals come in
 twos and threes.
-
-May import: the standard library.
 """
 
 from __future__ import annotations

@@ -55,6 +55,26 @@ def declare_wrench(node: TwinNode, read_only: bool = False, **others: Any) -> Wr
     )  # fmt: skip
 
 
+def declare_stamps(node: TwinNode, pair: str) -> dict[str, Any]:
+    """Declare the settings of a node that pairs wrenches with joint states.
+
+    :param pair: what is paired with the nearest of what.
+    """
+    d = WrenchSettings()
+    return {
+        "max_state_age": node.declare(
+            "max_state_age", d.max_state_age, f"largest time between {pair}", **SECONDS
+        ),
+        "future_tolerance": node.declare(
+            "future_tolerance", d.future_tolerance, "how far time stamps may be ahead of the clock",
+            **SECONDS,
+        ),
+        "accept_zero_stamp": node.declare(
+            "accept_zero_stamp", d.accept_zero_stamp, "accept a zero stamp, as the arrival time"
+        ),
+    }  # fmt: skip
+
+
 def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | None:
     """The transforms that tell where a sensor stands; None where the parameters tell it.
 

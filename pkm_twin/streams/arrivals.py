@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller must notice in a stream of stamped torques. Pure: times are arguments.
-
-May import: pkm_twin's stream monitor, the standard library.
-"""
+"""What a controller must notice in a stream of stamped torques. Pure: times are arguments."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a stream of joint states is clear of singularities and moves without jumps.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
-"""
+"""Whether a stream of joint states is clear of singularities and moves without jumps."""
 
 from __future__ import annotations
 
@@ -15,8 +12,8 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.stream import stream_kernel
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measured deflections of a platform out of messages, by attributes only: live or decoded.
 
-Pure: times are arguments. May import: numpy, pkm_twin's core, messages, the standard library.
+Pure: times are arguments.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
-from pkm_twin.ros.messages import TINY, StampRules, stamp_of
+from pkm_twin.messages.reading import TINY
+from pkm_twin.messages.stamps import StampRules, stamp_of
 
 Array = NDArray[np.float64]
 

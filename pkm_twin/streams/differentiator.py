@@ -9,8 +9,6 @@ slope of the window, which is the acceleration half a window ago.
 
 A. Savitzky, M. J. E. Golay, Smoothing and differentiation of data by simplified least squares
 procedures, Analytical Chemistry 36 (1964), doi:10.1021/ac60214a047.
-
-May import: numpy, pkm_twin's core, the standard library.
 """
 
 from __future__ import annotations
@@ -22,11 +20,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.expressions import Objects, Tape, sqrt
-from pkm_twin.codegen.kernels import Code, Kernel
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.messages.stamps import SECOND
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,7 @@
 The effort of a drive that is off, or behind a closed brake, does not bear the machine. The effort
 of a drive that holds it agrees with the model, or at least changes with the noise of its current.
 
-Pure. May import: numpy, the standard library.
+Pure.
 """
 
 from __future__ import annotations

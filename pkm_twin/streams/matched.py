@@ -6,7 +6,7 @@ the motion are damped and late in it. A cutter's force makes such parts, and so 
 bears it; beside a damped acceleration neither fits. Through the same weights both do: the equations
 of motion are linear in acceleration, wrench and effort, and the pose hardly changes in a window.
 
-Pure. May import: numpy, pkm_twin's core, messages, this package.
+Pure.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
-from pkm_twin.ros.messages import SECOND, JointSample, WrenchSample
+from pkm_twin.messages.reading import JointSample, WrenchSample
+from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.wrench import Mount, Recent, WrenchReader, counting
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Counts what is rejected, lost or late and latches the stop of a stream. Pure: no clock here.
-
-May import: the standard library.
-"""
+"""Counts what is rejected, lost or late and latches the stop of a stream. Pure: no clock here."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which samples of a stream are answered where a rate is the most. Pure: no clock here.
-
-May import: the standard library.
-"""
+"""Which samples of a stream are answered where a rate is the most. Pure: no clock here."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What cores have in common that pair joint states with measured wrenches.
 
-Pure: times are arguments. May import: pkm_twin's core, messages, this package.
+Pure: times are arguments.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from pkm_twin.errors import MessageError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import JointReader
+from pkm_twin.messages.reading import JointReader
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.wrench import STAMP_ORDER, Mounts, WrenchReader, WrenchSettings, counting
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A joint trajectory between its points, as joint_trajectory_controller goes it.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
-"""
+"""A joint trajectory between its points, as joint_trajectory_controller goes it."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.ros.messages import Trajectory
+from pkm_twin.messages.reading import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ So a rate counts as zero where it is below its doubt: what the noise of the posi
 makes of it, and what the differentiation itself is wrong by. The noise is what a divided difference
 of order six leaves; of a smooth motion it leaves nothing.
 
-Pure. May import: numpy, messages, the standard library.
+Pure.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.messages.stamps import SECOND
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

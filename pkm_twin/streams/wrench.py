@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measured wrenches: where they are measured, and what they are at the platform's reference point.
 
-Pure: times are arguments. May import: numpy, pkm_twin's core, messages, this package.
+Pure: times are arguments.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine import rotations
-from pkm_twin.ros.messages import SECOND, StampRules, WrenchSample, read_wrench
+from pkm_twin.messages.reading import WrenchSample, read_wrench
+from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.streams.monitor import StreamMonitor
 
 Array = NDArray[np.float64]

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time stamps and durations of messages: nanoseconds, and which stamps are accepted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pkm_twin.errors import MessageError
+
+SECOND: Final = 1_000_000_000
+
+
+MAX_DURATION: Final = 1_000_000 * SECOND
+"""Bounds beyond all machines of this kind, for values that no limit of the robot bounds."""
+
+
+@dataclass(frozen=True)
+class StampRules:
+    """What a stamp has to keep to, relative to the node's clock; ns, None where unchecked."""
+
+    accept_zero: bool = False
+    future_tolerance: int = SECOND // 10
+    max_age: int | None = None
+
+    def check(self, stamp: int, now: int) -> int:
+        """The stamp to use: the message's, or the arrival time where zero is accepted."""
+        if stamp == 0:
+            if self.accept_zero:
+                return now
+            raise MessageError("zero stamp", "the stamp is zero; set accept_zero_stamp to allow it")
+        if stamp > now + self.future_tolerance:
+            hint = "; use_sim_time is set and no /clock arrives?" if now == 0 else ""
+            raise MessageError(
+                "future stamp",
+                f"the stamp is {(stamp - now) / SECOND:.3f} s ahead of the clock, "
+                f"allowed {self.future_tolerance / SECOND:g} s{hint}",
+            )
+        if self.max_age is not None and stamp < now - self.max_age:
+            raise MessageError(
+                "stale stamp",
+                f"the stamp is {(now - stamp) / SECOND:.3f} s old, allowed "
+                f"{self.max_age / SECOND:g} s; a replayed bag needs use_sim_time and a /clock",
+            )
+        return stamp
+
+
+def stamp_of(header: Any) -> int:
+    """A header's stamp in nanoseconds, checked to be a valid time."""
+    return _nanoseconds("stamp", header.stamp)
+
+
+def duration_of(duration: Any) -> int:
+    """A duration in nanoseconds; may be negative."""
+    nanosec = int(duration.nanosec)
+    if not 0 <= nanosec < SECOND:
+        raise MessageError("time", f"nanosec is {nanosec}, allowed 0 to {SECOND - 1}")
+    return int(duration.sec) * SECOND + nanosec
+
+
+def _nanoseconds(what: str, time: Any) -> int:
+    sec, nanosec = time.sec, time.nanosec
+    if sec < 0 or not 0 <= nanosec < SECOND:
+        raise MessageError("time", f"{what} is {sec} s and {nanosec} ns")
+    return int(sec * SECOND + nanosec)

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a node is: counts, log lines at a bounded rate, and its diagnostic status."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from copy import copy
+from itertools import product
+from typing import Final
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSCompatibility, qos_check_compatible
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from pkm_twin.streams.monitor import TopicStatistics
+
+OK: Final = DiagnosticStatus.OK
+WARN: Final = DiagnosticStatus.WARN
+ERROR: Final = DiagnosticStatus.ERROR
+
+OVERRUN_SHARE: Final = 100
+"""One callback in so many may take longer than its period before the diagnostics warn."""
+MAX_TEXT: Final = 500
+"""Characters of a line in the log or of a value in the diagnostics."""
+
+
+class Health:
+    """What a node's callbacks met, and what is wrong around it.
+
+    :param now: the ROS clock, ns.
+    """
+
+    def __init__(self, node: LifecycleNode, now: Callable[[], int]) -> None:
+        """Nothing of the node is used before it is made."""
+        self._node, self._now = node, now
+        self.seen = dict.fromkeys(
+            ("messages", "exceptions", "requests rejected", "clock messages rejected"), 0
+        )
+        self.statistics: dict[str, TopicStatistics] = {}
+        self.awaited: list[str] = []
+        """Topics of which the diagnostics warn until the first message."""
+        self._logged: dict[str, float] = {}
+        self._last_exception = ""
+        self._last_kind = ""
+        self._reported = (0, 0, 0, 0)
+        self._watched: dict[str, list[Callable[[str], None]]] = {}
+        self._unfit: dict[str, dict[bytes, str]] = {}
+        self._incompatible = 0
+        self._last_clock = 0
+
+    def caught(self, where: str, error: Exception) -> None:
+        """An exception in a callback: the node lives; one traceback a kind."""
+        self.seen["exceptions"] += 1
+        self._last_kind = cut(f"{where}: {type(error).__name__}: {error}")
+        text = traceback.format_exc()
+        if text != self._last_exception:
+            self._last_exception = text
+            self._node.get_logger().error(
+                f"{where}: exception in the callback\n{text[-10 * MAX_TEXT :]}"
+            )
+
+    def log_throttled(self, reason: str, text: str) -> None:
+        """At most a line a second and reason; the counts are in the diagnostics."""
+        now = time.monotonic()
+        if now - self._logged.get(reason, -1.0) >= 1.0:
+            self._logged[reason] = now
+            self._node.get_logger().warning(cut(text))
+
+    def watch(self, topic: str, tell: Callable[[str], None] | None = None) -> None:
+        """Tell of other nodes with which this one cannot exchange messages on a topic.
+
+        :param tell: called with what does not fit (``QoS: POLICY`` or ``message type: TYPE``), once
+            a publisher or subscriber.
+        """
+        self._watched.setdefault(topic, []).extend([tell] if tell else [])
+
+    def _look(self) -> None:
+        """Find those nodes in the graph, which costs less than the middleware's events."""
+        for topic, listeners in self._watched.items():
+            before, now = self._unfit.get(topic, {}), self._misfits(topic)
+            self._unfit[topic] = now
+            for end in now.keys() - before.keys():
+                self._incompatible += now[end].startswith("QoS")
+                self.log_throttled(
+                    f"{topic} {now[end]}", f"another node on {topic} has an incompatible {now[end]}"
+                )
+                for tell in listeners:
+                    tell(now[end])
+
+    def _misfits(self, topic: str) -> dict[bytes, str]:
+        """What does not fit at other nodes' publishers and subscribers, by their identity."""
+        # The name as it was given: both calls remap it.
+        speakers = self._node.get_publishers_info_by_topic(topic)
+        listeners = self._node.get_subscriptions_info_by_topic(topic)
+        speaking, listening = ([*filter(self._is_own, ends)] for ends in (speakers, listeners))
+        strangers = [end for end in speakers if not self._is_own(end)]
+        # Every node's own are few: the others are looked at once, however many there are.
+        pairs = [(s, r, r) for s, r in product(speaking, listeners)]
+        pairs += [(s, r, s) for s, r in product(strangers, listening)]
+        found = {bytes(end.endpoint_gid): misfit(s, r) for s, r, end in pairs}
+        return {end: text for end, text in found.items() if text}
+
+    def _is_own(self, end: TopicEndpointInfo) -> bool:
+        node = self._node
+        return (end.node_name, end.node_namespace) == (node.get_name(), node.get_namespace())
+
+    def _troubles(self) -> list[tuple[bytes, str]]:
+        """What is wrong with the node's surroundings, worst first."""
+        found: list[tuple[bytes, str]] = []
+        if self.seen["exceptions"]:
+            found.append((ERROR, f"a callback raised an exception: {self._last_kind}"))
+        self._look()
+        found += [
+            (WARN, f"another node on {topic} has an incompatible {text}")
+            for topic, unfit in self._unfit.items()
+            for text in sorted(set(unfit.values()))
+        ]
+        if self._node.get_parameter("use_sim_time").value:
+            now = self._now()
+            if now == 0:
+                found.append((WARN, "use_sim_time is set and no /clock arrives"))
+            elif now == self._last_clock:
+                found.append((WARN, "use_sim_time is set and /clock stands still"))
+            self._last_clock = now
+        # Every node has one; of the list of names, an ended node's last words may bring it back.
+        publishers = self._node.get_publishers_info_by_topic("/parameter_events")
+        namesakes = sum(map(self._is_own, publishers))
+        if namesakes > 1:
+            found.append((WARN, f"{namesakes} nodes have this name"))
+        taken, clocks = self.seen["messages"], self.seen["clock messages rejected"]
+        lost = sum(topic.missed for topic in self.statistics.values())
+        overruns = sum(topic.overruns for topic in self.statistics.values())
+        before, self._reported = self._reported, (taken, lost, overruns, clocks)
+        taken, lost, overruns, clocks = (a - b for a, b in zip(self._reported, before, strict=True))
+        if clocks:
+            found.append(
+                (WARN, f"{clocks} messages of /clock had an invalid time in the last second")
+            )
+        if lost:
+            found.append((WARN, f"{lost} messages lost in the last second"))
+        # A single late one on a machine that also does other things is no trouble.
+        if overruns > taken / OVERRUN_SHARE:
+            found.append((WARN, f"{overruns} of {taken} callbacks took longer than their period"))
+        return found
+
+    def report(
+        self, level: bytes, message: str, values: dict[str, object], *, active: bool
+    ) -> DiagnosticArray:
+        """The diagnostics of the last second.
+
+        :param values: the node's own, which are added to.
+        """
+        waiting = [topic for topic in self.awaited if not self.statistics[topic].messages]
+        if not active:
+            level, message = OK, "inactive"
+        elif level == OK and waiting:
+            level, message = WARN, f"waiting for {', '.join(waiting)}"
+        troubles = self._troubles()
+        if level == ERROR:
+            troubles.insert(0, (level, message))
+        elif level != OK or not troubles or not active:
+            troubles.append((level, message))
+        status = DiagnosticStatus(
+            level=max(level for level, _ in troubles),
+            name=self._node.get_fully_qualified_name(),
+            message=cut(troubles[0][1]),
+        )
+        status.hardware_id = str(values.pop("robot", ""))
+        values |= self.seen
+        # The message is the worst; what else there is stands here.
+        values["other problems"] = "; ".join(text for _, text in troubles[1:])
+        values["incompatible QoS"] = self._incompatible
+        for topic, statistics in self.statistics.items():
+            values[f"lost: {topic}"] = statistics.missed
+            values[f"overruns: {topic}"] = statistics.overruns
+            values[f"longest callback (ms): {topic}"] = f"{1e3 * statistics.longest:.3f}"
+        status.values = [KeyValue(key=key, value=cut(str(value))) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        return array
+
+
+def misfit(speaker: TopicEndpointInfo, listener: TopicEndpointInfo) -> str:
+    """Why a publisher's messages do not reach a subscriber; empty if they do."""
+    if speaker.topic_type != listener.topic_type:
+        return f"message type: {speaker.topic_type} for {listener.topic_type}"
+    offered, requested = speaker.qos_profile, listener.qos_profile
+    if qos_check_compatible(offered, requested)[0] != QoSCompatibility.ERROR:
+        return ""
+    for policy in ("reliability", "durability", "deadline"):
+        alike = copy(offered)
+        setattr(alike, policy, getattr(requested, policy))
+        if qos_check_compatible(offered, alike)[0] == QoSCompatibility.ERROR:
+            return f"QoS: {policy}"
+    return "QoS: liveliness"
+
+
+def cut(text: str) -> str:
+    """A text that strangers may have made long."""
+    return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}... ({len(text)} characters)"

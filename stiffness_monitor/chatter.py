@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Regenerative chatter in milling: the axial depth of cut up to which a pose cuts stably.
+
+With the tool point's displacement u in the cutting plane, x along the feed and y to its left, the
+force of a depth b is F = -b W(t) (u(t) - u(t - T)), T the time from tooth to tooth (Altintas and
+Budak 1995). The teeth cut by turns, so W is periodic in T. :func:`stability_lobes` discretises one
+period: modes go exactly under forces that are linear in time between its steps, as in the full
+discretisation of Ding et al. (2010), and are stable where all eigenvalues of the period's map have
+a size below one. :func:`stable_depth` takes the mean of W (zero-order), at the worst spindle speed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag  # type: ignore[import-untyped]
+from scipy.optimize import brentq  # type: ignore[import-untyped]
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.robot.robot import Robot
+from stiffness_monitor.vibration import ToolModes, tool_modes
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+SHARE: Final = 0.01
+"""Least peak of a mode in the cutting plane, of the greatest, to count."""
+MOST_MODES: Final = 8
+WAVES: Final = 20.0
+"""Most vibrations of a mode from tooth to tooth; at so low speeds process damping governs."""
+SMOOTH: Final = 10
+"""Degree of a displacement from tooth to tooth beside four for each vibration."""
+STEPS: Final = 20
+"""Steps of a vibration, and twice as many at least from tooth to tooth."""
+RATIO: Final = 1.25
+"""Between two depths that are tried before the limit is bracketed."""
+LOWEST: Final = 0.4
+"""First depth that is tried, of the zero-order one that is stable at every speed."""
+DEEPEST: Final = 25.0
+"""Last depth by default, likewise."""
+BATCH: Final = 5
+"""Depths that are tried at once."""
+CLOSE: Final = 2e-3
+"""Relative width of the bracket that a limit is found in."""
+
+
+@dataclass(frozen=True)
+class Milling:
+    """A milling process; the tool's axis is the platform's z, its rotation clockwise from above.
+
+    ``teeth``: number, evenly spaced, without helix. ``tangential``: cutting coefficient Kt, N/m2.
+    ``radial``: force across over tangential force, Kr. ``immersion``: radial depth of cut over tool
+    diameter, above 0 to 1. ``up``: up-milling instead of down-milling. ``feed``: direction of the
+    feed in the platform's xy plane from x towards y, rad.
+
+    :raises ParameterError: a number out of range.
+    """
+
+    teeth: int
+    tangential: float
+    radial: float
+    immersion: float = 1.0
+    up: bool = False
+    feed: float = 0.0
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "teeth": (1 <= self.teeth <= 100, "1 to 100"),
+            "tangential": (0.0 < self.tangential < 1e13, "above 0, N/m2"),
+            "radial": (-10.0 <= self.radial <= 10.0, "-10 to 10, a ratio"),
+            "immersion": (0.0 < self.immersion <= 1.0, "above 0 to 1"),
+            "feed": (abs(self.feed) < 1e3, "an angle, rad"),
+        }
+        for field in fields(self):
+            good, text = bounds.get(field.name, (True, ""))
+            if not good:
+                raise ParameterError(field.name, getattr(self, field.name), text)
+
+    @property
+    def engaged(self) -> tuple[float, float]:
+        """Angles at which a tooth enters and leaves, from y towards x, rad."""
+        width = float(np.arccos(1.0 - 2.0 * self.immersion))
+        return (0.0, width) if self.up else (np.pi - width, np.pi)
+
+    def primitive(self, angle: Array) -> Array:
+        """Integral of one tooth's W from 0 to angles (..., ) over the cut alone, (..., 2, 2)."""
+        a = np.clip(angle, *self.engaged)
+        one, two = 0.5 * a - 0.25 * np.sin(2.0 * a), 0.5 * np.sin(a) ** 2
+        rest, r = a - one, self.radial
+        rows = [[two + r * one, rest + r * two], [r * two - one, r * rest - two]]
+        return self.tangential * np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+    def mean(self) -> Array:
+        """W averaged over time, shape (2, 2)."""
+        ends = self.primitive(np.array(self.engaged))
+        return np.asarray(self.teeth / (2.0 * np.pi) * (ends[1] - ends[0]))
+
+    def steps(self, count: int) -> Array:
+        """W from tooth to tooth, each step's mean about its time, shape (count, 2, 2)."""
+        pitch = 2.0 * np.pi / self.teeth
+        edges = pitch / count * (np.arange(count + 1) - 0.5)
+        whole = edges + pitch * np.arange(self.teeth)[:, None]
+        total = self.primitive(whole).sum(0)
+        return np.asarray(np.diff(total, axis=0) * (count / pitch))
+
+
+@dataclass(frozen=True, eq=False)
+class Lobes:
+    """Limit depths over spindle speeds.
+
+    ``speeds``: (k,), rpm. ``depths``: (k,), m, the depth at which the cut becomes unstable.
+    ``open``: (k,), where it is still stable at the deepest that was tried, which ``depths`` has.
+    ``safe``: the zero-order depth that is stable at every speed, m.
+    """
+
+    speeds: Array
+    depths: Array
+    open: NDArray[np.bool_]
+    safe: float
+
+    @property
+    def best(self) -> int:
+        """Index of the speed with the greatest depth, of equal ones the fastest."""
+        return int(np.flatnonzero(self.depths == self.depths.max())[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Plane:
+    """Modes in the cutting plane: rad/s and damping ratios (m,), shapes (m, 2) of unit mass."""
+
+    turn: Array
+    damping: Array
+    shapes: Array
+
+    @classmethod
+    def of(cls, modes: ToolModes, milling: Milling) -> _Plane:
+        c, s = np.cos(milling.feed), np.sin(milling.feed)
+        axes = modes.rotation @ np.array([[c, -s], [s, c], [0.0, 0.0]])
+        shapes, turn = modes.shapes[:, :3] @ axes, 2.0 * np.pi * modes.frequencies
+        peak = (shapes**2).sum(1) / (2.0 * modes.damping * turn**2)
+        order = np.argsort(-peak)[:MOST_MODES]
+        kept = np.sort(order[peak[order] >= SHARE * peak.max()])
+        return cls(turn[kept], modes.damping[kept], shapes[kept])
+
+    def stable_depth(self, milling: Milling) -> tuple[float, float]:
+        """By the zero-order approximation, at the worst speed, m; and where it chatters, rad/s."""
+        far = np.geomspace(4.0, 100.0, 16)
+        near = np.concatenate([-far, np.linspace(-4.0, 4.0, 65), far])
+        at = (self.turn[:, None] * (1.0 + self.damping[:, None] * near)).ravel()
+        at = at[at > 0.0][:, None]
+        gain = 1.0 / (self.turn**2 - at**2 + 2j * self.damping * self.turn * at)
+        response = np.einsum("km,mi,mj->kij", gain, self.shapes, self.shapes)
+        real = np.linalg.eigvals(milling.mean() @ response).real.min(1)
+        k = int(real.argmin())
+        return (-0.5 / float(real[k]) if real[k] < 0.0 else np.inf), float(at[k, 0])
+
+    def step(self, h: float) -> tuple[Array, Array, Array]:
+        """Of time h: the modes' map (m, 2, 2), what forces at its begin and end add, (m, 2)."""
+        w, z = self.turn, self.damping
+        root = w * np.sqrt(1.0 - z * z)
+        decay, c, s = np.exp(-z * w * h), np.cos(root * h), np.sin(root * h)
+        s = s / root
+        # Of position and rate: free motion, then that of a constant and of a rising force.
+        free = np.array([[c + z * w * s, s], [-w * w * s, c - z * w * s]]) * decay
+        one = np.array([(1.0 - free[0, 0]) / w**2, free[0, 1]])
+        ramp = np.array([h - 2.0 * z / w * (1.0 - free[0, 0]) - free[0, 1], 1.0 - free[0, 0]])
+        end = ramp / (w**2 * h)
+        return np.moveaxis(free, -1, 0), (one - end).T, end.T
+
+    def growth(self, milling: Milling, speed: float, depths: Array) -> Array:
+        """Largest size of an eigenvalue from tooth to tooth, of depths (k,), m, at a speed, rpm."""
+        period = 60.0 / (speed * milling.teeth)
+        waves = float(self.turn.max()) * period / (2.0 * np.pi)
+        count = max(2 * STEPS, int(np.ceil(STEPS * waves)))
+        force = milling.steps(count)
+        free, begin, end = self.step(period / count)
+        # Only displacements at which a tooth cuts come back. They are smooth: polynomials of time.
+        cut = np.flatnonzero(np.abs(force).max((1, 2)) > 1e-12 * milling.tangential)
+        parts = np.split(cut, np.flatnonzero(np.diff(cut) > 1) + 1)
+        basis = block_diag(*(_polynomials(len(part), waves / count) for part in parts))
+        own = 2 * len(self.turn)
+        n, b = own + 2 * basis.shape[1], depths[:, None, None]
+        before = np.zeros((count, 2, n))
+        before[cut, 0, own::2] = before[cut, 1, own + 1 :: 2] = basis
+        begins, ends = (v[:, :, None] * self.shapes[:, None] for v in (begin, end))
+        gain, at = self.shapes.T @ ends[:, 0], self.shapes.T
+        state = np.broadcast_to(np.eye(own, n).reshape(-1, 2, n), (len(depths), own // 2, 2, n))
+        first = u = at @ state[:, :, 0]
+        f = -b * (force[0] @ (u - before[0]))
+        rows = []
+        for k in range(count):
+            rows.append(u)
+            w = force[(k + 1) % count]
+            past = before[k + 1] if k + 1 < count else first
+            state = free @ state + begins @ f[:, None]
+            u = at @ state[:, :, 0]
+            f = -b * np.linalg.solve(np.eye(2) + b * (w @ gain), w @ (u - past))
+            state, u = state + ends @ f[:, None], u + gain @ f
+        fitted = np.einsum("ck,kdin->dcin", np.linalg.pinv(basis), np.array(rows)[cut])
+        whole = np.concatenate([part.reshape(len(depths), -1, n) for part in (state, fitted)], 1)
+        return np.asarray(np.abs(np.linalg.eigvals(whole)).max(-1))
+
+    def limit(self, milling: Milling, speed: float, low: float, deepest: float) -> float:
+        """The least depth that is unstable at a speed, m; infinite where the deepest is stable.
+
+        :param low: depth to begin at.
+        """
+
+        def margin(depth: float) -> float:
+            return float(np.log(self.growth(milling, speed, np.array([depth]))[0]))
+
+        while margin(low) >= 0.0:
+            low /= 4.0
+        count = max(2, int(np.ceil(np.log(deepest / low) / np.log(RATIO))) + 1)
+        tried = np.geomspace(low, deepest, count)
+        for part in np.array_split(np.arange(1, count), max(1, count // BATCH)):
+            bad = self.growth(milling, speed, tried[part]) >= 1.0
+            if bad.any():
+                k = int(part[bad.argmax()])
+                return float(brentq(margin, tried[k - 1], tried[k], rtol=CLOSE))
+        return np.inf
+
+
+def _polynomials(count: int, waves: float) -> Array:
+    """Polynomials in even steps, shape (count, degree + 1); few steps stay as they are.
+
+    :param waves: vibrations in a step.
+    """
+    degree = SMOOTH + int(np.ceil(4.0 * waves * count))
+    if count < 2 * degree:
+        return np.eye(count)
+    return np.asarray(np.polynomial.chebyshev.chebvander(np.linspace(-1.0, 1.0, count), degree))
+
+
+def stability_lobes(
+    robot: Robot,
+    pose: ArrayLike,
+    milling: Milling,
+    speeds: ArrayLike,
+    *,
+    damping: ArrayLike | None = None,
+    tool: ArrayLike = (0.0, 0.0, 0.0),
+    deepest: float | None = None,
+) -> Lobes:
+    """Axial depths at which milling begins to chatter, over spindle speeds.
+
+    A pose's lowest modes count that move the tool point in the cutting plane, actuators locked.
+
+    :param pose: shape (m,), the mechanism's pose coordinates, m and rad.
+    :param speeds: spindle speeds, shape (k,), rpm.
+    :param damping, tool: as of :func:`~stiffness_monitor.vibration.tool_modes`; so are errors.
+    :param deepest: depth up to which to look, m; default :data:`DEEPEST` times the depth that is
+        stable at every speed.
+    :raises ParameterError: a speed with more than :data:`WAVES` vibrations from tooth to tooth.
+    """
+    return lobes_of(tool_modes(robot, pose, damping=damping, tool=tool), milling, speeds, deepest)
+
+
+def lobes_of(
+    modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: float | None = None
+) -> Lobes:
+    """The same of modes at the tool point, also measured ones; as :func:`stability_lobes`."""
+    plane = _Plane.of(modes, milling)
+    at = np.atleast_1d(np.asarray(speeds, np.float64))
+    least = 60.0 * float(plane.turn.max()) / (2.0 * np.pi * WAVES * milling.teeth)
+    if at.ndim != 1 or not (np.isfinite(at).all() and (at >= least).all()):
+        bound = f"{least:.4g} rpm or more: process damping governs at lower speeds"
+        raise ParameterError("speeds", at.min() if at.ndim == 1 else at.shape, bound)
+    safe, _ = plane.stable_depth(milling)
+    if deepest is None and not np.isfinite(safe):
+        raise ParameterError("deepest", None, "a depth, m, as no depth is unstable in theory")
+    last = DEEPEST * safe if deepest is None else float(deepest)
+    if not 0.0 < last < np.inf:
+        raise ParameterError("deepest", deepest, "a depth above 0, m")
+    low = min(LOWEST * safe, 0.5 * last)
+    found = np.array([plane.limit(milling, float(speed), low, last) for speed in at])
+    return Lobes(at, np.minimum(found, last), found > last, safe)
+
+
+def stable_depth(
+    robot: Robot,
+    pose: ArrayLike,
+    milling: Milling,
+    *,
+    damping: ArrayLike | None = None,
+    tool: ArrayLike = (0.0, 0.0, 0.0),
+) -> float:
+    """The axial depth that is stable at every spindle speed, zero-order approximation, m.
+
+    Infinite where no depth is unstable. Parameters and errors as :func:`stability_lobes`.
+    """
+    return stable_depth_of(tool_modes(robot, pose, damping=damping, tool=tool), milling)[0]
+
+
+def stable_depth_of(modes: ToolModes, milling: Milling) -> tuple[float, int]:
+    """The same of modes at the tool point; and the index of the mode nearest to the chatter."""
+    depth, turn = _Plane.of(modes, milling).stable_depth(milling)
+    return depth, int(np.abs(2.0 * np.pi * modes.frequencies - turn).argmin())

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frequency response of the tool point in a pose, actuators locked, by damped modes.
+
+The lowest modes of the elastic frame respond dynamically, the others as springs (static residual):
+H = sum of p p' / (w^2 - W^2 + 2 i z w W) + (C - sum of p p' / w^2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import cho_solve  # type: ignore[import-untyped]
+
+from pkm_twin.codegen.arrays import one_vector
+from pkm_twin.errors import ParameterError
+from pkm_twin.robot.robot import Robot
+from stiffness_monitor.frame import rigid_offset
+from stiffness_monitor.modes import ELEMENTS, frame_system, solve_modes, stiffness_root
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+COUNT: Final = 24
+"""Modes that respond dynamically."""
+
+
+@dataclass(frozen=True, eq=False)
+class ToolModes:
+    """Modes of a robot in a pose at its tool point, lowest first.
+
+    ``frequencies``: (count,), Hz. ``damping``: ratios (count,). ``shapes``: displacement and
+    rotation of the tool point in base axes, of unit generalised mass, (count, 6). ``rest``: static
+    compliance of the modes left out, (6, 6). ``rotation``: of the platform, (3, 3).
+    """
+
+    frequencies: Array
+    damping: Array
+    shapes: Array
+    rest: Array
+    rotation: Array
+
+    def receptance(self, frequencies: ArrayLike) -> Complex:
+        """Displacement per force at frequencies (k,), Hz; shape (k, 6, 6), m and rad per N, N m."""
+        turn = 2.0 * np.pi * np.asarray(frequencies, np.float64)[:, None]
+        own = 2.0 * np.pi * self.frequencies
+        gain = 1.0 / (own**2 - turn**2 + 2j * self.damping * own * turn)
+        return np.asarray(np.einsum("km,mi,mj->kij", gain, self.shapes, self.shapes) + self.rest)
+
+
+def tool_modes(
+    robot: Robot,
+    pose: ArrayLike,
+    *,
+    damping: ArrayLike | None = None,
+    tool: ArrayLike = (0.0, 0.0, 0.0),
+    elements: int = ELEMENTS,
+) -> ToolModes:
+    """Modes at the tool point; errors as :func:`~stiffness_monitor.modes.natural_frequencies`.
+
+    :param pose: shape (m,), the mechanism's pose coordinates, m and rad.
+    :param damping: ratio of all modes, or of each from the lowest on, the last one of all further
+        modes; default the robot file's ``modal_damping``.
+    :param tool: from the platform's reference point, platform axes, m.
+    :raises ParameterError: no damping is given, or a ratio that is not between 0 and 1.
+    """
+    q = robot.inverse(one_vector(pose, len(robot.pose_names), "the pose"))
+    system = frame_system(robot, q, elements)
+    count = min(COUNT, len(system.mass))
+    ratios = damping_ratios(robot, damping, count)
+    frequencies, vectors = solve_modes(system, count, (), vectors=True)
+    rotation = robot.platform(q)[1]
+    moved = rigid_offset(rotation @ one_vector(tool, 3, "the tool point"))
+    shapes = (moved @ vectors[:6]).T
+    loads = np.zeros((len(system.mass), 6))
+    loads[:6] = moved.T
+    whole = loads.T @ cho_solve((stiffness_root(system, ()), True), loads)
+    rest = whole - (shapes.T / (2.0 * np.pi * frequencies) ** 2) @ shapes
+    return ToolModes(frequencies, ratios, shapes, rest, rotation)
+
+
+def frequency_response(
+    robot: Robot,
+    pose: ArrayLike,
+    frequencies: ArrayLike,
+    *,
+    damping: ArrayLike | None = None,
+    tool: ArrayLike = (0.0, 0.0, 0.0),
+) -> Complex:
+    """Receptance of the tool point, actuators locked: displacement per harmonic force.
+
+    :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
+    :param frequencies: shape (k,), Hz.
+    :returns: shape (..., k, 6, 6), complex; rows displacement (m) and rotation (rad) of the tool
+        point, columns force (N) and moment (N m) there, base axes.
+
+    Other parameters and errors as :func:`tool_modes`.
+    """
+    poses = np.asarray(pose, np.float64)
+    at = np.atleast_1d(np.asarray(frequencies, np.float64))
+    if at.ndim != 1 or not (np.isfinite(at).all() and (at >= 0.0).all()):
+        raise ValueError("frequencies: expected finite numbers, 0 Hz or more, shape (k,)")
+    found = [
+        tool_modes(robot, one, damping=damping, tool=tool).receptance(at)
+        for one in poses.reshape(-1, poses.shape[-1])
+    ]
+    return np.array(found).reshape(*poses.shape[:-1], len(at), 6, 6)
+
+
+def damping_ratios(robot: Robot, given: ArrayLike | None, count: int) -> Array:
+    """Damping ratios of modes, shape (count,); parameters and errors as :func:`tool_modes`."""
+    field = "modal_damping" if given is None else "damping"
+    values = np.atleast_1d(np.asarray(robot.modal_damping if given is None else given, np.float64))
+    if not values.size:
+        raise ParameterError(
+            field, None, "damping ratios of the modes, in the robot's file or given"
+        )
+    if values.ndim != 1 or not ((values > 0.0) & (values < 1.0)).all():
+        raise ParameterError(field, values.tolist(), "damping ratios above 0 and below 1")
+    return values[np.minimum(np.arange(count), len(values) - 1)]
