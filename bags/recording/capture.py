@@ -57,8 +57,9 @@ def parameters_digest(parameters: Mapping[str, Any]) -> str:
 
     A bag whose digest is not that of the machine's file was recorded with another machine.
     """
-    # How well the numbers are known changes no machine.
-    machine = {name: value for name, value in parameters.items() if name != "uncertainty"}
+    # How well the numbers are known changes no machine, nor does damping that no recording has.
+    beside = ("uncertainty", "modal_damping")
+    machine = {name: value for name, value in parameters.items() if name not in beside}
     return hashlib.sha256(json.dumps(machine, sort_keys=True).encode()).hexdigest()
 
 

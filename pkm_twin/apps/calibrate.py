@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 from textwrap import fill
-from typing import Annotated, Any
+from typing import Annotated, Any, Optional
 
 import numpy as np
 import typer
@@ -14,23 +14,45 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from pkm_twin.apps.calibration import HELD_OUT, Calibration, calibrate, geometric
-from pkm_twin.apps.calibration_faults import Outlier
-from pkm_twin.apps.calibration_fit import STEPS, Parameter
-from pkm_twin.apps.calibration_state import BESIDE, Errors
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
 from pkm_twin.apps.options import Accept, BeyondLimits, Json, RobotName
-from pkm_twin.apps.pose_table import LENGTHS, parse_columns, read_poses
-from pkm_twin.apps.transmission import Transmission, written
+from pkm_twin.apps.partial_report import (
+    WIDTH,
+    outlier_texts,
+    parse_noise,
+    parse_within,
+    partial_data,
+    plan_data,
+    plan_table,
+    print_partial,
+    print_plan,
+    scale_text,
+)
+from pkm_twin.apps.pose_table import LENGTHS, parse_columns, read_partial, read_poses
 from pkm_twin.console import file_name, print_json, progress, refuse_existing, table_console
 from pkm_twin.errors import ParameterError, one_line
-from pkm_twin.machine.edited import Fitted, edited_yaml, write_edited
+from pkm_twin.files import replace_file
+from pkm_twin.identification.calibration import (
+    HELD_OUT,
+    Calibration,
+    Estimate,
+    calibrate,
+    geometric,
+)
+from pkm_twin.identification.calibration_faults import Outlier
+from pkm_twin.identification.calibration_fit import STEPS, Parameter
+from pkm_twin.identification.calibration_state import BESIDE, Errors, Poses
+from pkm_twin.identification.measurements import Partial, kinds_of
+from pkm_twin.identification.partial import PartialCalibration, calibrate_partial
+from pkm_twin.identification.plan import MOST
+from pkm_twin.identification.plan import plan as plan_poses
+from pkm_twin.identification.transmission import Transmission, written
+from pkm_twin.robot.edited import Fitted, edited_yaml, write_edited
 
 Array = NDArray[np.float64]
 
-WIDTH = 100
-"""Columns of a line of text."""
+UNKNOWN = "; not determined by these measurements"
 MOST_SHOWN = 10
 """Outliers that are printed."""
 
@@ -38,13 +60,13 @@ MOST_SHOWN = 10
 def calibrate_command(
     robot: RobotName,
     poses: Annotated[
-        Path,
+        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
         typer.Argument(
             help="CSV: JOINT.position columns, x y z (m), perhaps roll pitch yaw (rad) or "
-            "qx qy qz qw",
+            "qx qy qz qw; or what --measure names",
             show_default=False,
         ),
-    ],
+    ] = None,
     out: Annotated[
         Path, typer.Option(help="the calibrated robot, a YAML", callback=file_name)
     ] = Path("calibrated.yaml"),
@@ -85,6 +107,38 @@ def calibrate_command(
     unit: Annotated[
         str, typer.Option(help="of x, y and z where their headers have none: m, cm, mm or um")
     ] = "m",
+    measure: Annotated[
+        list[str],
+        typer.Option(
+            help="what was measured, where not whole poses, separated by commas: height, distance "
+            "(of two poses), radius (ball bar), plane (contact), tilt (roll, pitch), or of x, y, "
+            "z, roll, pitch, yaw"
+        ),
+    ] = [],  # noqa: B006  typer copies it
+    noise: Annotated[
+        list[str],
+        typer.Option(help="KIND=VALUE: known standard deviation of a measurement, m or rad"),
+    ] = [],  # noqa: B006  typer copies it
+    plan: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            help="write the poses to measure next, a CSV, and predict how well the machine will "
+            "be known; calibrate nothing",
+            callback=file_name,
+        ),
+    ] = None,
+    count: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(min=1, max=MOST, help="poses of a plan"),
+    ] = None,
+    accuracy: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(min=1e-9, help="position's standard deviation that a plan is to reach, m"),
+    ] = None,
+    within: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="where a plan measures: x=-0.1:0.1,z=0 (m, rad); default: everywhere"),
+    ] = None,
     beyond_limits: BeyondLimits = False,
     accept: Accept = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
@@ -100,6 +154,10 @@ def calibrate_command(
     Poses that this machine cannot have been in are rejected with the reason, and so are poses in
     another frame than the base's without --frame; --accept calibrates anyway and marks the
     file.
+
+    With --measure any quantities of the poses are enough: cells may be empty. Each measurement is
+    then compared with the fit to all others, and the report says whether the scale is determined.
+    --plan chooses the most informative poses.
     """
     from pkm_twin import load
 
@@ -107,15 +165,46 @@ def calibrate_command(
         raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
     if unit not in LENGTHS:
         raise ParameterError("unit", unit, f"one of {', '.join(LENGTHS)}")
-    refuse_existing(out, overwrite, poses)
+    if plan is not None and plan.suffix != ".csv":
+        raise ParameterError("plan", str(plan), "a name that ends in .csv")
+    refuse_existing(plan or out, overwrite, poses)
     machine = load(robot)
-    measured = read_poses(poses, machine, parse_columns(columns), unit)
-    q = machine.controller.positions(measured.joints)
-    _, beyond = find_beyond(machine, q)
-    if not beyond_limits:
-        refuse_beyond(beyond)
-    notes = [f"beyond limits: {item}" for item in beyond]
+    kinds = kinds_of(measure or (["position"] if plan else []))
+    known, named = parse_noise(noise), parse_columns(columns)
+    measured: Poses | Partial | None = None
+    if poses is not None and kinds:
+        measured = read_partial(poses, machine, kinds, known, named, unit)
+    elif poses is not None:
+        measured = read_poses(poses, machine, named, unit)
+    notes = []
+    if measured is not None:
+        q = machine.controller.positions(measured.joints)
+        _, beyond = find_beyond(machine, q)
+        if not beyond_limits:
+            refuse_beyond(beyond)
+        notes = [f"beyond limits: {item}" for item in beyond]
+    options: dict[str, Any] = {
+        "offsets": offsets, "frame": frame, "target": target, "prior": prior,
+        "transmission": transmission,
+    }  # fmt: skip
+    if plan is not None:
+        some = measured if isinstance(measured, Partial) else None
+        chosen = plan_poses(
+            machine, kinds, only, measured=some, within=parse_within(within), count=count,
+            accuracy=accuracy, noise=known, **options,
+        )  # fmt: skip
+        replace_file(plan, ("\n".join([*plan_table(machine, chosen), ""])).encode())
+        if as_json:
+            print_json({"robot": machine.name, "out": str(plan), **plan_data(chosen, accuracy)})
+            return
+        print_plan(chosen, accuracy)
+        _print_open(chosen.known)
+        typer.echo(f"{plan}: {len(chosen.joints)} poses")
+        return
+    if poses is None or measured is None:
+        raise ParameterError("poses", None, "a CSV of measured poses, or --plan FILE.csv")
     paths = geometric(machine, q, only)
+    result: Calibration | PartialCalibration
     with progress("steps", 2 * STEPS) as update:
         done = 0
 
@@ -124,16 +213,18 @@ def calibrate_command(
             done += count
             update(done)
 
-        result = calibrate(
-            machine, measured, paths, offsets=offsets, frame=frame, target=target, prior=prior,
-            transmission=transmission, accept=accept, progress=step,
-        )  # fmt: skip
+        options |= {"accept": accept, "progress": step}
+        if isinstance(measured, Partial):
+            result = calibrate_partial(machine, measured, paths, **options)
+        else:
+            result = calibrate(machine, measured, paths, **options)
     marks = [*(f"accepted anyway: {fault}" for fault in result.faults), *notes]
     source = f"calibrated with {one_line(poses.name, 100)}"
+    own = measured.own if isinstance(measured, Partial) else {}
     values = {
-        p.name: Fitted(p.value, p.deviation, p.unit, source)
+        p.name: Fitted(p.value, p.deviation, p.unit, source + ("" if p.observed else UNKNOWN))
         for p in result.parameters
-        if not p.name.startswith(BESIDE)
+        if not p.name.startswith(BESIDE) and p.name not in own
     }
     mapped = {p.name: (p.value, p.deviation) for p in result.parameters}
     values |= {
@@ -141,14 +232,21 @@ def calibrate_command(
         for path, number in written(machine, result.joint_map, mapped).items()
     }
     head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
-    head += [f"Outlier, hardly counted: {_outlier_text(one)}." for one in result.outliers]
+    if isinstance(result, PartialCalibration):
+        head += [f"Measured: {', '.join(f'{a.rows} {a.name}' for a in result.agreements)}."]
+        if result.scale is not None:
+            head.append(f"{scale_text(result.scale)}.")
+        outliers = outlier_texts(result)
+    else:
+        outliers = [_outlier_text(one) for one in result.outliers]
+    head += [f"Outlier, hardly counted: {line}." for line in outliers]
     write_edited(out, [*head, *marks], edited_yaml(machine, robot, values))
     if as_json:
-        named = {
+        about = {
             "robot": machine.name, "out": str(out), "beyond_limits": notes,
             "accepted": [str(fault) for fault in result.faults],
         }  # fmt: skip
-        print_json({**named, **as_data(result)})
+        print_json({**about, **as_data(result)})
         return
     _print(result)
     for line in marks:
@@ -156,10 +254,9 @@ def calibrate_command(
     typer.echo(f"{out}: {len(values)} numbers")
 
 
-def as_data(result: Calibration) -> dict[str, Any]:
+def as_data(result: Calibration | PartialCalibration) -> dict[str, Any]:
     """Plain numbers for a script, SI units."""
-    pairs = {"fitted": result.fitted, "held_out": result.held_out}
-    return {
+    listed = {
         "parameters": {
             p.name: {
                 "unit": p.unit,
@@ -169,7 +266,13 @@ def as_data(result: Calibration) -> dict[str, Any]:
                 "observed": p.observed,
             }
             for p in result.parameters
-        },
+        }
+    }
+    if isinstance(result, PartialCalibration):
+        return {**listed, **partial_data(result)}
+    pairs = {"fitted": result.fitted, "held_out": result.held_out}
+    return {
+        **listed,
         "not_observed": list(result.unobserved),
         "outliers": [
             {
@@ -197,13 +300,21 @@ def _errors(errors: Errors) -> dict[str, float]:
     return {names[key]: value for key, value in asdict(errors).items() if value is not None}
 
 
-def _print(result: Calibration) -> None:
+def _print(result: Calibration | PartialCalibration) -> None:
     table = Table(title=Text("calibrated numbers"))
     for column in ("number", "before", "after", "standard deviation", "unit", "observed"):
         table.add_column(column)
     for p in result.parameters:
         table.add_row(Text(p.name), *_row(p))
     table_console().print(table)
+    if isinstance(result, PartialCalibration):
+        print_partial(result)
+    else:
+        _print_errors(result)
+    _print_open(result)
+
+
+def _print_errors(result: Calibration) -> None:
     errors = Table(title=Text("distance of measured and computed poses"))
     for column in ("poses", "rms before", "rms after", "worst before", "worst after"):
         errors.add_column(column)
@@ -226,6 +337,9 @@ def _print(result: Calibration) -> None:
         typer.echo(f"outlier, hardly counted: {_outlier_text(one)}")
     if len(result.outliers) > MOST_SHOWN:
         typer.echo(f"{len(result.outliers) - MOST_SHOWN} more outliers: see --json")
+
+
+def _print_open(result: Estimate) -> None:
     open_lines = result.undetermined
     if open_lines:
         typer.echo("the poses do not determine, and the file's values stay:")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any, Final, Protocol
 
@@ -21,8 +21,10 @@ from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.apps.certificate.description import UnfitError
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import States, random_states
-from pkm_twin.errors import PkmTwinError, install
-from pkm_twin.machine.robot_urdf import robot_description
+from pkm_twin.errors import ParameterError, PkmTwinError, install
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.robot_urdf import robot_description
+from pkm_twin.robot.variation import KINDS, varied
 
 Array = NDArray[np.float64]
 
@@ -45,6 +47,8 @@ all else relative."""
 LOOSE: Final = {"mujoco": 1e3}
 """Engines whose bounds are this much wider: MuJoCo wants some inertia in every body, which a
 small machine shows."""
+SPREAD: Final = 0.02
+"""Relative standard deviation of the numbers of drawn machines."""
 SMALL: Final = 1e-3
 """A state's efforts are not measured against less than this part of the greatest of all states."""
 
@@ -97,6 +101,8 @@ class Certificate:
     missing: Mapping[str, str]
     """Engine to why it was not asked."""
     items: Sequence[Item]
+    variants: int = 0
+    """Machines that were drawn and compared too."""
 
     @property
     def good(self) -> bool:
@@ -110,6 +116,7 @@ class Certificate:
             "good": self.good,
             "seed": self.seed,
             "states": self.states,
+            "variants": self.variants,
             "drawn": self.drawn,
             "mobility": self.mobility,
             "rank": self.rank,
@@ -188,6 +195,48 @@ def certify(
 def certificate_of(robot: Any, **options: Any) -> Certificate:
     """As :func:`certify`, with the description that the robot brings."""
     return certify(robot, robot_description(robot), **options)
+
+
+def certify_variants(
+    robot: Robot, count: int, *, seed: int = 1, progress: Callable[[int], None], **options: Any
+) -> Certificate:
+    """As :func:`certificate_of`, of the robot and of machines with other numbers, together.
+
+    :param count: machines whose masses, inertias, friction and lengths differ by ``SPREAD``; the
+        lengths stay where the loops close with them alone.
+    :param seed: of the states, and of the machines' numbers.
+    """
+    found: list[Certificate] = []
+    for k in range(count + 1):
+        machine = robot if k == 0 else drawn(robot, seed + k)
+        done = sum(one.states for one in found)
+        found.append(
+            certificate_of(
+                machine, seed=seed, progress=lambda n, done=done: progress(done + n), **options
+            )
+        )
+    by_name: dict[tuple[str, str], list[Item]] = {}
+    for item in (item for one in found for item in one.items):
+        by_name.setdefault((item.engine, item.what), []).append(item)
+    items = [
+        replace(
+            same[0], worst=max(item.worst for item in same),
+            median=float(np.median([item.median for item in same])),
+        )
+        for same in by_name.values()
+    ]  # fmt: skip
+    missing = {name: reason for one in found for name, reason in one.missing.items()}
+    states = sum(one.drawn for one in found)
+    return replace(found[0], items=items, missing=missing, drawn=states, variants=count)
+
+
+def drawn(robot: Robot, seed: int) -> Robot:
+    """A machine of other numbers, with other lengths only if its loops close."""
+    kinds = [kind for kind in KINDS if kind != "lengths"]
+    try:
+        return varied(robot, dict.fromkeys(KINDS, SPREAD), seed).robot
+    except ParameterError:
+        return varied(robot, dict.fromkeys(kinds, SPREAD), seed).robot
 
 
 def _own(robot: Any, states: States) -> list[Item]:

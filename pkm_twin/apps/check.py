@@ -20,7 +20,7 @@ from pkm_twin.apps.recorded import Recording, read_recording
 from pkm_twin.apps.topics import Topics
 from pkm_twin.apps.verdict import Item, Verdict
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.drives import idle_samples
 from pkm_twin.streams.rest import SIGMAS, fit_gain, noise, rate_doubt

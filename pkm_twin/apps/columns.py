@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pkm_twin.apps.tables import cells, in_si
 from pkm_twin.errors import FileError, ParameterError, warn
 from pkm_twin.files import STANDARD, decimal, open_regular
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 MAX_CSV_BYTES = 1024**3
@@ -34,10 +34,13 @@ MAX_CSV_LINE = 1024**2
 """Longest line of it, characters."""
 
 
-def read_columns(path: Path, robot: Robot | None = None) -> dict[str, Array]:
+def read_columns(
+    path: Path, robot: Robot | None = None, *, blank: bool = False
+) -> dict[str, Array]:
     """Columns of a CSV with a header row, by name, shape (rows,) each, in SI units.
 
-    :param path: ``-`` is stdin. ``robot``: whose joints and pose the columns may be of.
+    :param path: ``-`` is stdin. ``robot``: whose joints and pose the columns may be of. ``blank``:
+        whether cells may be empty, which are NaN.
 
     Lines above the header that begin with # are comments.
 
@@ -46,14 +49,14 @@ def read_columns(path: Path, robot: Robot | None = None) -> dict[str, Array]:
     try:
         if str(path) == STANDARD:
             with io.TextIOWrapper(sys.stdin.buffer, encoding="utf-8-sig", newline="") as text:
-                return in_si(_parse_columns(path, _rows(text, path)), robot)
+                return in_si(_parse_columns(path, _rows(text, path), blank), robot)
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > MAX_CSV_BYTES:
                 raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_CSV_BYTES}")
             # Spreadsheets put a byte order mark before the header row.
             with io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text:
-                return in_si(_parse_columns(path, _rows(text, path)), robot)
+                return in_si(_parse_columns(path, _rows(text, path), blank), robot)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(path, error, "a CSV file") from None
 
@@ -111,7 +114,7 @@ def _lines(text: TextIO, path: Path) -> Iterator[str]:
         yield line
 
 
-def _parse_columns(path: Path, rows: Iterator[list[str]]) -> dict[str, Array]:
+def _parse_columns(path: Path, rows: Iterator[list[str]], blank: bool) -> dict[str, Array]:
     first, above = next(rows, []), 0
     while first and first[0].startswith("#"):
         first, above = next(rows, []), above + 1
@@ -124,10 +127,12 @@ def _parse_columns(path: Path, rows: Iterator[list[str]]) -> dict[str, Array]:
         if len(row) != len(header):
             raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
         try:
-            values = [decimal(cell) for cell in row]
+            values = [math.nan if blank and not c.strip() else decimal(c) for c in row]
         except ValueError as error:
             raise ParameterError(f"{path}: line {number}", str(error), "numbers") from None
-        if not all(map(math.isfinite, values)):
+        if not all(
+            math.isfinite(v) or (blank and not c.strip()) for v, c in zip(values, row, strict=True)
+        ):
             raise ParameterError(f"{path}: line {number}", row, "finite numbers")
         data.extend(values)
     if not data:

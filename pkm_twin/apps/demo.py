@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pkm_twin.apps import demo_tracking
+from pkm_twin.apps.demo_pictures import draw
 from pkm_twin.apps.demo_recorder import (
     DEPTH,
     PATIENCE,
@@ -35,7 +36,7 @@ from pkm_twin.apps.demo_recorder import (
     process,
     wait_for,
 )
-from pkm_twin.apps.demo_report import REPORTS, Finding, draw, print_findings
+from pkm_twin.apps.demo_report import REPORTS, Finding, print_findings
 from pkm_twin.apps.tracking_report import report_tracking
 from pkm_twin.bags.reader import BagMessage, BagWriter, inspect
 from pkm_twin.errors import PkmTwinError

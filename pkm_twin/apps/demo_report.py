@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the demonstration found: figures, verdicts and the picture, read from its recording."""
+"""What the demonstration found: figures and verdicts, read from its recording."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,9 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.apps.check import motion
 from pkm_twin.apps.recorded import Recording, read_recording
-from pkm_twin.atlas import plots
 from pkm_twin.bags.reader import inspect, read_messages
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import stamp_of
-
-if TYPE_CHECKING:
-    from pkm_twin.apps.tracking_report import TrackingSeries
+from pkm_twin.messages.stamps import stamp_of
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -71,13 +67,11 @@ class DynamicsSeries:
 
 @dataclass(frozen=True)
 class StiffnessSeries:
-    """Deflection and strain-energy factors over time, and the frame's ground truth."""
+    """Deflection over time, and the frame's ground truth."""
 
     title: str
     time: Array
     deflection: Array
-    elements: tuple[str, ...]
-    factors: Array
     truth_time: Array
     truth: Array
 
@@ -96,7 +90,7 @@ def report_dynamics(
         np.zeros((len(stamps), len(robot.joint_names))) if r.effort is None else r.effort[answered]
     )
     series = DynamicsSeries(
-        f"{prefix}: {robot.name}",
+        prefix,
         robot.joint_names,
         unit,
         r.time[answered],
@@ -221,15 +215,12 @@ def report_stiffness(
     pose = np.array([[float(values[s][name]) for name in robot.pose_names] for s in common])
     local = np.array([_xyz(moved[s].transform.translation) for s in common]).reshape(-1, 3)
     fixed = np.einsum("nij,nj->ni", robot.rotation(pose.reshape(-1, len(robot.pose_names))), local)
-    elements = tuple(key for key in (values[common[0]] if common else {}) if key[0].isdigit())
     judged = [s for s in common if s in truth]
     true = np.array([_xyz(truth[s].transform.translation) for s in judged]).reshape(-1, 3)
     series = StiffnessSeries(
-        f"{prefix}: {robot.name}",
+        prefix,
         (np.array(common) - start) / 1e9,
         fixed,
-        elements,
-        np.array([[float(values[s].get(e, "nan")) for e in elements] for s in common]),
         (np.array(judged) - start) / 1e9,
         true,
     )
@@ -284,21 +275,6 @@ def print_findings(console: Console, findings: list[Finding]) -> None:
         table.add_row(f.bag if f.bag != last else "", f.what, f.value, f.bound, verdict)
         last = f.bag
     console.print(table)
-
-
-def draw(
-    series: Mapping[str, DynamicsSeries | StiffnessSeries | TrackingSeries], path: Path
-) -> Path:
-    """One picture of all stages: a column each."""
-    figure, axes = plots.columns(len(series), 3)
-    for column, data in zip(axes, series.values(), strict=True):
-        if isinstance(data, DynamicsSeries):
-            plots.efforts(column, data)
-        elif isinstance(data, StiffnessSeries):
-            plots.deflections(column, data)
-        else:
-            plots.tracking(column, data)
-    return plots.save(figure, path)
 
 
 def _by_stamp(bag: Path, topic: str) -> dict[int, Any]:

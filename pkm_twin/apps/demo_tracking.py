@@ -30,7 +30,7 @@ from pkm_twin.apps.demo_recorder import (
     wait_for,
 )
 from pkm_twin.apps.tracking_report import PERIOD, ROBOT, prefix
-from pkm_twin.ros.messages import SECOND, stamp_of
+from pkm_twin.messages.stamps import SECOND, stamp_of
 
 SPREADS: Final = (0.01, 0.2)
 AMPLITUDES: Final = (0.5, -0.4, 0.6)

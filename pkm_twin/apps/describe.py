@@ -11,8 +11,8 @@ import numpy as np
 
 from delta_dynamics import reactions
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.plausibility import Finding, findings
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.plausibility import Finding, findings
+from pkm_twin.robot.robot import Robot
 
 MOST_NAMES: Final = 6
 """Most names that a line has."""

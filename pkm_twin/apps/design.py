@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, Optional
 
@@ -60,6 +61,12 @@ def design_command(
         int,
         typer.Option(help="machines of a sweep: per axis of a grid, or in total with sobol", min=1),
     ] = 20,
+    scheduler: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="of a sweep: address of a Dask scheduler: tcp://HOST:8786", show_default=False
+        ),
+    ] = None,
     wrench: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
@@ -102,15 +109,18 @@ def design_command(
     singularity is the least singularity index on the path. The search uses exact gradients from
     several starts and ends in a local optimum.
 
-    --sweep writes all quantities of machines within the bounds to a NetCDF file. --tolerance prints
+    --sweep writes all quantities of machines within the bounds to a NetCDF file, with --scheduler
+    computed by a Dask cluster. --tolerance prints
     the standard deviations of the platform's position and rotation, with the share of each value,
     on the path or, without --path, over the workspace.
     """
     from pkm_twin import load
     from pkm_twin.apps import design_report as report
+    from pkm_twin.atlas.run import on_cluster
     from pkm_twin.design import design as find
     from pkm_twin.design import sweep as sweep_box
     from pkm_twin.design.optimise import searches
+    from pkm_twin.design.sweep import here
     from pkm_twin.design.variables import parse_vary
 
     for target in (out, picture):
@@ -138,13 +148,17 @@ def design_command(
         if out is None or out.suffix != ".nc":
             raise ParameterError("out", str(out), "a name that ends in .nc, for --sweep")
         count = samples ** len(box) if sweep == "grid" else samples
+        compute = here if scheduler is None else partial(on_cluster, scheduler=scheduler)
         with progress("machines", count) as update:
             table = sweep_box(
                 machine, box, way, report.known_quantities(machine, way), samples,
                 "grid" if sweep == "grid" else "sobol", seed=seed, progress=update,
+                compute=compute,
             )  # fmt: skip
         _print(report.write_sweep(machine, table, sweep, path, out), as_json)
         return
+    if scheduler is not None:
+        raise typer.BadParameter("--scheduler goes with --sweep only")
     if not minimise:
         raise typer.BadParameter("give --minimise, --sweep or --tolerance")
     if out is not None and out.suffix not in (".yaml", ".yml"):

@@ -21,9 +21,9 @@ from pkm_twin.design.pose_path import Followed
 from pkm_twin.design.tolerance import workspace_states
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.edited import Chosen, edited_yaml, write_edited
-from pkm_twin.machine.entries import entries
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.edited import Chosen, edited_yaml, write_edited
+from pkm_twin.robot.entries import entries
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

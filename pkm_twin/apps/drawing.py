@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot at home as a drawing of its graph: bodies between their joints, rods, actuated joints."""
+"""A picture of a robot at home: the scene of ``pkm-twin view``, drawn without a browser."""
 
 from __future__ import annotations
 
@@ -7,66 +7,200 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
+from pkm_twin.apps.view.scene import GROUND, PLATFORM, Scene
+from pkm_twin.apps.view.stage import LOOK
 from pkm_twin.atlas.plots import rendered
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.files import replace_file
-from pkm_twin.machine.graph import BASE, Graph
-from pkm_twin.machine.outline import body_points, crosspieces, platform_face
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
 PICTURES: Final = (".png", ".svg")
 """What a picture's name may end in."""
-BODY: Final = "#7F7F7F"
-ROD: Final = "#56B4E9"
-PLATFORM: Final = "#D55E00"
-GROUND: Final = "#000000"
-DRIVE: Final = "#0072B2"
-"""Colours that are told apart with every kind of colour vision (Okabe and Ito 2008)."""
+WIDTH, HEIGHT = 600, 480
+DPI: Final = 100
+FINE: Final = 2
+"""Samples per pixel and direction."""
+AXES: Final = ((213, 60, 40), (40, 140, 60), (40, 80, 200))
+"""Colours of the base frame's x, y and z."""
+LIGHT: Final = np.array([-0.45, 0.65, -0.61])
+"""Where light comes from: right, up, and away from the eye."""
 
 
-def draw(robot: Robot, ax: Any = None) -> Any:
-    """The robot at home on 3-D axes, those given or new ones; returns them.
+class Camera:
+    """Parallel projection from :data:`~pkm_twin.apps.view.stage.LOOK` on a grid of samples.
 
-    A body is lines from its joints' middle to each of them, the platform a face; a dot is a joint,
-    an arrow an actuated one along its axis.
+    Coordinates of the camera are right, up, and the distance from the eye, m. Each ``draw`` keeps
+    what is nearer than what was drawn before.
     """
-    if ax is None:
-        import matplotlib
 
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
+    def __init__(self, low: Array, high: Array) -> None:
+        """:param low: least base coordinates in the picture, ``high`` the greatest, (3,) m."""
+        away = -LOOK / np.linalg.norm(LOOK)
+        right = np.cross(away, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        self.turn = np.array([right, np.cross(right, away), away])
+        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+        seen = self.see(corners)[:, :2]
+        middle = (seen.min(0) + seen.max(0)) / 2
+        size = np.array([WIDTH, HEIGHT])
+        self.pixel = float((np.ptp(seen, axis=0) / (0.86 * size)).max())
+        self.low, self.high = middle - self.pixel * size / 2, middle + self.pixel * size / 2
+        x, y = (
+            np.linspace(a, b, FINE * n)
+            for a, b, n in zip(self.low, self.high, (WIDTH, HEIGHT), strict=True)
+        )
+        self.x, self.y = x, y
+        self.depth = np.full((len(y), len(x)), np.inf)
+        self.image = np.ones((len(y), len(x), 3))
 
-        ax = pyplot.figure(figsize=(6, 6), layout="constrained").add_subplot(projection="3d")
-    graph = robot.graph
-    points = body_points(graph)
-    for name, places in points.items():
-        if name == BASE:
-            ax.scatter(*np.array(places).T, color=GROUND, s=30, marker="s", label="base")
-        elif name == graph.platform:
-            _platform(ax, graph, np.array(places))
-        else:
-            _lines(ax, np.array([*places, *_only_com(graph, name, places)]), BODY, 3)
-    for rod in graph.rods.values():
-        for shift in (0.0,) if rod.pair is None else (-rod.width / 2, rod.width / 2):
-            aside = shift * (np.zeros(3) if rod.pair is None else rod.pair)
-            ax.plot(*(rod.ends + aside).T, color=ROD, linewidth=2)
-    for bar in crosspieces(graph):
-        colour = PLATFORM if bar.part == graph.platform else BODY
-        ax.plot(*np.array([bar.start[1], bar.end[1]]).T, color=colour, linewidth=2)
-    for joint in graph.joints.values():
-        if joint.kind == "translation":
-            continue
-        ax.scatter(*joint.at, color=DRIVE if joint.actuated else BODY, s=14)
-        if joint.actuated:
-            ax.quiver(
-                *joint.at, *joint.axes[0], length=0.15 * graph.size, color=DRIVE, normalize=True
-            )
-    _frame(ax, np.array([p for places in points.values() for p in places]), robot)
-    return ax
+    def see(self, points: Array) -> Array:
+        """Base coordinates, (..., 3), in those of the camera."""
+        return np.asarray(points @ self.turn.T, np.float64)
+
+    def _window(self, points: Array, radius: float) -> tuple[Any, Array, Array]:
+        """The samples around some points, and their coordinates."""
+        (left, low), (right, high) = points[:, :2].min(0) - radius, points[:, :2].max(0) + radius
+        columns = slice(*np.searchsorted(self.x, [left, right]))
+        rows = slice(*np.searchsorted(self.y, [low, high]))
+        x, y = np.meshgrid(self.x[columns], self.y[rows])
+        return (rows, columns), x, y
+
+    def _paint(
+        self, window: Any, depth: Array, normal: Array, colour: Any, opacity: float = 1.0
+    ) -> None:
+        bright = 0.5 + 0.5 * np.clip(normal @ LIGHT, 0.0, 1.0)
+        nearer = depth < self.depth[window]
+        lit = bright[..., None] * np.asarray(colour) / 255.0
+        under = self.image[window]
+        under[nearer] += opacity * (lit - under)[nearer]
+        self.depth[window][nearer] = depth[nearer]
+
+    def ball(self, at: Array, radius: float, colour: Any) -> None:
+        """A ball around a point (3,) in base coordinates."""
+        (middle,) = self.see(at[None])
+        window, x, y = self._window(middle[None], radius)
+        across = np.stack([x - middle[0], y - middle[1]], -1)
+        with np.errstate(invalid="ignore"):
+            towards = np.sqrt(radius**2 - (across**2).sum(-1))
+        normal = np.concatenate([across, -towards[..., None]], -1) / radius
+        self._paint(window, np.nan_to_num(middle[2] - towards, nan=np.inf), normal, colour)
+
+    def cylinder(self, ends: Array, radius: float, colour: Any) -> None:
+        """A cylinder between two points (2, 3) in base coordinates, with its lids."""
+        start, end = self.see(ends)
+        length = float(np.linalg.norm(end - start))
+        if not length > 0.0:
+            return
+        axis = (end - start) / length
+        window, x, y = self._window(np.array([start, end]), radius)
+        ray = np.stack([x, y, np.zeros_like(x)], -1) - start
+        along = ray @ axis
+        across = ray - along[..., None] * axis
+        slope = np.array([0.0, 0.0, 1.0]) - axis[2] * axis
+        a, b, c = slope @ slope, across @ slope, (across**2).sum(-1) - radius**2
+        with np.errstate(invalid="ignore", divide="ignore"):
+            depth = (-b - np.sqrt(b**2 - a * c)) / a
+            place = along + depth * axis[2]
+            wall = ray + depth[..., None] * [0.0, 0.0, 1.0] - place[..., None] * axis
+            good = (place >= 0.0) & (place <= length)
+            self._paint(window, np.where(good, depth, np.inf), wall / radius, colour)
+            lid = ((0.0 if axis[2] > 0.0 else length) - along) / axis[2]
+            good = ((across + lid[..., None] * slope) ** 2).sum(-1) <= radius**2
+        facing = np.broadcast_to(-np.sign(axis[2]) * axis, ray.shape)
+        self._paint(window, np.where(good, lid, np.inf), facing, colour)
+
+    def plate(self, corners: Array, colour: Any, opacity: float = 1.0) -> None:
+        """A flat plate by its corners in base coordinates, shape (k, 3)."""
+        corners = self.see(corners)
+        middle = corners.mean(0)
+        normal = np.linalg.svd(corners - middle)[2][2]
+        normal = normal * -np.sign(normal[2])
+        if abs(normal[2]) < 1e-3:  # seen from its edge
+            return
+        window, x, y = self._window(corners, 0.0)
+        inside = Outline(corners[:, :2]).contains_points(np.stack([x, y], -1).reshape(-1, 2))
+        away = ((x - middle[0]) * normal[0] + (y - middle[1]) * normal[1]) / normal[2]
+        depth = np.where(inside.reshape(x.shape), middle[2] - away, np.inf)
+        self._paint(window, depth, np.broadcast_to(normal, (*x.shape, 3)), colour, opacity)
+
+    def pixels(self) -> Array:
+        """The picture, shape (HEIGHT, WIDTH, 3), the first row at the bottom."""
+        fine = self.image.reshape(HEIGHT, FINE, WIDTH, FINE, 3)
+        return np.asarray(fine.mean((1, 3)), np.float64)
+
+
+def draw(robot: Robot) -> Any:
+    """A matplotlib figure of the robot at home.
+
+    Colours are those of ``pkm-twin view``: drives blue, rods light blue, the platform orange. The
+    names of the drives are next to them, the base frame and a scale in the corners.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import patheffects, pyplot
+
+    scene, q = Scene(robot), robot.inverse(robot.home())
+    shapes = scene.shapes(q)
+    camera = Camera(*scene.box())
+    half = shapes.cylinder_sizes[:, 2:] / 2 * _along(shapes.cylinder_turns)
+    ends = np.stack([shapes.cylinder_at - half, shapes.cylinder_at + half], axis=1)
+    sizes = shapes.cylinder_sizes[:, 0]
+    for pair, radius, colour in zip(ends, sizes, shapes.cylinder_colours, strict=True):
+        camera.cylinder(pair, float(radius), colour)
+    for at, radius, colour in zip(
+        shapes.ball_at, shapes.ball_sizes[:, 0], shapes.ball_colours, strict=True
+    ):
+        camera.ball(at, float(radius), colour)
+    if len(scene.platform):
+        camera.plate(scene.platform + shapes.platform_at, PLATFORM)
+    if len(scene.base):
+        camera.plate(scene.base, GROUND, opacity=0.35)
+    figure = pyplot.figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    extent = (camera.low[0], camera.high[0], camera.low[1], camera.high[1])
+    ax.imshow(camera.pixels(), origin="lower", extent=extent, interpolation="nearest")
+    ax.axis("off")
+    halo = patheffects.withStroke(linewidth=3, foreground="w")
+    style: dict[str, Any] = {"fontsize": 9, "path_effects": [halo], "ha": "center"}
+    for name, place in scene.drive_places(q).items():
+        right, up, _ = camera.see(place)
+        ax.annotate(name, (right, up), (0, 9), textcoords="offset points", **style)
+    _corners(ax, camera, style)
+    return figure
+
+
+def _along(turns: Array) -> Array:
+    """The z axes of quaternions with w first, shape (k, 3)."""
+    w, x, y, z = turns.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+
+
+def _corners(ax: Any, camera: Camera, style: dict[str, Any]) -> None:
+    """Directions of the base frame at the left, a length at the right."""
+    start = camera.low + 45 * camera.pixel
+    for name, colour, axis in zip("xyz", AXES, np.eye(3), strict=True):
+        tip = start + 32 * camera.pixel * camera.see(axis)[:2]
+        ax.annotate(
+            "", tip, start,
+            arrowprops={"arrowstyle": "-|>", "color": np.array(colour) / 255, "linewidth": 1.5},
+        )  # fmt: skip
+        at = start + 42 * camera.pixel * camera.see(axis)[:2]
+        ax.text(*at, name, va="center", **style)
+    reach = 0.25 * (camera.high[0] - camera.low[0])
+    length = max(
+        part * 10.0 ** np.floor(np.log10(reach))
+        for part in (1, 2, 5)
+        if part * 10.0 ** np.floor(np.log10(reach)) <= reach
+    )
+    right, low = camera.high[0] - 25 * camera.pixel, camera.low[1] + 22 * camera.pixel
+    ax.plot([right - length, right], [low, low], color="k", linewidth=2)
+    ax.text(right - length / 2, low + 8 * camera.pixel, f"{length:g} m", **style)
 
 
 def picture(robot: Robot, path: Path) -> None:
@@ -77,59 +211,8 @@ def picture(robot: Robot, path: Path) -> None:
     if path.suffix not in PICTURES:
         # Another one would get an ending that nobody has asked for.
         raise ParameterError("picture", str(path), f"a name that ends in {' or '.join(PICTURES)}")
-    figure = draw(robot).figure
-    data = rendered(figure, 90, path.suffix[1:])
+    data = rendered(draw(robot), DPI, path.suffix[1:])
     try:
         replace_file(path, data)
     except OSError as error:
         raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None
-
-
-def _only_com(graph: Graph, name: str, places: list[Array]) -> list[Array]:
-    """The centre of mass of a body with one joint: else nothing of it could be seen."""
-    return [graph.bodies[name].com] if len({tuple(p) for p in places}) == 1 else []
-
-
-def _lines(ax: Any, places: Array, colour: str, width: float) -> None:
-    """From the first to the second of two points, else from the middle to each."""
-    if len(places) == 2:
-        ax.plot(*places.T, color=colour, linewidth=width, solid_capstyle="round")
-        return
-    middle = places.mean(0)
-    for place in places:
-        ax.plot(*np.array([middle, place]).T, color=colour, linewidth=width)
-
-
-def _platform(ax: Any, graph: Graph, places: Array) -> None:
-    """A face around the joints of the platform where they span one, and lines in any case."""
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
-
-    origin, joints = places[0], places[1:]
-    corners = platform_face(graph)
-    if len(corners):
-        face = Poly3DCollection([corners], facecolor=PLATFORM, alpha=0.35, edgecolor=PLATFORM)
-        ax.add_collection3d(face)
-    else:
-        _lines(ax, joints, PLATFORM, 3)
-    for joint in joints:
-        ax.plot(*np.array([origin, joint]).T, color=PLATFORM, linewidth=1, alpha=0.6)
-    ax.scatter(*origin, color=PLATFORM, s=50, marker="*", label="reference point")
-
-
-def _frame(ax: Any, points: Array, robot: Robot) -> None:
-    """Equal scales around everything, names and units."""
-    low, high = points.min(0), points.max(0)
-    half = 0.55 * float((high - low).max())
-    middle = (low + high) / 2
-    for set_limits, centre in zip((ax.set_xlim, ax.set_ylim, ax.set_zlim), middle, strict=True):
-        set_limits(centre - half, centre + half)
-    ax.set_box_aspect((1, 1, 1))
-    ax.locator_params(nbins=5)
-    ax.set(xlabel="x, m", ylabel="y, m", title=f"{robot.name} at home")
-    ax.set_zlabel("z, m", labelpad=3)
-    ax.plot([], [], [], color=BODY, linewidth=3, label="bodies")
-    if robot.graph.rods:
-        ax.plot([], [], [], color=ROD, linewidth=2, label="rods")
-    ax.plot([], [], [], color=DRIVE, marker=">", label="actuated joints, along their axes")
-    ax.view_init(elev=20, azim=-60)
-    ax.legend(loc="upper left", fontsize="small")

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.apps.columns import read_columns, times_of
-from pkm_twin.apps.elastic_fit import AXES, Deflected
 from pkm_twin.apps.recorded import (
     BASE_FRAME,
     WRENCH_AXES,
@@ -23,8 +22,10 @@ from pkm_twin.apps.topics import TRANSFORM, require_definition
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import BagError, MessageError, ParameterError, UnknownNameError, one_line
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import MAX_FORCE, MAX_MOMENT, SECOND, TINY, StampRules
+from pkm_twin.identification.elastic_fit import AXES, Deflected
+from pkm_twin.messages.reading import MAX_FORCE, MAX_MOMENT, TINY
+from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.deflection import MAX_SHIFT, MAX_TURN, in_base_axes, read_deflection
 
 Array = NDArray[np.float64]

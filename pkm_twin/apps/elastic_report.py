@@ -12,8 +12,6 @@ import typer
 from numpy.typing import NDArray
 from rich.table import Table
 
-from delta_dynamics.fit import Number
-from pkm_twin.apps.elastic_fit import AXES, Combination, ElasticFit, Group
 from pkm_twin.apps.fit_report import (
     HEAD_OF_PAGE,
     MOST_SAMPLES,
@@ -25,6 +23,8 @@ from pkm_twin.apps.fit_report import (
 )
 from pkm_twin.atlas.plots import COLOURS, columns
 from pkm_twin.console import table_console
+from pkm_twin.identification.elastic_fit import AXES, Combination, ElasticFit, Group
+from pkm_twin.identification.fit import Number
 
 Array = NDArray[np.float64]
 

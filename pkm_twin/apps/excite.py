@@ -4,15 +4,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from pkm_twin.apps.options import Json, RobotName
+from pkm_twin.apps.options import Json, OverwriteBoth, RobotName
 from pkm_twin.console import file_name, print_json, progress, refuse_existing
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError
+
+if TYPE_CHECKING:
+    from pkm_twin.identification.excitation import Bounds, Judge
 
 Array = NDArray[np.float64]
 
@@ -30,6 +33,12 @@ def excite(
         Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
         typer.Option(help="also report the condition number of this bag", show_default=False),
     ] = None,
+    friction: Annotated[
+        bool,
+        typer.Option(
+            "--friction", help="slow sweeps up and down, a joint at a time, which show friction"
+        ),
+    ] = False,
     duration: Annotated[float, typer.Option(help="duration, s", min=1.0, max=600.0)] = 10.0,
     harmonics: Annotated[int, typer.Option(help="harmonics per joint", min=3, max=50)] = 6,
     rate: Annotated[float, typer.Option(help="points per second", min=10.0, max=1000.0)] = 100.0,
@@ -48,7 +57,7 @@ def excite(
     ] = 0.1,
     trials: Annotated[int, typer.Option(help="number of trajectories to try", min=10)] = 300,
     seed: Annotated[int, typer.Option(help="seed of the trials", min=0)] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace both files")] = False,
+    overwrite: OverwriteBoth = False,
     json_output: Json = False,
 ) -> None:
     """Design a trajectory that excites the parameters to identify.
@@ -58,28 +67,91 @@ def excite(
     position, velocity and effort limits and inside the workspace, away from singularities. The
     command writes a trajectory_msgs/JointTrajectory on /delta_dynamics/joint_trajectory, and a CSV
     for `pkm-twin torques`.
+
+    With --friction every joint alone sweeps its range up and down at three speeds, 1 : 4 : 16, and
+    --duration is that of all sweeps; --harmonics, --trials and --seed are not used.
     """
-    from delta_dynamics.excitation import Bounds, Judge
-    from delta_dynamics.excitation import excite as design
-    from delta_dynamics.file_parameters import file_parameters
     from pkm_twin import load
     from pkm_twin.apps.fit import kinds_of
-    from pkm_twin.apps.torques import write_table
-    from pkm_twin.apps.trajectories import write_trajectory
+    from pkm_twin.identification.excitation import Bounds, Judge
+    from pkm_twin.identification.file_parameters import file_parameters
 
+    table = checked_outputs(out, overwrite)
+    machine = load(robot)
+    judge = Judge.of(machine, file_parameters(machine, kinds_of(what)))
+    other = None if beside is None else _condition_of(beside, judge)
+    bounds = Bounds(share, acceleration, singularity, rate)
+    best, points = write_motion(
+        judge, out, bounds, duration, harmonics, trials=trials, seed=seed, friction=friction,
+        overwrite=overwrite,
+    )  # fmt: skip
+    if json_output:
+        print_json(
+            {
+                "robot": machine.name, "condition": best.condition, "duration_s": best.duration,
+                "base_parameters": len(judge.columns),
+                **({"speeds": best.speeds.tolist(), "speed_units": machine.joint_units}
+                   if friction else
+                   {"frequencies_Hz": (best.harmonics / best.duration).tolist()}),
+                "beside": None if beside is None else str(beside),
+                "condition_beside": other if other is not None and np.isfinite(other) else None,
+                "out": str(out), "table": str(table),
+            }
+        )  # fmt: skip
+        return
+    typer.echo(f"condition number {best.condition:.4g} over {len(judge.columns)} base parameters")
+    if other is not None:
+        told = f"{other:.4g}" if np.isfinite(other) else "infinite, it does not excite all of them"
+        typer.echo(f"condition number of {beside}: {told}")
+    typer.echo(f"{out}, {table}: {points} points, {best.duration:.4g} s")
+
+
+def checked_outputs(out: Path, overwrite: bool) -> Path:
+    """The table's name next to a bag to write; both are checked.
+
+    :raises ParameterError: another ending.
+    :raises PkmTwinError: a file that may not be replaced.
+    """
     if out.suffix != ".mcap":
         raise ParameterError("out", str(out), "a name that ends in .mcap")
     table = out.with_suffix(".csv")
     for target in (out, table):
         refuse_existing(target, overwrite)
-    machine = load(robot)
-    judge = Judge.of(machine, file_parameters(machine, kinds_of(what)))
-    other = None if beside is None else _condition_of(beside, judge)
-    bounds = Bounds(share, acceleration, singularity, rate)
-    with progress("excite", trials) as update:
-        best = design(judge, duration, harmonics, bounds, trials=trials, seed=seed, progress=update)
-    time = np.arange(round(duration * rate) + 1) / rate
-    time = time[time <= duration]
+    return table
+
+
+def write_motion(
+    judge: Judge,
+    out: Path,
+    bounds: Bounds,
+    duration: float,
+    harmonics: int = 6,
+    *,
+    trials: int,
+    seed: int = 0,
+    friction: bool = False,
+    overwrite: bool = False,
+) -> tuple[Any, int]:
+    """Design a motion, or slow sweeps with ``friction``, and write its bag and its table.
+
+    :returns: the motion, and how many points are written.
+    """
+    from pkm_twin.apps.torques import write_table
+    from pkm_twin.apps.trajectories import write_trajectory
+    from pkm_twin.identification.excitation import excite as design
+    from pkm_twin.identification.sweeps import sweeps
+
+    machine, table = judge.robot, out.with_suffix(".csv")
+    best: Any
+    if friction:
+        best = sweeps(judge, duration, bounds)
+    else:
+        with progress("excite", trials) as update:
+            best = design(
+                judge, duration, harmonics, bounds, trials=trials, seed=seed, progress=update
+            )
+    time = np.arange(round(best.duration * bounds.rate) + 1) / bounds.rate
+    time = time[time <= best.duration]
     motion = best.at(time)
     facts = {"robot": machine.name, "source": "pkm-twin excite", "condition": best.condition}
     write_trajectory(out, machine, time, motion, None, facts, overwrite)
@@ -91,29 +163,13 @@ def excite(
         write_table(columns, table)
     except OSError as error:
         raise PkmTwinError(f"cannot write {error.filename or table}: {error.strerror}") from None
-    if json_output:
-        print_json(
-            {
-                "robot": machine.name, "condition": best.condition, "duration_s": best.duration,
-                "base_parameters": len(judge.columns),
-                "frequencies_Hz": (best.harmonics / best.duration).tolist(),
-                "beside": None if beside is None else str(beside),
-                "condition_beside": other if other is not None and np.isfinite(other) else None,
-                "out": str(out), "table": str(table),
-            }
-        )  # fmt: skip
-        return
-    typer.echo(f"condition number {best.condition:.4g} over {len(judge.columns)} base parameters")
-    if other is not None:
-        told = f"{other:.4g}" if np.isfinite(other) else "infinite, it does not excite all of them"
-        typer.echo(f"condition number of {beside}: {told}")
-    typer.echo(f"{out}, {table}: {len(time)} points, {duration:g} s")
+    return best, len(time)
 
 
 def _condition_of(path: Path, judge: Any) -> float:
     """Condition number of a recorded motion."""
-    from delta_dynamics.samples import tracks
     from pkm_twin.apps.recorded import read_recording
+    from pkm_twin.identification.samples import tracks
 
     r = read_recording(path, judge.robot, limited=False)
     none = np.zeros((len(r.time), 6))

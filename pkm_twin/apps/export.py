@@ -14,7 +14,7 @@ from pkm_twin.apps.options import RobotName
 from pkm_twin.console import refuse_existing
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import replace_file
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 app = typer.Typer(help="Export a robot to other software.", no_args_is_help=True)
 
@@ -123,7 +123,7 @@ def mjcf(
     """Write an MJCF for MuJoCo: bodies, loops as constraints, motors, a keyframe at home."""
     from delta_dynamics import inverse_dynamics
     from pkm_twin import load
-    from pkm_twin.machine.robot_urdf import robot_mjcf
+    from pkm_twin.robot.robot_urdf import robot_mjcf
 
     loaded = load(robot)
     home = loaded.massive().graph.home
@@ -141,7 +141,7 @@ def sdf(
 ) -> None:
     """Write an SDF model: links and all joints, also those that close the loops."""
     from pkm_twin import load
-    from pkm_twin.machine.robot_urdf import robot_sdf
+    from pkm_twin.robot.robot_urdf import robot_sdf
 
     refuse_existing(out, overwrite)
     replace_file(out, robot_sdf(load(robot)).encode())

@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Optional
 
 import numpy as np
 import typer
@@ -19,8 +19,8 @@ from pkm_twin.apps.options import Accept, BagTopics, BeyondLimits, Json, LoadTim
 from pkm_twin.console import file_name, print_json, progress, refuse_existing, table_console
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError, one_line
 from pkm_twin.files import replace_file
-from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.schema import parse_yaml
+from pkm_twin.machine.strict_yaml import parse_yaml
+from pkm_twin.robot.catalogue import robot_of_data
 
 Array = NDArray[np.float64]
 
@@ -56,6 +56,21 @@ def fit(
         bool,
         typer.Option("--per-copy", help="fit each copy of a limb by itself, and write all of them"),
     ] = False,
+    friction: Annotated[
+        str,
+        typer.Option(
+            help="friction laws of the drives in addition to the file's: auto, coulomb (no other), "
+            "stribeck, load-dependent, periodic, several with commas"
+        ),
+    ] = "auto",
+    torque_constant: Annotated[
+        Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        typer.Option(
+            help="efforts are motor currents, A: N m or N per ampere at the joint, one number or "
+            "one per joint with commas; `fit` takes it from the masses of the file",
+            show_default=False,
+        ),
+    ] = None,
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
     load_times: LoadTimes = None,
@@ -81,6 +96,13 @@ def fit(
     recordings, what does not fit and which error is likely. If the model does not explain them,
     standard deviations are widened or withheld.
 
+    Where Coulomb and viscous friction leave something unexplained, `fit` tries the other friction
+    laws and takes one that predicts the held-out part better; a line gives the evidence.
+    `--friction coulomb` keeps the law of the file, `--friction LAW` takes a law in any case.
+
+    With --torque-constant the efforts of the recordings are motor currents in A; in a CSV they may
+    be in columns JOINT.current.
+
     --payload and --load-times give a known payload. When `payload` is fitted, they give the times
     at which it is held.
 
@@ -90,7 +112,7 @@ def fit(
     were measured, all at the platform's reference point in base axes.
     """
     from pkm_twin.apps.fit_files import fitted_yaml, robot_text, yaml_head
-    from pkm_twin.machine.edited import write_edited
+    from pkm_twin.robot.edited import write_edited
 
     page = out.with_suffix(".html")
     if out.suffix not in (".yaml", ".yml"):
@@ -108,15 +130,21 @@ def fit(
             beyond_limits, accept,
         )  # fmt: skip
         return
-    kinds = kinds_of(what)
+    from pkm_twin.identification.friction_laws import laws_of
+
+    kinds, laws = kinds_of(what), laws_of(friction)
     text, machine = robot_text(robot, per_copy=per_copy)
     carried = load_of(payload, load_times)
     with progress("fit", 2 * len(recordings)) as update:
-        result, beyond = fit_recordings(
+        result, beyond, choices = fit_recordings(
             machine, recordings, kinds, topic, carried, update, limited=not beyond_limits,
-            accept=accept,
+            accept=accept, laws=laws, constant=torque_constant,
         )  # fmt: skip
-    marks = [*(f"accepted by --accept: {line}" for line in result.accepted), *beyond]
+    marks = [
+        *(str(choice) for choice in choices),
+        *(f"accepted by --accept: {line}" for line in result.accepted),
+        *beyond,
+    ]
     names = [one_line(path.name, 100) for path in recordings]
     fitted = fitted_yaml(text, result, names)
     _check_loads(fitted, out)
@@ -130,7 +158,8 @@ def fit(
         raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
     if json_output:
         files = {"out": str(out), "report": str(page) if report else None}
-        print_json(as_json(result) | files | {"beyond_limits": beyond})
+        told = [dataclasses.asdict(choice) for choice in choices]
+        print_json(as_json(result) | files | {"beyond_limits": beyond, "friction_laws": told})
         return
     _print(result)
     for line in marks:
@@ -180,10 +209,10 @@ def _fit_compliance(
 ) -> None:  # fmt: skip
     """The fit of elastic elements, its files and what it says."""
     from pkm_twin.apps import elastic_report
-    from pkm_twin.apps.elastic_fit import fit_elements
     from pkm_twin.apps.elastic_recordings import read_deflected
     from pkm_twin.apps.fit_files import fitted_yaml, robot_text
-    from pkm_twin.machine.edited import write_edited
+    from pkm_twin.identification.elastic_fit import fit_elements
+    from pkm_twin.robot.edited import write_edited
 
     if what.strip() != COMPLIANCE:
         raise ParameterError("what", what, "compliance alone: it is fitted to other recordings")
@@ -228,21 +257,27 @@ def fit_recordings(
     update: Callable[[int], None] | None = None,
     limited: bool = True,
     accept: bool = False,
-) -> tuple[Any, list[str]]:
+    laws: Sequence[str] | None = (),
+    constant: str | None = None,
+) -> tuple[Any, list[str], Any]:
     """The fit of recordings, read as ``pkm-twin fit`` reads them.
 
     :param limited: refuse what is beyond the robot's limits.
     :param accept: fit recordings that the machine cannot have made, too.
-    :returns: a :class:`delta_dynamics.fit.Fit`, and a line on each joint beyond its limits.
+    :param laws: of friction beside the file's, see
+        :func:`~pkm_twin.identification.friction_laws.fit_with_laws`.
+    :param constant: as of ``--torque-constant``.
+    :returns: a :class:`~pkm_twin.identification.fit.Fit`, a line on each joint beyond its limits,
+        and the friction laws that were tried.
     :raises PkmTwinError: a recording without efforts, too short, or that shows nothing.
     """
-    from delta_dynamics.fit import fit as fit_robot
     from pkm_twin.bags.storage import is_bag
+    from pkm_twin.identification.friction_laws import fit_with_laws
 
     pairs = [
         _of_bag(path, machine, topics, carried)
         if is_bag(path)
-        else (_of_csv(path, machine), carried)
+        else (_of_csv(path, machine, "effort" if constant is None else "current"), carried)
         for path in recordings
     ]
     beyond = _beyond(machine, [(r.name, r.q) for r, _ in pairs], limited)
@@ -262,7 +297,28 @@ def fit_recordings(
             recorded = _away_from_changes(recorded, load)
             held = load.held(recorded.time).astype(np.float64)
         made.append(dataclasses.replace(recorded, held=held, carried=known))
-    return fit_robot(base, made, kinds, accept=accept, progress=update), beyond
+    if constant is not None:
+        made, told = _with_efforts(base, made, constant, kinds)
+        beyond = [*told, *beyond]
+    result, choices = fit_with_laws(base, made, kinds, laws, accept=accept, progress=update)
+    return result, beyond, choices
+
+
+def _with_efforts(
+    machine: Any, recordings: Sequence[Any], constant: str, kinds: Sequence[Any]
+) -> tuple[list[Any], list[str]]:
+    """Recordings of currents with efforts, and a line on each torque constant that was fitted."""
+    from pkm_twin.identification.torque_constant import FIT, fitted_constants, given_constants
+
+    if constant != FIT:
+        found = given_constants(machine, constant)
+    elif {"payload", "inertia"} & set(kinds):
+        raise ParameterError(
+            "torque-constant", FIT, "--what friction,rotor: the masses of the file are its scale"
+        )
+    else:
+        found = fitted_constants(machine, recordings)
+    return [found.applied(one) for one in recordings], found.lines(machine)
 
 
 def _away_from_changes(recorded: Any, load: Any) -> Any:
@@ -289,8 +345,8 @@ def kinds_of(what: str) -> tuple[Any, ...]:
 
 
 def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tuple[Any, Any]:
-    from delta_dynamics.fit_rows import Recorded
     from pkm_twin.apps.recorded import read_recording
+    from pkm_twin.identification.fit_rows import Recorded
 
     r = read_recording(path, robot=machine, topics=topics, carried=carried, limited=False)
     if r.effort is None:
@@ -301,18 +357,21 @@ def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tu
     return Recorded(one_line(path.name, 100), r.time, r.q, r.effort, r.wrench), r.load
 
 
-def _of_csv(path: Path, machine: Any) -> Any:
-    from delta_dynamics.fit_rows import Recorded
+def _of_csv(path: Path, machine: Any, drive: str = "effort") -> Any:
     from pkm_twin.apps.columns import read_columns, times_of
     from pkm_twin.apps.recorded import WRENCH_AXES
+    from pkm_twin.identification.fit_rows import Recorded
 
     columns = read_columns(path, machine)
-    for what in ("position", "effort"):
+    if drive != "effort" and not any(f"{j}.{drive}" in columns for j in machine.joint_names):
+        drive = "effort"
+    for what in ("position", drive):
         missing = [j for j in machine.joint_names if f"{j}.{what}" not in columns]
-        if missing and what == "effort" and len(missing) == len(machine.joint_names):
+        if missing and what == drive and len(missing) == len(machine.joint_names):
             raise ParameterError(
-                str(path), "no efforts", f"columns {missing[0]}.effort ...: what the drives gave"
-            )
+                str(path), "no efforts", f"columns {missing[0]}.effort ...: what the drives gave; "
+                f"or {missing[0]}.current ... with --torque-constant"
+            )  # fmt: skip
         if missing:
             raise ParameterError(str(path), ", ".join(columns), f"a column {missing[0]}.{what}")
     if "time" not in columns:
@@ -320,7 +379,7 @@ def _of_csv(path: Path, machine: Any) -> Any:
     time = times_of(path, columns["time"])
     q, effort = (
         np.stack([columns[f"{joint}.{what}"] for joint in machine.joint_names], -1)
-        for what in ("position", "effort")
+        for what in ("position", drive)
     )
     wrench = None
     if any(axis in columns for axis in WRENCH_AXES):

@@ -6,15 +6,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from delta_dynamics.fit import Fit, Number
 from pkm_twin import Robot, load
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.catalogue import TREES, robot_of_data, robot_path
+from pkm_twin.identification.fit import Fit, Number
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
-from pkm_twin.machine.robot_urdf import robot_description
 from pkm_twin.machine.shared import Key
-from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.machine.yaml_edit import edit_yaml
+from pkm_twin.robot.catalogue import TREES, robot_of_data, robot_path
+from pkm_twin.robot.robot_urdf import robot_description
+from pkm_twin.robot.urdf_read import read_urdf
 
 
 class Fitted(Protocol):

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from delta_dynamics.fit import Fit, Number
 from pkm_twin.atlas.plots import COLOURS, columns, rendered
+from pkm_twin.identification.fit import Fit, Number
 from pkm_twin.identification.verdict import Verdict
 
 HEAD_OF_PAGE: Final = """<!DOCTYPE html>

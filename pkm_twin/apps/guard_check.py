@@ -14,8 +14,8 @@ import typer
 from pkm_twin.apps.verdict import Item, Verdict, items_table
 from pkm_twin.console import print_json, table_console
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.messages.stamps import stamp_of
 from pkm_twin.ros.listener import listening_node
-from pkm_twin.ros.messages import stamp_of
 from pkm_twin.ros.signals import first_signal
 from pkm_twin.streams.arrivals import SECOND, Arrivals
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording tells of a machine's state, and a file that keeps it night by night (SQLite)."""
+"""A machine's state from a recording, and an SQLite database with one row per recording."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pkm_twin.apps.check import modelled
 from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.recorded import Recording
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -141,8 +141,8 @@ def _fitted(table: Array, target: Array, block: NDArray[np.int64]) -> tuple[Arra
 
 
 def _elasticity(r: Recording) -> list[Measured]:
-    from pkm_twin.apps.elastic_fit import fit_elements
     from pkm_twin.apps.elastic_recordings import read_deflected
+    from pkm_twin.identification.elastic_fit import fit_elements
     from stiffness_monitor.modes import has_modes, natural_frequencies
 
     if r.bag is None:

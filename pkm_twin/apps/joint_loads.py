@@ -26,7 +26,7 @@ from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.files import STANDARD, replace_file
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from pkm_twin.paths.durability import Life
@@ -39,7 +39,7 @@ BLOCK: Final = 512
 CLASSES: Final = 32
 ALONG: Final = 1e-9
 """Part of a direction below which it is across another."""
-SHOWN: Final = 8
+SHOWN: Final = 6
 """Most joints in a picture."""
 
 
@@ -273,9 +273,9 @@ def draw(motion: Motion, loads: list[JointLoad], path: Path) -> None:
 
     sizes = {load.name: np.linalg.norm(load.wrench[:, :3], axis=-1) for load in loads if load.known}
     order = sorted(sizes, key=lambda name: -float(sizes[name].max()))[:SHOWN]
-    figure, axes = figures.subplots(1, 2, figsize=(13, 4.5), layout="constrained")
+    figure, axes = figures.subplots(1, 2, figsize=(9, 4.6), layout="constrained")
     by_name = {load.name: load for load in loads}
-    for colour, name in zip(plots.COLOURS, order, strict=False):
+    for colour, name in zip(figures.LINES, order, strict=False):
         axes[0].plot(motion.time, sizes[name], color=colour, lw=1, label=name)
         own = by_name[name].own[:, :3]
         axis = int(np.ptp(own, axis=0).argmax())
@@ -291,8 +291,9 @@ def draw(motion: Motion, loads: list[JointLoad], path: Path) -> None:
     for ax in axes:
         ax.grid(alpha=0.3)
         if order:
-            ax.legend(fontsize=8)
-    worst = f": {order[0]}, {float(sizes[order[0]].max()):.4g} N" if order else ""
+            # Below: beside curves that fill their axes there is no room.
+            ax.legend(fontsize=9, ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    worst = f" {order[0]}, {float(sizes[order[0]].max()):.4g} N" if order else ""
     figure.suptitle(f"{motion.robot.name}: which joint bears most?{worst}")
     plots.save(figure, path)
 

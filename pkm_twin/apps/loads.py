@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pkm_twin.bags.reader import Bag
 from pkm_twin.console import parse_numbers
 from pkm_twin.errors import BagError, ParameterError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -12,14 +12,26 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from pkm_twin.apps.vibration import (
+    Damping,
+    Feed,
+    Immersion,
+    Radial,
+    Tangential,
+    Teeth,
+    Tool,
+    Up,
+    process_of,
+)
 from pkm_twin.atlas.commands import Alone, kind
 from pkm_twin.console import numbers, print_json, refuse_existing
 from pkm_twin.errors import ParameterError
 
 if TYPE_CHECKING:
+    from pkm_twin.atlas.maps.milling import Process
     from pkm_twin.atlas.maps.quantity import Case, Found, Quantity
     from pkm_twin.atlas.sweep import Sweep
-    from pkm_twin.machine.robot import Robot
+    from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -186,7 +198,7 @@ class PathMap:
 
 
 def _made(
-    name: str,
+    name: str | Process,
     machine: Robot,
     points: int | None,
     wrench: Sequence[str],
@@ -214,7 +226,7 @@ def _made(
         )  # fmt: skip
     from pkm_twin.apps.sizes import motion_of
 
-    quantity = QUANTITIES[name]
+    quantity = QUANTITIES[name] if isinstance(name, str) else name.quantity
     check(machine, quantity, cases)
     motion = motion_of(along, machine, (), None)
     return PathMap(
@@ -270,3 +282,26 @@ _offer(
     circle of each height, and the command compares the result with table 2 of the 2UPR-RPU paper.
     """,
 )
+
+
+@kind
+def cutting_depth(
+    machine: Robot,
+    points: int | None,
+    teeth: Teeth,
+    tangential: Tangential,
+    radial: Radial,
+    immersion: Immersion = 1.0,
+    up: Up = False,
+    feed: Feed = 0.0,
+    tool: Tool = "0,0,0",
+    damping: Damping = None,
+    payload: LoadOf = None,
+    along: Along = None,
+    least_singularity: Singularity = _SINGULARITY,
+    least_clearance: Clearance = 0.0,
+) -> Sweep | Alone:
+    """The axial depth of cut that mills without chatter at every spindle speed (zero-order)."""
+    process = process_of(teeth, tangential, radial, immersion, up, feed, tool, damping)
+    bounds = least_singularity, least_clearance
+    return _made(process, machine, points, (), payload, along, *bounds)

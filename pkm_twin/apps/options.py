@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
 
+from pkm_twin.console import file_name, refuse_existing
 from pkm_twin.errors import ParameterError
+from pkm_twin.files import STANDARD
 
 RobotName = Annotated[
     str, typer.Argument(help="a robot's name (see `pkm-twin robots`), a YAML file or a URDF")
@@ -59,6 +62,20 @@ Platform = Annotated[
     Optional[str],  # noqa: UP045  typer reads it
     typer.Option(help="for a URDF: the link that carries the tool", show_default=False),
 ]
+OverwriteBoth = Annotated[bool, typer.Option("--overwrite", help="replace both files")]
+LimitShare = Annotated[
+    float, typer.Option(help="fraction of the file's effort and velocity limits to use")
+]
+SampleRate = Annotated[float, typer.Option(help="samples per second in the file", min=1.0, max=1e5)]
+MotionOut = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(
+        help="file to write: FILE.mcap (a JointTrajectory with efforts), or a table, FILE.csv, "
+        ".parquet or .mat",
+        callback=file_name,
+        show_default=False,
+    ),
+]
 
 
 def load_of(payload: str | None, times: str | None) -> Any:
@@ -74,3 +91,35 @@ def load_of(payload: str | None, times: str | None) -> Any:
         return Load(*parse_payload(payload), spans)
     except ParameterError as error:
         raise typer.BadParameter(str(error)) from None
+
+
+def loaded(robot: str, platform: str | None, payload: str | None) -> tuple[Any, Any]:
+    """The robot of a command line with its payload, and that payload, None where none is given."""
+    from pkm_twin import load
+
+    machine, carried = load(robot, platform=platform), load_of(payload, None)
+    return (machine if carried is None else carried.on(machine)), carried
+
+
+def drawing_of(
+    out: Path | None,
+    picture: bool,
+    overwrite: bool,
+    endings: Sequence[str],
+    source: Path | None = None,
+) -> Path | None:
+    """The picture's name beside a file to write, None for none, both checked before the work.
+
+    :raises ParameterError: another ending.
+    :raises PkmTwinError: a file that may not be replaced.
+    """
+    piped = str(out) == STANDARD
+    if out is None:
+        return None
+    if out.suffix not in endings and not piped:
+        raise ParameterError("out", str(out), f"a name that ends in {' or '.join(endings)}")
+    drawing = out.with_suffix(".png") if picture and not piped else None
+    for target in (out, drawing):
+        if target is not None:
+            refuse_existing(target, overwrite, source)
+    return drawing

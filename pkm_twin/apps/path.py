@@ -11,17 +11,29 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from pkm_twin.apps.options import Json, Payload, Platform, RobotName, load_of
-from pkm_twin.console import file_name, numbers, parse_numbers, print_json, refuse_existing
+from pkm_twin.apps.options import (
+    Json,
+    LimitShare,
+    MotionOut,
+    OverwriteBoth,
+    Payload,
+    Platform,
+    RobotName,
+    SampleRate,
+    drawing_of,
+    loaded,
+)
+from pkm_twin.console import numbers, parse_numbers, print_json
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.files import STANDARD
-from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.geometry import Path as Way
 from pkm_twin.paths.geometry import Space
+from pkm_twin.paths.motion import TimedPath
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
-ENDINGS: Final = (".mcap", ".csv")
+ENDINGS: Final = (".mcap", ".csv", ".parquet", ".mat")
 OPTIONS: Final = ("blend", "dwell", "arc")
 """Columns of waypoints beside their coordinates."""
 MILLIMETRES: Final = 1e-3
@@ -180,29 +192,34 @@ def path_command(
         Optional[float],  # noqa: UP045
         typer.Option(help="speed limit of the tool point, m/s; default: none", show_default=False),
     ] = None,
-    share: Annotated[
-        float, typer.Option(help="fraction of the file's effort and velocity limits to use")
-    ] = 1.0,
+    share: LimitShare = 1.0,
     singularity: Annotated[
         float, typer.Option(help="least singularity index on the path, 0 to 1", min=0.0, max=1.0)
     ] = 0.01,
-    payload: Payload = None,
-    platform: Platform = None,
-    rate: Annotated[
-        float, typer.Option(help="samples per second in the file", min=1.0, max=1e5)
-    ] = 1000.0,
-    out: Annotated[
-        Optional[Path],  # noqa: UP045
+    shaper: Annotated[
+        _PerJoint,
         typer.Option(
-            help="file to write: FILE.mcap (a JointTrajectory with efforts) or FILE.csv",
-            callback=file_name,
+            help="input shaper for the first natural frequency, which depends on the pose: zv, or "
+            "zvd, which tolerates more error of the frequency; costs half or one vibration at each "
+            "stop",
             show_default=False,
         ),
     ] = None,
+    damping: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(
+            help="damping ratio of that mode; default: `modal_damping` of the robot file",
+            show_default=False,
+        ),
+    ] = None,
+    payload: Payload = None,
+    platform: Platform = None,
+    rate: SampleRate = 1000.0,
+    out: MotionOut = None,
     picture: Annotated[
         bool, typer.Option(help="plot which limit binds where; the PNG has the file's name")
     ] = True,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace both files")] = False,
+    overwrite: OverwriteBoth = False,
     as_json: Json = False,
 ) -> None:
     """Plan a motion along a path, also the fastest one.
@@ -220,22 +237,11 @@ def path_command(
     The CSV that it writes has the columns time, JOINT.position, JOINT.velocity, JOINT.acceleration,
     JOINT.effort and the pose's coordinates. `pkm-twin torques` and `pkm-twin size` read it.
     """
-    from pkm_twin import load
     from pkm_twin.apps.path_report import draw_limits, report, write
     from pkm_twin.paths import timed
 
-    piped = str(out) == STANDARD
-    drawing = None if out is None or not picture or piped else out.with_suffix(".png")
-    if out is not None:
-        if out.suffix not in ENDINGS and not piped:
-            raise ParameterError("out", str(out), f"a name that ends in {' or '.join(ENDINGS)}")
-        for target in (out, drawing):
-            if target is not None:
-                refuse_existing(target, overwrite, waypoints)
-    machine = load(robot, platform=platform) if platform else load(robot)
-    carried = load_of(payload, None)
-    if carried is not None:
-        machine = carried.on(machine)
+    drawing = drawing_of(out, picture, overwrite, ENDINGS, waypoints)
+    machine, carried = loaded(robot, platform, payload)
     made = _chosen(machine, waypoints, cycle, circle, at, direction, blend, dwell)
     bounds: dict[str, Any] = {
         name: None if text is None else _limit(name, text, machine)
@@ -248,6 +254,10 @@ def path_command(
         machine, made, "fastest" if fastest else law, duration=duration, speed=speed, share=share,
         singularity=singularity, **bounds,
     )  # fmt: skip
+    if shaper is not None:
+        motion = _shaped(motion, shaper, damping, singularity)
+    elif damping is not None:
+        raise typer.BadParameter("--damping is for --shaper")
     try:
         if out is not None:
             write(motion, motion.uniform(rate), carried, out, overwrite)
@@ -259,7 +269,20 @@ def path_command(
     if as_json:
         print_json(data)
     else:
-        typer.echo(text, err=piped)
+        typer.echo(text, err=str(out) == STANDARD)
+
+
+def _shaped(motion: TimedPath, shaper: str, damping: float | None, singularity: float) -> TimedPath:
+    """The motion with an input shaper for the first mode of its robot, actuators locked."""
+    from pkm_twin.paths import shaped
+    from stiffness_monitor.modes import natural_frequencies
+    from stiffness_monitor.vibration import damping_ratios
+
+    robot = motion.robot
+    return shaped(
+        motion, shaper, lambda poses: natural_frequencies(robot, poses, 1)[..., 0],
+        float(damping_ratios(robot, damping, 1)[0]), singularity=singularity,
+    )  # fmt: skip
 
 
 def _limit(name: str, text: str, machine: Robot) -> list[float]:

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.apps.loads import Load
-from pkm_twin.files import STANDARD
-from pkm_twin.paths import Samples, TimedPath
+from pkm_twin.paths import Samples, ShapedPath, TimedPath
 
 Array = NDArray[np.float64]
 
@@ -36,8 +35,8 @@ def columns_of(motion: TimedPath, samples: Samples) -> dict[str, Array]:
 def write(
     motion: TimedPath, samples: Samples, carried: Load | None, out: Path, overwrite: bool
 ) -> None:
-    """The motion as a CSV or as a bag with one JointTrajectory."""
-    if out.suffix == ".csv" or str(out) == STANDARD:
+    """The motion as a table or as a bag with one JointTrajectory."""
+    if out.suffix != ".mcap":
         from pkm_twin.apps.torques import write_table
 
         write_table(columns_of(motion, samples), out)
@@ -93,11 +92,21 @@ def report(
         "out": None if out is None else str(out),
         "picture": None if drawing is None else str(drawing),
     }  # fmt: skip
+    note = ""
+    if isinstance(motion, ShapedPath):
+        low, high = motion.frequencies
+        data["shaper"] = {
+            "kind": motion.shaper, "added_s": motion.added, "lowest_hz": low, "highest_hz": high,
+        }  # fmt: skip
+        note = (
+            f"; {motion.added:.4g} s of it for the shaper {motion.shaper} of {low:.4g} to "
+            f"{high:.4g} Hz"
+        )
     count = len(motion.runs)
     lines = [
         f"{robot.name}: {motion.path.kind}, {motion.path.length:.4g} m, "
         f"{count} stretch{'' if count == 1 else 'es'} from rest to rest, law {motion.law}",
-        f"duration {motion.duration:.6g} s; payload: {carried or 'the robot file alone'}",
+        f"duration {motion.duration:.6g} s{note}; payload: {carried or 'the robot file alone'}",
         "limits that bind:",
     ]
     for bound in motion.bounds:
@@ -110,7 +119,7 @@ def report(
     lines.append(f"  tool point: speed {fine.speed.max():.4g} m/s")
     worst = sorted(motion.worst.items(), key=lambda item: -item[1])
     shown = ", ".join(f"{name} {100 * value:.4g} %" for name, value in worst[:6])
-    lines.append(f"greatest parts of limits: {shown or 'there are no limits'}")
+    lines.append(f"largest used fractions of limits: {shown or 'there are no limits'}")
     lines += [str(target) for target in (out, drawing) if target is not None]
     return data, "\n".join(lines)
 
@@ -138,7 +147,8 @@ def draw_limits(motion: TimedPath, path: Path) -> None:
     )
     top.set_ylabel("part of the limit (%)")
     top.set_ylim(0, 105)
-    top.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
+    if shown:
+        top.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     low.plot(time, motion.fine.speed, color="black", lw=1.2)
     low.set_title("speed of the tool point; colours are those of the limit that binds")
     low.set_ylabel("speed (m/s)")

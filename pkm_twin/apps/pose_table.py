@@ -11,10 +11,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.calibration_state import Poses, rotations
 from pkm_twin.apps.columns import read_columns
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.identification.calibration_state import Poses, rotations
+from pkm_twin.identification.measurements import KINDS, Kind, Partial, partial_of
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -64,28 +65,10 @@ def read_poses(
     :raises ParameterError: a column is missing, or a value is no finite number.
     """
     joints = [f"{name}.position" for name in robot.controller.names]
-    known = [*joints, *POSITIONS, *ANGLES, *QUATERNION]
-    table = read_columns(path)
-    headers = _named(table, known, renamed or {})
-    columns: dict[str, Array] = {}
-    for header, values in table.items():
-        name, own = headers.get(header, (header, ""))
-        if name in columns:
-            raise ParameterError(f"{path}: header row", header, f"one column {name}")
-        columns[name] = values * _factor(path, header, name, own, unit)
-    columns = _found(columns, joints, unit)
-    for name in columns:
-        if name.endswith(".position") and name not in known:
-            raise UnknownNameError(f"{path}: column", name, known)
+    columns = _columns_of(path, joints, (*POSITIONS, *ANGLES, *QUATERNION), renamed, unit)
 
     def stack(names: Sequence[str]) -> Array:
-        missing = [name for name in names if name not in columns]
-        if missing:
-            raise ParameterError(
-                str(path), ", ".join(table),
-                f"a column {missing[0]!r}; --columns {missing[0]}=HEADER names another",
-            )  # fmt: skip
-        return np.stack([columns[name] for name in names], -1)
+        return _stacked(path, columns, names)
 
     def stack_some(names: Sequence[str]) -> Array | None:
         return stack(names) if any(name in columns for name in names) else None
@@ -110,6 +93,79 @@ def read_poses(
     elif angles is not None:
         rotation = rotations().from_euler("xyz", angles).as_matrix()
     return Poses(q, position, rotation)
+
+
+def read_partial(
+    path: Path, robot: Robot, kinds: Sequence[Kind], noise: Mapping[str, float],
+    renamed: Mapping[str, str] | None = None, unit: str = "m",
+) -> Partial:  # fmt: skip
+    """Measurements of some quantities, of a CSV in which cells may be empty.
+
+    Columns: ``JOINT.position`` of every joint, and one by the name of each kind. ``z`` stands for a
+    missing ``height``, ``height`` for a missing ``plane``, which is contact without both. Of a
+    distance the other pose is in ``JOINT.position_2`` columns, or in the row whose number, from 1,
+    is in a column ``to``.
+
+    :raises ParameterError: a column is missing, or a value is no finite number.
+    """
+    joints = [f"{name}.position" for name in robot.controller.names]
+    others = [f"{name}_2" for name in joints]
+    names = [kind.name for kind in kinds]
+    columns = _columns_of(path, joints, (*others, *KINDS, "to"), renamed, unit, blank=True)
+    q = _stacked(path, columns, joints)
+    if "height" in names and "height" not in columns and "z" in columns:
+        columns["height"] = columns["z"]
+    if "plane" in names:
+        columns.setdefault("plane", columns.get("height", np.zeros(len(q))))
+    second = None
+    if "to" in columns:
+        given = np.isfinite(columns["to"])
+        to = columns["to"][given].astype(int)
+        if len(to) and not (to.min() > 0 and to.max() <= len(q)):
+            raise ParameterError(f"{path}: to", int(to.max()), f"a row from 1 to {len(q)}")
+        second = np.full_like(q, np.nan)
+        second[given] = q[to - 1]
+    elif any(name in columns for name in others):
+        second = _stacked(path, columns, others)
+    if not np.isfinite(q).all():
+        line = int(np.flatnonzero(~np.isfinite(q).all(1))[0]) + 2
+        raise ParameterError(f"{path}: line {line}", "an empty cell", "every joint's position")
+    values = {name: _stacked(path, columns, [name])[:, 0] for name in names}
+    return partial_of(q, second, values, np.arange(len(q)) + 2, noise)
+
+
+def _columns_of(
+    path: Path, joints: Sequence[str], others: Sequence[str], renamed: Mapping[str, str] | None,
+    unit: str, *, blank: bool = False,
+) -> dict[str, Array]:  # fmt: skip
+    """Columns by name in SI units.
+
+    :raises ParameterError: two columns of one name, or a joint that the robot has not.
+    """
+    known = [*joints, *others]
+    table = read_columns(path, blank=blank)
+    headers = _named(table, known, renamed or {})
+    columns: dict[str, Array] = {}
+    for header, values in table.items():
+        name, own = headers.get(header, (header, ""))
+        if name in columns:
+            raise ParameterError(f"{path}: header row", header, f"one column {name}")
+        columns[name] = values * _factor(path, header, name, own, unit)
+    columns = _found(columns, joints, unit)
+    for name in columns:
+        if name.endswith(".position") and name not in known:
+            raise UnknownNameError(f"{path}: column", name, known)
+    return columns
+
+
+def _stacked(path: Path, columns: Mapping[str, Array], names: Sequence[str]) -> Array:
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise ParameterError(
+            str(path), ", ".join(columns),
+            f"a column {missing[0]!r}; --columns {missing[0]}=HEADER names another",
+        )  # fmt: skip
+    return np.stack([columns[name] for name in names], -1)
 
 
 def _named(
@@ -146,12 +202,12 @@ def _factor(path: Path, header: str, name: str, own: str, unit: str) -> float:
 
     :raises ParameterError: a unit of another kind.
     """
-    kinds = {**dict.fromkeys(POSITIONS, LENGTHS), **dict.fromkeys(ANGLES, TURNS)}
+    kinds = {name: LENGTHS if kind.unit == "m" else TURNS for name, kind in KINDS.items()}
     if name not in kinds:
         return 1.0
     if own and own not in kinds[name]:
         raise ParameterError(f"{path}: {header}", own, f"a unit of {', '.join(kinds[name])}")
-    return UNITS[own or (unit if name in POSITIONS else "rad")]
+    return UNITS[own or (unit if kinds[name] is LENGTHS else "rad")]
 
 
 def _found(columns: dict[str, Array], joints: Sequence[str], unit: str) -> dict[str, Array]:

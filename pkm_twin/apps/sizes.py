@@ -21,10 +21,10 @@ from pkm_twin.apps.torques import Motion, motion_of_bag, motion_of_csv
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.machine import schema
-from pkm_twin.machine.catalogue import config_folder
-from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.sizing import DriveDuty, Motor, size_drives
 from pkm_twin.paths.worst import worst_over_workspace
+from pkm_twin.robot.catalogue import config_folder
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -177,8 +177,8 @@ def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], s
                 f"{100 * fit.speed:.4g} %, inertia ratio {fit.inertia_ratio:.3g}"
             )
     lines.append(
-        f"all drives: energy {sum(total):.4g} J, of it regenerated "
-        f"{data['regenerated_J']:.4g} J, mean power {data['mean_power_W']:.4g} W"
+        f"all drives: energy {sum(total):.4g} J ({data['regenerated_J']:.4g} J regenerated), "
+        f"mean power {data['mean_power_W']:.4g} W"
     )
     lines += list(m.notes)
     return data, "\n".join(lines)

@@ -21,7 +21,7 @@ import typer
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -103,8 +103,9 @@ def in_si(columns: Mapping[str, Array], robot: Robot | None) -> dict[str, Array]
 
 
 def _dialect(
-    separator: str | None, decimal: str | None, columns: str | None, units: str | None
-) -> Dialect:
+    separator: str | None, decimal: str | None, columns: str | None, units: str | None,
+    time: str | None,
+) -> Dialect:  # fmt: skip
     if separator is not None and separator not in SEPARATORS:
         raise ParameterError("--separator", separator, "one of , ; tab")
     if decimal is not None and decimal not in (".", ","):
@@ -115,6 +116,10 @@ def _dialect(
         if not (ours.strip() and sign and theirs.strip()):
             raise ParameterError("--columns", pair, "NAME=COLUMN, several with commas between")
         names[ours.strip()] = theirs.strip()
+    if time is not None:
+        if not time.strip() or names.get("time", time.strip()) != time.strip():
+            raise ParameterError("--time", time, "one column's name")
+        names["time"] = time.strip()
     sizes: dict[str, float] = {}
     for word in (units or "").split(",") if units else []:
         if word.strip() not in UNITS:
@@ -142,8 +147,9 @@ def _options(
     units: Annotated[
         _Text, typer.Option(help="of a table: of rad, deg, m, mm, s, ms, us; default SI")
     ] = None,
+    time: Annotated[_Text, typer.Option(help="name of a table's column of times")] = None,
 ) -> None:
-    del separator, decimal, columns, units
+    del separator, decimal, columns, units, time
 
 
 def tables(command: Callable[..., None]) -> Callable[..., None]:

@@ -11,7 +11,7 @@ from typing import Final
 from pkm_twin.bags.definitions import parse_definition
 from pkm_twin.bags.reader import Bag
 from pkm_twin.errors import BagError, one_line
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
@@ -41,7 +41,7 @@ float64 x
 float64 y
 float64 z
 """
-_DEFINITIONS: Final = {
+DEFINITIONS: Final = {
     JOINT_STATE: _STAMPED
     + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
     + _HEADER,
@@ -162,13 +162,18 @@ def _choose_wrench(
     return _only(bag, "wrenches", fit, "wrench", left_out)
 
 
+def is_output(topic: str) -> bool:
+    """Whether the name is one of the twin's own topics."""
+    return any(part in TWIN_OUTPUTS for part in topic.split("/")[-2:])
+
+
 def _candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]) -> list[str]:
     """Topics of a type: the wanted ones, else all but the twin's own."""
     fit = []
     for name in (name for name, info in bag.report.topics.items() if info.type == kind):
         if wanted and name not in wanted:
             left_out[name] = "not chosen"
-        elif not wanted and any(part in TWIN_OUTPUTS for part in name.split("/")[-2:]):
+        elif not wanted and is_output(name):
             left_out[name] = "published by pkm_twin"
         else:
             fit.append(name)
@@ -215,7 +220,7 @@ def require_definition(bag: Bag, topic: str) -> None:
         recorded = parse_definition(info.type, info.definition)
     except BagError as error:
         raise _choice_error(bag, f"topic {topic}: {error}", error.reason) from None
-    for held, fields in parse_definition(info.type, _DEFINITIONS[info.type]).items():
+    for held, fields in parse_definition(info.type, DEFINITIONS[info.type]).items():
         found = recorded.get(held, ())
         if found == fields:
             continue

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -32,13 +33,13 @@ from pkm_twin.errors import (
     UnreachableError,
 )
 from pkm_twin.files import STANDARD, replacing
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.rest import gradient_gain, rate_doubt
 
 Array = NDArray[np.float64]
 BLOCK = 4096
 """Samples computed at a time, so that memory stays flat."""
-ENDINGS = (".csv", ".parquet")
+ENDINGS = (".csv", ".parquet", ".mat")
 INPUTS = ("position", "velocity", "acceleration")
 BEYOND_LIMITS = "beyond_limits"
 MAPPED = "tables use the model's joint values; joint_map applies to messages and bags only"
@@ -269,15 +270,17 @@ def check_target(path: Path) -> None:
 
 
 def write_table(columns: dict[str, Array], path: Path) -> None:
-    """Write CSV, or Parquet where the name ends so (needs pyarrow).
+    """Write CSV, or where the name ends so Parquet (needs pyarrow) or a MATLAB file.
 
-    The file appears only once it is complete.
+    The file appears only once it is complete. In MATLAB a name's points and spaces are underscores.
 
     :raises ParameterError: another ending, or pyarrow is missing.
     """
     check_target(path)
     with replacing(path) as hidden:
-        (_write_parquet if path.suffix == ".parquet" else _write_csv)(columns, hidden)
+        {".parquet": _write_parquet, ".mat": _write_mat}.get(path.suffix, _write_csv)(
+            columns, hidden
+        )
 
 
 def _write_csv(columns: dict[str, Array], path: Path) -> None:
@@ -287,6 +290,16 @@ def _write_csv(columns: dict[str, Array], path: Path) -> None:
         for row in zip(*(values.tolist() for values in columns.values()), strict=True):
             # An undetermined reaction is an empty cell; repr keeps every digit.
             writer.writerow(["" if value != value else repr(value) for value in row])
+
+
+def _write_mat(columns: dict[str, Array], path: Path) -> None:
+    from scipy.io import savemat  # type: ignore[import-untyped]
+
+    named = {re.sub(r"^(?=[\d_])", "x", re.sub(r"\W", "_", name)): v for name, v in columns.items()}
+    if len(named) < len(columns):
+        raise ParameterError("out", str(path), "CSV: names of columns are the same in MATLAB")
+    with path.open("wb") as file:
+        savemat(file, named, oned_as="column")
 
 
 def _write_parquet(columns: dict[str, Array], path: Path) -> None:

@@ -14,7 +14,8 @@ from pkm_twin import load
 from pkm_twin.apps.demo_report import Finding, share
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.errors import BagError
-from pkm_twin.ros.messages import SECOND, JointReader, stamp_of
+from pkm_twin.messages.reading import JointReader
+from pkm_twin.messages.stamps import SECOND, stamp_of
 from pkm_twin.streams.path import JointPath
 
 Array = NDArray[np.float64]

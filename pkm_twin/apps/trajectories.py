@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.bags.reader import Bag, BagWriter
 from pkm_twin.errors import BagError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ DRIFT: Final = 1
 """Exit code where something drifts."""
 FEWEST: Final = 6
 """Recordings below which nothing is judged."""
-SHOWN: Final = 12
+SHOWN: Final = 4
 """Most series in a picture."""
 
 
@@ -157,20 +157,25 @@ def trend(
             draw(results, picture)
         except OSError as error:
             raise PkmTwinError(f"cannot write {picture}: {error.strerror}") from None
+    few = sum(len(one.series.value) < FEWEST for one in results)
     if as_json:
         print_json(
             {
-                "history": str(history), "drifts": bool(drifting),
+                "history": str(history), "drifts": bool(drifting), "judged": len(results) - few,
                 "series": [one.as_json() for one in results],
             }
         )  # fmt: skip
     else:
         for one in results:
             typer.echo(_line(one))
-        few = sum(len(one.series.value) < FEWEST for one in results)
         if few:
             typer.echo(f"not judged: {few} series with fewer than {FEWEST} recordings")
-        typer.echo(f"drift in {len(drifting)} of {len(results)} series" if drifting else "no drift")
+        if drifting:
+            typer.echo(f"drift in {len(drifting)} of {len(results)} series")
+        elif few < len(results):
+            typer.echo(f"no drift in {len(results) - few} series")
+        else:
+            typer.echo("no verdict")
         if picture is not None:
             typer.echo(str(picture))
     if drifting:
@@ -182,7 +187,7 @@ def _line(one: Judged) -> str:
     name = f"{s.machine}: {s.quantity} of {s.part}"
     last = f"{s.value[-1]:.4g} {s.unit}"
     if len(s.value) < FEWEST:
-        return f"{name}: {last}, {len(s.value)} recordings"
+        return f"{name}: {last}, too few recordings: {len(s.value)}"
     text = f"{name}: {last}, limits {one.low:.4g} to {one.high:.4g}"
     if one.change is not None:
         when = _day(s.time[one.change])
@@ -198,10 +203,10 @@ def draw(results: Sequence[Judged], path: Path) -> None:
 
     order = sorted(results, key=lambda one: (not one.drifts, -len(one.series.value)))[:SHOWN]
     drifting = sum(one.drifts for one in results)
-    columns = min(3, len(order))
+    columns = min(2, len(order))
     rows = math.ceil(len(order) / columns)
     figure, axes = figures.subplots(
-        rows, columns, figsize=(5.2 * columns, 3.2 * rows), layout="constrained", squeeze=False
+        rows, columns, figsize=(4.5 * columns, 3.2 * rows), layout="constrained", squeeze=False
     )
     for ax in axes.ravel()[len(order) :]:
         ax.set_visible(False)
@@ -219,12 +224,13 @@ def draw(results: Sequence[Judged], path: Path) -> None:
             ax.axhspan(one.low, one.high, color=plots.COLOURS[2], alpha=0.15, lw=0)
         if one.change is not None:
             ax.axvline(days[one.change], color=plots.COLOURS[1], ls="--", lw=1.2)
-        ax.set_title(f"{s.machine}: {s.quantity} of {s.part}", fontsize=9)
+        ax.set_title(f"{s.machine}: {s.quantity} of {s.part}", fontsize=11)
         ax.set_ylabel(s.unit)
-        ax.tick_params(axis="x", labelrotation=30, labelsize=7)
+        ax.tick_params(axis="x", labelrotation=30, labelsize=9)
         ax.grid(alpha=0.3)
     answer = f"drift in {drifting} of {len(results)} series" if drifting else "no drift"
-    figure.suptitle(f"Is it getting worse? {answer}")
+    shown = "" if len(order) == len(results) else f"; {len(order)} shown"
+    figure.suptitle(f"Is it getting worse? {answer}{shown}")
     plots.save(figure, path)
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
     from pkm_twin.atlas.sweep import Sweep
-    from pkm_twin.machine.robot import Robot
+    from pkm_twin.robot.robot import Robot
 
 MOST: Final = 10**11
 """Samples beyond which a number is a slip."""
@@ -42,6 +42,10 @@ class _Kinds(TyperGroup):
     """The kinds as commands after the robot; an unknown one is a name like any other."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[0] in ctx.help_option_names:
+            # After the robot, options are those of a kind.
+            typer.echo(ctx.get_help())
+            ctx.exit()
         if args[0] not in self.commands:
             raise UnknownNameError("map", args[0], tuple(self.commands))
         return super().resolve_command(ctx, args)

@@ -63,7 +63,7 @@ def contours(ax: Axes, x: Array, y: Array, values: Array, label: str, **options:
     from matplotlib import ticker
 
     least = float(np.nanmin(values)) if "least" not in options else options.pop("least")
-    greatest = float(np.nanmax(values))
+    greatest = float(np.nanmax(values)) if "greatest" not in options else options.pop("greatest")
     if "levels" not in options:
         if not greatest > least:
             least, greatest = least - 0.5, least + 0.5
@@ -127,6 +127,12 @@ def every(count: int) -> int:
 def thin(ticks: Array) -> Array:
     """The ticks that are drawn."""
     return ticks[:: every(len(ticks))]
+
+
+def unit_of(variable: Any) -> str:
+    """The unit of a stored field, for a label."""
+    unit = str(variable.attrs["units"])
+    return "dimensionless" if unit == "1" else unit
 
 
 def in_degrees(coordinate: Any) -> tuple[Array, str]:

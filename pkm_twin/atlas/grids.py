@@ -3,8 +3,6 @@
 
 A robot tells how its poses are laid out (``robot.grid()``) and where they end
 (``robot.search_box()``); nothing here knows a mechanism.
-
-May import: numpy, scipy, pkm_twin's core; never rclpy.
 """
 
 from __future__ import annotations
@@ -17,14 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.workspace import (
+from pkm_twin.machine.pose_grid import PoseGrid
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import (
     CLEAR,
     circle_radii,
     reachable,
     try_forward,
 )
-from pkm_twin.machine.pose_grid import PoseGrid
-from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

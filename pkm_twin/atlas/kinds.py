@@ -80,7 +80,10 @@ def write_page(atlas: Dataset, path: Path) -> Path:
         auto_play=False,
     )
     text = pages.SHELL.format(
-        title=html.escape(kind.title(atlas)), plot=plot, help=html.escape(kind.help)
+        title=html.escape(kind.title(atlas)),
+        plot=plot,
+        help=html.escape(kind.help),
+        width=pages.LEAST[len(list(drawn.select_scenes())) > 1],
     )
     with writing(path):
         replace_file(path, text.encode())

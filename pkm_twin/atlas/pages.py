@@ -26,6 +26,9 @@ FLAT: Final = {"eye": {"x": 0.0, "y": -0.6, "z": 1.5}, "projection": {"type": "o
 CONFIG: Final = {"displaylogo": False, "responsive": True, "showSendToCloud": False}
 """No buttons that lead into the network."""
 MENU: Final = {"x": 0.0, "y": 1.0, "xanchor": "left", "yanchor": "bottom", "pad": {"b": 8}}
+LEAST: Final = (760, 1000)
+"""Widths below which titles and labels would overlap, pixels: of one scene and of two. Narrower
+windows scroll sideways."""
 MARGIN: Final = {"l": 20, "r": 20, "t": 110, "b": 20}
 # The text below the plot comes first: the plot takes the room that is left when it is drawn.
 SHELL: Final = """<!DOCTYPE html>
@@ -37,8 +40,8 @@ SHELL: Final = """<!DOCTYPE html>
 html, body {{ margin: 0; height: 100%; }}
 body {{ display: grid; grid-template-rows: 1fr auto; font: 14px sans-serif; color: #2a3f5f; }}
 p {{ grid-row: 2; margin: 4px 20px 10px; }}
-main {{ grid-row: 1; position: relative; min-height: 0; }}
-main > div {{ position: absolute; inset: 0; }}
+main {{ grid-row: 1; position: relative; min-height: 0; overflow-x: auto; }}
+main > div {{ position: absolute; inset: 0; min-width: {width}px; }}
 </style>
 </head>
 <body>

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Planes of a stored grid of poses, two coordinates each and the others held; their pictures.
-
-May import: numpy, matplotlib and plotly when it draws, this package, the standard library.
-"""
+"""Planes of a stored grid of poses, two coordinates each and the others held; their pictures."""
 
 from __future__ import annotations
 

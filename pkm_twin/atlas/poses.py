@@ -2,8 +2,6 @@
 """A grid of poses over all that a machine reaches, and which of them count.
 
 All coordinates of two or three; of more every pair of them, with the others at home.
-
-May import: numpy, pkm_twin's core; never rclpy.
 """
 
 from __future__ import annotations
@@ -20,8 +18,8 @@ from numpy.typing import NDArray
 from pkm_twin.atlas.grids import FULL, workspace_box
 from pkm_twin.atlas.sweep import Chunk, Sweep, Variable
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.clearance import has_clearance
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.clearance import has_clearance
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from concurrent.futures import CancelledError as FutureCancelled
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import pkm_twin
 from pkm_twin.atlas.extras import require
@@ -31,7 +31,8 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.threads import one_blas_thread_for_children
 
 Progress = Callable[[int], None]
-Work = Sequence[tuple[int, Chunk]]
+Work = Sequence[tuple[int, Any]]
+"""Numbered parts of a task."""
 
 ATTEMPTS: Final = 3
 """How often workers may die at one chunk before the sweep is given up."""
@@ -41,6 +42,17 @@ CONNECT: Final = "10s"
 """How long a scheduler may take to answer."""
 IN_FLIGHT: Final = 2
 """Chunks a worker that are handed out at a time."""
+
+
+class Task(Protocol):
+    """Work that workers get whole with each of its parts, as :class:`Sweep` with its chunks."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Of this task alone."""
+
+    def evaluate(self, chunk: Any, /) -> Values:
+        """Results of one part."""
 
 
 class ClusterError(PkmTwinError):
@@ -165,7 +177,7 @@ def _pool(sweep: Sweep, work: Work, workers: int, folder: Path) -> Iterator[int]
         pool.shutdown(cancel_futures=True)
 
 
-def on_cluster(sweep: Sweep, work: Work, scheduler: str) -> Iterator[tuple[int, Values]]:
+def on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, Values]]:
     """Chunks on a Dask cluster, in the order in which they are done.
 
     The scheduler gives the chunks of a lost worker to another one.
@@ -200,7 +212,7 @@ def on_cluster(sweep: Sweep, work: Work, scheduler: str) -> Iterator[tuple[int, 
 
 
 def _from_workers(
-    sweep: Sweep, work: Work, distributed: Any, client: Any, threads: int
+    sweep: Task, work: Work, distributed: Any, client: Any, threads: int
 ) -> Iterator[tuple[int, Values]]:
     queue = iter(work)
 
@@ -231,7 +243,7 @@ def _from_workers(
             finished.add(following)
 
 
-def compute(sweep: Sweep, chunk: Chunk, version: str) -> Values:
+def compute(sweep: Task, chunk: Any, version: str) -> Values:
     """One chunk, in a worker.
 
     :raises PkmTwinError: what the chunk raises, in a form that passes between processes; or a
@@ -257,7 +269,7 @@ def _unpacked(packed: bytes) -> Sweep:
     return sweep
 
 
-def _some(queue: Iterator[tuple[int, Chunk]], count: int) -> Iterator[tuple[int, Chunk]]:
+def _some(queue: Iterator[tuple[int, Any]], count: int) -> Iterator[tuple[int, Any]]:
     for _, item in zip(range(count), queue, strict=False):
         yield item
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a kind of atlas is: a grid, the fields on it, and how one chunk of it is computed.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
-"""
+"""What a kind of atlas is: a grid, the fields on it, and how one chunk of it is computed."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pkm_twin
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

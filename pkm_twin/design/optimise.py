@@ -4,10 +4,8 @@
 The starts of a Sobol sequence are computed as one batch. From the best ones, the greatest piece of
 a quantity is made least by scipy's SLSQP (Kraft 1988) with exact derivatives, on the pieces that
 are near the greatest; pieces that pass it join, and it goes on (an exchange method, Hettich and
-Kortanek 1993). A machine that cannot follow the path ends a run, which begins anew in a smaller box
-around the best machine so far: the search stays where machines can follow it.
-
-May import: numpy, scipy, pkm_twin's core, this package, the standard library.
+Kortanek 1993). A machine that cannot follow the path ends a run; the next run starts in a smaller
+box around the best machine so far, so that the search stays where machines can follow the path.
 """
 
 from __future__ import annotations
@@ -24,8 +22,8 @@ from pkm_twin.design.quantities import QUANTITIES, Constraint, Quantity, quantit
 from pkm_twin.design.variables import Variables
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.machine.entries import with_entries
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.entries import with_entries
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -13,8 +13,6 @@ qdd and g,
     J^T a = tau_qdd,   J^T v = tau_qd - A_qd^T a,   J^T p = tau_q - A_q^T a - V_q^T v
 
 (the adjoint of the implicit function theorem, three times).
-
-May import: numpy, pkm_twin's core, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from pkm_twin.design import programs
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Programs that are asked of many machines, and what each takes of a machine's numbers.
-
-May import: numpy, pkm_twin's core, delta_dynamics, stiffness_monitor, the standard library.
-"""
+"""Programs that are asked of many machines, and what each takes of a machine's numbers."""
 
 from __future__ import annotations
 
@@ -14,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics.derivatives import motion_gradient, numbers_gradient
+from delta_dynamics.reactions import loads_kernel
 from delta_dynamics.virtual_work import masses_kernel
 from delta_dynamics.virtual_work import torques as torques_kernel
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.kinematics.derivatives import geometry_numbers
 from pkm_twin.kinematics.gradients import free_forward, platform_gradient, pose_motion_gradient
-from pkm_twin.kinematics.numbers import FileNumbers, geometry_and_masses
 from pkm_twin.kinematics.singularity import singularity_gradient
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.derivatives import geometry_numbers
+from pkm_twin.robot.numbers import FileNumbers, geometry_and_masses
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_gradient
 from stiffness_monitor.numbers import numbers_of
 from stiffness_monitor.programs import elastic_of
@@ -114,6 +112,11 @@ def singularity(robot: Robot) -> Asked:
 def torques(robot: Robot) -> Asked:
     """Of q, qd, qdd and wrench to efforts."""
     return torques_kernel(robot), of_masses
+
+
+def loads(robot: Robot) -> Asked:
+    """Of q, qd, qdd and wrench to what joints have to bear, and where they are."""
+    return loads_kernel(robot), of_masses
 
 
 def masses(robot: Robot) -> Asked:

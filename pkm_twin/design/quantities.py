@@ -3,8 +3,6 @@
 
 A quantity is the greatest (of the singularity index the least) of several smooth pieces: of the
 efforts of all joints in all samples, say, or of one number.
-
-May import: numpy, pkm_twin's core, this package, the standard library.
 """
 
 from __future__ import annotations
@@ -20,8 +18,8 @@ from numpy.typing import NDArray
 
 from pkm_twin.design.pose_path import Followed
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.kinematics.numbers import FileNumbers
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.numbers import FileNumbers
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

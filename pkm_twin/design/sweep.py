@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All quantities of many machines in a box of numbers: on a grid, or on points that fill it evenly.
-
-May import: numpy, pkm_twin's core, this package, the standard library.
-"""
+"""All quantities of many machines in a box of numbers: on a grid, or on evenly spread points."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final, Literal
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final, Literal
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +17,14 @@ from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.quantities import quantity_of
 from pkm_twin.design.variables import Variables
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
 MOST: Final = 10_000_000
 """Machines of a sweep."""
 STEP: Final = 256
-"""Machines between two reports of progress."""
+"""Machines that are computed together, between two reports of progress."""
 
 
 @dataclass(frozen=True)
@@ -41,21 +40,61 @@ class Sweep:
     quantities: Mapping[str, Array]
 
 
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A box of machines and what is asked of them; workers get it whole with their points."""
+
+    robot: Robot
+    vary: Mapping[str, tuple[float, float]]
+    path: PosePath
+    quantities: tuple[str, ...]
+    fingerprint: str = field(default_factory=lambda: uuid4().hex)
+    """Of this object and its copies alone."""
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The machines on the path."""
+        return Problem(self.robot, Variables.of(self.robot, self.vary), self.path)
+
+    def evaluate(self, points: Array) -> dict[str, Array]:
+        """Quantities of points (k, d) of the box, each 0 to 1, by name: shape (k,)."""
+        wanted = [quantity_of(name, "quantities") for name in self.quantities]
+        found = self.problem.pieces(points, wanted)
+        return {q.name: q.worst(pieces) for q, pieces in zip(wanted, found, strict=True)}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is made once a process."""
+        return {key: value for key, value in vars(self).items() if key != "problem"}
+
+
+Work = Sequence[tuple[int, Array]]
+"""Numbered points."""
+
+
+def here(box: Box, work: Work) -> Iterator[tuple[int, dict[str, Array]]]:
+    """Points part by part in this process."""
+    for index, points in work:
+        yield index, box.evaluate(points)
+
+
 def sweep(
     robot: Robot, vary: Mapping[str, tuple[float, float]], path: PosePath,
     quantities: Sequence[str], samples: int, kind: Literal["grid", "sobol"] = "grid", *,
     seed: int = 0, progress: Callable[[int], None] = lambda _: None,
+    compute: Callable[[Box, Work], Iterable[tuple[int, Mapping[str, Array]]]] = here,
 ) -> Sweep:  # fmt: skip
     """Quantities of machines of a box.
 
     :param vary: as of :func:`pkm_twin.design.design`; also of the path.
     :param samples: machines along each variable of a grid, or in all.
     :param progress: called with how many machines are done.
+    :param compute: evaluates the parts, in any order.
     :raises ParameterError: a path, a quantity or a count that there is not.
     """
-    wanted = [quantity_of(name, "quantities") for name in quantities]
-    problem = Problem(robot, Variables.of(robot, vary), path)
-    d = len(problem.variables)
+    names = tuple(quantity_of(name, "quantities").name for name in quantities)
+    box = Box(robot, vary, path, names)
+    variables = box.problem.variables
+    d = len(variables)
     count = samples**d if kind == "grid" else samples
     if samples < 1 or count > MOST:
         raise ParameterError("samples", samples, f"1 or more, at most {MOST} machines in all")
@@ -65,18 +104,18 @@ def sweep(
         points = np.stack([axis.ravel() for axis in axes], -1)
     else:
         points, shape = sobol(d, samples, seed), (samples,)
-    rows: list[list[Array]] = []
-    for k in range(0, count, STEP):
-        part = points[k : k + STEP]
-        found = problem.pieces(part, wanted)
-        rows.append([q.worst(pieces) for q, pieces in zip(wanted, found, strict=True)])
-        progress(k + len(part))
-    named = np.array([problem.variables.named(y) for y in points])
+    table = {name: np.empty(count) for name in names}
+    done = 0
+    work = [(k, points[k : k + STEP]) for k in range(0, count, STEP)]
+    for first, found in compute(box, work):
+        size = len(points[first : first + STEP])
+        for name, values in found.items():
+            table[name][first : first + size] = values
+        done += size
+        progress(done)
+    named = np.array([variables.named(y) for y in points])
     return Sweep(
         shape,
-        {n: named[:, i].reshape(shape) for i, n in enumerate(problem.variables.names)},
-        {
-            q.name: np.concatenate([row[i] for row in rows]).reshape(shape)
-            for i, q in enumerate(wanted)
-        },
+        {n: named[:, i].reshape(shape) for i, n in enumerate(variables.names)},
+        {name: values.reshape(shape) for name, values in table.items()},
     )

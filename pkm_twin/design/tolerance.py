@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the platform is from where the file says, by tolerances of the file's numbers.
-
-May import: numpy, pkm_twin's core, this package, the standard library.
-"""
+"""How far the platform is from where the file says, by tolerances of the file's numbers."""
 
 from __future__ import annotations
 
@@ -15,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.derivatives import platform_derivatives
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.derivatives import platform_derivatives
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a design may change: numbers of the file, alone or several together, between bounds.
-
-May import: numpy, pkm_twin's core, the standard library.
-"""
+"""What a design may change: numbers of the file, alone or several together, between bounds."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

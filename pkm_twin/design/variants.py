@@ -4,8 +4,6 @@
 They share the programs of one robot; only what hangs on their numbers is computed for each. Where a
 machine does not have what a program takes for constant, a zero or a parallel axis, it is asked
 through a program of its own structure.
-
-May import: numpy, pkm_twin's core, delta_dynamics, stiffness_monitor, the standard library.
 """
 
 from __future__ import annotations
@@ -14,21 +12,24 @@ import copy
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from delta_dynamics.reactions import BALANCE_BOUND, Reactions, balanced, known_alone
 from pkm_twin.codegen.arrays import doubles
-from pkm_twin.codegen.kernels import MISSED, Code, Kernel
+from pkm_twin.codegen.code import Code
+from pkm_twin.codegen.kernels import MISSED, Kernel
 from pkm_twin.design import programs
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.kinematics.derivatives import twist_rows
-from pkm_twin.machine.entries import with_entries
 from pkm_twin.machine.geometry import pattern_of
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.tree import Tree
+from pkm_twin.robot.derivatives import twist_rows
+from pkm_twin.robot.entries import with_entries
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import HELD
 from stiffness_monitor.programs import elastic_of
 
@@ -37,6 +38,12 @@ Mask = NDArray[np.bool_]
 
 CORNERS: Final = 5
 """Most numbers of a section of which every combination of least and greatest is looked at."""
+BALANCES: Final = 2048
+"""Samples whose joint loads are solved at a time: large tables for each."""
+BY_SAMPLE: Final = (
+    "points", "wrenches", "determinate", "values", "determinate_components", "residual",
+)  # fmt: skip
+"""Arrays of reactions."""
 NEAR: Final = 1e-3
 """How far beside home a machine has to be assembled too, rad, or part of the machine's size."""
 
@@ -119,6 +126,35 @@ class Variants:
         """Efforts, shape (k, ..., n), see :func:`delta_dynamics.inverse_dynamics`."""
         load = np.zeros(6) if wrench is None else wrench
         return self.run(programs.torques, q, qd, qdd, load)[0][0]
+
+    def reactions(
+        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
+    ) -> Reactions:
+        """Of arrays (k, ..., joints, 6) and so on, see :func:`delta_dynamics.reactions`.
+
+        Where a machine has no assembly or no equilibrium nothing is determinate. Components along
+        "across 1" and "across 2" are in the directions that the first robot has.
+        """
+        load = np.zeros(6) if wrench is None else wrench
+        loads, good = self.run(programs.loads, q, qd, qdd, load)
+        rows, at = [part.reshape(good.size, -1) for part in loads], np.flatnonzero(good)
+        parts = []
+        for start in range(0, max(1, len(at)), BALANCES):
+            taken = [row[at[start : start + BALANCES]] for row in rows]
+            found = balanced(self.robot, taken, strict=False)
+            parts.append(known_alone(found.reactions(found.value, found.null)))
+        kept = np.concatenate([part.residual <= BALANCE_BOUND for part in parts])
+
+        def everywhere(name: str) -> NDArray[Any]:
+            values = np.concatenate([getattr(part, name) for part in parts])
+            missing = False if values.dtype == bool else np.nan
+            table = np.full((good.size, *values.shape[1:]), missing)
+            table[at[kept]] = values[kept]
+            table.setflags(write=False)
+            return table.reshape(*good.shape[:-1], *values.shape[1:])
+
+        made: dict[str, Any] = {name: everywhere(name) for name in BY_SAMPLE}
+        return replace(parts[0], **made)
 
     def mass_matrix(self, q: ArrayLike) -> Array:
         """Shape (k, ..., n, n), see :func:`delta_dynamics.mass_matrix`."""

@@ -4,8 +4,6 @@
 A machine's numbers are folded into its programs, so that the code has fewer operations than the
 one that all machines of a structure share. Newton's method makes the same tests in the same order
 as the other back ends.
-
-May import: pkm_twin's codegen, the standard library.
 """
 
 from __future__ import annotations
@@ -17,8 +15,8 @@ from textwrap import indent
 from typing import Any, Final
 
 from pkm_twin.codegen import expressions
+from pkm_twin.codegen.code import STEPS
 from pkm_twin.codegen.expressions import PARAMETER, SAMPLE, Expression, Tape, count, ordered
-from pkm_twin.codegen.kernels import STEPS
 from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
@@ -93,7 +91,16 @@ class Routine:
     summary: str = ""
 
 
+HOT: Final = "PKM_HOT "
+"""Before the function that a control loop calls."""
 _FIXED: Final = f"""\
+/* Where the compiler can, one form for this processor family's vector units, chosen at load. */
+#ifdef PKM_CLONES
+#define PKM_HOT __attribute__((flatten, target_clones("arch=x86-64-v3", "default")))
+#else
+#define PKM_HOT
+#endif
+
 static int @_finite(const double *values, int count)
 {{
     double total = 0.0;
@@ -276,7 +283,7 @@ static int @_{name}(const double *{q.target}, int steps, double *h, double *x)
     def routine(self, routine: Routine, kind: str = "") -> None:
         """A function with parameters.
 
-        :param kind: ``static`` and what its name ends on then.
+        :param kind: what stands before it: ``static`` or :data:`HOT`.
         """
         q = self._solvers.get(routine.solver)
         results = [e for row in routine.outputs.values() for e in row]

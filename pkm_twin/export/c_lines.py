@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Expressions as straight-line C99, and the few functions that it calls.
-
-May import: pkm_twin's codegen, the standard library.
-"""
+"""Expressions as straight-line C99, and the few functions that it calls."""
 
 from __future__ import annotations
 

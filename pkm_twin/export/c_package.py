@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot as a package of C99: header, source, example, CMakeLists.txt and README.
-
-May import: numpy, pkm_twin's core, delta_dynamics, stiffness_monitor, the standard library.
-"""
+"""A robot as a package of C99: header, source, example, CMakeLists.txt and README."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import TURNS
 from pkm_twin.errors import ParameterError
-from pkm_twin.export.c99 import CORRECTIONS, LADDER, Folding, Routine, Unit, edge
+from pkm_twin.export.c99 import CORRECTIONS, HOT, LADDER, Folding, Routine, Unit, edge
 from pkm_twin.export.c_lines import HEAD, table
 from pkm_twin.export.c_templates import (
     ABOUT,
@@ -32,7 +29,7 @@ from pkm_twin.export.c_templates import (
     README,
 )
 from pkm_twin.machine.inertia import Layout
-from pkm_twin.machine.robot import SAME_POSE, SINGULARITY_BOUND, Robot
+from pkm_twin.robot.robot import SAME_POSE, SINGULARITY_BOUND, Robot
 from stiffness_monitor.compliance import HELD
 from stiffness_monitor.programs import Elastic, elastic_of
 
@@ -117,12 +114,14 @@ class Package:
             name: str,
             summary: str,
             inputs: Mapping[str, int],
-            kernel: Callable[[], Kernel],
+            kernels: Callable[[], Kernel] | Sequence[Callable[[], Kernel]],
             own: Sequence[Any] | Array = (),
             **outputs: str,
         ) -> None:
             if self._wants(name):
-                rows = self._rows(kernel(), own)
+                rows: dict[str, list[Expression]] = {}
+                for kernel in [kernels] if callable(kernels) else kernels:
+                    rows |= self._rows(kernel(), own)
                 made = {key: rows[row] for key, row in outputs.items()}
                 result.append(Routine(name, inputs, made, (), SOLVER, summary))
 
@@ -131,6 +130,13 @@ class Package:
             add(
                 "torques", "Actuator efforts tau (N m or N) for a motion.",
                 rates | {"qdd": n} | wrench, lambda: torques(robot), p, tau="efforts",
+            )  # fmt: skip
+            add(
+                "torques_and_singularity",
+                "Both for the time of one: actuator efforts tau, and the singularity index.",
+                rates | {"qdd": n} | wrench,
+                [lambda: torques(robot), robot.singularity_kernel], p,
+                tau="efforts", index="measure",
             )  # fmt: skip
         add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
         add(
@@ -200,7 +206,7 @@ class Package:
     def _inertial(self) -> Array:
         """Run-time inputs of the dynamics, by the payload's numbers."""
         mass, com, inertia = self.payload[0], self.payload[1:4], self.payload[4:].reshape(3, 3)
-        layout = Layout(self.robot.engine.tree)
+        layout = Layout(self.robot.massive().tree)
         return np.asarray(self.robot.own_inertial + layout.payload(mass, com, inertia))
 
     def _payload(self) -> list[float]:
@@ -217,7 +223,7 @@ class Package:
         if self.massive:
             self._write_parameters()
         for routine in self.routines:
-            unit.routine(routine)
+            unit.routine(routine, HOT if routine.name == "torques_and_singularity" else "")
             unit.own(routine)
         if self._wants("inverse"):
             self._write_inverse()

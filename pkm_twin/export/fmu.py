@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot as a Functional Mock-up Unit, FMI 2.0 or 3.0: model exchange and co-simulation.
-
-May import: pkm_twin's core, delta_dynamics, this package, the standard library.
-"""
+"""A robot as a Functional Mock-up Unit, FMI 2.0 or 3.0: model exchange and co-simulation."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ from pkm_twin.export.c_package import Package
 from pkm_twin.export.fmu_interface import interface, source
 from pkm_twin.export.fmu_xml import Description, Variable, build_of, quoted, text_of
 from pkm_twin.machine.inertia import loaded_joints
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 VERSIONS: Final = (2, 3)
 KINDS: Final = ("dynamics", "torques")
@@ -64,10 +61,16 @@ class Fmu:
 
     def __init__(self, robot: Robot, version: int = 3, kind: str = "dynamics") -> None:
         robot.massive()
+        if robot.laws and kind == "dynamics":
+            law = robot.laws[0]
+            raise ParameterError(
+                "friction", law, "viscous, coulomb and offset in an FMU of kind dynamics; "
+                "--kind torques has every law"
+            )  # fmt: skip
         self.robot, self.version, self.kind = robot, version, kind
         self.dynamic = kind == "dynamics"
         self.n = robot.joints_count
-        names = ("terms", "forward") if self.dynamic else ("torques", "forward", "singularity")
+        names = ("terms" if self.dynamic else "torques_and_singularity", "forward")
         self._package = Package(robot, names)
         self.identifier = self._package.prefix
         passive = loaded_joints(robot.graph)

@@ -3,8 +3,6 @@
 
 The types are those of the standard's headers (fmi-standard.org), so that a binary fits every
 importer, and the sources compile without its headers.
-
-May import: the standard library.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The variables of an FMU and its modelDescription.xml, of FMI 2.0 and 3.0, byte for byte the same.
-
-May import: the standard library.
-"""
+"""An FMU's variables and its modelDescription.xml of FMI 2.0 and 3.0, always the same bytes."""
 
 from __future__ import annotations
 

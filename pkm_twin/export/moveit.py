@@ -6,8 +6,6 @@ joints of the tree are declared passive, so that nobody waits for their states. 
 platform's pose need inverse kinematics that knows the loops: a plugin of one's own, by name. A
 numeric solver only solves the chain of the tree that leads to the platform, a group of its own
 where that chain has a drive (a Delta's has none).
-
-May import: numpy, PyYAML, the standard library, pkm_twin's core.
 """
 
 from __future__ import annotations
@@ -22,9 +20,9 @@ import yaml
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.robot_urdf import robot_urdf
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.robot_urdf import robot_urdf
 
 Array = NDArray[np.float64]
 

@@ -3,8 +3,6 @@
 
 The sources stand in ``ros2_control_package`` as they are written; words between two ``@`` stand for
 the robot's names and numbers, most of them in ``include/robot.hpp``.
-
-May import: numpy, PyYAML, the standard library, pkm_twin's core, this package, delta_dynamics.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from delta_dynamics.simulation import tuned
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c_package import c_package, identifier
 from pkm_twin.machine.graph import POSE
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,6 @@ With v = ds/dt, x = v^2 and u = d2s/dt2 the efforts are exactly
 
 a by the masses, b by the velocity terms, w by viscous and k by dry friction in the direction of the
 path, g by gravity, offsets and the wrench. The five come from five calls of the inverse dynamics.
-
-May import: numpy, delta_dynamics, pkm_twin's core, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -21,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.joint_path import JointPath, place_at
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -116,7 +114,14 @@ class Forces:
     def of(
         cls, robot: Robot, q: Array, first: Array, second: Array, wrench: Array | None = None
     ) -> Forces:
-        """From the inverse dynamics at joint positions with derivatives by s, (p, n) each."""
+        """From the inverse dynamics at joint positions with derivatives by s, (p, n) each.
+
+        :raises ParameterError: friction of a law that these five do not describe.
+        """
+        if robot.laws:
+            raise ParameterError(
+                "friction", robot.laws[0], "viscous, coulomb and offset alone for a fastest motion"
+            )
         zero = np.zeros_like(q)
         rates = (zero, zero, first, -first, 2.0 * first)
         changes = (zero, first, second, second, 4.0 * second)
@@ -199,7 +204,7 @@ def _most(part: JointPath, limits: Limits) -> Array:
     least = NOTHING * max(float(rates.max()), 1e-300)
     with np.errstate(divide="ignore"):
         fastest = np.where(rates > least, limits.velocity / np.maximum(rates, least), np.inf)
-        tool = limits.speed / np.maximum(part.travel, 1e-300)
+        tool = limits.speed / np.maximum(part.felt, 1e-300)
     return np.asarray(np.minimum(fastest.min(1), tool) ** 2, np.float64)
 
 

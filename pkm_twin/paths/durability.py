@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a load over time does to a part: rainflow cycles, equivalent range, and a bearing's life.
-
-May import: numpy, the standard library.
-"""
+"""What a load over time does to a part: rainflow cycles, equivalent range, and a bearing's life."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shortest motion along a path within the limits of drives, joints and tool.
-
-May import: numpy, delta_dynamics, pkm_twin's core, the standard library; never rclpy.
-"""
+"""The shortest motion along a path within the limits of drives, joints and tool."""
 
 from __future__ import annotations
 
@@ -14,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.constraints import Limits, Rows, check_rest, shares
 from pkm_twin.paths.geometry import Path, through
 from pkm_twin.paths.jerk import smooth_profile, smooth_run
-from pkm_twin.paths.joint_path import JointPath, joint_paths
+from pkm_twin.paths.joint_path import JointPath, Slowdown, joint_paths
 from pkm_twin.paths.laws import LAWS, Law, quintic, shortest
 from pkm_twin.paths.motion import Run, Timed, TimedPath, forces_at, needs_forces
 from pkm_twin.paths.profile import fastest_profile
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -55,6 +52,7 @@ def fastest(
     singularity: float = SINGULARITY,
     wrench: ArrayLike | None = None,
     points: int = POINTS,
+    slowdown: Slowdown | None = None,
 ) -> TimedPath:
     """The shortest motion along a path, at rest at its ends, by the exact inverse dynamics.
 
@@ -73,6 +71,8 @@ def fastest(
     :param singularity: least singularity index on the path, 0 to 1.
     :param wrench: constant external wrench on the platform, (6,), base axes.
     :param points: of the path, about; with a limit of jerk at most :data:`JERK_POINTS`.
+    :param slowdown: divides ``speed`` at points of the path, by their joint positions (p, n) and
+        the direction (p, 3) of the reference point, base axes: returns 1 or more, (p,).
     :returns: the motion: ``.times``, ``.q``, ``.qd``, ``.qdd``, ``.effort`` and ``.pose`` at its
         points, the same of ``.uniform(rate)`` and ``.sample(times)``; ``.bounds``, which limit
         binds when; ``.duration``, s.
@@ -90,7 +90,7 @@ def fastest(
         points = min(points, JERK_POINTS)
     runs, begin = [], 0.0
     for part, stretch in zip(
-        joint_paths(robot, made, points, singularity), made.stretches, strict=True
+        joint_paths(robot, made, points, singularity, slowdown), made.stretches, strict=True
     ):
         runs.append(_run(robot, part, limits, load, begin))
         begin += stretch.length
@@ -204,7 +204,7 @@ def passed(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) -> Ar
         load = None if wrench is None else np.broadcast_to(wrench, (len(q), 6))
         effort = inverse_dynamics(robot, q, qd, qdd, load)
     left = part.left[interval]
-    travel = (1.0 - at) * part.travel[left] + at * part.travel[left + 1]
+    travel = (1.0 - at) * part.felt[left] + at * part.felt[left + 1]
     jerk = np.zeros_like(qd)
     if np.isfinite(limits.jerk).any():
         inner = np.arange(len(time)).reshape(count, -1)[:, 1:-1]

@@ -4,8 +4,6 @@
 A path is a chain of stretches, each from rest to rest; a stretch is a chain of pieces that meet
 with the same direction. The coordinate s of a piece is a length: angles count by the platform's
 radius, see :func:`scales_of`.
-
-May import: numpy, scipy, pkm_twin's core, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -15,12 +13,12 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.pieces import Arc, Corner, Line, Piece, Smooth, arc_through
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Space = Literal["pose", "joint"]
@@ -102,7 +100,7 @@ def through(robot: Robot, points: ArrayLike, *, space: Space = "pose") -> Path:
     if len(values) == 2:
         piece: Piece = Line(values[0], (values[1] - values[0]) / knots[1], float(knots[1]))
     else:
-        piece = Smooth(CubicSpline(knots, values))
+        piece = Smooth(scipy.interpolate.CubicSpline(knots, values))
     return Path(space, (Stretch((piece,)),), kind="smooth curve")
 
 

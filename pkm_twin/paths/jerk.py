@@ -5,8 +5,6 @@ A joint's jerk is v (q' du/ds + 3 q'' u + q''' x) with x = v^2, so a limit J on 
 J / sqrt(x) on what is linear in x. That bound is convex: its tangent at a profile that keeps the
 limit is stricter, so every program's result keeps it too, and each is at least as fast as the one
 before. It starts from a quintic.
-
-May import: numpy, scipy, pkm_twin's core, the standard library, this package; never rclpy.
 """
 
 from __future__ import annotations
@@ -17,9 +15,8 @@ from itertools import product
 from typing import Any, Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import NDArray
-from scipy.optimize import linprog  # type: ignore[import-untyped]
-from scipy.sparse import coo_matrix, csr_matrix, vstack  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.constraints import Limits, Rows
@@ -105,9 +102,10 @@ def smooth_profile(part: JointPath, rows: Rows, limits: Limits, start: Array) ->
         weight[:-1] += share / v[:-1]
         weight[1:] += share / v[1:]
         most = _most(part, rows, limits)
-        answer = linprog(
+        answer = scipy.optimize.linprog(
             -weight / weight[1:-1].max(),
-            A_ub=vstack([fixed + drag, more]).tocsr(), b_ub=np.concatenate([bound - rest, top]),
+            A_ub=scipy.sparse.vstack([fixed + drag, more]).tocsr(),
+            b_ub=np.concatenate([bound - rest, top]),
             bounds=np.stack([np.zeros(len(x)), most], 1), method="highs",
         )  # fmt: skip
         if answer.status != 0:
@@ -142,12 +140,12 @@ def _most(part: JointPath, rows: Rows, limits: Limits) -> Array:
     return most
 
 
-def _triplets(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> csr_matrix:
+def _triplets(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> scipy.sparse.csr_matrix:
     values, row, column = (np.concatenate([np.ravel(r[k]) for r in rows]) for k in range(3))
-    return coo_matrix((values, (row, column)), shape=shape).tocsr()
+    return scipy.sparse.coo_matrix((values, (row, column)), shape=shape).tocsr()
 
 
-def _rows(part: JointPath, rows: Rows, h: Array) -> tuple[csr_matrix, Array]:
+def _rows(part: JointPath, rows: Rows, h: Array) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Efforts and accelerations at both ends of all intervals, without viscous friction."""
     count, width = len(h), rows.alpha.shape[1]
     made: list[tuple[Any, Any, Any]] = []
@@ -166,7 +164,7 @@ def _rows(part: JointPath, rows: Rows, h: Array) -> tuple[csr_matrix, Array]:
     return _triplets(made, (at, count + 1)), np.concatenate(bounds)
 
 
-def _drag_rows(rows: Rows, part: JointPath, x: Array) -> tuple[csr_matrix, Array]:
+def _drag_rows(rows: Rows, part: JointPath, x: Array) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Viscous friction about a profile, in the order of :func:`_rows`."""
     count, width = len(part.left), rows.drag.shape[1]
     v = np.maximum(np.sqrt(x), 0.01 * np.sqrt(x.max()))
@@ -184,7 +182,9 @@ def _drag_rows(rows: Rows, part: JointPath, x: Array) -> tuple[csr_matrix, Array
     return _triplets(made, (at, count + 1)), np.concatenate(rests)
 
 
-def _jerk_rows(part: JointPath, limits: Limits, h: Array, x: Array) -> tuple[csr_matrix, Array]:
+def _jerk_rows(
+    part: JointPath, limits: Limits, h: Array, x: Array
+) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Jerks at the points between two intervals, their bound's tangent at a profile."""
     used = np.isfinite(limits.jerk)
     first, second, sides = _sides(part)

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A path as joint positions over its length: points with derivatives, and quintics between.
-
-May import: numpy, pkm_twin's core, the standard library; never rclpy.
-"""
+"""A path as joint positions over its length: points with derivatives, and quintics between."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.paths.pieces import Piece, Smooth
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -37,7 +35,8 @@ class JointPath:
     ``s``: points, shape (p,), m; where two pieces meet there are two points of one s.
     ``q``, ``first``, ``second``: joint positions and derivatives by s, shape (p, n).
     ``travel``: the reference point's way by s, shape (p,); ``left``: first point of each interval,
-    whose other end is the next point.
+    whose other end is the next point. ``felt``: travel times what multiplies the speed for its
+    limit, shape (p,).
     """
 
     s: Array
@@ -46,6 +45,7 @@ class JointPath:
     second: Array
     travel: Array
     left: Index
+    felt: Array
 
     @property
     def steps(self) -> Array:
@@ -91,8 +91,17 @@ def _joints(robot: Robot, places: Array, way: Array) -> Array:
     return robot.inverse(places)
 
 
+Slowdown = Callable[[Array, Array], Array]
+"""Of joint positions (p, n) and the way that the reference point goes (p, 3): factors (p,)."""
+
+
 def joint_path(
-    robot: Robot, path: Path, stretch: Stretch, points: int, begin: float = 0.0
+    robot: Robot,
+    path: Path,
+    stretch: Stretch,
+    points: int,
+    begin: float = 0.0,
+    slowdown: Slowdown | None = None,
 ) -> JointPath:
     """A stretch of a path as joint positions.
 
@@ -129,7 +138,10 @@ def joint_path(
         second = np.linalg.solve(jacobian, (bend - own)[..., None])[..., 0]
     twist = np.einsum("kij,kj->ki", robot.platform_jacobian(q)[:, :3], first)
     travel = np.linalg.norm(twist, axis=1)
-    return JointPath(s, q, first, second, travel, left)
+    felt = travel
+    if slowdown is not None:
+        felt = travel * slowdown(q, twist / np.maximum(travel, 1e-300)[:, None])
+    return JointPath(s, q, first, second, travel, left, felt)
 
 
 def _least(piece: Piece) -> int:
@@ -210,7 +222,9 @@ def check_positions(robot: Robot, part: JointPath, begin: float, singularity: fl
     return float(index[row])
 
 
-def joint_paths(robot: Robot, path: Path, points: int, singularity: float) -> list[JointPath]:
+def joint_paths(
+    robot: Robot, path: Path, points: int, singularity: float, slowdown: Slowdown | None = None
+) -> list[JointPath]:
     """All stretches of a path, checked; ``points`` shared by their lengths.
 
     :raises ParameterError: a place beyond a limit or too close to a singularity.
@@ -220,7 +234,7 @@ def joint_paths(robot: Robot, path: Path, points: int, singularity: float) -> li
     for stretch in path.stretches:
         share = max(2 * LEAST_POINTS, round(points * stretch.length / path.length))
         try:
-            part = joint_path(robot, path, stretch, share, begin)
+            part = joint_path(robot, path, stretch, share, begin, slowdown)
         except (UnreachableError, SingularityError) as error:
             raise ParameterError("path", str(error), "joints that can be assembled") from None
         check_positions(robot, part, begin, singularity)

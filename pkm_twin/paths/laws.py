@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time laws of a path from rest to rest: a quintic, or an S-curve of limited jerk.
-
-May import: numpy, pkm_twin's core, the standard library, this package; never rclpy.
-"""
+"""Time laws of a path from rest to rest: a quintic, or an S-curve of limited jerk."""
 
 from __future__ import annotations
 
@@ -15,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.constraints import Forces, Limits
 from pkm_twin.paths.joint_path import JointPath
 from pkm_twin.paths.motion import needs_forces
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -119,7 +116,7 @@ def shortest(
     qdd = first * u[:, None] + second * (v**2)[:, None]
     jerk = np.gradient(qdd, run.times, axis=0)
     left = part.left[interval]
-    travel = v * ((1.0 - share) * part.travel[left] + share * part.travel[left + 1])
+    travel = v * ((1.0 - share) * part.felt[left] + share * part.felt[left + 1])
     duration = max(
         float((np.abs(qd) / limits.velocity).max()),
         float((travel / limits.speed).max()),

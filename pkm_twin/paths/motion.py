@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A motion along a path in time, and which limit binds where.
-
-May import: numpy, pkm_twin's core, the standard library, this package; never rclpy.
-"""
+"""A motion along a path in time, and which limit binds where."""
 
 from __future__ import annotations
 
@@ -17,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
 from pkm_twin.paths.constraints import Forces, Limits, names_of, shares
 from pkm_twin.paths.geometry import Path
 from pkm_twin.paths.joint_path import JointPath
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -162,7 +159,7 @@ class TimedPath:
         t = np.asarray(times, np.float64)
         n = self.robot.joints_count
         q, qd, qdd = (np.zeros((len(t), n)) for _ in range(3))
-        travel = np.zeros(len(t))
+        travel, felt = np.zeros(len(t)), np.zeros(len(t))
         run_of = np.clip(np.searchsorted(self.begins, t, side="right") - 1, 0, None)
         for k, (begin, run) in enumerate(zip(self.begins, self.runs, strict=True)):
             mine = np.flatnonzero(run_of == k)
@@ -177,13 +174,13 @@ class TimedPath:
             qd[mine] = first * v[:, None]
             qdd[mine] = first * u[:, None] + second * (v**2)[:, None]
             left = run.part.left[interval]
-            slopes = run.part.travel
-            travel[mine] = v * ((1.0 - part) * slopes[left] + part * slopes[left + 1])
+            for speeds, slopes in ((travel, run.part.travel), (felt, run.part.felt)):
+                speeds[mine] = v * ((1.0 - part) * slopes[left] + part * slopes[left + 1])
         effort = None
         if has_masses(self.robot):
             load = None if self.wrench is None else np.broadcast_to(self.wrench, (len(t), 6))
             effort = inverse_dynamics(self.robot, q, qd, qdd, load)
-        return Samples(t, q, qd, qdd, effort, self.robot.forward(q), travel)
+        return Samples(t, q, qd, qdd, effort, self.robot.forward(q), travel, felt)
 
     def uniform(self, rate: float) -> Samples:
         """The motion at ``rate`` samples a second; the last is its end, half to three halves of a
@@ -239,7 +236,7 @@ class TimedPath:
         jerk = np.zeros_like(s.q)
         if np.isfinite(self.limits.jerk).any() and len(s.time) > 2:
             jerk = np.gradient(s.qdd, s.time, axis=0)
-        return shares(self.limits, s.effort, s.qd, s.qdd, jerk, s.speed)
+        return shares(self.limits, s.effort, s.qd, s.qdd, jerk, s.felt)
 
     @cached_property
     def bounds(self) -> list[Bound]:
@@ -262,7 +259,7 @@ class Samples:
     """A motion at times (k,), s: joint positions, rates, accelerations and efforts, shape (k, n),
     rad or m, per s and s2, N m or N; the pose (k, m); speed of the reference point (k,), m/s.
 
-    ``effort`` is None for a robot without masses.
+    ``effort`` is None for a robot without masses. ``felt``: the speed that its limit is for, (k,).
     """
 
     time: Array
@@ -272,6 +269,7 @@ class Samples:
     effort: Array | None
     pose: Array
     speed: Array
+    felt: Array
 
 
 def has_masses(robot: Robot) -> bool:

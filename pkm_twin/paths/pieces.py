@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pieces of paths: curves p(s) with their first two derivatives.
-
-May import: numpy, scipy, errors, the standard library; never rclpy.
-"""
+"""Pieces of paths: curves p(s) with their first two derivatives."""
 
 from __future__ import annotations
 
@@ -11,8 +8,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError
 
@@ -108,7 +105,7 @@ class Arc:
 class Smooth:
     """A cubic spline over its length."""
 
-    spline: CubicSpline
+    spline: scipy.interpolate.CubicSpline
 
     @property
     def length(self) -> float:

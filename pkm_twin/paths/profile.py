@@ -8,8 +8,6 @@ allowed.
 
 Source: Pham, Pham: A new approach to time-optimal path parameterization based on reachability
 analysis, IEEE Transactions on Robotics 34 (2018), with the first-order interpolation scheme.
-
-May import: numpy, the standard library, this package; never rclpy.
 """
 
 from __future__ import annotations

@@ -8,8 +8,6 @@ rotor inertia J and efficiency e of the gear, the motor gives
     torque = J N qdd + load e / N       where it gives power back,
 
 with load = effort - J N^2 qdd, what goes through the gear.
-
-May import: numpy, delta_dynamics, pkm_twin's core, the standard library; never rclpy.
 """
 
 from __future__ import annotations
@@ -24,8 +22,8 @@ from numpy.typing import NDArray
 
 from delta_dynamics import mass_matrix
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
 from pkm_twin.machine.sections import DriveSpec
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

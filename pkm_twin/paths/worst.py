@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The greatest efforts and speeds of drives over the whole workspace.
-
-May import: numpy, delta_dynamics, pkm_twin's core, the standard library; never rclpy.
-"""
+"""The greatest efforts and speeds of drives over the whole workspace."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.directions import sphere_directions
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

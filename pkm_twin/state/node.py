@@ -18,19 +18,19 @@ from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
-from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.robot_urdf import robot_urdf
-from pkm_twin.ros import node as health
-from pkm_twin.ros import outputs
+from pkm_twin.messages.intake import JointStateDecoder
+from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.robot_urdf import robot_urdf
+from pkm_twin.ros import health, outputs
 from pkm_twin.ros.changes import follow_changes
-from pkm_twin.ros.intake import JointStateDecoder
-from pkm_twin.ros.messages import SECOND
+from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import (
-    SECONDS,
     WRENCH_CHANGES,
     changed,
     declare_mounts,
+    declare_stamps,
     declare_wrench,
     triple,
 )
@@ -44,11 +44,11 @@ LIFETIME = 1.0
 """How long what a load does is drawn after the last marker, s."""
 
 
-class MachineStateNode(health.TwinNode):
+class MachineStateNode(TwinNode):
     """What others need to see the machine: rviz2, Foxglove, robot_state_publisher, plots."""
 
     def __init__(self) -> None:
-        super().__init__("machine_state", executor="events")
+        super().__init__("machine_state")
         robot = load(
             self.declare(
                 "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
@@ -144,7 +144,7 @@ class MachineStateNode(health.TwinNode):
         values: dict[str, object] = {
             "robot": core.robot.name,
             "joint states answered": core.states.accepted,
-            "wrenches taken": core.wrenches.accepted,
+            "wrenches accepted": core.wrenches.accepted,
             "older stamps dropped": core.dropped,
             "velocities": "" if core.latest is None else str(core.latest.twist is not None).lower(),
         }
@@ -159,24 +159,9 @@ class MachineStateNode(health.TwinNode):
         return frame
 
     def _declare_settings(self) -> WrenchSettings:
-        d = WrenchSettings()
-        return declare_wrench(
-            self,
-            base_frame=self._declare_frame("base_frame", d.base_frame, "of the base"),
-            max_state_age=self.declare(
-                "max_state_age", d.max_state_age, "largest time between a joint state and the "
-                "nearest wrench",
-                **SECONDS,
-            ),
-            future_tolerance=self.declare(
-                "future_tolerance", d.future_tolerance, "how far time stamps may be ahead of the "
-                "clock",
-                **SECONDS,
-            ),
-            accept_zero_stamp=self.declare(
-                "accept_zero_stamp", d.accept_zero_stamp, "accept a zero stamp, as the arrival time"
-            ),
-        )  # fmt: skip
+        base = self._declare_frame("base_frame", WrenchSettings().base_frame, "of the base")
+        stamps = declare_stamps(self, "a joint state and the nearest wrench")
+        return declare_wrench(self, base_frame=base, **stamps)
 
     def _declare_scales(self) -> Scales:
         d = Scales()

@@ -2,7 +2,6 @@
 """Shapes of a machine and of what a load does to it, for whoever draws. Pure.
 
 Shapes are in base axes, m. What elasticity tells comes as numbers, from whoever computes them.
-May import: numpy, pkm_twin's core, this package; never rclpy.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 
 from pkm_twin.machine import rotations
 from pkm_twin.machine.members import Place
-from pkm_twin.machine.outline import Posture, robot_bars
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.outline import Posture, robot_bars
+from pkm_twin.robot.robot import Robot
 from pkm_twin.state.state import State
 
 Array = NDArray[np.float64]

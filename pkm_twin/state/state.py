@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The core of ``machine_state``: joint states in, the whole machine's state out. Pure.
-
-May import: numpy, pkm_twin's core, messages, streams; never rclpy.
-"""
+"""The core of ``machine_state``: joint states in, the whole machine's state out. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import MessageError
-from pkm_twin.ros.messages import SECOND, JointSample, WrenchSample, as_message_error
+from pkm_twin.messages.reading import JointSample, WrenchSample, as_message_error
+from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.pairing import PairingCore
 from pkm_twin.streams.wrench import Mount, Recent, check_order

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A machine's plain description, limbs written out, every vector in base axes at home.
-
-May import: numpy, the standard library.
-"""
+"""A machine's plain description, limbs written out, every vector in base axes at home."""
 
 from __future__ import annotations
 
@@ -69,6 +66,8 @@ class Joint:
     coulomb: float
     offset: float
     rotor_inertia: float
+    friction: Mapping[str, Any]
+    """As the file has it."""
 
 
 @dataclass(frozen=True)
@@ -276,14 +275,44 @@ def _joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
         float(friction.get("viscous", 0.0)),
         float(friction.get("coulomb", 0.0)),
         float(friction.get("offset", 0.0)),
-        float(entry.get("rotor_inertia", 0.0)),
+        _rotor(entry),
+        friction,
     )
+
+
+def _rotor(entry: Mapping[str, Any]) -> float:
+    """The inertia of a drive at its joint: given, or the rotor's times the square of its turns."""
+    drive = entry.get("drive")
+    if not drive:
+        return float(entry.get("rotor_inertia", 0.0))
+    turns = drive.get("ratio") or 2.0 * math.pi / drive["lead"]
+    return float(drive["inertia"] * turns**2)
 
 
 def _rod(name: str, entry: Mapping[str, Any], known: set[str]) -> Rod:
     inner, outer = _ends(f"rods.{name}", entry, known)
     ends = np.array([vector(end) for end in entry["ends"]])
     return Rod(name, inner, outer, ends, float(entry.get("mass", 0.0)))
+
+
+def with_laws(drives: Sequence[Joint], q: Array, qd: Array, tau: Array) -> Array:
+    """Efforts with the friction laws of the drives beside viscous, Coulomb and offset, shape (n,).
+
+    :param tau: efforts with these three only, N m or N.
+    """
+    result: Array = np.array(tau, dtype=float)
+    for k, joint in enumerate(drives):
+        f, way = joint.friction, float(np.sign(qd[k]))
+        load = tau[k] - joint.viscous * qd[k] - joint.coulomb * way - joint.offset
+        result[k] += way * float(f.get("load_dependent", 0.0)) * abs(load)
+        if f.get("stribeck"):
+            ratio = qd[k] / float(f["stribeck_speed"])
+            result[k] += way * float(f["stribeck"]) * math.exp(-(ratio**2))
+        if f.get("cogging_period"):
+            angle = 2.0 * math.pi * q[k] / float(f["cogging_period"])
+            result[k] += float(f.get("cogging_cos", 0.0)) * math.cos(angle)
+            result[k] += float(f.get("cogging_sin", 0.0)) * math.sin(angle)
+    return result
 
 
 def cross(a: Array, b: Array) -> Array:

@@ -9,8 +9,6 @@ All bodies are free; a joint is equations between two of them, see ``rows``:
 by least squares over all rows, redundant ones too. Positions come from home by continuation along
 the straight line in joint space: a step of second order, then Newton's method on all rows, with
 the step's length held so that Newton has little to do. No tree, no spanning, no symbolic algebra.
-
-May import: numpy, the standard library.
 """
 
 from __future__ import annotations
@@ -32,6 +30,7 @@ from pkm_twin.apps.certificate.description import (
     angles,
     cross,
     read,
+    with_laws,
 )
 from pkm_twin.apps.certificate.rows import Jet, Moving
 
@@ -332,7 +331,7 @@ class Maximal(Moving):
         tau: Array = tangent.T @ force
         for k, joint in enumerate(self.machine.actuated):
             tau[k] += joint.rotor_inertia * qdd[k] + drag(joint, qd[k : k + 1])[0]
-        return tau
+        return with_laws(self.machine.actuated, q, qd, tau)
 
     def mass_matrix(self, q: Array) -> Array:
         """Inertia felt at the actuated joints, shape (n, n), kg m2, kg or kg m."""

@@ -6,8 +6,7 @@ Pinocchio judge's. Points and directions move by MuJoCo's kinematics, their Jaco
 Jacobians' derivatives; ``mj_inverse`` gives the tree's forces, which are projected on the actuated
 joints by least squares over all loops. Body frames stand in the base's at home.
 
-MuJoCo wants some inertia in whatever moves: TINY is added to every body. May import: mujoco,
-numpy, the standard library.
+MuJoCo wants some inertia in whatever moves: TINY is added to every body.
 """
 
 from __future__ import annotations
@@ -30,6 +29,7 @@ from pkm_twin.apps.certificate.description import (
     across,
     cross,
     read,
+    with_laws,
 )
 from pkm_twin.apps.certificate.rows import Jet, Moving, Rows
 
@@ -290,8 +290,8 @@ class MujocoTree(Moving):
                 force += row.columns.T @ drag
         data.qacc[:] = change
         mujoco.mj_inverse(self._model, data)
-        result: Array = tangent.T @ (force + data.qfrc_inverse)
-        return result
+        tau = tangent.T @ (force + data.qfrc_inverse)
+        return with_laws(self.machine.actuated, q, qd, tau)
 
     def mass_matrix(self, q: Array) -> Array:
         """Inertia felt at the actuated joints, shape (n, n), kg m2, kg or kg m."""

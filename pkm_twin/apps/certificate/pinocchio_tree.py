@@ -4,8 +4,6 @@
 Another route than the maximal one in every part: a spanning tree of Pinocchio's joints, a rod as a
 body of its own on a universal joint, loops as the relative twist of two frames in the inner one's
 axes, inertia forces by recursive Newton-Euler, positions by Newton's method in many equal steps.
-
-May import: pinocchio, numpy, the standard library.
 """
 
 from __future__ import annotations
@@ -28,6 +26,7 @@ from pkm_twin.apps.certificate.description import (
     across,
     cross,
     read,
+    with_laws,
 )
 
 STEPS: Final = 64
@@ -391,8 +390,7 @@ class PinocchioTree:
         for k, joint in enumerate(self.machine.actuated):
             own = joint.viscous * qd[k] + joint.coulomb * np.sign(qd[k]) + joint.offset
             effort[self._driven[k]] += own + joint.rotor_inertia * qdd[k]
-        result: Array = tangent.T @ effort
-        return result
+        return with_laws(self.machine.actuated, q, qd, tangent.T @ effort)
 
     def mass_matrix(self, q: Array) -> Array:
         """Inertia felt at the actuated joints, shape (n, n), kg m2, kg or kg m."""

@@ -4,8 +4,6 @@
 How a point moves is the engine's; what a joint holds is written here once for those engines that
 work with velocities in base axes. A row is made of vectors, each with its velocity and the part of
 its acceleration that needs no acceleration of the coordinates.
-
-May import: numpy, the standard library.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random states that a machine can be judged in.
-
-May import: numpy, the standard library.
-"""
+"""Random states that a machine can be judged in."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What running nodes say, message by message: the latest of each, and traces of the torques.
 
-Messages are read by their attributes alone. May import: numpy, scipy, the core, ``ros.messages``.
+Messages are read by their attributes alone.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.errors import MessageError, one_line
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.messages import SECOND, JointReader, StampRules, stamp_of
+from pkm_twin.messages.reading import JointReader
+from pkm_twin.messages.stamps import SECOND, StampRules, stamp_of
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot under sliders: a state in, numbers out; what cannot be is refused in words.
-
-May import: numpy, the core, dynamics and elasticity, the limits of the command line.
-"""
+"""A robot under sliders: a state in, numbers out; what cannot be is refused in words."""
 
 from __future__ import annotations
 
@@ -19,9 +16,9 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Settings
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
-from pkm_twin.kinematics.clearance import has_clearance, joint_clearance
-from pkm_twin.kinematics.workspace import has_joint_angles
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.clearance import has_clearance, joint_clearance
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import has_joint_angles
 from stiffness_monitor import PlatformResponse, platform_response
 
 Array = NDArray[np.float64]

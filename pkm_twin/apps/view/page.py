@@ -81,12 +81,13 @@ class Page:
         self._wake = threading.Event()
         self._tops = np.array([r.high for r in model.wrench_ranges])
         server.gui.configure_theme(
-            control_layout="fixed",
-            control_width="large",
+            control_width="medium",
             show_logo=False,
             show_share_button=False,
             brand_color=DRIVE,
         )
+        # On a narrow screen the browser shows it as a sheet at the bottom instead.
+        server.gui.main_panel.dock_right()
         server.gui.set_panel_label(f"pkm-twin view {model.robot.name}")
         self._build_panel()
         self._show()

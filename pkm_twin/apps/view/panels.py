@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Of the joints' curves (Okabe and Ito 2008)."""
 SPEEDS: Final = ("0.25", "0.5", "1", "2", "4")
-WIDTH: Final = 400
+WIDTH: Final = 330
 """Of the panel, pixels."""
 MARKED: Final = 0.25
 """How often the curves' mark of the present moves while a bag plays, s."""

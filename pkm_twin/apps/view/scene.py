@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A state as shapes: cylinders, balls and plates with their places and colours, in numbers.
-
-May import: numpy, scipy, the core; what it draws is ``pkm_twin.machine.outline``'s.
-"""
+"""A state as shapes: cylinders, balls and plates with their places and colours, in numbers."""
 
 from __future__ import annotations
 
@@ -14,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
-from pkm_twin.apps import drawing
 from pkm_twin.machine.graph import BASE, Joint
 from pkm_twin.machine.members import Place
-from pkm_twin.machine.outline import (
+from pkm_twin.robot.outline import (
     BAR,
     Bar,
     Posture,
@@ -25,25 +21,21 @@ from pkm_twin.machine.outline import (
     platform_face,
     robot_bars,
     telescope,
+    tube_start,
 )
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 
-def rgb(code: str) -> Colour:
-    """Numbers of a colour's code, ``#7F7F7F``."""
-    red, green, blue = bytes.fromhex(code[1:])
-    return red, green, blue
-
-
 BODY: Final = (128, 136, 146)
-ROD: Final = rgb(drawing.ROD)
-PLATFORM: Final = rgb(drawing.PLATFORM)
-DRIVE: Final = rgb(drawing.DRIVE)
+ROD: Final = (86, 180, 233)
+PLATFORM: Final = (213, 94, 0)
+DRIVE: Final = (0, 114, 178)
 GROUND: Final = (70, 74, 80)
 JOINT: Final = (98, 104, 112)
+"""Rods, platform and drives: distinct with every kind of colour vision (Okabe and Ito 2008)."""
 SCALE: Final = np.array([[198, 206, 214], [240, 228, 66], [213, 94, 0]], np.float64)
 """From no share of the energy to the greatest one: grey, yellow, vermilion (Okabe and Ito 2008)."""
 
@@ -213,7 +205,8 @@ class Scene:
         if telescope(joint):
             parts = {joint.inner, joint.outer}
             radius = max((bar.radius for bar in self.bars if bar.part in parts), default=radius)
-            middle = posture.place(joint.inner, joint.at + joint.home * joint.axes[0] / 2)
+            foot = tube_start(self.robot.graph, joint)
+            middle = posture.place(joint.inner, foot + joint.home * joint.axes[0] / 2)
             half, radius = 1.5 * radius, 1.5 * radius
         elif joint.kind == "prismatic":
             middle = posture.place(joint.outer, joint.at)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -19,6 +21,19 @@ ARROW: Final = 0.4
 """Length of the greatest wrench's arrow, per size of the machine."""
 LOOK: Final = np.array([0.62, -0.95, 0.42])
 """From where the machine is looked at, in its greatest extents from its middle."""
+LIFT: Final = 0.28
+"""How far up the machine is in a tall window, where a sheet of sliders covers the lower part, in
+parts of the window's height."""
+
+
+def framing(width: float, height: float) -> tuple[float, float]:
+    """How much farther away the camera is in a narrow window, and how far up the machine is.
+
+    :returns: factor of the distance, and part of the window's height.
+    """
+    aspect = width / height
+    farther = max(1.0, 1.0 / aspect, min(1.3 / aspect, 2.0))
+    return farther, LIFT * min(max((1.0 - aspect) / 0.3, 0.0), 1.0)
 
 
 class Stage:
@@ -64,11 +79,36 @@ class Stage:
             position=(0.0, 0.0, float(min(low[2], 0.0, lowest)) - 0.06 * size),
             plane_color=(248, 249, 250), plane_opacity=1.0,
         )  # fmt: skip
+        self._server.on_client_connect(self._frame)
         camera = self._server.initial_camera
         camera.position = tuple((middle + 1.25 * reach * LOOK).tolist())
         camera.look_at = tuple(middle.tolist())
         camera.up = (0.0, 0.0, 1.0)
         draw.add_frame("/base", **_axes(0.12 * size, size))
+
+    async def _frame(self, client: Any) -> None:
+        """Let the machine be seen whole in this window, and after its size has changed."""
+        begin = np.array(self._server.initial_camera.position)
+        last, drop = (1.0, 0.0), 0.0
+
+        async def fit(camera: Any) -> None:
+            nonlocal last, drop
+            # A browser may send any numbers: those of no window change nothing.
+            with contextlib.suppress(ArithmeticError, TypeError, ValueError):
+                if np.allclose(camera.position, begin, rtol=1e-4):
+                    # The page was opened, or its view reset.
+                    last, drop = (1.0, 0.0), 0.0
+                now = framing(camera.image_width, camera.image_height)
+                if now == last:
+                    return
+                way = (camera.position - camera.look_at) * now[0] / last[0]
+                below = now[1] * 2.0 * float(np.linalg.norm(way)) * math.tan(camera.fov / 2.0)
+                middle = camera.look_at + np.array([0.0, 0.0, drop - below])
+                last, drop = now, below
+                with client.atomic():
+                    camera.position, camera.look_at = middle + way, middle
+
+        client.camera.on_update(fit)
 
     def _plates(self) -> None:
         draw, scene, size = self._server.scene, self._scene, self._scene.size

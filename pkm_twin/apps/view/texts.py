@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page's numbers as HTML: every number has an id, a unit and, where it is judged, a colour.
-
-May import: numpy, the standard library, the model's own types.
-"""
+"""The page's numbers as HTML: every number has an id, a unit and, where it is judged, a colour."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from pkm_twin.apps.view.live import Heard
 from pkm_twin.apps.view.model import Grade, Model, Numbers, State
 from pkm_twin.apps.view.scene import share_colours
 from pkm_twin.apps.view.timeline import Instant, Timeline
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -162,11 +159,11 @@ def heard(robot: Robot, live: Heard, waiting: str) -> str:
 
 def _judged(key: str, what: str, value: float | None, unit: str, grade: Grade, hint: str) -> str:
     # Text and colour both say it: not everybody sees the colour.
-    words = {"good": "", "warn": " low", "bad": " too low"}[grade]
-    cell = _value(key, value, unit, GRADES[grade], bold=True)
+    words, colour = {"good": "", "warn": " low", "bad": " too low"}[grade], GRADES[grade]
     if value is None:
-        words = " unknown"
-    note = f'<span style="color:{GRADES[grade]}">{words}</span>' if words else ""
+        words, colour = " unknown", "inherit"
+    cell = _value(key, value, unit, colour, bold=True)
+    note = f'<span style="color:{colour}">{words}</span>' if words else ""
     return _row(f'<span title="{escape(hint)}">{what}</span>', cell + note)
 
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded bag as a time line: where the robot stood, and the twin's torques beside it.
-
-May import: numpy, the core, dynamics, the reading of recordings.
-"""
+"""A recorded bag as a time line: where the robot stood, and the twin's torques beside it."""
 
 from __future__ import annotations
 

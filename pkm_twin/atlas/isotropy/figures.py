@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of an isotropy atlas: spheres of directions, and how far an index differs over them.
-
-May import: numpy, matplotlib when it draws, the figures' common parts, this package.
-"""
+"""Figures of an isotropy atlas: spheres of directions, and how far an index differs over them."""
 
 from __future__ import annotations
 
@@ -136,7 +133,7 @@ def spheres(atlas: Dataset, index: str = "eta", ax: Axes | None = None) -> Axes:
         ax.set_xlim(-reach, reach)
         ax.set_ylim(-reach, reach)
     ax.set_aspect("equal")
-    unit = atlas[index].attrs["units"]
+    unit = figures.unit_of(atlas[index])
     label = f"eta_KE = E_M / E_all ({unit})" if index == "eta" else f"F_max ({unit})"
     colour = cm.ScalarMappable(norm, steps)
     bar = ax.figure.colorbar(colour, ax=ax, shrink=0.9, fraction=0.04, aspect=32, extend="both")
@@ -219,8 +216,8 @@ def spread_over_poses(atlas: Dataset, index: str = "eta", ax: Axes | None = None
         if index == "eta"
         else np.ptp(atlas[index].values, axis=(-2, -1))
     )
-    unit = atlas[index].attrs["units"]
-    what = "spread of eta_KE" if index == "eta" else "spread of F_max"
+    unit = figures.unit_of(atlas[index])
+    what = "range of eta_KE" if index == "eta" else "range of F_max"
     if names == ("azimuth", "tilt"):
         tilt = np.degrees(atlas.tilt.values)
         for k, azimuth in enumerate(np.degrees(atlas.azimuth.values)):
@@ -272,21 +269,23 @@ def _spheres(atlas: Dataset, index: str) -> Figure:
     figure, ax = figures.subplots(figsize=(10.6, 8.6), layout="constrained")
     spheres(atlas, index, ax)
     if index == "eta":
-        what = "the platform's part of the kinetic energy, by direction of the pose rates"
+        what = "which part of the kinetic energy is the platform's, per direction?"
     else:
         energy = json.loads(atlas.attrs["settings"])["energy"]
-        what = f"largest driving {_effort(atlas)} at a platform energy of {energy:g} J"
+        what = (
+            f"how much drive {_effort(atlas)} per direction, at a platform energy of {energy:g} J?"
+        )
     figure.suptitle(f"{at_height(atlas)}: {what}")
     return figure
 
 
 def _spreads(atlas: Dataset) -> Figure:
-    figure, axes = figures.subplots(1, 2, figsize=(12, 4.8), layout="constrained")
+    figure, axes = figures.subplots(1, 2, figsize=(9, 4), layout="constrained")
     titles = ("the platform's part of the kinetic energy", f"largest driving {_effort(atlas)}")
     for index, title, ax in zip(("eta", "force"), titles, axes, strict=True):
         spread_over_poses(atlas, index, ax)
         ax.set_title(title)
-    figure.suptitle(f"{at_height(atlas)}: greatest less least over all directions")
+    figure.suptitle(f"{at_height(atlas)}: greatest minus least value over all directions")
     return figure
 
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of an isotropy atlas: its spheres, to be turned.
-
-May import: numpy, plotly when it draws, the pages' common parts, this package.
-"""
+"""The page of an isotropy atlas: its spheres, to be turned."""
 
 from __future__ import annotations
 
@@ -47,7 +44,7 @@ def page(atlas: Dataset) -> Any:
         )
     buttons = []
     for label, said, field, logarithmic in (
-        ("eta_KE (1)", "eta_KE %{intensity:.4~g}", balls.eta, False),
+        ("eta_KE (dimensionless)", "eta_KE %{intensity:.4~g}", balls.eta, False),
         (f"F_max ({unit})", f"F_max %{{customdata:.4~g}} {unit}", balls.force, True),
     ):
         coloured = [np.log10(values) if logarithmic else values for values in field]
@@ -83,10 +80,12 @@ def page(atlas: Dataset) -> Any:
         tilts = np.degrees(part.tilt.values)
         figure.add_scatter3d(**_polar_names(part.azimuth.values, tilts, balls.step))
     figure.update_layout(
-        title=f"{title(atlas)}; {around}axes of a sphere: {ends}",
+        title=f"{title(atlas)}<br><span style='font-size:12px'>"
+        f"{around}axes of a sphere: {ends}</span>",
         coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8}},
         scene=scene,
-        margin=pages.MARGIN,
+        # Room for a title of two lines.
+        margin=pages.MARGIN | {"t": 140},
         updatemenus=[{"buttons": buttons, **pages.MENU}],
     )
     figure.update_layout(buttons[0]["args"][1])
@@ -178,17 +177,15 @@ def _rims(balls: _Balls) -> dict[str, Any]:
 
 
 def _polar_names(azimuth: Array, tilt: Array, step: float) -> dict[str, Any]:
-    """Names of azimuths (rad) around the spheres and of tilts (deg) between them, as a trace."""
+    """Names of azimuths (rad) around the spheres and of tilts (deg) among them, as a trace."""
     far = float(tilt[-1]) + 1.9 * step
     x = (far * np.cos(azimuth)).tolist()
     y = (far * np.sin(azimuth)).tolist()
     text = [f"{math.degrees(a):.0f}°" for a in azimuth]
-    between = math.pi / len(azimuth)
     for k, value in enumerate(tilt[1:].tolist()):
-        # The spheres of the first ring leave no room on it.
-        out = value + (0.35 if k == 0 else 1.0) * step
-        x.append(out * math.cos(between))
-        y.append(out * math.sin(between))
+        # Below the spheres of azimuth 0; at the first ring the room is inside it.
+        x.append(value + (0.0 if k == 0 else step))
+        y.append(0.0 if k == 0 else -0.72 * step)
         text.append(f"{value:.4g}°")
     return {
         "x": x,
@@ -196,6 +193,7 @@ def _polar_names(azimuth: Array, tilt: Array, step: float) -> dict[str, Any]:
         "z": [0.0] * len(x),
         "mode": "text",
         "text": text,
+        "textposition": "middle center",
         "hoverinfo": "skip",
         "showlegend": False,
     }

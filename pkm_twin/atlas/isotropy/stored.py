@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a stored isotropy atlas says of its poses, as text for its figures and its page.
-
-May import: the standard library.
-"""
+"""What a stored isotropy atlas says of its poses, as text for its figures and its page."""
 
 from __future__ import annotations
 

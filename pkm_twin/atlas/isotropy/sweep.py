@@ -4,8 +4,6 @@
 The indices of delta_dynamics/isotropy.py, eta_KE and F_max, over unit vectors of three pose rates.
 A machine that tilts stands on a polar grid of azimuth and tilt (3-PRRU paper, section 5), others on
 a grid of two coordinates: of those across the axis, or of the first two.
-
-May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
 """
 
 from __future__ import annotations
@@ -28,8 +26,8 @@ from delta_dynamics.isotropy import (
 from pkm_twin.atlas.grids import circles, ladder, turns, workspace_box
 from pkm_twin.atlas.sweep import FLAG, POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.workspace import distance_unit, reachable, singularity_at, try_inverse
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import distance_unit, reachable, singularity_at, try_inverse
 
 Array = NDArray[np.float64]
 
@@ -80,7 +78,7 @@ class IsotropySweep(Sweep):
             "eta_greatest": Field(self.axes, {**SHARE, "long_name": f"greatest {share}, exact"}),
             "singularity": Field(
                 self.axes,
-                {**SHARE, "long_name": "distance to a singularity: 0 in one, 1 at best"},
+                {**SHARE, "long_name": "singularity index: 0 in a singularity, 1 at best"},
             ),
             "within_limits": Field(
                 self.axes,

@@ -6,11 +6,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkm_twin.atlas.maps.quantity import Array, Found, Quantity, largest_axis, no_wrench
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.uncertainty import Factor
+from pkm_twin.robot.derivatives import position_effects
+from pkm_twin.robot.robot import Robot
 
 
 def pose_error(robot: Robot, q: Array, wrench: Array | None) -> Found:
@@ -22,23 +23,23 @@ def pose_error(robot: Robot, q: Array, wrench: Array | None) -> Found:
     :raises ParameterError: a file that says nothing of its geometry's numbers.
     """
     del wrench
-    effects = np.stack([cause.effect(lambda r: r.platform(q)[0]) for cause in _causes(robot)], -2)
+    moving = _moving(robot)
+    effects = position_effects(robot, q)[..., moving].swapaxes(-1, -2)
     value, direction = largest_axis(effects.swapaxes(-1, -2) @ effects)
     along = np.abs((effects * direction[..., None, :]).sum(-1))
     return Found(np.sqrt(np.maximum(value, 0.0)), direction, along.argmax(-1))
 
 
-def _causes(robot: Robot) -> tuple[Factor, ...]:
-    """Causes that move the platform at home."""
-    home = robot.graph.home
-    found = [f for f in robot.factors if f.effect(lambda r: r.platform(home)[0]).any()]
-    if not found:
+def _moving(robot: Robot) -> NDArray[np.intp]:
+    """Places of the causes that move the platform at home."""
+    found = np.flatnonzero(position_effects(robot, robot.graph.home).any(0))
+    if not len(found):
         raise ParameterError(
             "uncertainty",
             None,
             "the standard deviation of a length or angle that moves the platform",
         )
-    return tuple(found)
+    return found
 
 
 POSE_ERROR: Final = Quantity(
@@ -46,7 +47,7 @@ POSE_ERROR: Final = Quantity(
     "standard deviation of the platform's position in the worst direction",
     "where is it least accurate?",
     pose_error,
-    lambda robot: tuple(cause.name for cause in _causes(robot)),
+    lambda robot: tuple(list(robot.causes)[k] for k in _moving(robot)),
     lambda robot, case: "m",
     no_wrench("tolerances"),
     element="cause",

@@ -9,7 +9,7 @@ import numpy as np
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.atlas.maps.quantity import Array, Case, Found, Quantity, no_wrench, require_effort
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 
 def capacity(robot: Robot, q: Array, wrench: Array | None) -> Found:

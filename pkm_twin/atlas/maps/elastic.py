@@ -16,7 +16,7 @@ from pkm_twin.atlas.maps.quantity import (
     no_wrench,
     size_and_direction,
 )
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor import platform_response
 
 

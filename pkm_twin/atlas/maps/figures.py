@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture and page of a map: planes through its worst pose, its answer in the title.
-
-May import: numpy, matplotlib when it draws, the pictures' common parts, this package.
-"""
+"""The picture and page of a map: planes through its worst pose, its answer in the title."""
 
 from __future__ import annotations
 
@@ -45,8 +42,9 @@ def answers(atlas: Dataset) -> list[dict[str, Any]]:
 
 def sentence(answer: dict[str, Any]) -> str:
     """One case's worst in words."""
-    pose = ", ".join(f"{name} {value:.4g}" for name, value in answer["pose"].items())
-    way = ", ".join(f"{value:.3g}" for value in answer["direction"])
+    # Zero is not printed as rounding.
+    pose = ", ".join(f"{k} {round(value, 12) + 0.0:.4g}" for k, value in answer["pose"].items())
+    way = ", ".join(f"{round(value, 12) + 0.0:.3g}" for value in answer["direction"])
     shown = f"0 {answer['unit']}"
     if answer["value"]:
         value, unit = figures.prefixed(np.array(answer["value"]), answer["unit"])

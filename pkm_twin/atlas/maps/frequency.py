@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from typing import Final
 
+from pkm_twin.atlas.maps.elastic import COMPLIANCE
 from pkm_twin.atlas.maps.quantity import Array, Found, Quantity, no_wrench, size_and_direction
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.modes import modes
 
 
@@ -37,4 +38,5 @@ FREQUENCY: Final = Quantity(
     samples=256,
     population=24,
     rounds=40,
+    screen=COMPLIANCE,
 )

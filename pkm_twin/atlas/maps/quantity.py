@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map shows: a function of joint positions to a value, its direction and its element.
-
-May import: numpy, pkm_twin's core; never rclpy.
-"""
+"""What a map shows: a function of joint positions to a value, its direction and its element."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -51,7 +48,7 @@ class Quantity:
     wrench. ``elements``: names that it blames. ``unit``: of a robot and a case. ``largest``: is the
     largest value the worst? ``default``: the case without one given. ``points``: of the grid;
     ``chunk``: poses computed at once; ``samples``, ``population`` and ``rounds``: of the search
-    for the worst pose.
+    for the worst pose. ``screen``: of a quantity that takes long, one that is bad where it is.
     """
 
     name: str
@@ -69,6 +66,7 @@ class Quantity:
     samples: int = 8192
     population: int = 256
     rounds: int = 200
+    screen: Quantity | None = None
     attrs: Mapping[str, Any] = field(default_factory=lambda: {"valid_min": 0.0})
 
 

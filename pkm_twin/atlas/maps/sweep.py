@@ -5,14 +5,12 @@ Poses count where actuators and passive joints keep their limits, limbs stay apa
 singularity index is not below a bound. The worst pose is that of the whole workspace, between the
 grid's poses and off its planes too: a search begins at the worst of the grid and of joint states
 all over the limits.
-
-May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -22,12 +20,13 @@ from pkm_twin.atlas.maps.accuracy import POSE_ERROR
 from pkm_twin.atlas.maps.drives import ACCELERATION, PAYLOAD
 from pkm_twin.atlas.maps.elastic import COMPLIANCE, STRAIN_ENERGY
 from pkm_twin.atlas.maps.frequency import FREQUENCY
+from pkm_twin.atlas.maps.milling import Process
 from pkm_twin.atlas.maps.quantity import Array, Case, Found, Quantity
 from pkm_twin.atlas.poses import PoseSweep, pose_axes, texts
 from pkm_twin.atlas.sweep import SHARE, Chunk, Field, Values, Variable
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.kinematics.workspace import keeps_limits
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import keeps_limits
 
 QUANTITIES: Final[Mapping[str, Quantity]] = {
     q.name: q for q in (COMPLIANCE, STRAIN_ENERGY, PAYLOAD, ACCELERATION, FREQUENCY, POSE_ERROR)
@@ -36,16 +35,19 @@ LEAST: Final = 0.05
 """Singularity index below which a pose does not count, by default."""
 KEPT: Final = 16
 """Worst poses of a chunk that the search may begin at."""
+HALVINGS: Final = 12
+"""Of the way to a place that does not count, to find where it still does."""
 INSIDE: Final = 1e-9
 """Part of a joint's range that the search stays away from its ends."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MapSweep(PoseSweep):
-    """A quantity by its name, and its load cases."""
+    """A quantity by its name, and its load cases; ``process``: of the milling that it maps."""
 
     name: str
     cases: tuple[Case, ...]
+    process: Process | None = None
 
     @property
     def kind(self) -> str:  # type: ignore[override]
@@ -55,7 +57,7 @@ class MapSweep(PoseSweep):
     @property
     def quantity(self) -> Quantity:
         """What is computed."""
-        return QUANTITIES[self.name]
+        return QUANTITIES[self.name] if self.process is None else self.process.quantity
 
     @property
     def elements(self) -> tuple[str, ...]:
@@ -91,9 +93,10 @@ class MapSweep(PoseSweep):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Also the wrenches of the cases."""
+        """Also the wrenches of the cases, and the process."""
         wrenches = {case.name: case.wrench for case in self.cases}
-        return super().settings | {"cases": wrenches, "question": self.quantity.question}
+        process = {} if self.process is None else {"process": asdict(self.process)}
+        return super().settings | {"cases": wrenches, "question": self.quantity.question} | process
 
     @property
     def attributes(self) -> dict[str, str]:
@@ -264,18 +267,32 @@ def worst_of(sweep: MapSweep, case: Case, starts: Array, quantity: Quantity | No
         q, known = robot.try_inverse(x)
         return np.where(known[:, None], q, robot.graph.home), x, known
 
-    def score(x: Array) -> Array:
+    def score(x: Array, what: Quantity = quantity) -> Array:
         q, pose, known = state(x)
         inside = sweep.counts(q, pose, known)
         result = np.full(len(x), -np.inf)
-        result[inside] = sweep.score(found_of(quantity, robot, q[inside], case).value)
+        load = case if what is quantity else what.default
+        value = found_of(what, robot, q[inside], load).value
+        result[inside] = np.where(np.isfinite(value), value if what.largest else -value, -np.inf)
         return result
 
-    # Extremes are often where joints are at their limits.
-    ends = rng.integers(0, 3, (quantity.samples // 2, len(low))) / 2.0
-    inner = rng.random((quantity.samples - len(ends), len(low)))
-    tried = np.concatenate([first, low + np.concatenate([ends, inner]) * (high - low)])
-    x, best = evolved(score, np.clip(tried, low, high), low, high, quantity, rng)
+    def drawn(count: int) -> Array:
+        # Extremes are often where joints are at their limits.
+        ends = rng.integers(0, 3, (count // 2, len(low))) / 2.0
+        inner = rng.random((count - len(ends), len(low)))
+        return np.asarray(low + np.concatenate([ends, inner]) * (high - low))
+
+    tried = np.concatenate([first, drawn(quantity.samples)])
+    if quantity.screen is not None:
+        more = drawn(quantity.screen.samples)
+        order = np.argsort(-score(more, quantity.screen), kind="stable")
+        tried = np.concatenate([tried, more[order[: quantity.samples]]])
+
+    def inside(x: Array) -> NDArray[np.bool_]:
+        return sweep.counts(*state(x))
+
+    kept = inside if quantity.screen is not None else None
+    x, best = evolved(score, np.clip(tried, low, high), low, high, quantity, rng, kept)
     if not np.isfinite(best):
         raise ParameterError("robot", robot.name, "a workspace in which some pose counts")
     q, pose, _ = state(x[None])
@@ -289,12 +306,15 @@ def evolved(
     high: Array,
     quantity: Quantity,
     rng: np.random.Generator,
+    inside: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> tuple[Array, float]:
     """The place (n,) of the highest score in a box, and it, from the best of the places tried.
 
     Each place of a population climbs for itself, so that many hills are climbed: by steps along one
     coordinate or all, whose size follows their success, and by differences of two others
     (differential evolution, Storn and Price 1997); some go towards the best.
+
+    :param inside: which places (k, n) count; a step to where none does ends at the border between.
     """
     scores = np.concatenate([score(part) for part in np.array_split(tried, 1 + len(tried) // 4096)])
     order = np.argsort(-scores, kind="stable")[: quantity.population]
@@ -311,6 +331,8 @@ def evolved(
         far = rng.uniform(0.4, 0.9, (count, 1)) * (a - b + pull) * crossed
         local = np.asarray(rng.random(count) < 0.7)
         moved = np.clip(x + np.where(local[:, None], near, far), low, high)
+        if inside is not None:
+            moved = _bordered(x, moved, inside)
         reached = score(moved)
         better = reached > f
         step = np.clip(np.where(local, step * np.where(better, 1.5, 0.9), step), 1e-6, 0.3)
@@ -318,9 +340,22 @@ def evolved(
     return x[f.argmax()], float(f.max())
 
 
+def _bordered(x: Array, moved: Array, inside: Callable[[Array], NDArray[np.bool_]]) -> Array:
+    """Places moved (k, n), those outside drawn back towards x as far as they have to, by halving.
+
+    Extremes are often where a pose just counts: at a limit or the least singularity index.
+    """
+    share = inside(moved).astype(float)
+    step = np.where(share < 1.0, 0.5, 0.0)
+    for _ in range(HALVINGS):
+        good = inside(x + (share + step)[:, None] * (moved - x))
+        share, step = share + np.where(good, step, 0.0), 0.5 * step
+    return np.asarray(x + share[:, None] * (moved - x))
+
+
 def map_sweep(
     robot: Robot,
-    name: str,
+    name: str | Process,
     points: int | None = None,
     *,
     cases: Sequence[Case] = (),
@@ -329,12 +364,13 @@ def map_sweep(
 ) -> MapSweep:
     """The map of a quantity over a robot's workspace.
 
-    :param name: of :data:`QUANTITIES`; ``points``: poses of the grid, about.
+    :param name: of :data:`QUANTITIES`, or a milling process, for the depth of cut without chatter.
+    :param points: poses of the grid, about.
     :param cases: load cases; default the quantity's own.
     :raises ParameterError: the robot's file lacks what the quantity needs; others as
         :func:`~pkm_twin.atlas.poses.pose_axes`.
     """
-    quantity = QUANTITIES[name]
+    quantity = name.quantity if isinstance(name, Process) else QUANTITIES[name]
     # First, as it says what the file lacks.
     quantity.elements(robot)
     check(robot, quantity, cases)
@@ -343,8 +379,9 @@ def map_sweep(
         raise ParameterError("points", total, "50 or more")
     axes = pose_axes(robot, total, least_singularity, least_clearance)
     return MapSweep(
-        robot, axes, robot.home(), least_singularity, least_clearance, name=name,
+        robot, axes, robot.home(), least_singularity, least_clearance, name=quantity.name,
         cases=tuple(cases) or (quantity.default,),
+        process=name if isinstance(name, Process) else None,
     )  # fmt: skip
 
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a modes atlas: frequencies across and along the axis, and mode shapes.
-
-May import: numpy, matplotlib when it draws, the figures' common parts, this package.
-"""
+"""Figures of a modes atlas: frequencies across and along the axis, and mode shapes."""
 
 from __future__ import annotations
 
@@ -27,18 +24,20 @@ if TYPE_CHECKING:
 
 
 def frequency(
-    atlas: Dataset, mode: int = 1, z: float | None = None, ax: Axes | None = None
+    atlas: Dataset, mode: int = 1, z: float | None = None, ax: Axes | None = None, **options: Any
 ) -> Axes:
     """One natural frequency across the axis at one height.
 
     :param mode: 1 is the lowest.
     :param z: m; the nearest height is drawn; default the middle one.
+    :param options: for ``contourf``; ``least`` and ``greatest``: values of the first and the last
+        colour.
     """
     ax = figures.axes_or_new(ax)
     middle = float(atlas.z[atlas.sizes["z"] // 2])
     layer = atlas.frequency.sel(mode=mode).sel(z=middle if z is None else z, method="nearest")
     x, y, values, labels = across(atlas, layer.values)
-    figures.contours(ax, x, y, values, "frequency (Hz)")
+    figures.contours(ax, x, y, values, "frequency (Hz)", **options)
     ax.set_xlabel(labels[0])
     ax.set_ylabel(labels[1])
     ax.set_title(f"mode {mode}, z = {float(layer.z):.3f} m")
@@ -117,10 +116,14 @@ def mode_shape(atlas: Dataset, mode: int = 1, ax: Any = None) -> Any:
 
 
 def _frequency_plane(atlas: Dataset) -> Figure:
-    figure, axes = figures.subplots(2, 3, figsize=(14.5, 8.2), layout="constrained")
-    for mode, ax in zip(atlas.mode.values.tolist(), axes.ravel(), strict=False):
-        frequency(atlas, mode, ax=ax)
-    figure.suptitle(f"{atlas.attrs['robot']}: natural frequencies, actuators locked")
+    """The four lowest, on one scale."""
+    figure, axes = figures.subplots(2, 2, figsize=(9, 7.6), layout="constrained")
+    modes = atlas.mode.values.tolist()[:4]
+    layer = atlas.frequency.sel(mode=modes).isel(z=atlas.sizes["z"] // 2)
+    scale = {"least": 0.0, "greatest": float(layer.max())}
+    for mode, ax in zip(modes, axes.ravel(), strict=False):
+        frequency(atlas, mode, ax=ax, **scale)
+    figure.suptitle(f"{atlas.attrs['robot']}: lowest natural frequencies, actuators locked")
     return figure
 
 
@@ -137,16 +140,16 @@ def _mode_shapes(atlas: Dataset) -> Figure:
     from matplotlib import cm, colors
 
     figure, axes = figures.subplots(
-        2, 3, figsize=(12.5, 8), layout="constrained", subplot_kw={"projection": "3d"}
+        2, 2, figsize=(9, 8.5), layout="constrained", subplot_kw={"projection": "3d"}
     )
-    for mode, ax in zip(atlas.mode.values.tolist(), axes.ravel(), strict=False):
+    for mode, ax in zip(atlas.mode.values.tolist()[:4], axes.ravel(), strict=False):
         mode_shape(atlas, mode, ax)
     colour = cm.ScalarMappable(colors.Normalize(0.0, 1.0), figures.MAP)
     bar = figure.colorbar(colour, ax=axes, shrink=0.6, aspect=30, pad=0.05)
-    bar.set_label("displacement over the mode's largest (1)")
+    bar.set_label("displacement over the mode's largest (dimensionless)")
     figure.suptitle(
         f"{atlas.attrs['robot']} at {shape_pose(atlas)}: lowest modes, actuators locked\n"
-        "grey: at rest; coloured: deformed, enlarged; below: the parts that hold most energy"
+        "grey: at rest; coloured: deformed, enlarged; in the titles: the parts with most energy"
     )
     return figure
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a modes atlas: mode shapes that swing, beside the frequency over the workspace.
-
-May import: numpy, plotly when it draws, the pages' common parts, this package.
-"""
+"""The page of a modes atlas: mode shapes that swing, beside the frequency over the workspace."""
 
 from __future__ import annotations
 
@@ -130,7 +127,7 @@ def page(atlas: Dataset) -> Any:
             "cmin": 0.0,
             "cmax": 1.0,
             "colorbar": {
-                "title": {"text": "displacement over<br>the mode's largest (1)"},
+                "title": {"text": "displacement over<br>the mode's largest"},
                 "x": 0.44,
                 "len": 0.7,
                 "thickness": 18,

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is read off a stored modes atlas: planes across the axis, mode shapes, where energy is.
-
-May import: numpy, the figures' common parts, the standard library.
-"""
+"""What is read off a stored modes atlas: planes across the axis, mode shapes, where energy is."""
 
 from __future__ import annotations
 

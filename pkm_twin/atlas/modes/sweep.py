@@ -5,8 +5,6 @@ The grid: heights, distances from the axis (tilts, for a machine that tilts) and
 
 The file also has the shapes of the modes at one pose, on the axis at the middle height, and the
 lines of the frame to draw them on: a stored atlas is drawn without the robot.
-
-May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
 """
 
 from __future__ import annotations
@@ -30,9 +28,9 @@ from pkm_twin.atlas.grids import (
 )
 from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.workspace import distance_unit
 from pkm_twin.machine.graph import BASE
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import distance_unit
 from stiffness_monitor.modes import has_modes, modes, natural_frequencies
 from stiffness_monitor.structure import StructuralModel, structural_model
 

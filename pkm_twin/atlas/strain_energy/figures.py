@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a strain-energy atlas: planes and slices of the energy, and the elements' factors.
-
-May import: numpy, matplotlib when it draws, the figures' common parts, this package.
-"""
+"""Figures of a strain-energy atlas: planes and slices of the energy, and the elements' factors."""
 
 from __future__ import annotations
 
@@ -36,7 +33,8 @@ def plane(
 
     :param variable: ``energy``, or the name of an element for its factor.
     :param z: m; the nearest height is drawn; default that of the paper's figures.
-    :param options: for ``contourf``; ``least``: the value of the first colour.
+    :param options: for ``contourf``; ``least`` and ``greatest``: values of
+        the first and the last colour.
     """
     ax = figures.axes_or_new(ax)
     layer = atlas.isel(z=nearest_height(atlas, z))
@@ -51,7 +49,10 @@ def plane(
         values, unit = figures.prefixed(layer.energy.values, "J")
         label = f"total strain energy ({unit})"
     else:
-        values, label = layer.factor.sel(element=variable).values, f"factor of {variable} (1)"
+        values, label = (
+            layer.factor.sel(element=variable).values,
+            "share of the strain energy (dimensionless)",
+        )
     shown = np.isfinite(values).any(1)
     turn, values = figures.around(azimuth, values[shown])
     beta, gamma = (np.degrees(tilt[shown])[:, None] * f(turn) for f in (np.cos, np.sin))
@@ -78,7 +79,7 @@ def global_factors(atlas: Dataset, ax: Axes | None = None) -> Axes:
         ax.bar(place, values, width, label=label, color=colour)
     ax.set_xticks(np.arange(len(names)), names)
     ax.set_xlabel("element: limb, and revolute joint, bar or universal joint")
-    ax.set_ylabel("global strain-energy factor (1)")
+    ax.set_ylabel("global strain-energy factor (dimensionless)")
     ax.grid(axis="y", alpha=0.3)
     ax.legend()
     return ax
@@ -143,12 +144,17 @@ def _energy_slices(atlas: Dataset) -> Figure:
 
 
 def _factor_plane(atlas: Dataset) -> Figure:
-    figure, axes = figures.subplots(3, 3, figsize=(13.5, 10), layout="constrained")
-    height = float(atlas.z[nearest_height(atlas, None)])
-    for name, ax in zip(atlas.element.values, axes.T.ravel(), strict=True):
-        plane(atlas, str(name), ax=ax, least=0.0)
+    """The four elements with the greatest shares at this height, on one scale."""
+    figure, axes = figures.subplots(2, 2, figsize=(9, 7.6), layout="constrained")
+    layer = nearest_height(atlas, None)
+    greatest = atlas.factor.isel(z=layer).max(("tilt", "azimuth"))
+    names = greatest.sortby(greatest, ascending=False).element.values[:4]
+    for name, ax in zip(sorted(names), axes.ravel(), strict=True):
+        plane(atlas, str(name), ax=ax, least=0.0, greatest=float(greatest.max()))
         ax.set_title(f"element {name}")
-    figure.suptitle(f"{load_case(atlas)}: strain-energy factors at z = {height:.3f} m")
+    figure.suptitle(
+        f"{load_case(atlas)}\nwhich elements store the energy at z = {float(atlas.z[layer]):.3f} m?"
+    )
     return figure
 
 

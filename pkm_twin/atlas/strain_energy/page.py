@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a strain-energy atlas: slices by height, of the energy or an element's factor.
-
-May import: numpy, plotly when it draws, the pages' common parts, this package.
-"""
+"""The page of a strain-energy atlas: slices by height, of the energy or an element's factor."""
 
 from __future__ import annotations
 
@@ -45,7 +42,9 @@ def page(atlas: Dataset) -> Any:
     fields = [pages.Shown(label, "energy", unit, closed(energy), logarithmic=ratio)]
     for k, name in enumerate(part.element.values):
         values = closed(part.factor.values[..., k])
-        fields.append(pages.Shown(f"factor of {name} (1)", f"factor of {name}", "", values))
+        fields.append(
+            pages.Shown(f"share of {name} (dimensionless)", f"factor of {name}", "", values)
+        )
     first, second = lateral_of(atlas)
     return pages.layers(
         title(atlas),

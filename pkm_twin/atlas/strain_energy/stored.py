@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a stored strain-energy atlas says of its wrench and its tilts.
-
-May import: this package, the standard library.
-"""
+"""What a stored strain-energy atlas says of its wrench and its tilts."""
 
 from __future__ import annotations
 

@@ -3,8 +3,6 @@
 
 The grid: heights, tilts and azimuths of the tilt, beta = tilt cos(azimuth), gamma = tilt
 sin(azimuth). Tilts beyond a height's circle are left out (NaN, element -1).
-
-May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ from pkm_twin.atlas.maps.sweep import (
 )
 from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import strain_energy
 
 Array = NDArray[np.float64]

@@ -11,6 +11,6 @@ KIND: Final = Kind(
     figures=figures.FIGURES,
     page=page.page,
     title=page.title,
-    help="Reachable poses, coloured by the distance to a singularity: 0 in one, 1 at best. The "
+    help="Reachable poses, coloured by the singularity index: 0 in a singularity, 1 at best. The "
     "menu chooses what is shown, the slider one layer alone.",
 )

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a workspace atlas: sections, and where limbs come near each other.
-
-May import: numpy, matplotlib when it draws, the figures' common parts, this package.
-"""
+"""Figures of a workspace atlas: sections, and where limbs come near each other."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ Array = NDArray[np.float64]
 def section(
     atlas: Dataset, ax: Axes | None = None, upright: bool = True, z: float | None = None
 ) -> Axes:
-    """A section through the workspace, coloured by the distance to a singularity.
+    """A section through the workspace, coloured by the singularity index.
 
     What limb interference takes away is hatched.
 
@@ -78,7 +75,7 @@ def section(
         )
         ax.set_aspect("equal")
     _legend_above(ax, marks)
-    figures.bar(ax, mesh, "distance to a singularity (1)")
+    figures.bar(ax, mesh, "singularity index (dimensionless)")
     return ax
 
 
@@ -95,30 +92,12 @@ def closest(atlas: Dataset, ax: Axes | None = None, upright: bool = True) -> Axe
         gap = gap.T
     # The colours are those of what is not hatched.
     shown = np.where(gap > _least_clearance(atlas), 1e3 * gap, np.nan)
-    mesh = _mesh(atlas, ax, first, second, shown, cmap=figures.OTHER_MAP)
-    ax.set_title(f"least over {hidden}")
+    mesh = _mesh(atlas, ax, first, second, shown, cmap=figures.OTHER_MAP, vmin=0.0)
+    ax.set_title(f"least clearance over {hidden}")
     if not upright:
         ax.set_aspect("equal")
     _legend_above(ax, _hatch(atlas, ax, first, second, gap, f"for some {hidden} limbs"))
-    figures.bar(ax, mesh, "least clearance of the limbs (mm)")
-    return ax
-
-
-def clearance_over_height(atlas: Dataset, ax: Axes | None = None) -> Axes:
-    """Least and greatest clearance of the limbs at each height, also of poses where they meet."""
-    ax = figures.axes_or_new(ax)
-    upwards = atlas.attrs["height"]
-    low, high = (1e3 * _clearance(atlas, ufunc, [upwards]) for ufunc in (np.fmin, np.fmax))
-    height = atlas[upwards].values
-    ax.fill_betweenx(height, low, high, color=plots.COLOURS[0], alpha=0.35)
-    ax.plot(low, height, color=plots.COLOURS[0], lw=1.2, label="least")
-    ax.plot(high, height, color=plots.COLOURS[0], lw=1.2, ls="--", label="greatest")
-    bound = 1e3 * _least_clearance(atlas)
-    ax.axvline(bound, color="black", ls=":", lw=1.2, label=f"left of it limbs {_near(atlas)}")
-    ax.set_xlabel("clearance of the limbs (mm)")
-    ax.set_ylabel(f"{upwards} (m)")
-    ax.grid(alpha=0.3)
-    _legend_above(ax, ax.get_legend_handles_labels()[0])
+    figures.bar(ax, mesh, "clearance between limbs (mm)")
     return ax
 
 
@@ -188,25 +167,6 @@ def _legend_above(ax: Axes, handles: list[Any]) -> None:
     ax.legend(handles=handles, loc="upper right", fontsize=8)
 
 
-def circle_radii(atlas: Dataset, ax: Axes | None = None) -> Axes:
-    """Radius of the largest circle about the axis over the height."""
-    ax = figures.axes_or_new(ax)
-    rad = atlas.circle.attrs["units"] == "rad"
-    scale = 180 / math.pi if rad else 1.0
-    ax.plot(scale * atlas.circle.values, atlas.height.values, color=plots.COLOURS[0])
-    low, high = float(atlas.cylinder_low), float(atlas.cylinder_high)
-    radius = scale * float(atlas.cylinder_radius)
-    ax.fill_between(
-        [0.0, radius], low, high, color=plots.COLOURS[4], alpha=0.5, label="largest cylinder"
-    )
-    ax.set_xlabel(f"radius of the largest circle ({'deg of tilt' if rad else 'm'})")
-    ax.set_ylabel(f"{atlas.attrs['height']} (m)")
-    ax.set_xlim(left=0.0)
-    ax.grid(alpha=0.3)
-    ax.legend(fontsize=8)
-    return ax
-
-
 def middle_height(atlas: Dataset) -> float:
     """Middle of the largest cylinder, m."""
     low, high = float(atlas.cylinder_low), float(atlas.cylinder_high)
@@ -241,21 +201,14 @@ def _sections(atlas: Dataset) -> Figure:
 def _upright(atlas: Dataset) -> Figure:
     known = "clearance" in atlas
     figure, axes = figures.subplots(
-        1 + known,
-        3,
-        figsize=(16, 9.5 if known else 5),
-        layout="constrained",
-        width_ratios=(1, 1, 0.75),
-        squeeze=False,
+        1 + known, 2, figsize=(9, 8 if known else 4.2), layout="constrained", squeeze=False
     )
     section(atlas, axes[0, 0])
     section(atlas, axes[0, 1], upright=False)
-    circle_radii(atlas, axes[0, 2])
     share = ""
     if known:
         closest(atlas, axes[1, 0])
         closest(atlas, axes[1, 1], upright=False)
-        clearance_over_height(atlas, axes[1, 2])
         lost = 100 * float(atlas.interference)
         where = "nowhere" if lost == 0.0 else f"in {lost:.3g} % of otherwise reachable poses"
         share = f"; limbs {_near(atlas)} {where}"
@@ -264,7 +217,7 @@ def _upright(atlas: Dataset) -> Figure:
     shown = f"{math.degrees(radius):.1f} deg" if unit == "rad" else f"{radius:.3f} m"
     figure.suptitle(
         f"{atlas.attrs['robot']}: reachable {float(atlas.volume):.4g} "
-        f"{atlas.volume.attrs['units']}; largest cylinder {atlas.attrs['height']} = "
+        f"{atlas.volume.attrs['units']}\nlargest cylinder {atlas.attrs['height']} = "
         f"{float(atlas.cylinder_low):.3f} to "
         f"{float(atlas.cylinder_high):.3f} m, radius {shown}{share}"
     )

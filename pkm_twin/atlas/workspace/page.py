@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a workspace atlas: slices of three coordinates, or one picture for each two.
-
-May import: numpy, the pages' common parts, this package.
-"""
+"""The page of a workspace atlas: slices of three coordinates, or one picture for each two."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ if TYPE_CHECKING:
 
 
 LABELS: Final = {
-    "singularity": Label("distance to a singularity (1)", "distance to a singularity", ""),
+    "singularity": Label("singularity index (dimensionless)", "singularity index", ""),
     "clearance": Label("clearance of the limbs (mm)", "clearance", "mm", 1e3),
     "joint_angle": Label(
         "largest passive joint angle (deg)", "passive angle", "deg", 180 / math.pi

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Workspace sweep: reach, distance to a singularity and clearance over a grid of poses.
+"""Workspace sweep: reach, singularity index and clearance over a grid of poses.
 
 The grid is the pose's own: all coordinates of two or three, of more every pair of them with the
 others at home. Reachable: the limits of actuators and of passive joints, limbs apart from each
 other where the file tells their diameters, on the branch of the home pose. Regular, of poses that
 lie about an axis: the largest circle about it at each height, and the largest upright cylinder
 that fits into them.
-
-May import: numpy, pkm_twin's core and the two packages above it; never rclpy.
 """
 
 from __future__ import annotations
@@ -24,15 +22,15 @@ from pkm_twin.atlas.grids import circles, largest_cylinder
 from pkm_twin.atlas.poses import PoseSweep, pose_axes
 from pkm_twin.atlas.sweep import FLAG, POSITIVE, SHARE, Chunk, Field, Values, Variable
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.clearance import clearance, has_clearance
-from pkm_twin.kinematics.workspace import (
+from pkm_twin.robot.clearance import clearance, has_clearance
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.workspace import (
     distance_unit,
     has_joint_angles,
     joint_angle_at,
     reachable,
     singularity_at,
 )
-from pkm_twin.machine.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -63,7 +61,7 @@ class WorkspaceSweep(PoseSweep):
                 self.dims,
                 {
                     **SHARE,
-                    "long_name": "distance to a singularity: 0 in one, 1 at best; reachable poses",
+                    "long_name": "singularity index of reachable poses: 0 singular, 1 at best",
                 },
             ),
         }

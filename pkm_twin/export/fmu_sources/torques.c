@@ -7,14 +7,12 @@ static int results(Model *m)
         const double *q = m->v + Q;
         status = prepare(m);
         if (status == 0) {
-            status = @_torques_with(
-                m->parameters, q, m->v + QD, m->v + QDD, m->v + WRENCH, m->v + TAU);
+            status = @_torques_and_singularity_with(
+                m->parameters, q, m->v + QD, m->v + QDD, m->v + WRENCH, m->v + TAU,
+                m->v + SINGULARITY);
         }
         if (status == 0) {
             status = @_forward_with(m->parameters, q, m->v + POSE);
-        }
-        if (status == 0) {
-            status = @_singularity_with(m->parameters, q, m->v + SINGULARITY);
         }
         m->v[STATUS] = (double)status;
         m->results = (status == 0) ? 1 : 0;

@@ -32,18 +32,27 @@ inline Vector model_rates(const Vector & rates)
   return result;
 }
 
+/// Efforts, and the singularity index: 0 in a singularity, 1 at best.
 inline int efforts(
   const Parameters & parameters, const Vector & q, const Vector & qd, const Vector & qdd,
-  Vector & tau)
+  Vector & tau, double & index)
 {
   constexpr std::array<double, 6> no_wrench{};
   const Vector x = model_positions(q), v = model_rates(qd), a = model_rates(qdd);
-  const int status = @PREFIX@_torques_with(
-    parameters.data(), x.data(), v.data(), a.data(), no_wrench.data(), tau.data());
+  const int status = @PREFIX@_torques_and_singularity_with(
+    parameters.data(), x.data(), v.data(), a.data(), no_wrench.data(), tau.data(), &index);
   for (std::size_t i = 0; i < JOINTS; ++i) {
     tau[i] /= DRIVES[i].factor;
   }
   return status;
+}
+
+inline int efforts(
+  const Parameters & parameters, const Vector & q, const Vector & qd, const Vector & qdd,
+  Vector & tau)
+{
+  double index;
+  return efforts(parameters, q, qd, qdd, tau, index);
 }
 
 /// Friction of the drives. Dry friction is zero at rest.
@@ -70,12 +79,6 @@ inline int mass_matrix(
     }
   }
   return status;
-}
-
-/// Singularity index: 0 in a singularity, 1 at best.
-inline int singularity(const Vector & q, double & index)
-{
-  return @PREFIX@_singularity(model_positions(q).data(), &index);
 }
 
 /// The platform's reference point in base axes, and its rotation from home, row by row.

@@ -43,14 +43,11 @@ Rejection Feedforward::compute(const Motion & motion, Vector & effort) const
   if (!finite(motion.position) || !finite(motion.velocity) || !finite(motion.acceleration)) {
     return NOT_FINITE;
   }
-  const int status =
-    efforts(settings_.parameters, motion.position, motion.velocity, motion.acceleration, effort);
+  double index;
+  const int status = efforts(
+    settings_.parameters, motion.position, motion.velocity, motion.acceleration, effort, index);
   if (status != 0) {
     return status == 1 ? NO_ASSEMBLY : NOT_FINITE;
-  }
-  double index = 1.0;
-  if (settings_.singularity_stop > 0.0 && singularity(motion.position, index) != 0) {
-    return SINGULAR;
   }
   return index < settings_.singularity_stop ? SINGULAR : REJECTIONS;
 }

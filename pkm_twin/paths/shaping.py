@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Input shaping of a motion: the first mode, whose frequency depends on the pose, rests at its end.
+
+ZV and ZVD (Singer and Seering 1990) split a motion into two or three, half a damped vibration
+apart. As the frequency changes along the path, delays are measured in the vibration's phase: the
+delayed motion is x(theta) with phase(theta(t)) = phase(t) - pi. Pose coordinates are shaped, so
+that a straight line stays one. Each stretch comes to rest at its end before the next begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator  # type: ignore[import-untyped]
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.paths.joint_path import JointPath, check_positions
+from pkm_twin.paths.motion import Samples, TimedPath, has_masses
+
+Array = NDArray[np.float64]
+
+DELAYS: Final = {"zv": 1, "zvd": 2}
+"""Half vibrations that each shaper takes."""
+KNOTS: Final = 16
+"""Poses of a stretch whose frequency is computed."""
+LOOKS: Final = 3
+"""How often: on the motion, then on what was shaped before."""
+CLOSEST: Final = 1e-9
+"""Times that are closer are one, s."""
+POINTS: Final = 4001
+"""Times at which a shaped motion is compared with its limits."""
+ROUNDING: Final = 1e-9
+ROUNDS: Final = 8
+"""How often a motion that passes a limit is slowed down."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """The vibration's phase over time: ``rate`` (rad/s) at ``times`` (k,), s, constant outside."""
+
+    times: Array
+    rate: Array
+
+    @cached_property
+    def _curve(self) -> Any:
+        return PchipInterpolator(self.times, self.rate)
+
+    @cached_property
+    def _whole(self) -> Any:
+        return self._curve.antiderivative()
+
+    def at(self, time: Array) -> tuple[Array, Array, Array]:
+        """Phase (rad), its rate and the rate's slope at times (k,)."""
+        inside = np.clip(time, self.times[0], self.times[-1])
+        rate = self._curve(inside)
+        slope = np.where(inside == time, self._curve(inside, 1), 0.0)
+        return self._whole(inside) + rate * (time - inside), rate, slope
+
+    def before(self, time: Array, phase: float) -> tuple[Array, Array, Array]:
+        """Times at which the phase was so much less, and their first and second derivatives."""
+        now, rate, slope = self.at(time)
+        found = time - phase / rate
+        for _ in range(50):
+            own, own_rate, own_slope = self.at(found)
+            step = (own - now + phase) / own_rate
+            found = found - step
+            if np.abs(step).max(initial=0.0) < 1e-13:
+                break
+        first = rate / own_rate
+        return found, first, (slope - own_slope * first**2) / own_rate
+
+
+@dataclass(frozen=True)
+class ShapedPath(TimedPath):
+    """A motion whose first mode is at rest at its stops; ``runs`` are those of the motion unshaped.
+
+    ``phase``: of the first mode. ``amplitudes``: of the split motion, sum 1, each half a vibration
+    after the one before. ``shaper``: ``zv`` or ``zvd``; ``frequencies``: lowest and highest, Hz;
+    ``added``: to the duration, s.
+    """
+
+    phase: Phase | None = None
+    amplitudes: tuple[float, ...] = (1.0,)
+    shaper: str = ""
+    frequencies: tuple[float, float] = (0.0, 0.0)
+    added: float = 0.0
+
+    @cached_property
+    def _points(self) -> Array:
+        return np.linspace(0.0, self.duration, POINTS)
+
+    def sample(self, times: ArrayLike) -> Samples:
+        """The shaped motion at times (k,), s from its beginning."""
+        t = np.asarray(times, np.float64)
+        robot = self.robot
+        pose, rate, change = (np.zeros((len(t), robot.joints_count)) for _ in range(3))
+        for k, amplitude in enumerate(self.amplitudes):
+            assert self.phase is not None  # noqa: S101  shaped() gives it
+            when, first, second = self.phase.before(t, k * np.pi)
+            own = super().sample(when)
+            jacobian = robot.jacobian(own.q)
+            own_rate = (jacobian @ own.qd[..., None])[..., 0]
+            own_change = robot.pose_acceleration(own.q, own.qd, own.qdd)
+            pose += amplitude * own.pose
+            rate += amplitude * own_rate * first[:, None]
+            change += amplitude * (own_change * (first**2)[:, None] + own_rate * second[:, None])
+        q = robot.inverse(pose)
+        jacobian = robot.jacobian(q)
+        qd = np.asarray(np.linalg.solve(jacobian, rate[..., None])[..., 0], np.float64)
+        rest = robot.pose_acceleration(q, qd, np.zeros_like(qd))
+        qdd = np.asarray(np.linalg.solve(jacobian, (change - rest)[..., None])[..., 0], np.float64)
+        effort = None
+        if has_masses(robot):
+            load = None if self.wrench is None else np.broadcast_to(self.wrench, (len(t), 6))
+            effort = inverse_dynamics(robot, q, qd, qdd, load)
+        moved = (robot.platform_jacobian(q)[:, :3] @ qd[..., None])[..., 0]
+        speed = np.linalg.norm(moved, axis=1)
+        return Samples(t, q, qd, qdd, effort, pose, speed, speed)
+
+
+def shaped(
+    motion: TimedPath,
+    shaper: str,
+    frequency: Callable[[Array], Array],
+    damping: float,
+    *,
+    singularity: float = 0.01,
+) -> ShapedPath:
+    """A motion that leaves the first mode at rest at every stop.
+
+    Each stretch takes half (``zv``) or one (``zvd``) damped vibration more. ``zvd`` tolerates more
+    error of the frequency. Corners that are not stops become a little rounder. Where the shaped
+    motion would pass a limit, the whole is slowed down.
+
+    :param frequency: natural frequencies (k,), Hz, of poses (k, m).
+    :param damping: ratio of the mode, 0 or above and below 1.
+    :param singularity: least singularity index of the shaped motion, 0 to 1.
+    :raises ParameterError: no such shaper, damping or frequency, or limits that cannot be kept.
+    """
+    if shaper not in DELAYS:
+        raise UnknownNameError("shaper", shaper, tuple(DELAYS))
+    if not 0.0 <= damping < 1.0:
+        raise ParameterError("damping", damping, "0 or above and below 1")
+    root = float(np.sqrt(1.0 - damping**2))
+    weights = np.array([1.0, 1.0] if shaper == "zv" else [1.0, 2.0, 1.0])
+    weights *= float(np.exp(-np.pi * damping / root)) ** np.arange(len(weights))
+    amplitudes = tuple((weights / weights.sum()).tolist())
+
+    def settled(plain: TimedPath, phase: Phase) -> TimedPath:
+        """With rests in which all parts of the split motion arrive."""
+        rests, end = [plain.rests[0]], 0.0
+        for run, rest in zip(plain.runs, plain.rests[1:], strict=True):
+            end += rests[-1] + run.duration
+            arrived = phase.before(np.array([end]), -DELAYS[shaper] * np.pi)[0]
+            rests.append(float(arrived[0]) - end + rest)
+        return replace(plain, rests=tuple(rests))
+
+    def made(plain: TimedPath) -> ShapedPath:
+        looked, tails = plain, np.zeros(len(plain.runs))
+        for _ in range(LOOKS):
+            # The shaped motion is later than the plain one, and so are its frequencies.
+            spans = zip(looked.begins, looked.runs, tails, strict=True)
+            times = np.concatenate(
+                [begin + np.linspace(0.0, run.duration + tail, KNOTS) for begin, run, tail in spans]
+            )
+            times = times[np.diff(times, prepend=-1.0) > CLOSEST]
+            rate = _rates(looked, times, frequency, root)
+            phase = Phase(times, rate)
+            base = settled(plain, phase)
+            tails = np.array(base.rests[1:]) - plain.rests[1:]
+            low, high = float(rate.min()), float(rate.max())
+            looked = shaped_path = ShapedPath(
+                **{field.name: getattr(base, field.name) for field in fields(TimedPath)},
+                phase=phase, amplitudes=amplitudes, shaper=shaper,
+                frequencies=(low / root / (2.0 * np.pi), high / root / (2.0 * np.pi)),
+                added=base.duration - motion.duration,
+            )  # fmt: skip
+        return shaped_path
+
+    plain = motion
+    for _ in range(ROUNDS):
+        result = made(plain)
+        over = max(result.worst.values(), default=0.0)
+        if over <= 1.0 + ROUNDING:
+            fine = result.fine
+            way = np.cumsum(fine.speed * np.diff(fine.time, prepend=0.0))
+            none = np.empty_like(fine.q)
+            part = JointPath(way, fine.q, none, none, way, np.empty(0, np.int64), way)
+            check_positions(motion.robot, part, 0.0, singularity)
+            return result
+        plain = replace(plain, runs=tuple(run.slower(over) for run in plain.runs))
+    raise ParameterError("shaper", shaper, "limits that the shaped motion keeps")
+
+
+def _rates(
+    motion: TimedPath, times: Array, frequency: Callable[[Array], Array], root: float
+) -> Array:
+    """Damped angular frequency of the first mode at times of a motion, rad/s."""
+    found = np.asarray(frequency(motion.sample(times).pose), np.float64)
+    if not (np.isfinite(found).all() and (found > 0.0).all()):
+        raise ParameterError("frequency", found.tolist(), "finite numbers above 0, Hz")
+    return 2.0 * np.pi * root * found
