@@ -10,7 +10,7 @@ SEED ?= 1
 ENDLESS := test/bags/test_fuzz.py test/fuzz/test_nodes.py test/nodes/test_soak.py
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality pages docs clean help
+.PHONY: demo test lint types unit long bags bench certificate fuzz faults soak audit scale reality contact-table pages docs clean help
 
 help:
 	@echo "make demo         set up .venv, run the main nodes on the recorded bags, table and picture in out/"
@@ -25,6 +25,7 @@ help:
 	@echo "make audit        known vulnerabilities of the installed packages"
 	@echo "make scale        measure the cost of workspace maps, into docs/scale.md"
 	@echo "make reality      compare recordings of real machines with the models, into docs/reality.md"
+	@echo "make contact-table  simulate 1,000 contacts, into docs/contact.md (an hour)"
 	@echo "make pages        write the generated pages and pictures of docs/"
 	@echo "make docs         build the site, in out/site"
 	@echo "make clean        remove .venv, out and caches"
@@ -73,8 +74,8 @@ bench: $(VENV)/bench.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.pinocchio_c docs/export_c.md
 
 certificate: $(VENV)/certificate.stamp
-	$(BIN)/python -m test.certificate
-	$(BIN)/python -m test.machine.certificate_page
+	$(BIN)/python -m tools.certificate
+	$(BIN)/python -m tools.certificate.own_machines
 
 # Every bit of a bag; then at random in this process, at real nodes, and the figures.
 fuzz: $(VENV)/test.stamp
@@ -99,14 +100,18 @@ scale: $(VENV)/test.stamp
 reality: $(VENV)/test.stamp
 	$(BIN)/python -m tools.reality docs/reality.md
 
+contact-table: $(VENV)/test.stamp
+	OMP_NUM_THREADS=1 $(BIN)/python -m tools.contact_table docs/contact.md
+
 pages: $(VENV)/test.stamp
-	$(BIN)/python -m test.docs.parameters docs/parameters.md
-	$(BIN)/python -m test.docs.commands docs/commands.md
-	$(BIN)/python -m test.docs.errors docs/errors.md
-	$(BIN)/python -m test.docs.engine docs/engine.md
-	$(BIN)/python -m test.docs.architecture docs/architecture.png
-	$(BIN)/python -m test.docs.robots docs/gallery
-	$(BIN)/python -m test.docs.view docs/gallery
+	$(BIN)/python -m tools.pages.parameters docs/parameters.md
+	$(BIN)/python -m tools.pages.commands docs/commands.md
+	$(BIN)/python -m tools.pages.errors docs/errors.md
+	$(BIN)/python -m tools.pages.engine docs/engine.md
+	$(BIN)/python -m tools.pages.trend docs/trend.md
+	$(BIN)/python -m tools.pages.architecture docs/architecture.png
+	$(BIN)/python -m tools.pages.robots docs/gallery
+	$(BIN)/python -m tools.pages.view docs/gallery
 
 # Strict: a warning is an error.
 docs: $(VENV)/docs.stamp

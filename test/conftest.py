@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
+import fcntl
 import functools
 import gc
 import os
 import signal
+import sys
+from pathlib import Path
 
 # The cores have tests of their own, and matrices are small. Read when numpy is loaded.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -27,15 +30,31 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """In a fresh clone one worker writes the bytecode of the tests, and the others read it."""
+    here = Path(__file__)
+    # Of the folder that is collected last.
+    if sys.dont_write_bytecode or any(here.parent.glob("view/__pycache__/test_*")):
+        return (yield)
+    with here.open() as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            fcntl.flock(lock, fcntl.LOCK_SH)
+        return (yield)
+
+
 def pytest_collection_modifyitems(items):
     """Files that wait for nodes stand evenly among those that compute, and end before them.
 
-    Workers take files in this order; a waiting one leaves its core to another.
+    Workers take files in this order; a waiting one leaves its core to another. Short ones are last.
     """
     files = list(dict.fromkeys(item.path for item in items))
     waiting = [path for path in files if path.parent.name == "nodes"]
     place = {path: k / len(waiting) * 0.85 for k, path in enumerate(waiting)}
     others = [path for path in files if path not in place]
+    others.sort(key=lambda path: path.parent.name == "laws")
     place |= {path: k / len(others) for k, path in enumerate(others)}
     items.sort(key=lambda item: place[item.path])
 

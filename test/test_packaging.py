@@ -8,6 +8,8 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
+import venv
 import zipfile
 from functools import cache
 from importlib.util import find_spec
@@ -128,6 +130,42 @@ class TestWheel:
         assert all("extra ==" in line for line in required if line.startswith("ros-"))
 
 
+@pytest.fixture
+def sdist_wheel(copy, tmp_path):
+    """A wheel built from the source distribution."""
+    code = f"from setuptools import build_meta; print(build_meta.build_sdist({str(tmp_path)!r}))"
+    run(sys.executable, "-c", code, cwd=copy)
+    (source,) = tmp_path.glob("*.tar.gz")
+    command = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", source]
+    run(sys.executable, *command, cwd=tmp_path)
+    (built,) = tmp_path.glob("*.whl")
+    return built
+
+
+@pytest.mark.long
+@pytest.mark.skipif(find_spec("wheel") is None, reason="wheel is not installed")
+class TestSourceDistribution:
+    def test_gives_the_same_wheel(self, wheel, sdist_wheel):
+        names = [set(zipfile.ZipFile(file).namelist()) for file in (wheel, sdist_wheel)]
+        assert names[0] == names[1]
+
+    def test_both_run_in_a_clean_environment(self, wheel, sdist_wheel, tmp_path):
+        """Its own packages are this one alone; those that it needs are found beside."""
+        for built in (wheel, sdist_wheel):
+            home = tmp_path / f"clean_{built.parent.name}"
+            venv.create(home, with_pip=False)
+            python = home / "bin/python"
+            options = ["--python", python, "install", "--quiet", "--no-deps", "--no-index", built]
+            run(sys.executable, "-m", "pip", *options, cwd=tmp_path)
+            beside = {"PYTHONPATH": sysconfig.get_path("purelib")}
+            code = "import pkm_twin; print(pkm_twin.__file__, pkm_twin.__version__)"
+            place, version = run(python, "-c", code, cwd=tmp_path, **beside).split()
+            assert Path(place).is_relative_to(home)
+            assert version == pkm_twin.__version__
+            listed = run(home / "bin/pkm-twin", "robots", cwd=tmp_path, **beside)
+            assert {line.split()[0] for line in listed.splitlines()} == robots()
+
+
 @needs_colcon
 class TestColcon:
     def test_list(self, copy):
@@ -223,7 +261,7 @@ class TestManifest:
 
 DECLARED = {
     "hypothesis", "matplotlib", "numpy", "pkm_twin", "delta_dynamics", "stiffness_monitor",
-    "pytest", "rich", "scipy", "setuptools", "support", "test", "bags", "typer", "yaml",
+    "pytest", "rich", "scipy", "setuptools", "support", "test", "tools", "bags", "typer", "yaml",
     "zstandard", "lz4", "mcap",
 }  # fmt: skip
 """What package.xml's dependencies bring, and this package."""

@@ -155,7 +155,7 @@ class Deck:
             raise AssertionError(f"{support.joint} holds {held}")
 
     def hold(self, axis, node, name, place):
-        """axis . (displacement of the node - that of the body's point at place) = 0."""
+        """Axis . (displacement of the node - that of the body's point at place) = 0."""
         terms = [((node, k + 1), axis[k]) for k in range(3)]
         if name == self.moving:
             centre, turn = self.platform
@@ -213,6 +213,29 @@ def frequencies(frame: StructuralModel, count: int, folder: Path, divisions: int
     assert (found[: deck.idle] < 0.1).all()
     assert (found[deck.idle :] > 1.0).all()
     return found[deck.idle :]
+
+
+def harmonic(frame, damping, highest, folder, *, modes=30, divisions=8):
+    """CalculiX's natural frequencies, frequencies (k,) between them, Hz, and its responses there.
+
+    :returns: the platform's complex displacements (k, 3) to a unit force along x.
+    """
+    deck = Deck(frame, divisions)
+    count, node = modes + deck.idle, deck.platform[0]
+    text = deck.text(count).replace("*FREQUENCY", "*FREQUENCY, STORAGE=YES")
+    text = text.replace("*NODE FILE\nU\n", "").replace("*STEP", f"*NSET, NSET=TOOL\n{node}\n*STEP")
+    text += (
+        f"*STEP\n*STEADY STATE DYNAMICS\n1., {highest:.9e}, 6, 1.\n"
+        f"*MODAL DAMPING\n1, {count}, {damping}\n*CLOAD\n{node}, 1, 1.\n"
+        "*NODE PRINT, NSET=TOOL\nU\n*END STEP\n"
+    )
+    output = run(text, folder)
+    rows = re.findall(r"^\s+\d+" + 4 * r"\s+([-+.E\d]+)" + r"\s*$", output, re.M)
+    own = np.array([float(row[2]) for row in rows])[deck.idle : count]
+    found = re.findall(r"set TOOL and time\s+(\S+)\s+\d+\s+(\S+)\s+(\S+)\s+(\S+)", output)
+    table = np.array(found, float)
+    # Real parts, then imaginary ones, of each frequency.
+    return own, table[::2, 0], table[::2, 1:] + 1j * table[1::2, 1:]
 
 
 # As solids

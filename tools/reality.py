@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pkm_twin import Robot, load
-from pkm_twin.apps.calibration import Calibration, calibrate, geometric
-from pkm_twin.apps.calibration_state import Poses, rotations
 from pkm_twin.apps.columns import read_columns
 from pkm_twin.apps.drive_friction import GRAVITY
 from pkm_twin.apps.pose_table import read_poses
+from pkm_twin.identification.calibration import Calibration, calibrate, geometric
+from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.hanging_mass import drive_friction, lines
 
 Array = NDArray[np.float64]
@@ -192,6 +192,36 @@ drive-friction` with `leg_currents.csv` and `--lever 0.011391` prints
 At one speed Coulomb and viscous friction are one number. That number alone is rejected: friction
 grows with the load. Four weights, recalled and not weighed, are few: the torque constant is as
 good as the weights.
+
+## Send a recording
+
+We look for recordings of joint positions with motor efforts, of any parallel machine. `record-kit`
+prepares one:
+
+    pkm-twin record-kit delta_cu --out kit
+
+writes an exciting motion and slow friction sweeps inside the limits of the robot file, `NOTES.md`
+with what to note, and `README.md` with the commands to record and to judge. After the recording
+
+    pkm-twin record-kit delta_cu --anonymise bags/delta_cu_collision.mcap --out anonymous.mcap
+
+writes a bag of joint states, wrenches and trajectories alone. Joints are `joint_1`, `joint_2` and
+so on, in the order of the robot file. Topics and frames have neutral names, time begins at zero,
+and no metadata, definition or QoS of the original stays. The command lists the topics that it
+leaves out. `--keep-names` keeps names of joints and topics.
+
+Checklist:
+
+- [ ] a robot file with lengths and masses, and where they are from
+- [ ] `NOTES.md` filled in: payload, temperature, unit of the efforts, encoder side, frames
+- [ ] joint states at 200 Hz or more with position, velocity and effort, with the drives' own stamps
+- [ ] drives warm; `excitation` and `friction`, each without a payload and with a weighed one
+- [ ] `pkm-twin check` of each recording: complete, no gaps, the drives on
+- [ ] anonymised bags, and no name in `NOTES.md` that must not be published
+- [ ] a licence that allows publication
+
+Poses by an instrument are worth as much: a CSV of joint positions and poses as of
+[calibration](calibration.md), with the instrument's standard deviation.
 
 [jugglebot]: https://github.com/Project-DeepBlue-Juggling/Jugglebot
 """

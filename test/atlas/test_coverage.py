@@ -16,7 +16,7 @@ from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.workspace import reachable, singularity_at, try_forward
+from pkm_twin.robot.workspace import reachable, singularity_at, try_forward
 from test.support.robots import SHIPPED, load, partly_long
 
 COUNTS = partly_long([20_000, 100_000], 20_000)
@@ -34,9 +34,7 @@ def reached(robot, rng, count):
 
 
 @pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize(
-    "name", partly_long(robot_names(), "delta_cu", "five_bar", "upr_rpu", "stewart")
-)
+@pytest.mark.parametrize("name", partly_long(robot_names(), "delta_cu", "five_bar", "upr_rpu"))
 def test_the_default_atlas_holds_all_that_is_reachable(name, count, rng):
     robot = load(name)
     poses = reached(robot, rng, count)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 from html.parser import HTMLParser
 
 import numpy as np
@@ -45,17 +46,20 @@ def test_all_figures_have_axes_with_labels(name, small_atlases):
         pyplot.close(figure)
 
 
+LONG = functools.partial(pytest.param, marks=pytest.mark.long)
+
+
 @pytest.mark.parametrize(
     ("name", "draw"),
     [
         ("strain-energy upr_rpu", strain_energy.figures.plane),
-        ("strain-energy upr_rpu", strain_energy.figures.global_factors),
+        LONG("strain-energy upr_rpu", strain_energy.figures.global_factors),
         ("isotropy prru", isotropy.figures.spheres),
-        ("isotropy delta_cu", isotropy.figures.spread_over_poses),
-        ("workspace prru", workspace.figures.section),
-        ("workspace delta_cu", workspace.figures.circle_radii),
+        LONG("isotropy delta_cu", isotropy.figures.spread_over_poses),
+        LONG("workspace prru", workspace.figures.section),
+        ("workspace delta_cu", workspace.figures.closest),
         ("modes upr_rpu", modes.figures.frequency),
-        ("modes delta_cu", modes.figures.frequency_range),
+        LONG("modes delta_cu", modes.figures.frequency_range),
     ],
 )
 def test_functions_draw_on_given_axes_or_their_own(name, draw, small_atlases):

@@ -4,22 +4,32 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.atlas.maps.milling import Process
 from pkm_twin.atlas.maps.quantity import Case
-from pkm_twin.atlas.maps.sweep import LEAST, QUANTITIES, counts, found_of, map_sweep
+from pkm_twin.atlas.maps.sweep import (
+    LEAST,
+    QUANTITIES,
+    counts,
+    evolved,
+    found_of,
+    map_sweep,
+    worst_of,
+)
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.passive_limits import passive_values
-from pkm_twin.kinematics.workspace import reachable, try_forward
-from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.schema import read_yaml
-from stiffness_monitor import compliance, strain_energy
+from pkm_twin.machine.strict_yaml import read_yaml
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.passive_limits import passive_values
+from pkm_twin.robot.workspace import reachable, try_forward
+from stiffness_monitor import Milling, compliance, stable_depth, strain_energy
 from stiffness_monitor.modes import natural_frequencies
 from test.machine.random_machines import FILES
 from test.support.command import command
@@ -204,6 +214,55 @@ def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
     rows = (tmp_path / "a.csv").read_text().splitlines()
     assert [float(row.split(",")[4]) for row in rows[1:]] == pytest.approx(values.tolist())
     assert (tmp_path / "a.png").stat().st_size
+
+
+def test_milling_depths_are_those_of_each_pose(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robot, milling = load("upr_rpu"), Milling(2, 600e6, 0.3, 0.5, up=True, feed=np.radians(30.0))
+    tool, damping = (0.0, 0.0, -0.1), (0.03, 0.02)
+    poses = robot.home() + np.array([[0.0, 0.0, 0.0], [0.01, 0.05, 0.0], [0.02, 0.1, 0.05]])
+    header = ",".join(["time", *robot.pose_names])
+    rows = [",".join(map(repr, [0.1 * k, *pose.tolist()])) for k, pose in enumerate(poses)]
+    (tmp_path / "path.csv").write_text("\n".join([header, *rows]) + "\n")
+    done = command(
+        capsys, "atlas", "upr_rpu", "cutting-depth", "--teeth", "2", "--tangential", "600e6",
+        "--radial", "0.3", "--immersion", "0.5", "--up", "--feed", "30", "--tool", "0,0,-0.1",
+        "--damping", "0.03,0.02", "--along", "path.csv", "--out", "a.csv", "--no-picture", "--json",
+    )  # fmt: skip
+    told = json.loads(done.out)["worst"][0]
+    each = [stable_depth(robot, p, milling, damping=damping, tool=tool) for p in poses]
+    assert told["value"] == pytest.approx(min(each)) and told["unit"] == "m"
+    assert told["element"].startswith("mode ")
+    # A process goes with its map, so that another does not continue it.
+    sweeps = [
+        map_sweep(robot, Process(each, damping, tool), 60)
+        for each in (milling, Milling(3, 600e6, 0.3, 0.5))
+    ]
+    assert sweeps[0].settings != sweeps[1].settings and sweeps[0].kind == "cutting-depth"
+
+
+def test_a_search_finds_what_is_best_at_the_border(rng):
+    """The highest place of a ramp over a disc, also with few looks."""
+    few = replace(QUANTITIES["frequency"], population=8, rounds=30)
+    best = [
+        evolved(
+            lambda x: np.where((x**2).sum(1) <= 1.0, x[:, 0] + 0.2 * x[:, 1], -np.inf),
+            rng.uniform(-0.7, 0.7, (8, 2)), np.full(2, -1.0), np.ones(2), few, rng, inside,
+        )[1]
+        for inside in (lambda x: (x**2).sum(1) <= 1.0, None)
+    ]  # fmt: skip
+    assert 1.04**0.5 - best[0] < 1e-3 and best[0] > best[1]
+
+
+@pytest.mark.long
+def test_the_lowest_frequency_is_found():
+    """The Delta rings lowest where the singularity index is as low as it may be."""
+    robot = load("delta")
+    sweep = map_sweep(robot, "frequency")
+    worst = worst_of(sweep, sweep.cases[0], np.empty((0, 3)))
+    assert robot.singularity(worst.q) == pytest.approx(LEAST, abs=2e-3)
+    # 44.03 Hz by five times the rounds.
+    assert worst.found.value[0] < 44.03 * 1.002
 
 
 def test_ball_joints_swivel_so_far(rng):

@@ -10,15 +10,19 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
+import numpy as np
 import pytest
 
 from pkm_twin import load, robot_names
 from pkm_twin.atlas import run as running
 from pkm_twin.atlas.extras import MissingExtraError
-from pkm_twin.atlas.run import ClusterError, run
+from pkm_twin.atlas.run import ClusterError, on_cluster, run
 from pkm_twin.atlas.store import AtlasError, Parts, open_atlas
 from pkm_twin.atlas.strain_energy.sweep import WRENCHES, strain_energy_sweep
+from pkm_twin.design.pose_path import PosePath
+from pkm_twin.design.sweep import sweep as design_sweep
 from pkm_twin.errors import PkmTwinError
 from test.atlas.conftest import same
 from test.atlas.scale import command
@@ -127,6 +131,21 @@ def test_a_cluster_is_one_process(strain, tmp_path, cluster):
     sweep, path = strain
     out = run(sweep, tmp_path / "a.nc", scheduler=cluster.scheduler_address)
     assert same(path, out)
+
+
+def test_a_sweep_of_a_design_is_computed_on_a_cluster(cluster):
+    robot = load("five_bar")
+    time, box = np.linspace(0.0, 0.5, 20), {"payload.mass": (0.1, 1.0)}
+    q = robot.graph.home + 0.1 * np.sin(6.0 * time)[:, None]
+    path = PosePath.of_joints(robot, time, q, np.ones_like(q), q)
+    done: list[int] = []
+    table, expected = (
+        design_sweep(robot, box, path, ["peak-effort"], 600, progress=done.append, **how)
+        for how in ({"compute": partial(on_cluster, scheduler=cluster.scheduler_address)}, {})
+    )
+    assert done[2] == done[-1] == 600 and len(done) == 6
+    for name, values in expected.quantities.items():
+        np.testing.assert_array_equal(table.quantities[name], values)
 
 
 def test_a_killed_worker_costs_time_not_results(strain, tmp_path, cluster):
@@ -293,6 +312,7 @@ def test_a_target_that_is_no_file_is_not_replaced(small, tmp_path):
             open_atlas(tmp_path / name)
 
 
+@pytest.mark.long
 def test_a_killed_scheduler_is_one_error_and_costs_no_finished_chunk(strain, tmp_path):
     pytest.importorskip("distributed")
     sweep, path = strain

@@ -12,8 +12,8 @@ from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
 from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.clearance import clearance
-from pkm_twin.kinematics.workspace import CLEAR, RAYS, singularity_at
+from pkm_twin.robot.clearance import clearance
+from pkm_twin.robot.workspace import CLEAR, RAYS, singularity_at
 from stiffness_monitor import reachable, regular_workspace
 from test.atlas.conftest import LAYERS
 from test.support.robots import load, parameters_of, partly_long

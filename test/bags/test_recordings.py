@@ -18,7 +18,7 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
-from pkm_twin.ros.messages import stamp_of
+from pkm_twin.messages.stamps import stamp_of
 from stiffness_monitor.monitor import Monitor
 from test.support.robots import load
 

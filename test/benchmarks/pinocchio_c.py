@@ -18,12 +18,12 @@ import pinocchio
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.export.c_package import c_package
-from pkm_twin.machine.catalogue import robot_of_data
 from pkm_twin.machine.joints import across
-from pkm_twin.machine.robot_urdf import robot_description, robot_tree
 from pkm_twin.machine.simulated import hang
 from pkm_twin.machine.tree import axes_with_z
 from pkm_twin.machine.urdf_write import GROUND
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.robot_urdf import robot_description, robot_tree
 from test.support.robots import joint_range
 
 ROBOTS = "delta", "delta_cu", "linear_delta", "prru", "rps3", "stewart"

@@ -57,7 +57,21 @@ def main(source, target):
             f"{statistics.median(seconds):.2f} s (median of {len(seconds)}, worst "
             f"{max(seconds):.2f})."
         )
+    lines += [design(one) for one in told.get("design", [])]
     Path(target).write_text("\n".join(lines) + "\n" + TARGETS)
+
+
+def design(one):
+    """The line of a design and its rival."""
+    ratio = one["others_seconds"] / one["seconds"]
+    return (
+        "- `pkm-twin design` of the Delta's two lengths for a pick-and-place path, least peak "
+        "effort with a singularity index of at least 0.1: "
+        f"{one['best']:.5f} N m in {one['seconds']:.2f} s of processor time. "
+        "Nelder-Mead that compiles each machine: "
+        f"{one['others_best']:.5f} N m in {one['others_seconds']:.1f} s "
+        f"({one['compiled']} machines), {ratio:.0f} times as long."
+    )
 
 
 def round_trip(trip):

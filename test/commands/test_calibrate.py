@@ -17,11 +17,11 @@ from bags.recording.capture import machine_parameters
 from bags.recording.record_poses import NOISE, OFFSETS, SHIFTS, TURNS, record
 from pkm_twin import Robot
 from pkm_twin.apps.calibrate import read_poses
-from pkm_twin.apps.calibration import calibrate, geometric
-from pkm_twin.apps.calibration_state import Poses
 from pkm_twin.apps.cli import app
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.entries import entries, with_entries
+from pkm_twin.identification.calibration import calibrate, geometric
+from pkm_twin.identification.calibration_state import Poses
+from pkm_twin.robot.entries import entries, with_entries
 from test.support.robots import load, random_joints
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from pkm_twin.bags.reader import BagWriter, inspect, open_bag, read_messages
 from test.bags.folders import make_folder
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
 from test.support.mapped import sides
-from test.support.robots import massless, often
+from test.support.robots import massless, often, partly_long
 
 JOINTS = "/joint_states"
 
@@ -72,9 +72,12 @@ def items_of(result):
     return {item["what"]: item for item in data["items"]}
 
 
-@pytest.mark.parametrize("bag", [DELTA, MILLING, STIFFNESS], ids=lambda path: path.stem)
-def test_recordings_are_good(process, bag):
-    result = process("check", bag)
+# The lines of the documents check the others.
+@pytest.mark.parametrize(
+    "bag", partly_long([DELTA, MILLING, STIFFNESS], STIFFNESS), ids=lambda path: path.stem
+)
+def test_recordings_are_good(twin, bag):
+    result = twin("check", bag)
     assert (result.code, result.err) == (0, "")
     assert result.out.splitlines()[-1].startswith("good")
     assert ("not judged: torque residual" in result.out) == (bag == STIFFNESS)
@@ -110,9 +113,6 @@ def test_a_fault_is_bad_and_named(twin, tmp_path, change, what, value):
     item = items_of(result)[what]
     assert item["verdict"] == "bad"
     assert value in item["value"]
-    shown = twin("check", bag)
-    assert shown.code == 1
-    assert what in shown.out.splitlines()[-1]
 
 
 @pytest.mark.parametrize("effort", [0.0, 0.1])
@@ -140,12 +140,13 @@ def test_drives_that_are_off_or_braked_are_left_out(twin, tmp_path, effort):
 
 
 def test_only_the_contradicted_joint_is_bad(twin, tmp_path):
-    items = items_of(
-        twin("check", rewrite(DELTA, tmp_path / "b.mcap", one_effort_reversed), "--json")
-    )
-    assert [what for what, item in items.items() if item["verdict"] == "bad"] == [
-        "torque residual of arm_2"
-    ]
+    bag = rewrite(DELTA, tmp_path / "b.mcap", one_effort_reversed)
+    items = items_of(twin("check", bag, "--json"))
+    bad = "torque residual of arm_2"
+    assert [what for what, item in items.items() if item["verdict"] == "bad"] == [bad]
+    shown = twin("check", bag)
+    assert shown.code == 1
+    assert bad in shown.out.splitlines()[-1]
 
 
 def test_a_bad_wrench_is_bad(twin, tmp_path):
@@ -269,7 +270,7 @@ def without_crcs(source, target):
 
 
 class TestDamage:
-    @pytest.mark.parametrize("count", often(60, 200))
+    @pytest.mark.parametrize("count", often(24, 200))
     def test_flips_never_pass(self, twin, tiny, tmp_path, count):
         whole = tiny.read_bytes()
         assert twin("check", tiny).code == 0
@@ -288,7 +289,7 @@ class TestDamage:
         assert set(codes) <= {1, 3}
         assert codes.count(3) > count / 4
 
-    @pytest.mark.parametrize("step", often(151, 37))
+    @pytest.mark.parametrize("step", often(503, 37))
     def test_cuts_never_pass(self, twin, tiny, tmp_path, step):
         whole = tiny.read_bytes()
         path = tmp_path / "cut.mcap"
@@ -363,11 +364,6 @@ class TestRecover:
 
 class TestPlay:
     """The player itself is tested over the middleware; here only what the command refuses."""
-
-    def test_process_help(self, process):
-        result = process("play", "--help")
-        assert (result.code, result.err) == (0, "")
-        assert "--clock" in result.out
 
     @pytest.mark.parametrize(
         ("arguments", "code", "text"),
@@ -553,17 +549,22 @@ class TestPayload:
     @pytest.mark.parametrize(
         ("name", "value"),
         [
-            ("payload_mass_kg", "heavy"),
             ("payload_mass_kg", "nan"),
-            ("payload_mass_kg", "-1"),
             ("payload_mass_kg", None),
-            ("payload_picked_s", ""),
             ("payload_picked_s", "1e400"),
             ("payload_released_s", "0"),
-            ("payload_released_s", None),
             ("robot", "/dev/zero"),
-            ("robot", "../config/delta_cu.yaml"),
-            ("robot", "nobody"),
+            *(
+                pytest.param(*case, marks=pytest.mark.long)
+                for case in (
+                    ("payload_mass_kg", "heavy"),
+                    ("payload_mass_kg", "-1"),
+                    ("payload_picked_s", ""),
+                    ("payload_released_s", None),
+                    ("robot", "../config/delta_cu.yaml"),
+                    ("robot", "nobody"),
+                )
+            ),
         ],
     )
     def test_metadata_that_are_no_numbers(self, twin, tmp_path, name, value):
@@ -594,8 +595,9 @@ def test_a_type_without_its_fields(twin, tmp_path, definition):
 
 
 @pytest.mark.parametrize("mode", ["", "MESSAGE", "FILE"])
-def test_rosbag2_folders_go_straight_in(twin, tmp_path, sample, mode):
-    folder = make_folder(tmp_path / "rec", sample, mode=mode)
+def test_rosbag2_folders_go_straight_in(twin, tmp_path, mode):
+    moving = rewrite(DELTA, tmp_path / "moving.mcap", begin=1.0, seconds=0.3)
+    folder = make_folder(tmp_path / "rec", moving, mode=mode)
     result = twin("check", folder, "--robot", "delta_cu", "--json")
     assert result.code == 0
     assert items_of(result)["file"]["verdict"] == "unknown"

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from pkm_twin.machine.catalogue import load
+from pkm_twin.robot.catalogue import load
 
 VARY = ("--vary", "geometry.arm_length=0.15:0.3", "--vary", "geometry.forearm_length=0.3:0.6")
 TOLERANCES = ("--tolerance", "geometry.arm_length=1e-4", "--tolerance", "geometry.base_radius=5e-5")

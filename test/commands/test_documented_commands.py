@@ -27,7 +27,11 @@ NOT_RUN = {
 """Lines that are parsed but not run, and why."""
 ENDS = {"pkm-twin recover damaged.mcap saved.mcap": 3}
 """Exit codes other than 0, as the page says."""
-SLOW = r"pkm-twin (torques (\S+\.mcap|\S+ \S+\.mcap|better\.yaml)|atlas|show|design|excite)\b.*"
+SLOW = (
+    r"pkm-twin (torques (\S+\.mcap|\S+ \S+\.mcap|better\.yaml)|atlas|show|design|excite|record-kit|"
+    r"path stewart|check \S+ --(robot|topic|payload)|fit delta_cu|"
+    r"lobes|path delta_cu .*--shaper)\b.*"
+)
 """Lines of seconds that other tests run on smaller files: with `make long`."""
 PROGRAMS = ("pkm-twin ", "head -c ")
 """Ours, and what prepares a file for it."""

@@ -11,7 +11,7 @@ import yaml
 from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.fit_files import robot_text
 from pkm_twin.bags.reader import open_bag
-from pkm_twin.machine.entries import entries, with_entries
+from pkm_twin.robot.entries import entries, with_entries
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
@@ -190,7 +190,7 @@ def test_numbers_that_are_no_recording_of_this_machine(
     capsys, tmp_path, monkeypatch, column, how, text
 ):
     monkeypatch.chdir(tmp_path)
-    plain = table(tmp_path / "plain.csv", load("five_bar"))
+    plain = table(tmp_path / "plain.csv", load("five_bar"), 3.0)
     names = plain.read_text().splitlines()[0].split(",")
     data = np.loadtxt(plain, delimiter=",", skiprows=1)
     for k, name in enumerate(names):

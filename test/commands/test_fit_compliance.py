@@ -148,9 +148,10 @@ def everywhere(names, how):
         (everywhere(DEFLECTION, lambda v: -v), "against its loads"),
         (everywhere(DEFLECTION, np.zeros_like), "no deflection, every one is the same"),
         (everywhere(DEFLECTION, lambda v: 0.0 * v + 1e-4), "no deflection, every one is the same"),
-        (
+        pytest.param(
             {n: np.random.default_rng(k).permutation for k, n in enumerate(DEFLECTION)},
             "no compliance of this robot explains",
+            marks=pytest.mark.long,
         ),
         (
             {

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables as other programs write them are the same motion, and what is not certain is refused."""
 
+import csv
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 
 from test.support.command import command
 from test.support.robots import load
@@ -81,6 +84,9 @@ def test_names_and_units_of_columns(motion, capsys):
     same(
         sized(capsys, "b.csv", "--columns", names, "--units", "deg,ms"), sized(capsys, "a.csv")
     )  # fmt: skip
+    others = names.removeprefix("time=t,")
+    both = ("--time", "t", "--columns", others, "--units", "deg,ms")
+    same(sized(capsys, "b.csv", *both), sized(capsys, "a.csv"))
     # Lengths stay as they are where a joint slides.
     legs = load("stewart")
     q = np.tile(legs.graph.home, (5, 1))
@@ -93,7 +99,8 @@ def test_names_and_units_of_columns(motion, capsys):
     "options",
     [
         ("--separator", "|"), ("--decimal", ";"), ("--units", "inch"), ("--units", "deg,rad"),
-        ("--columns", "time"), ("--columns", "time=nothing"),
+        ("--columns", "time"), ("--columns", "time=nothing"), ("--time", "nothing"),
+        ("--time", "t", "--columns", "time=u"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(options, motion, capsys):
@@ -107,6 +114,20 @@ def test_an_ambiguous_table_is_refused(motion, capsys):
     header = ["time", *(f"{j}.position" for j in robot.joint_names)]
     Path("a.csv").write_text(written(header, [time, *q.T], ",", ","))
     assert command(capsys, "size", "five_bar", "a.csv").code == 1
+
+
+def test_matlab_files_have_the_columns(motion, capsys):
+    Path("a.csv").write_text(plain(*motion))
+    for out in ("t.csv", "t.mat"):
+        done = command(capsys, "torques", "five_bar", "a.csv", "--out", out, "--no-picture")
+        assert done.code == 0, done.err
+    found = {k: v for k, v in loadmat("t.mat").items() if not k.startswith("__")}
+    with Path("t.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(found) == [re.sub(r"\W", "_", name) for name in rows[0]]
+    for name, values in zip(rows[0], found.values(), strict=True):
+        expected = [float(row[name] or "nan") for row in rows]
+        np.testing.assert_array_equal(values[:, 0], expected)
 
 
 def test_pipes(tmp_path, monkeypatch):

@@ -14,15 +14,15 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from pkm_twin import Robot
-from pkm_twin.apps.calibration import calibrate
-from pkm_twin.apps.calibration_state import Poses
 from pkm_twin.apps.cli import app
 from pkm_twin.apps.pose_table import parse_columns, read_poses
-from pkm_twin.apps.transmission import Transmission
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.entries import data_of
+from pkm_twin.identification.calibration import calibrate
+from pkm_twin.identification.calibration_state import Poses
+from pkm_twin.identification.transmission import Transmission
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
-from pkm_twin.ros.messages import JointReader
+from pkm_twin.messages.reading import JointReader
+from pkm_twin.robot.entries import data_of
 from test.support.robots import load, random_joints
 
 Array = NDArray[np.float64]

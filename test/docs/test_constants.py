@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from delta_dynamics.feedforward import Settings
 from pkm_twin.codegen import program
-from pkm_twin.codegen.kernels import STEPS
+from pkm_twin.codegen.code import STEPS
 from pkm_twin.codegen.lu import pivot_order
 from test.support.pages import numbers, text_of
 

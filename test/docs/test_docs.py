@@ -16,8 +16,8 @@ import pytest
 
 from pkm_twin import errors as module
 from pkm_twin import robot_names
-from test.docs import architecture, engine, errors, parameters
 from test.support.command import typed_line
+from tools.pages import architecture, engine, errors, parameters, trend
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -68,6 +68,24 @@ def test_a_new_machine_from_an_empty_file_to_torques(tmp_path, twin, monkeypatch
 
 
 @pytest.mark.long
+def test_a_printer_from_its_configuration_to_the_next(tmp_path, twin, monkeypatch):
+    """And the figures of the page are those that are printed."""
+    monkeypatch.chdir(tmp_path)
+    page = (DOCS / "partial_measurements.md").read_text(encoding="utf-8")
+    (tmp_path / "examples").symlink_to(DOCS.parent / "examples")
+    ((language, block, _),) = blocks("partial_measurements.md")
+    printed = run(language, block, tmp_path, twin)
+    for kind, before, after in zip(("height", "distance"), (1.02, 1.06), (2, 3), strict=True):
+        (row,) = re.findall(rf"^\W+{kind}\W+\d+\W+([\d.]+)\W+([\d.]+)", printed, re.M)
+        assert [float(x) for x in row] == pytest.approx([before, after / 1e3], abs=5e-3 * before)
+        assert re.search(rf"{kind}s (agree )?to {after} um[^()]*\({before} mm before\)", page)
+    known = r"known\s+to ([\d.]+) mm in 100 mm"
+    assert re.findall(known, page) == re.findall(known, printed)
+    assert "8 measurements give the position to 0.1 mm" in printed
+    assert "delta_radius" in printed
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("page", ["export_fmu.md", "simulators.md"])
 def test_the_blocks_of_a_page_run(page, tmp_path, twin, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -75,9 +93,9 @@ def test_the_blocks_of_a_page_run(page, tmp_path, twin, monkeypatch):
     assert len(printed) == 2 and all(printed)
 
 
-def test_blocks_of_variants_and_design(tmp_path, monkeypatch):
+def test_python_blocks_of_pages(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for page in ("variants.md", "design.md"):
+    for page in ("variants.md", "design.md", "friction.md", "contact.md"):
         space = {}
         for language, block, _ in blocks(page):
             if language == "python":
@@ -132,6 +150,13 @@ def test_the_sizes_of_the_engine_are_todays():
         # Rounding of another processor may leave a number beside zero, and an operation more.
         assert [int(n) for n in told[1:]] == pytest.approx([int(n) for n in found[1:]], rel=0.05)
     assert table.sub("", page) == table.sub("", now)
+
+
+def test_the_output_of_the_trend_page_is_todays(tmp_path):
+    """Else `make pages` writes it and draws its picture."""
+    page = (DOCS / "trend.md").read_text(encoding="utf-8")
+    assert trend.rewritten(page, tmp_path / "trend.png") == page
+    assert (tmp_path / "trend.png").stat().st_size
 
 
 def test_the_picture_of_imports_has_every_folder():

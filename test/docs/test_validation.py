@@ -147,8 +147,8 @@ def test_torques_of_random_machines():
     """Some of the states that `make certificate` takes are within what the page says of all."""
     pytest.importorskip("mujoco")
     pytest.importorskip("pinocchio")
-    from test.certificate.compare import compare
-    from test.certificate.machines import ROBOTS
+    from tools.certificate.compare import compare
+    from tools.certificate.machines import ROBOTS
 
     worst = numbers(PAGE, r"at 50 digits \(\d+ states\): worst relative difference (\S+)\. ")[0]
     for k, name in enumerate(ROBOTS):

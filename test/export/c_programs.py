@@ -44,6 +44,9 @@ def functions(robot: Robot) -> dict[str, Callable[..., Any]]:
     }
     if has(robot, "massive"):
         result["torques"] = lambda q, qd, qdd, w: inverse_dynamics(robot, q, qd, qdd, w)
+        result["torques_and_singularity"] = lambda q, *rest: np.column_stack(
+            [result["torques"](q, *rest), robot.singularity(q)]
+        )
         result["mass_matrix"] = lambda q: flat(mass_matrix(robot, q))
         result["accelerations"] = lambda q, qd, tau, w: forward_dynamics(robot, q, qd, tau, w)
     if has(robot, "structure"):
@@ -60,7 +63,7 @@ def inputs_of(robot: Robot, motion: tuple[Array, ...]) -> dict[str, tuple[Array,
     if "inverse" in result:
         result["inverse"] = (robot.try_forward(q)[0],)
     if "torques" in result:
-        result["torques"] = motion
+        result["torques"] = result["torques_and_singularity"] = motion
         result["accelerations"] = (q, qd, 0.1 * qdd, wrench)
     if "strain_energy" in result:
         result["strain_energy"] = (q, wrench)

@@ -15,8 +15,8 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.plant import Plant
 from pkm_twin import robot_names
 from pkm_twin.apps.cli import main
-from pkm_twin.machine.robot_urdf import robot_mjcf, robot_sdf, robot_urdf
 from pkm_twin.mechanisms.machine import Machine
+from pkm_twin.robot.robot_urdf import robot_mjcf, robot_sdf, robot_urdf
 from test.machine.random_machines import variant
 from test.support.robots import load, loaded, partly_long, random_motion
 

@@ -20,8 +20,9 @@ from unittest import mock
 import typer.main
 
 from pkm_twin.apps import cli
-from pkm_twin.machine import catalogue, schema
-from pkm_twin.machine.robot import Robot
+from pkm_twin.machine.strict_yaml import read_yaml
+from pkm_twin.robot import catalogue
+from pkm_twin.robot.robot import Robot
 from test.fuzz.bags import small_bag
 from test.fuzz.tally import Kind
 
@@ -37,8 +38,8 @@ class Once:
     def __init__(self) -> None:
         self.tree = functools.cache(typer.main.get_command)
         self.robots: dict[str, Robot] = {}
-        self.shipped = functools.cache(schema.read_yaml)
-        self.read, self.build = schema.read_yaml, catalogue.robot_of_data
+        self.shipped = functools.cache(read_yaml)
+        self.read, self.build = read_yaml, catalogue.robot_of_data
 
     def read_yaml(self, path: Path) -> dict[str, Any]:
         return self.shipped(path) if path.parent == catalogue.config_folder() else self.read(path)
@@ -53,7 +54,7 @@ class Once:
     def used(self) -> Iterator[None]:
         with (
             mock.patch.object(typer.main, "get_command", self.tree),
-            mock.patch.object(schema, "read_yaml", self.read_yaml),
+            mock.patch.object(catalogue, "read_yaml", self.read_yaml),
             mock.patch.object(catalogue, "robot_of_data", self.robot_of_data),
         ):
             yield

@@ -21,9 +21,9 @@ from pkm_twin import load, robot_names
 from pkm_twin.apps import torques
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.bags.reader import inspect
-from pkm_twin.machine.catalogue import config_folder, robot_of_data
-from pkm_twin.machine.robot import Robot
-from pkm_twin.machine.robot_urdf import robot_urdf
+from pkm_twin.robot.catalogue import config_folder, robot_of_data
+from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.robot_urdf import robot_urdf
 from test.bags.folders import make_folder
 from test.fuzz.bags import small_bag
 from test.fuzz.tally import Kind, damaged, refusal

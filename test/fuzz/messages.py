@@ -24,8 +24,8 @@ from pkm_twin import load
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
-from pkm_twin.machine.robot import Robot
-from pkm_twin.ros.intake import JointStateDecoder, RawTrajectory
+from pkm_twin.messages.intake import JointStateDecoder, RawTrajectory
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor import monitor
 from test.fuzz.rules import Rules
 from test.fuzz.tally import Kind

@@ -154,8 +154,8 @@ class Fuzzed:
             assert process.alive(), f"{name} died\n{process.output}"
             values = values_of(self.peer.diagnostics(f"/{name}"))
             assert values["exceptions"] == "0", f"{name} raised\n{process.output}"
-            refused["requests"] += int(values["requests refused"])
-            refused["clocks"] += int(values["clock messages refused"])
+            refused["requests"] += int(values["requests rejected"])
+            refused["clocks"] += int(values["clock messages rejected"])
         torques = self.peer.received("/feeding/joint_torques")
         for message in torques:
             assert all(map(math.isfinite, message.effort)), message

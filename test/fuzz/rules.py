@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from test.nodes.harness import SECOND
 
 STALE = SECOND // 10

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.fit_rows import Recorded
 from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.machine.entries import entries, with_entries
+from pkm_twin.identification.fit_rows import Recorded
+from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion
 
 Array = NDArray[np.float64]

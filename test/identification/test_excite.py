@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.excitation import Bounds, Judge, excite
-from delta_dynamics.file_parameters import file_parameters
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.excitation import Bounds, Judge, excite
+from pkm_twin.identification.file_parameters import file_parameters
 from test.support.robots import load
 
 

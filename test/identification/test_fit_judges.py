@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,12 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, mass_matrix
-from delta_dynamics.estimation import estimate
-from delta_dynamics.file_parameters import file_parameters
-from delta_dynamics.fit import Fit, fit
-from delta_dynamics.fit_plausible import recording_fault
-from delta_dynamics.fit_rows import Recorded, rows_of
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.estimation import estimate
+from pkm_twin.identification.file_parameters import file_parameters
+from pkm_twin.identification.fit import Fit, fit
+from pkm_twin.identification.fit_plausible import recording_fault
+from pkm_twin.identification.fit_rows import Recorded, rows_of
 from pkm_twin.machine.shared import above_zero
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy
 from test.laws.test_fit import truths
@@ -97,6 +98,28 @@ def test_others_are_rejected_too(what: str, name: str) -> None:
 @pytest.mark.parametrize("what", partly_long(list(WRONG), "gains", "sensors", "lengths"))
 def test_another_machine_of_the_file_s_kind_is_not_rejected(what: str) -> None:
     assert not rejected(what, "linear_delta", 4)
+
+
+WRONG_WAY = partly_long(
+    product(["five_bar", "prru", "rps3"], [True, False], [1.0, -1.0]), ("five_bar", False, -1.0)
+)
+
+
+@pytest.mark.parametrize("case", WRONG_WAY)
+def test_a_drive_that_counts_the_wrong_way_is_named(case: tuple[str, bool, float]) -> None:
+    """Its positions are mirrored where it was homed, or anywhere: no fault of units or times."""
+    name, homed, way = case
+    m = machine(load(name), np.random.default_rng(6), 6.0)
+    sound = noisy(m.recorded(), np.random.default_rng(7))
+    q, effort = sound.q.copy(), sound.effort.copy()
+    middle = m.robot.graph.home[-1] if homed else q[:, -1].mean() + 0.01 * m.robot.size
+    q[:, -1] = 2.0 * middle - q[:, -1]
+    effort[:, -1] *= way
+    record, everything = replace(sound, q=q, effort=effort), file_parameters(m.robot)
+    rows, _ = rows_of(m.robot, everything, record, None)
+    fault = recording_fault(m.robot, everything, record, rows)
+    both = "positions and efforts of" if way < 0.0 else "positions of"
+    assert fault is not None and fault.startswith(f"{both} {m.robot.joint_names[-1]} ")
 
 
 @pytest.mark.long

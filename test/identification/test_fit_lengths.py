@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.file_parameters import file_parameters
-from delta_dynamics.fit import fit
-from delta_dynamics.fit_lengths import USUAL, Lengths
-from delta_dynamics.fit_rows import Recorded, rows_of
 from pkm_twin import Robot
-from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.entries import data_of, with_entries
+from pkm_twin.identification.file_parameters import file_parameters
+from pkm_twin.identification.fit import fit
+from pkm_twin.identification.fit_lengths import USUAL, Lengths
+from pkm_twin.identification.fit_rows import Recorded, rows_of
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.entries import data_of, with_entries
 from test.identification.machines import machine, noisy
 from test.machine.random_machines import variant
 from test.support.robots import load
@@ -73,7 +73,7 @@ def test_columns_are_differences_of_the_efforts(name: str) -> None:
         expected = loaded * sides[0] + (1.0 - loaded) * sides[1]
         np.testing.assert_allclose(found[..., k], expected, rtol=0, atol=1e-4 * size)
         tried += 1
-    assert tried > 2
+    assert tried >= min(3, len(lengths.paths))
 
 
 def test_the_file_says_how_well_its_lengths_are_known() -> None:

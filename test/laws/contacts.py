@@ -3,18 +3,23 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from delta_dynamics import ContactMonitor, inverse_dynamics
+from delta_dynamics.isolation import CLAMPING, PLATFORM, joined_bodies, limbs_of
 from delta_dynamics.regressor import PAYLOAD, TEN, parameter_names, parameter_values, regressor
 from pkm_twin import Robot
-from test.support.robots import joint_range, load
+from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.members import Place
+from pkm_twin.robot.outline import Bar, body_points, robot_bars
+from test.support.robots import joint_range
 
 Array = NDArray[np.float64]
+Spot = tuple[Place, Place, float]
 
 RATE = 500.0
 REST = 2.0
@@ -55,14 +60,16 @@ class Stream:
         return touching
 
 
-def moves(robot: Robot, rng: np.random.Generator, count: int, share: float) -> tuple[Array, ...]:
+def moves(
+    robot: Robot, rng: np.random.Generator, count: int, share: float, rest: float = REST
+) -> tuple[Array, ...]:
     """Rest, then point to point without jerk at the ends: time, q, qd, qdd.
 
     :param share: of the joints' range that moves go to; each takes a quarter to half a second.
     """
     middle, half = joint_range(robot)
     here = robot.inverse(robot.home())
-    pieces = [np.repeat(here[None], round(REST * RATE), 0)]
+    pieces = [np.repeat(here[None], round(rest * RATE), 0)]
     while len(pieces) <= count:
         goal = middle + share * half * rng.uniform(-1.0, 1.0, len(middle))
         seconds = rng.uniform(0.25, 0.6)
@@ -81,15 +88,18 @@ def moves(robot: Robot, rng: np.random.Generator, count: int, share: float) -> t
 def measured(
     robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], *,
     masses: float = 0.0, each: float = 0.0, friction: float = 0.0, wrench: Array | None = None,
+    external: Array | None = None,
 ) -> Stream:  # fmt: skip
     """Efforts of a machine that departs from the model, with noise on rates and efforts.
 
     :param masses: all bodies are heavier by this share; ``each``: each by one of its own within it.
     :param friction: dry friction that the model does not have, a share of each joint's peak effort.
-    :param wrench: on the platform, shape (k, 6).
+    :param wrench: on the platform, shape (k, 6); ``external``: efforts of any contact, (k, n).
     """
     time, q, qd, qdd = motion
     effort = inverse_dynamics(robot, q, qd, qdd, wrench)
+    if external is not None:
+        effort = effort - external
     free = inverse_dynamics(robot, q, qd, qdd)
     peak = np.abs(free).max(0)
     if masses or each:
@@ -135,37 +145,144 @@ def seen_after(stream: Stream, robot: Robot, begin: float) -> float:
     return float(late[0]) if len(late) else np.inf
 
 
-def table(robots: list[str], seeds: range) -> str:
-    """Share of a run that is taken for a contact, and pushes that are seen, in Markdown."""
-    lines = ["| machine | " + " | ".join(robots) + " |", "|---" * (1 + len(robots)) + "|"]
-    for what, off in OFF.items():
-        cells = []
-        for name in robots:
-            robot, shares = load(name), []
-            for seed in seeds:
-                rng = np.random.default_rng(seed)
-                motion = moves(robot, rng, 8, 0.7)
-                shares.append(measured(robot, rng, motion, **off).watched(robot).mean())
-            cells.append(f"{100 * max(shares):.2g} %")
-        lines.append(f"| {what} | " + " | ".join(cells) + " |")
-    for share in (0.15, 0.2, 0.3, 0.5):
-        cells = []
-        for name in robots:
-            robot, delays = load(name), []
-            for seed in seeds:
-                rng = np.random.default_rng(seed)
-                motion = moves(robot, rng, 8, 0.7)
-                begin = rng.uniform(REST + 0.5, motion[0][-1] - 0.3)
-                wrench = pushed(robot, rng, motion, share, begin)
-                stream = measured(robot, rng, motion, wrench=wrench, **OFF["both, 3 % each"])
-                delays.append(seen_after(stream, robot, begin))
-            found = [delay for delay in delays if delay < 0.3]
-            late = f", {1e3 * np.median(found):.0f} ms" if found else ""
-            cells.append(f"{len(found)} of {len(delays)}{late}")
-        lines.append(f"| a push of {100 * share:.0f} % of peak | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+# Contacts with any body, of which the efforts follow from the places of points alone.
+
+STIFFNESS = 30e3
+"""Of what is struck, N/m: of the order of a human arm in ISO/TS 15066."""
+MOST = 500.0
+"""Greatest force, N."""
+GRIP = 0.2
+"""Coefficient of friction of the contact."""
+SLOWEST = 0.05
+"""Least speed of a contact, m/s."""
 
 
-if __name__ == "__main__":
-    ROBOTS = ["delta_cu", "linear_delta", "rps3", "stewart", "prru", "five_bar"]
-    print(table(ROBOTS, range(int(sys.argv[1]))))
+@dataclass(frozen=True)
+class Strike:
+    """A contact: its class as in ``ContactPlace.classes``, its bodies, and when it begins, s.
+
+    ``point``: where it is, (k, 3); ``external``: efforts, (k, n).
+    """
+
+    where: str
+    bodies: tuple[str, ...]
+    begin: float
+    point: Array
+    external: Array
+
+
+def place_and_jacobian(robot: Robot, q: Array, where: Spot) -> tuple[Array, Array]:
+    """A point of a bar at each sample (k, 3), and its Jacobian (k, 3, n), by differences."""
+    start, end, s = where
+    at = robot.engine.tree.at
+
+    def place(q: Array) -> Array:
+        turned, origin = robot.placements(q)
+        ends = [
+            origin[body] + turned[body] @ (point - at[body]) if body in turned else point
+            for body, point in (start, end)
+        ]
+        return np.asarray((1 - s) * ends[0] + s * ends[1], np.float64)
+
+    step = 1e-6
+    columns = [(place(q + step * e) - place(q - step * e)) / (2 * step) for e in np.eye(q.shape[1])]
+    return place(q), np.stack(columns, -1)
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12), np.float64)
+
+
+@lru_cache(16)
+def _bars(robot: Robot) -> tuple[Bar, ...]:
+    return robot_bars(robot)
+
+
+def spot(robot: Robot, rng: np.random.Generator, parts: list[str]) -> tuple[str, Spot, bool]:
+    """A place on one of the parts: which, where, and whether it is a bar."""
+    found = [bar for bar in _bars(robot) if bar.part in parts]
+    if not found:
+        body = parts[int(rng.integers(len(parts)))]
+        only = body, body_points(robot.graph)[body][0]
+        return body, (only, only, 0.0), False
+    length = np.array([np.linalg.norm(b.end[1] - b.start[1]) for b in found])
+    bar = found[int(rng.choice(len(found), p=length / length.sum()))]
+    sliding = any(
+        j.kind == "prismatic" and j.inner == BASE and j.outer == bar.part
+        for j in robot.graph.joints.values()
+    )
+    thin = bar.part != robot.graph.platform and not sliding
+    return bar.part, (bar.start, bar.end, float(rng.uniform())), thin
+
+
+def strike(
+    robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], kind: str
+) -> Strike | None:
+    """A contact of a kind, ``platform``, ``limb`` or ``clamping``; None where the draw is none.
+
+    The machine follows its path; what it strikes is a spring that the path compresses.
+    """
+    time, q, qd, _ = motion
+    moving = time[np.abs(qd).max(1) > 0.0][0]
+    limbs = limbs_of(robot)
+    platform, names = robot.graph.platform, sorted({*limbs.values()} - {PLATFORM})
+    limb = names[int(rng.integers(len(names)))]
+    own = [platform] if kind == PLATFORM else [p for p, name in limbs.items() if name == limb]
+    late = (time > moving + 0.2) & (time < time[-1] - 0.15)
+    k = int(rng.choice(np.flatnonzero(late)))
+    body, near, thin = spot(robot, rng, own)
+    far = near
+    bodies: tuple[str, ...] = (body,)
+    if kind == CLAMPING:
+        apart = [
+            p for p, name in limbs.items()
+            if name != limbs[body] and (p, body) not in joined_bodies(robot.graph)
+        ]  # fmt: skip
+        if not apart:
+            return None
+        other, far, _ = spot(robot, rng, apart)
+        bodies = (body, other)
+
+    def touch(q: Array) -> tuple[Array, Array, Array]:
+        """Where it is, its Jacobian, and what it is apart, by joint states (k, n)."""
+        point, jacobian = place_and_jacobian(robot, q, near)
+        if kind != CLAMPING:
+            return point, jacobian, 0.0 * point
+        point_b, jacobian_b = place_and_jacobian(robot, q, far)
+        return (point + point_b) / 2, jacobian - jacobian_b, point - point_b
+
+    _, jacobian, apart = touch(q[k : k + 1])
+    ahead = jacobian[0] @ qd[k]
+    if kind == CLAMPING:
+        normal = apart[0]
+        if np.linalg.norm(normal) > 0.4 * robot.graph.size:
+            return None
+    else:
+        # Even on a plate across the motion: normals as often as their cosine.
+        normal = _unit(rng.normal(size=3)) - _unit(ahead)
+        if thin:
+            ends = (
+                place_and_jacobian(robot, q[k : k + 1], (*near[:2], s))[0][0] for s in (0.0, 1.0)
+            )
+            along = _unit(np.subtract(*ends))
+            normal = normal - along * (along @ normal)
+    normal = _unit(normal)
+    if not -ahead @ normal >= SLOWEST:
+        return None
+    point, jacobian, _ = touch(q[k:])
+    velocity = np.einsum("kin,kn->ki", jacobian, qd[k:])
+    speed = -velocity @ normal
+    depth = np.maximum(np.cumsum(speed) / RATE, 0.0)
+    way = np.broadcast_to(normal, velocity.shape)
+    if kind != CLAMPING:
+        slip = velocity + speed[:, None] * normal
+        size = np.linalg.norm(slip, axis=1, keepdims=True)
+        way = normal - GRIP * np.divide(slip, size, out=np.zeros_like(slip), where=size > SLOWEST)
+    per_newton = np.einsum("kin,ki->kn", jacobian, way)
+    peak = np.abs(inverse_dynamics(robot, *motion[1:])).max(0)
+    most = min(MOST, 1.5 / max(float((np.abs(per_newton) / peak).max()), 1e-9))
+    external = np.zeros_like(q)
+    external[k:] = np.minimum(STIFFNESS * depth, most)[:, None] * per_newton
+    places = np.full((len(q), 3), np.nan)
+    places[k:] = point
+    return Strike(kind if kind != "limb" else limb, bodies, float(time[k]), places, external)

@@ -12,7 +12,7 @@ import pytest
 import delta_dynamics as dynamics
 import stiffness_monitor as elasticity
 from pkm_twin.codegen.arrays import doubles, later
-from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.robot.catalogue import robot_of_data
 from stiffness_monitor.modes import natural_frequencies
 from test.support.robots import load
 

@@ -15,8 +15,8 @@ from scipy.optimize import lsq_linear
 from delta_dynamics.isotropy import tilted_pose
 from pkm_twin.atlas.workspace.sweep import workspace_sweep
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.kinematics.clearance import clearance, distance, has_clearance
-from pkm_twin.kinematics.workspace import reachable, regular_workspace
+from pkm_twin.robot.clearance import clearance, distance, has_clearance
+from pkm_twin.robot.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import structural_model
 from test.support.robots import SHIPPED, both_ways, load, parameters_of, random_poses
 
@@ -357,11 +357,11 @@ PROGRAM = """
 import json, sys
 import numpy as np
 from pkm_twin import load
-from pkm_twin.codegen import kernels
-from pkm_twin.kinematics.clearance import clearance
-from pkm_twin.kinematics.workspace import reachable
+from pkm_twin.codegen.code import compiled
+from pkm_twin.robot.clearance import clearance
+from pkm_twin.robot.workspace import reachable
 given = json.loads(sys.stdin.read())
-result = {"compiled": kernels.compiled()}
+result = {"compiled": compiled()}
 for name, poses in given.items():
     result[name] = clearance(load(name), poses).tolist()
     result["one " + name] = float(clearance(load(name), poses[0]))

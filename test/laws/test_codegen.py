@@ -11,17 +11,22 @@ import sys
 import numpy as np
 import pytest
 
-from pkm_twin.codegen import cache, kernels
+from delta_dynamics import inverse_dynamics
+from pkm_twin import variants
+from pkm_twin.codegen import cache, parts
+from pkm_twin.codegen import code as codes
 from pkm_twin.codegen import expressions as ex
 from pkm_twin.codegen.cholesky import FLOOR, traces_over
-from pkm_twin.codegen.kernels import Code, Kernel
+from pkm_twin.codegen.code import Code
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU, independent_rows, pivot_order
 from pkm_twin.codegen.program import Program
+from pkm_twin.errors import ParameterError, UnreachableError
 from test.support.plain import PlainKernel
 from test.support.robots import every_robot, load, random_joints
 
 NONE = np.zeros(0)
-compiled = pytest.mark.skipif(not kernels.compiled(), reason="no compiler here")
+compiled = pytest.mark.skipif(not codes.compiled(), reason="no compiler here")
 
 
 def program(write, size):
@@ -124,6 +129,61 @@ def test_both_back_ends_agree_and_one_sample_has_the_bits_of_its_batch(name, rng
                 np.testing.assert_array_equal(one, fast[k])
 
 
+@compiled
+def test_large_batches_in_threads_have_the_same_bits(rng, monkeypatch):
+    """Of one machine and of many, with samples that are refused."""
+    robot = load("prru")
+    q = random_joints(robot, rng, 3 * parts.WORTH + 7)
+    motion = (q, *rng.normal(size=(2, *q.shape)))
+    few = tuple(array[:101].copy() for array in motion)
+    few[0][5, 0] = 40.0
+    out_of_reach = np.concatenate((q, few[0]))
+    many = variants(robot, {"geometry.limb_length": rng.uniform(0.5, 0.7, 3 * parts.WORTH // 50)})
+
+    def answers():
+        with pytest.raises(UnreachableError) as refused:
+            robot.forward(out_of_reach)
+        assert refused.value.index == (len(q) + 5,)
+        return inverse_dynamics(robot, *motion), many.inverse_dynamics(*few)
+
+    alone, used = answers(), []
+    monkeypatch.setattr(parts, "threads", lambda: used.append(3) or 3)
+    for one, other in zip(alone, answers(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert len(used) >= 3
+    assert np.isnan(alone[1][:, 5]).all()
+
+
+@compiled
+def test_a_call_keeps_its_arguments_while_other_threads_allocate(monkeypatch):
+    """Compiled code reads where and how many its samples are after the interpreter's lock."""
+    code = Code(lambda: program(lambda x: [2.0 * x[0]], 1), "test arguments")
+    header, prepare, batch, one = code._loaded
+    taken = []
+
+    def interrupted(address):
+        taken.extend(np.zeros(k, np.int64) for k in range(1, 40))
+        return batch(address)
+
+    monkeypatch.setitem(code.__dict__, "_loaded", (header, prepare, interrupted, one))
+    x = np.arange(codes.SMALL + 5.0)[:, None]
+    (y,), status = Kernel(code)(NONE, x)
+    assert status is None and len(taken) > 0
+    np.testing.assert_array_equal(y, 2.0 * x)
+
+
+def test_a_number_of_threads_is_a_number(monkeypatch):
+    monkeypatch.delenv(parts.VARIABLE, raising=False)
+    assert parts.threads() == 1
+    for text, number in (("", 1), ("3", 3), ("0", len(os.sched_getaffinity(0)))):
+        monkeypatch.setenv(parts.VARIABLE, text)
+        assert parts.threads() == number
+    for text in ("two", "-1", "1.5", "²"):
+        monkeypatch.setenv(parts.VARIABLE, text)
+        with pytest.raises(ParameterError):
+            parts.threads()
+
+
 @pytest.mark.parametrize("size", [1, 2, 5, 12])
 def test_sparse_factors_solve_as_numpy_does(size, rng):
     for _ in range(5):
@@ -186,10 +246,9 @@ def test_the_cache_is_an_optimisation(tmp_path):
     stored = sorted(folder.iterdir())
     assert len(stored) == 2
     whole = [path.read_bytes() for path in stored]
-    for damaged in (whole[0][:100], b"", b"\0" * len(whole[0]), whole[0][:-1] + b"\1"):
-        stored[0].write_bytes(damaged)
-        assert finished(start(folder)) == first
-        assert [path.read_bytes() for path in sorted(folder.iterdir())] == whole
+    stored[0].write_bytes(whole[0][:-1] + b"\1")
+    assert finished(start(folder)) == first
+    assert [path.read_bytes() for path in sorted(folder.iterdir())] == whole
     # Nobody writes into that FIFO, and the device never ends.
     for kind in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
         stored[0].unlink()
@@ -234,6 +293,11 @@ def other_owner(path, _):
         os.chown(path, 12345, -1)
 
 
+def content(change):
+    """A stored program, changed and not sealed."""
+    return lambda path, _: path.write_bytes(change(path.read_bytes()))
+
+
 def sealed(change):
     """A stored program, changed and then sealed again."""
 
@@ -259,6 +323,9 @@ HARM = [
     other_name,
     other_mode,
     other_owner,
+    content(lambda whole: b""),
+    content(lambda whole: whole[:100]),
+    content(lambda whole: bytes(len(whole))),
     sealed(lambda _, code: (b"{", code)),
     sealed(lambda _, code: (b"[" * 100_000, code)),
     sealed(lambda _, code: (b"[]", code)),

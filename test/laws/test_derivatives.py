@@ -16,7 +16,7 @@ from pkm_twin import (
     variants,
 )
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.entries import entries
+from pkm_twin.robot.entries import entries
 from stiffness_monitor import compliance, compliance_derivatives
 from test.support.robots import every_robot, has, load, often, partly_long, some_robots
 

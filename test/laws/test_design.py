@@ -3,11 +3,8 @@
 
 from __future__ import annotations
 
-from time import process_time
-
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import variants
@@ -16,8 +13,6 @@ from pkm_twin.design.pose_path import Followed
 from pkm_twin.design.quantities import QUANTITIES
 from pkm_twin.design.tolerance import workspace_states
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.kinematics.engine import Engine
-from pkm_twin.machine.entries import with_entries
 from pkm_twin.paths import cycle, timed
 from test.laws.test_derivatives import POINTS, WEIGHTS
 from test.support.robots import load, partly_long
@@ -46,13 +41,15 @@ def wave(name, samples=7):
     )
 
 
-@pytest.fixture(scope="module")
-def picking():
-    """The Delta's pick-and-place path."""
+def pick_and_place():
+    """The Delta and a path of it."""
     robot = load("delta")
     motion = timed(robot, cycle(robot, 0.025, 0.2, 0.025), duration=0.5).uniform(100.0)
     path = PosePath.of_joints(robot, motion.time, motion.q, motion.qd, motion.qdd)
     return robot, path
+
+
+picking = pytest.fixture(scope="module")(pick_and_place)
 
 
 @pytest.mark.parametrize("name", partly_long(("delta", "delta_cu", "stewart"), "delta"))
@@ -188,45 +185,3 @@ def test_an_error_budget_is_that_of_drawn_machines():
     apart = position - robot.platform(q)[0]
     np.testing.assert_allclose(found.position, np.sqrt((apart**2).mean(0).sum(-1)), rtol=0.05)
     assert sum(found.share(path) for path in sigma) == pytest.approx(1.0)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(3600)
-def test_an_optimiser_that_compiles_each_machine_finds_no_better_one(picking, monkeypatch):
-    robot, path = picking
-    began = process_time()
-    found = design(robot, BOX, path, "peak-effort", ["singularity>=0.1"], starts=16)
-    took = process_time() - began
-    structure = Engine.structure.func
-    monkeypatch.setattr(Engine, "structure", property(lambda e: structure(e) + e.graph.key))
-    counted = 0
-
-    def asked(x):
-        """Peak effort of the machine as a robot of its own; much where it misses a bound."""
-        nonlocal counted
-        counted += 1
-        try:
-            machine = with_entries(robot, dict(zip(BOX, x.tolist(), strict=True)))
-            q = machine.inverse(path.pose)
-            miss = 0.1 - machine.singularity(q).min()
-            qd = np.linalg.solve(machine.jacobian(q), path.rate[..., None])
-            bias = machine.pose_acceleration(q, qd[..., 0], np.zeros_like(q))
-            qdd = np.linalg.solve(machine.jacobian(q), (path.acceleration - bias)[..., None])
-            tau = inverse_dynamics(machine, q, qd[..., 0], qdd[..., 0])
-        except (PkmTwinError, ValueError):
-            return 1e3
-        return np.abs(tau).max() + 1e3 * max(0.0, miss)
-
-    start = np.array([robot.number(number) for number in BOX])
-    began = process_time()
-    other = minimize(
-        asked, start, method="Nelder-Mead", bounds=list(BOX.values()),
-        options={"xatol": 1e-4, "fatol": 1e-4},
-    )  # fmt: skip
-    theirs = process_time() - began
-    print(
-        f"design {found.best.quantities['peak-effort']:.5f} N m in {took:.2f} s, "
-        f"Nelder-Mead {other.fun:.5f} N m in {theirs:.1f} s, {counted} machines compiled"
-    )
-    assert found.best.quantities["peak-effort"] <= 1.005 * other.fun
-    assert took < theirs / 20.0

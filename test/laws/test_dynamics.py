@@ -212,8 +212,8 @@ import json, sys
 import numpy as np
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
-from pkm_twin.codegen import kernels
-found = {"compiled": kernels.compiled()}
+from pkm_twin.codegen.code import compiled
+found = {"compiled": compiled()}
 for name, given in json.loads(sys.stdin.read()).items():
     robot, q = load(name), np.array(given)
     tau = inverse_dynamics(robot, q, 2 * q, 3 * q, np.ones(6))

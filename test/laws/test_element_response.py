@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkm_twin.apps.elastic_fit import Deflected, fit_elements
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.machine.entries import with_entries
+from pkm_twin.identification.elastic_fit import Deflected, fit_elements
+from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, strain_energy
 from stiffness_monitor.response import element_response
 from test.support.robots import load, rigid

@@ -12,15 +12,15 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, regressor
-from delta_dynamics.estimation import estimate, possible
-from delta_dynamics.file_parameters import file_parameters
-from delta_dynamics.fit import Fit, Recorded, fit
 from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.entries import entries, with_entries
+from pkm_twin.identification.estimation import estimate, possible
+from pkm_twin.identification.file_parameters import file_parameters
+from pkm_twin.identification.fit import Fit, Recorded, fit
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.shared import pseudo_inertia
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.entries import entries, with_entries
 from test.laws.recordings import smooth_motion
 from test.support.robots import load, massive, parameters_of, random_motion
 

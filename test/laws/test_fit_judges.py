@@ -12,12 +12,13 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.fit import fit
-from delta_dynamics.fit_rows import Recorded
 from pkm_twin import Robot
 from pkm_twin.apps.certificate.maximal import Maximal, State
-from pkm_twin.machine.robot_urdf import robot_description
-from test.laws.recordings import engine_efforts, smooth_motion
+from pkm_twin.identification.fit import fit
+from pkm_twin.identification.fit_rows import Recorded
+from pkm_twin.robot.robot_urdf import robot_description
+from test.identification.machines import machine
+from test.laws.recordings import engine_efforts
 from test.laws.test_fit import truths
 from test.support.robots import load
 
@@ -47,23 +48,10 @@ def drawn(name: str) -> tuple[Robot, Robot, Recorded, Array]:
     """The robot as its file has it and in truth, a recording, and the efforts' size by joint."""
     rng = np.random.default_rng([7, *name.encode()])
     robot = load(name)
-    time, q, qd, qdd = smooth_motion(robot, rng, 12.0, 100.0)
-    size = np.sqrt(np.mean(inverse_dynamics(robot, q, qd, qdd) ** 2, 0))
-    n, radius = robot.joints_count, robot.size
-    mass = rng.uniform(0.3, 1.2) * robot.graph.bodies[robot.graph.platform].mass
-    moment = mass * (rng.uniform(0.2, 0.4) * radius) ** 2
-    truth = robot.changed(
-        friction={
-            "viscous": (rng.uniform(0.03, 0.15, n) * size / np.sqrt(np.mean(qd**2, 0))).tolist(),
-            "coulomb": (rng.uniform(0.02, 0.1, n) * size).tolist(),
-        },
-        payload={
-            "mass": mass, "com": (radius * rng.uniform(-0.3, 0.3, 3)).tolist(),
-            "inertia": [moment, 1.3 * moment, 1.6 * moment],
-        },
-    )  # fmt: skip
-    efforts = engine_efforts(Walking(robot_description(truth)), q, qd, qdd)
-    return robot, truth, Recorded(name, time, q, efforts), size
+    m = machine(robot, rng)
+    size = np.sqrt(np.mean(inverse_dynamics(robot, m.q, m.qd, m.qdd) ** 2, 0))
+    efforts = engine_efforts(Walking(robot_description(m.truth)), m.q, m.qd, m.qdd)
+    return robot, m.truth, Recorded(name, m.time, m.q, efforts), size
 
 
 @pytest.mark.long

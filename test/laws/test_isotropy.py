@@ -24,7 +24,7 @@ from delta_dynamics.cones import largest
 from delta_dynamics.least_form import _descended, least_direction
 from pkm_twin.errors import ParameterError, SearchError, SingularityError
 from test.support import robots
-from test.support.robots import load, loaded, loaded_like, random_joints
+from test.support.robots import load, loaded, loaded_like, partly_long, random_joints
 
 MASSIVE = [name for name in robots.MASSIVE if len(robots.SHIPPED[name].joint_names) == 3]
 """Directions are on a sphere: machines of three freedoms."""
@@ -165,7 +165,7 @@ def test_the_least_direction_is_global(shift, scales):
     In 14, 28 and 136 the descent from the best of a coarse grid ends in another minimum.
     """
     dense = sphere_directions(20_000)
-    for seed in (1, 2, 3, 14, 28, 136):
+    for seed in (1, 14, 28, 136):
         forms = np.random.default_rng(seed).normal(size=(3, 3, 3))
         forms = forms + forms.swapaxes(-1, -2) + shift * np.eye(3)
         forms = forms * np.array(scales)[:, None, None]
@@ -197,8 +197,8 @@ def test_the_least_direction_of_mirrored_limbs():
         assert value <= min(largest(forms, _descended(forms, x)) for x in best) + 1e-9 * value
 
 
-@pytest.mark.parametrize("count", range(1, 7))
-@pytest.mark.parametrize("size", [1, 2, 4, 6])
+@pytest.mark.parametrize("count", partly_long(range(1, 7), 1, 6))
+@pytest.mark.parametrize("size", partly_long([1, 2, 4, 6], 1, 2, 6))
 def test_the_least_direction_of_any_number_of_forms_and_coordinates(count, size):
     rng = np.random.default_rng(count)
     forms = rng.normal(size=(count, size, size))

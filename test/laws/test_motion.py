@@ -197,7 +197,7 @@ def test_pose_acceleration_is_the_second_derivative(name, rng):
 def test_passive_rates_are_the_derivative_of_passive_positions(name, rng):
     """A stencil of them along a motion: hinges, balls as three angles, slides, rods."""
     robot = load(name)
-    q = random_joints(robot, rng, 40)
+    q = random_joints(robot, rng, 12)
     qd = joint_units_of_size(robot) * rng.normal(size=q.shape)
     times = STEP * np.arange(-3, 4)[:, None, None]
     found = robot.passive_rates(q, qd)

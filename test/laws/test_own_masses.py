@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Machines of one geometry share their programs, but each has its own masses and rotors."""
 
+import copy
 import dataclasses
 import gc
 import weakref
@@ -10,7 +11,9 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, mass_matrix
-from pkm_twin.kinematics.engine import Engine
+from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.linkage import Linkage
+from pkm_twin.mechanisms.machine import Machine
 from test.support.robots import load, parameters_of
 
 
@@ -94,7 +97,23 @@ def test_states_near_home_are_found_once_a_geometry(monkeypatch, tmp_path):
     path = tmp_path / "chosen.yaml"
     path.write_text(yaml.safe_dump(data, sort_keys=False))
     found = []
-    once = Engine._near_home
-    monkeypatch.setattr(Engine, "_near_home", lambda self: found.append(self) or once(self))
+    once = Linkage._near_home
+    monkeypatch.setattr(Linkage, "_near_home", lambda self: found.append(self) or once(self))
     load(path).engine.check()
     assert len(found) == 1
+
+
+def test_masses_are_judged_by_the_file_s_own_numbers():
+    """Whatever machine of the same geometry was loaded before."""
+    data = parameters_of("five_bar")
+    for robot in (data, weightless := copy.deepcopy(data), data):
+        if robot is weightless:
+            for body in robot["bodies"].values():
+                body.update(mass=0.0)
+                body.pop("inertia", None)
+            for joint in robot["joints"].values():
+                joint.pop("rotor_inertia", None)
+            with pytest.raises(ParameterError):
+                Machine.from_data(robot, "weightless")
+        else:
+            assert Machine.from_data(copy.deepcopy(robot), "heavy").graph.bodies

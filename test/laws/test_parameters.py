@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from pkm_twin import load, robot_names
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_line
-from pkm_twin.machine.schema import MAX_FILE_SIZE
+from pkm_twin.machine.strict_yaml import MAX_FILE_SIZE
 from test.support.robots import parameters_of
 
 ROBOTS = robot_names()
@@ -206,6 +206,10 @@ class TestValues:
         error = refusal(load_data, changed(DELTA, dotted, value))
         assert error.field.startswith(dotted)
         assert error.value == value
+
+    def test_a_length_in_millimetres_is_told_the_unit(self, load_data):
+        error = refusal(load_data, changed(DELTA, "geometry.arm_length", 190.0))
+        assert error.bound.endswith(" 100 m")
 
     @pytest.mark.parametrize(
         ("dotted", "value"),

@@ -8,9 +8,9 @@ import yaml
 from delta_dynamics import inverse_dynamics, least_norm_reactions
 from pkm_twin import robot_names
 from pkm_twin.errors import SingularityError, UnreachableError
-from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.robot_urdf import robot_description
-from test.machine.random_machines import MACHINES
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.robot_urdf import robot_description
+from test.machine.random_machines import FILES
 from test.support.robots import every_robot, load, often, partly_long, random_joints
 
 SIZES = (0.15, 0.5, 1.2)
@@ -31,7 +31,7 @@ NAMES = [
 
 
 def machine(name):
-    return load(name) if name in robot_names() else load(MACHINES / f"{name}.yaml")
+    return load(name) if name in robot_names() else load(FILES[name])
 
 
 def apart(robot, one, other):
@@ -120,7 +120,7 @@ def test_tubes_are_half_as_long_as_the_limb_at_home():
 @pytest.mark.parametrize("shift", [0.0, 0.05])
 def test_all_joints_of_a_spherical_machine_in_one_point(shift, tmp_path, rng):
     """Reactions and torques do not hang on a size that there is not; nor where the point is."""
-    data = yaml.safe_load((MACHINES / "rrr3_spherical.yaml").read_text())
+    data = yaml.safe_load(FILES["rrr3_spherical"].read_text())
     data["origin"] = [0.0, 0.0, shift]
     for section in (data["bodies"], data["limbs"]["bodies"]):
         for body in section.values():

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
-from delta_dynamics.reactions import _joints, _loads
+from delta_dynamics.reactions import loads_kernel
+from delta_dynamics.transmission import transmitters
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from test.support.bodies import bodies, rubs
 from test.support.robots import (
@@ -277,10 +278,9 @@ def test_the_2upr_rpu_cannot_tell_how_its_three_limbs_share_a_twist():
 
 def balance(robot, motion):
     """What every component does to every body: shape (n, 6 bodies, components), base's origin."""
-    engine = robot.massive()
-    (_, rods, places, _), status = engine.kernel("loads", _loads)(robot.inertial, *motion[:3])
+    (_, rods, places), status = loads_kernel(robot)(robot.inertial, *motion)
     assert status is None
-    joints = _joints(engine.graph, rods, places)
+    joints = transmitters(robot.graph, rods, places)
     names = list(dict.fromkeys(c for joint in joints for c in joint.components))
     rows = [n for n in robot.body_names if n != "payload"]
     matrix = np.zeros((len(rods), len(rows), 6, len(names)))

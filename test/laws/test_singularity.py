@@ -18,7 +18,7 @@ from pkm_twin.apps.certificate.rows import stacked
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.singularity import Placed
 from pkm_twin.machine.graph_description import graph_description
-from pkm_twin.machine.robot_urdf import robot_description
+from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import compliance
 from test.machine.random_machines import NAMES, plain
 from test.support.robots import joint_range, load, random_joints

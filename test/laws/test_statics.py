@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.machine.entries import with_entries
+from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, platform_response, stiffness, strain_energy
 from stiffness_monitor.compliance import kernels, member_deflections
 from test.support.robots import ELASTIC, elastic, load, parameters_of, random_joints

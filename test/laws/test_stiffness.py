@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.kinematics.workspace import regular_workspace
 from pkm_twin.machine import schema
-from pkm_twin.machine.catalogue import config_folder
+from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.upr_rpu import UprRpu
+from pkm_twin.robot.catalogue import config_folder
+from pkm_twin.robot.workspace import regular_workspace
 from stiffness_monitor import compliance, reachable, stiffness, strain_energy
 from test.support.robots import load
 from test.support.upr_rpu import closed_form
 
 ROBOT = load("upr_rpu")
-FILE = schema.read_yaml(config_folder() / "upr_rpu.yaml")
+FILE = read_yaml(config_folder() / "upr_rpu.yaml")
 HOME = np.array([-0.6, 0.0, 0.0])
 SWAPPED = [3, 4, 5, 0, 1, 2, 6, 7, 8]
 

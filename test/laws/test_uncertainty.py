@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,16 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics, torque_deviation
+from delta_dynamics.derivatives import torque_effects
 from pkm_twin import Robot, variants
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.entries import entries, given, with_entries
-from stiffness_monitor import compliance, compliance_deviation
+from pkm_twin.machine.places import given
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.derivatives import position_effects
+from pkm_twin.robot.entries import entries, with_entries
+from stiffness_monitor import compliance, compliance_deviation, strain_energy
+from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from test.support.robots import joint_range, load
 
 Array = NDArray[np.float64]
@@ -83,6 +88,32 @@ def check(count: int, tolerance: float) -> None:
 )
 def test_random_machines_spread_as_is_said(count: int, tolerance: float) -> None:
     check(count, tolerance)
+
+
+def test_effects_are_differences_of_machines_with_other_numbers() -> None:
+    geometry = {"geometry.arm_length": {"deviation": 1e-4}, "inertia": {"relative": 0.1}}
+    robot = unsure("delta", {**geometry, "members": {"relative": 0.02}})
+    q, still = robot.graph.home + np.array([0.1, -0.1, 0.2]), np.ones(3)
+    loads = np.diag(np.repeat([1.0, 5.0], 3))
+    pose = robot.forward(q)
+
+    def effect(cause: dict[str, float], call: Callable[[Robot], Array]) -> Array:
+        low, high = (
+            with_entries(robot, {p: robot.number(p) + step * d for p, d in cause.items()})
+            for step in (-0.01, 0.01)
+        )
+        return (call(high) - call(low)) / 0.02
+
+    for found, call in (
+        (position_effects(robot, q), lambda r: r.platform(q)[0]),
+        (torque_effects(robot, q, still, still, loads[0]),
+         lambda r: inverse_dynamics(r, q, still, still, loads[0])),
+        (compliance_effects(robot, pose), lambda r: compliance(r, pose)),
+        (energy_effects(robot, pose, loads), lambda r: strain_energy(r, pose, loads).energies),
+    ):  # fmt: skip
+        expected = np.stack([effect(cause, call) for cause in robot.causes.values()], -1)
+        assert expected.any()
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
 def test_a_file_that_names_none_is_sure() -> None:

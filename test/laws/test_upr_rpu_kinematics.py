@@ -12,12 +12,13 @@ import pytest
 
 from pkm_twin.errors import ParameterError, SingularityError, UnknownNameError, UnreachableError
 from pkm_twin.machine import schema
-from pkm_twin.machine.catalogue import config_folder
+from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.upr_rpu import UprRpu
+from pkm_twin.robot.catalogue import config_folder
 from test.support.robots import both_ways, load
 
 ROBOT = load("upr_rpu")
-FILE = schema.read_yaml(config_folder() / "upr_rpu.yaml")
+FILE = read_yaml(config_folder() / "upr_rpu.yaml")
 SIZES = [(0.39, 0.26), (0.26, 0.39), (0.3, 0.3), (1.5, 0.2), (0.1, 0.45)]
 
 
@@ -370,7 +371,7 @@ PROGRAM = """
 import json, sys
 import numpy as np
 from pkm_twin import load
-from pkm_twin.codegen import kernels
+from pkm_twin.codegen.code import compiled
 from pkm_twin.errors import UnreachableError
 from stiffness_monitor import compliance, platform_response, strain_energy
 from stiffness_monitor.compliance import member_deflections
@@ -397,7 +398,7 @@ for l in ([0.9, 0.3, 0.6], [0.1, 0.1, 0.5], [0.6, 0.6, 2.0], [-1.0, 1, 1]):
     except UnreachableError as error:
         faults.append([robot.limb_names.index(error.limb), error.miss])
 print(json.dumps(frames | {
-    "compiled": kernels.compiled(), "q": q.tolist(), "pose": robot.forward(q).tolist(),
+    "compiled": compiled(), "q": q.tolist(), "pose": robot.forward(q).tolist(),
     "rates": robot.jacobian(q).tolist(), "twist": robot.platform_jacobian(q).tolist(),
     "compliance": (1e9 * compliance(robot, poses)).tolist(), "factors": energy.factors.tolist(),
     "total": (1e6 * energy.total).tolist(), "deflection": (1e6 * energy.deflection).tolist(),

@@ -4,25 +4,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from delta_dynamics import inverse_dynamics, mass_matrix
+from delta_dynamics import inverse_dynamics, mass_matrix, reactions
 from pkm_twin import Robot, variants
 from pkm_twin.apps.certificate.description import expand
 from pkm_twin.codegen.lu import pivot_order
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.entries import entries, with_entries
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.entries import entries, with_entries
 from stiffness_monitor import compliance
 from stiffness_monitor.programs import elastic_of, followed
 from test.machine.random_machines import plain
 from test.support.robots import elastic, load, often, parameters_of, partly_long, some_robots
 
-MACHINES = Path(__file__).resolve().parents[1] / "machine"
 ASIDE = ("limits", "joint_map", "uncertainty", "member", "section", "compliance", "radius")
 """Words in paths of numbers that no program of these reads."""
 
@@ -66,6 +64,42 @@ def judge(robot: Robot, numbers, rng, tolerance=1e-12):
             scale = max(1.0, np.abs(own_value).max())
             np.testing.assert_allclose(found, own_value, rtol=0, atol=tolerance * scale)
     return built
+
+
+def judge_reactions(robot: Robot, numbers, rng, tolerance=1e-12):
+    """Compare reactions of many with each machine's own; how many could be built."""
+    many = variants(robot, numbers)
+    q, qd, qdd = motion(robot, rng, 4)
+    wrench = rng.normal(size=(4, 6))
+    found = many.reactions(q, qd, qdd, wrench)
+    built = 0
+    for k in range(len(many)):
+        try:
+            own = reactions(many[k], q, qd, qdd, wrench)
+        except PkmTwinError:
+            assert np.isnan(found.wrenches[k]).any(-1).any() and not found.determinate[k].all()
+            continue
+        built += 1
+        assert (found.names, found.bodies) == (own.names, own.bodies)
+        np.testing.assert_array_equal(found.determinate[k], own.determinate)
+        for name in ("points", "wrenches", "efforts"):
+            value = getattr(own, name)
+            scale = max(1.0, np.nanmax(np.abs(value)))
+            np.testing.assert_allclose(
+                getattr(found, name)[k], value, rtol=0, atol=tolerance * scale
+            )
+    return built
+
+
+@some_robots
+def test_reactions_of_variants_are_those_of_the_robots(name, rng):
+    robot = load(name)
+    known = numbers_of(robot)
+    picked = rng.permutation([p for p in known if "inertia[" not in p and "axis" not in p])[:12]
+    numbers = {p: known[p] * (1 + 0.2 * rng.uniform(-1, 1, 3)) for p in picked}
+    assert judge_reactions(robot, numbers, rng) > 0 or "azimuth" in str(list(numbers))
+    mass = next(p for p in known if p.endswith("mass"))
+    assert judge_reactions(robot, {mass: [known[mass], -1.0]}, rng) == 1
 
 
 @some_robots
@@ -290,7 +324,7 @@ def test_closures_that_are_left_out_follow_from_the_others():
     elastic, engine = elastic_of(robot), robot.engine
     chosen = elastic.followers
     assert chosen is not None
-    for x, q in engine._samples:
+    for x, q in engine.samples:
         frame = elastic._frame(Motion(engine.tree, x, q))
         assert len(chosen.rows) < len(frame.held)
         assert np.abs(np.array(followed(frame, chosen)[2], float)).max() < 1e-12

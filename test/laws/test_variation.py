@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.variation import KINDS, varied
+from pkm_twin.robot.variation import KINDS, varied
 from test.support.robots import every_robot, load
 
 RIGID = dict.fromkeys(("masses", "inertias", "friction"), 0.05)

@@ -10,8 +10,8 @@ import numpy as np
 from pkm_twin.kinematics.passive import single_joints
 from pkm_twin.machine.graph import Body, Graph, Joint, Rod, array
 from pkm_twin.machine.tree import Tree
-from pkm_twin.machine.urdf_tree import urdf_tree
 from pkm_twin.machine.urdf_write import UrdfBody, UrdfDrive
+from pkm_twin.robot.urdf_tree import urdf_tree
 
 
 def turned(angle, vector):

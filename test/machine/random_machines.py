@@ -13,14 +13,16 @@ import numpy as np
 
 from pkm_twin.apps.certificate.description import expand, tensor
 from pkm_twin.apps.certificate.maximal import Maximal, rotation_of
-from pkm_twin.machine.catalogue import config_folder
-from pkm_twin.machine.schema import read_yaml
+from pkm_twin.machine.strict_yaml import read_yaml
+from pkm_twin.robot.catalogue import config_folder
 
 MACHINES = Path(__file__).resolve().parent / "machines"
 SHIPPED = ("five_bar", "linear_delta", "rps3", "stewart")
 """Machines that stand with the shipped robots."""
 FILES = {path.stem: path for path in MACHINES.glob("*.yaml")}
 FILES |= {name: config_folder() / f"{name}.yaml" for name in SHIPPED}
+GALLERY = MACHINES.parents[2] / "examples/machines"
+FILES["rrr3_planar"] = GALLERY / "rrr3_planar.yaml"
 NAMES = sorted(FILES)
 
 ANY, X, XZ, YZ = (1, 1, 1), (1, 0, 0), (1, 0, 1), (0, 1, 1)

@@ -7,9 +7,9 @@ import yaml
 
 from pkm_twin.apps.certificate.description import expand
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.kinematics.clearance import clearance
-from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.entries import with_entries
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.clearance import clearance
+from pkm_twin.robot.entries import with_entries
 from stiffness_monitor import compliance, platform_response, strain_energy
 from stiffness_monitor.beams import assemble
 from stiffness_monitor.modes import natural_frequencies

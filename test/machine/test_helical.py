@@ -4,10 +4,11 @@
 import numpy as np
 import pytest
 
-from delta_dynamics import energy, inverse_dynamics, least_norm_reactions, mass_matrix
+from delta_dynamics import energy, inverse_dynamics, least_norm_reactions, mass_matrix, reactions
+from pkm_twin import variants
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.catalogue import robot_of_data
-from pkm_twin.machine.robot_urdf import robot_description
+from pkm_twin.robot.catalogue import robot_of_data
+from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import platform_response
 
 GRAVITY = 9.81
@@ -151,3 +152,12 @@ def test_a_lead_stands_where_there_is_a_thread():
         with pytest.raises(ParameterError) as caught:
             robot_of_data(data, "bad")
         assert caught.value.field == f"joints.{joint}.lead"
+
+
+def test_screws_of_other_leads_have_their_own_reactions(rng):
+    robot, leads = slide(0.01), np.array([0.008, 0.01, -0.02])
+    q, qd, qdd, wrench = *rng.normal(size=(3, 5, 1)), rng.normal(size=(5, 6))
+    found = variants(robot, {"joints.nut.lead": leads}).reactions(q, qd, qdd, wrench)
+    for k, lead in enumerate(leads):
+        own = reactions(slide(lead), q, qd, qdd, wrench)
+        np.testing.assert_allclose(found.wrenches[k], own.wrenches, atol=1e-12 * 40)

@@ -11,8 +11,8 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.mechanisms.machine import Machine
+from pkm_twin.robot.urdf_read import read_urdf
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -12,10 +12,12 @@ from pkm_twin import robot_names
 from pkm_twin.apps.cli import main
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.moveit import GROUP, LIMB, moveit_package
-from test.support.robots import load, parameters_of
+from test.support.robots import load, parameters_of, partly_long
 
 
-@pytest.fixture(params=robot_names(), scope="module")
+@pytest.fixture(
+    params=partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu"), scope="module"
+)
 def exported(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("moveit") / "package"
     with pytest.raises(SystemExit) as ended:

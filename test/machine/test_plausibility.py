@@ -11,9 +11,11 @@ import yaml
 
 import pkm_twin
 from pkm_twin.errors import ParameterError, RobotWarning
-from pkm_twin.machine.plausibility import findings
 from pkm_twin.mechanisms.machine import Machine
+from pkm_twin.robot.plausibility import findings
 from test.support.robots import SHIPPED, partly_long
+
+pytest.importorskip("pinocchio")
 
 from .descriptions import DESCRIPTIONS
 from .random_machines import NAMES, changed, plain, variant

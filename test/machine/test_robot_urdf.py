@@ -11,10 +11,11 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
-from pkm_twin.machine import urdf_file, urdf_tree, urdf_xml
-from pkm_twin.machine.robot_urdf import robot_description, robot_urdf
-from pkm_twin.machine.urdf_read import read_urdf
+from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.mechanisms.machine import Machine
+from pkm_twin.robot import urdf_tree
+from pkm_twin.robot.robot_urdf import robot_description, robot_urdf
+from pkm_twin.robot.urdf_read import read_urdf
 from test.support.robots import load, partly_long
 
 pytest.importorskip("pinocchio")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.urdf_read import read_urdf
+from pkm_twin.robot.urdf_read import read_urdf
 
 PAGE = Path(__file__).parents[2] / "docs" / "urdf.md"
 XML = re.findall(r"```xml\n(.*?)```", PAGE.read_text(), re.DOTALL)

@@ -10,9 +10,9 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.urdf_read import read_tree
 from pkm_twin.mechanisms.machine import Machine
-from test.support.robots import partly_long, random_joints
+from pkm_twin.robot.urdf_read import read_tree
+from test.support.robots import often, partly_long, random_joints
 
 pytest.importorskip("pinocchio")
 
@@ -155,14 +155,15 @@ def test_a_drawing_with_spheres_is_the_machine_that_pinocchio_has(drawing, expor
         np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd), expected, atol=accuracy)
 
 
-def test_of_several_assemblies_the_best_conditioned_is_home(tmp_path):
+@pytest.mark.parametrize("tries", often(2, 12))
+def test_of_several_assemblies_the_best_conditioned_is_home(tries, tmp_path):
     """Those that Pinocchio's tree has with the motors at zero, each made a drawing of its own."""
     path = spheres(palletizer(), tmp_path)
     _, robot = read(path)
     best = float(robot.singularity(robot.inverse(robot.home())))
     tree = Tree(path)
     rng, found = np.random.default_rng(2), []
-    for _ in range(12):
+    for _ in range(tries):
         q = np.zeros(tree.model.nv)
         q[tree.loose] = rng.uniform(-np.pi, np.pi, len(tree.loose))
         for _ in range(60):

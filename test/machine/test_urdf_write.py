@@ -13,8 +13,8 @@ import pytest
 
 from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.machine.assembly import Assembly
-from pkm_twin.machine.urdf_read import read_urdf
 from pkm_twin.machine.urdf_write import write_urdf
+from pkm_twin.robot.urdf_read import read_urdf
 
 pytest.importorskip("pinocchio")
 

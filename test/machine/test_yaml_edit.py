@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pkm_twin.machine.catalogue import config_folder, robot_of_data
 from pkm_twin.machine.yaml_edit import edit_yaml, flow
+from pkm_twin.robot.catalogue import config_folder, robot_of_data
 from test.support.robots import massive, parameters_of
 
 

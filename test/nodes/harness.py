@@ -238,14 +238,14 @@ NODES = (
 )
 
 
-def fork_of(module, words, environment, output):
-    """Run a node in this process, which is a fork of one that has imported all."""
+def fork_of(module, words, environment, *outputs):
+    """Run ``main`` of a module in this process, which is a fork of one that has imported all."""
     os.setsid()
     end_with_parent()
-    with open(output, "ab") as file:
-        for stream in (sys.stdout, sys.stderr):
+    for output, stream in zip(outputs, (sys.stdout, sys.stderr), strict=True):
+        with open(output, "ab") as file:
             os.dup2(file.fileno(), stream.fileno())
-            stream.reconfigure(line_buffering=True)
+        stream.reconfigure(line_buffering=True)
     os.chdir(tempfile.gettempdir())
     os.environ.clear()
     os.environ.update(environment)
@@ -264,13 +264,32 @@ class ForkedNode(Process):
 
     def __init__(self, domain, module, *parameters, arguments=()):
         given = module, flags(parameters, arguments), domain.environment()
-        super().__init__(lambda output: _Fork(self.context, *given, output.name))
+        super().__init__(lambda output: _Fork(*given, output.name, output.name))
+
+
+class ForkedCommand(Process):
+    """``pkm-twin WORDS`` in such a fork; ``errors`` is what it has said on standard error."""
+
+    def __init__(self, domain, *words):
+        given = "pkm_twin.apps.cli", words, domain.environment()
+        self._errors = tempfile.NamedTemporaryFile("w+")  # noqa: SIM115
+        super().__init__(lambda output: _Fork(*given, output.name, self._errors.name))
+
+    @property
+    def errors(self):
+        self._errors.seek(0)
+        return self._errors.read()
+
+    def close(self):
+        super().close()
+        self._errors.close()
 
 
 class _Fork:
     """A forked process with the methods of subprocess.Popen."""
 
-    def __init__(self, context, *arguments):
+    def __init__(self, *arguments):
+        context = ForkedNode.context
         self._process = context.Process(target=fork_of, args=arguments, daemon=True)
         self._process.start()
         self.pid = self._process.pid
@@ -406,7 +425,7 @@ def values_of(array):
 
 def text_of(array):
     """The status message and what else is told: a busy machine's own lines may come first."""
-    return f"{array.status[0].message}; {values_of(array)['also']}"
+    return f"{array.status[0].message}; {values_of(array)['other problems']}"
 
 
 def counts_of(array, what):

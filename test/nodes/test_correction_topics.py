@@ -22,6 +22,8 @@ FORCE = (160.0, 90.0, 120.0)
 TOOL = [0.0, 0.0, -0.15]
 OFFSET, CORRECTED = "/stiffness_monitor/setpoint_offset", "/stiffness_monitor/corrected_setpoint"
 
+BOTH = "/stiffness_monitor/setpoint_with_torques"
+
 
 def state(peer, positions):
     message = JointState(name=list(ROBOT.joint_names), position=list(positions))
@@ -33,12 +35,15 @@ def test_set_points_are_corrected_by_the_measured_wrench(peer, launch):
     launch(
         "stiffness_monitor.node", "correct_setpoint:=true", "tool.xyz:=[0.0, 0.0, -0.15]",
         "max_state_age:=600.0", "correction_age:=600.0", "future_tolerance:=600.0",
+        "pair_torques:=true",
     )  # fmt: skip
     peer.talk(JointState, "/joint_states")
     peer.talk(JointState, "/setpoint")
     peer.talk(WrenchStamped, "/wrench")
     peer.hear(JointState, OFFSET)
     peer.hear(JointState, CORRECTED)
+    peer.talk(JointState, "/torques")
+    peer.hear(JointState, BOTH)
     peer.until(peer.matched)
 
     def push():
@@ -64,6 +69,22 @@ def test_set_points_are_corrected_by_the_measured_wrench(peer, launch):
     assert np.abs(expected).max() > 1e-5
     found = peer.received(CORRECTED)[-1].position
     np.testing.assert_allclose(found, Q + 1e-3 + expected, rtol=0, atol=1e-12)
+    # Torques of the same stamp are in one message with it, whichever comes first.
+    for first in (0, 1):
+        setpoint = state(peer, Q + 2e-3)
+        efforts = JointState(header=setpoint.header, name=setpoint.name, effort=[1.0, -2.0, 3.0])
+        sent = [("/setpoint", setpoint), ("/torques", efforts)]
+        before = len(peer.received(BOTH))
+        for topic, message in sent[first:] + sent[:first]:
+            peer.send(topic, message)
+        peer.until(lambda before=before: len(peer.received(BOTH)) > before)
+        both = peer.received(BOTH)[-1]
+        assert both.header.stamp == setpoint.header.stamp and list(both.name) == setpoint.name
+        np.testing.assert_allclose(both.position, Q + 2e-3 + expected, rtol=0, atol=1e-12)
+        assert list(both.effort) == [1.0, -2.0, 3.0]
+    alone = state(peer, Q)
+    alone.effort = [1.0, 2.0, 3.0]
+    peer.send("/torques", alone)
     # What the stamps of wrenches have to keep to holds for set points, as soon as it is set.
     peer.hear(DiagnosticArray, "/diagnostics")
     request = SetParameters.Request()
@@ -80,6 +101,7 @@ def test_set_points_are_corrected_by_the_measured_wrench(peer, launch):
     told = counts_of(array, "set points rejected")
     assert told["future stamp"] == told["not finite"] == 1
     assert int(values_of(array)["set points corrected"]) >= 1
+    assert len(peer.received(BOTH)) == 2
 
 
 SINGULAR = """

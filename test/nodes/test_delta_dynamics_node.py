@@ -295,7 +295,7 @@ class TestLimits:
         twin.settle()
         free = twin.effort()
         assert abs(free[0]) > self.weak[0]
-        before = int(values_of(twin.diagnostics())["effort limit passed"])
+        before = int(values_of(twin.diagnostics())["effort limit exceeded"])
         assert twin.set(effort_limits=self.weak).successful
         zero = [(0.0, 0.0, 0.0)]
         message = MAKE.trajectory(NAMES, [SECOND], [tuple(Q)], zero, zero, twin.begin())
@@ -311,7 +311,7 @@ class TestLimits:
             clamped = np.clip(free, -np.array(self.weak), self.weak)
             assert (effort == (free if name == "warning" else clamped)).all()
             array = twin.diagnostics(
-                lambda a: int(values_of(a)["effort limit passed"]) == before + 1
+                lambda a: int(values_of(a)["effort limit exceeded"]) == before + 1
             )
             assert array.status[0].level >= b"\x01"
         finally:
@@ -500,12 +500,12 @@ class TestLayers:
         "pkm_twin.errors",
         "pkm_twin.streams.monitor",
         "pkm_twin.codegen.kernels",
-        "pkm_twin.machine.catalogue",
-        "pkm_twin.ros.messages",
+        "pkm_twin.robot.catalogue",
+        "pkm_twin.messages.reading",
         "pkm_twin.machine.schema",
         "delta_dynamics",
         "pkm_twin.streams.differentiator",
-        "pkm_twin.ros.intake",
+        "pkm_twin.messages.intake",
         "delta_dynamics.feedforward",
         "delta_dynamics.gate",
         "stiffness_monitor",

@@ -22,7 +22,7 @@ from rich.console import Console
 from pkm_twin.apps import demo, demo_recorder
 from pkm_twin.bags.reader import BagWriter, inspect, read_messages
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.ros.messages import stamp_of
+from pkm_twin.messages.stamps import stamp_of
 
 SAMPLES = 1500
 FILLING = 30

@@ -8,14 +8,14 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from geometry_msgs.msg import InertiaStamped, WrenchStamped
+from geometry_msgs.msg import InertiaStamped, PointStamped, WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, String
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Torques
-from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.robot.catalogue import robot_of_data
 from test.nodes.harness import SECOND, Maker, Ros
 from test.support.robots import load, parameters_of
 
@@ -28,6 +28,8 @@ OUTPUTS = {
     "/delta_dynamics/external_wrench": WrenchStamped,
     "/delta_dynamics/external_effort": JointState,
     "/delta_dynamics/contact": Bool,
+    "/delta_dynamics/contact_body": String,
+    "/delta_dynamics/contact_point": PointStamped,
 }
 
 
@@ -86,11 +88,19 @@ def test_a_load_and_a_push_are_told(peer, launch):
         turns += 1
         swing.send()
 
+    bodies, points = (
+        peer.received(f"/delta_dynamics/contact_{name}") for name in ("body", "point")
+    )
+
     def told():
-        return any(m.wrench.force.x > 50.0 for m in pushed) and any(m.data for m in events)
+        seen = any(m.wrench.force.x > 50.0 for m in pushed) and any(m.data for m in events)
+        return seen and points and any(m.data for m in bodies)
 
     events.clear()
     peer.until(told, repeat=by_turns)
+    known = {"", "platform", "limb I", "limb II", "limb III", "unknown"}
+    assert {m.data for m in bodies} <= known
+    assert points[-1].header.frame_id == "base_link"
     assert pushed[-1].header.frame_id == "base_link"
 
 
@@ -195,4 +205,4 @@ def test_a_file_that_says_nothing_of_its_efforts_is_warned_of():
     sure = robot_of_data(data, "sure")
     estimates = Estimates(Topics(), lambda: sure, ("base_link", "platform"))
     assert not estimates.warning()
-    assert estimates.diagnose()["model uncertainty"] == "the file's"
+    assert estimates.diagnose()["model uncertainty"] == "robot file"

@@ -56,7 +56,7 @@ def test_a_robot_without_limits_has_a_way_to_go_too(tmp_path, monkeypatch):
         np.testing.assert_allclose(client.reaches(load(path), 0.1), 0.1 * np.array(expected))
 
 
-@pytest.mark.parametrize("name", ["trajectory_client.py", "computed_torque.py", "feed_rate.py"])
+@pytest.mark.parametrize("name", ["trajectory_client.py", "computed_torque.py"])
 def test_what_an_example_cannot_go_with_is_one_line(launch, name):
     process = example(launch, name, "--robot", "none")
     assert process.wait(PATIENCE) == 1
@@ -128,11 +128,3 @@ class TestByTheTwin:
         assert points == 101
         assert np.abs(np.array(peak) - expected).max() < 5e-3 * expected.max()
         assert miss < 1e-4
-
-    def test_the_feed_is_slower_where_the_machine_is_softer(self, launch):
-        cut = example(launch, "feed_rate.py")
-        assert cut.wait(PATIENCE) == 0, cut.output
-        _, slow, fast, bent, tolerance, states = numbers(cut.output)
-        assert 1.2 * slow < fast <= 200.0
-        assert 0.99 * tolerance < bent <= tolerance == 100.0
-        assert states > 100

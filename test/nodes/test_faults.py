@@ -6,6 +6,7 @@ import re
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,13 +16,17 @@ from test.nodes.harness import SECOND, Domain, Peer, counts_of, stamp_of, text_o
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
+from pkm_twin.ros.health import Health
 from test.nodes.twin import (
     COMMON,
     MAKE,
@@ -396,7 +401,7 @@ class TestClocks:
             clock = Clock()
             clock.clock.sec, clock.clock.nanosec = sec, nanosec
             timed.peer.send("/clock", clock)
-        array = timed.diagnostics(lambda a: int(values_of(a)["clock messages refused"]) >= 1)
+        array = timed.diagnostics(lambda a: int(values_of(a)["clock messages rejected"]) >= 1)
         assert "messages of /clock had an invalid time" in text_of(array)
         assert stamp_of(array) == self.start + SECOND
         assert values_of(array)["exceptions"] == "0"
@@ -457,6 +462,62 @@ class TestNeighbours:
         node.destroy_publisher(publisher)
         self.told(strict, lambda text: line not in text)
         assert int(values_of(strict.diagnostics())["incompatible QoS"]) == 1
+
+    def test_a_publisher_of_another_type_is_told(self, fleet):
+        strict = fleet["strict"]
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=strict.peer.context.get_domain_id())
+        stranger = rclpy.create_node("stranger", context=context)
+        try:
+            # One participant has one type a topic.
+            stranger.create_publisher(Bool, "/strict/states", QoSProfile(depth=1))
+            line = (
+                "another node on joint_states has an incompatible message type: std_msgs/msg/Bool"
+            )
+            self.told(strict, lambda text: line in text)
+        finally:
+            stranger.destroy_node()
+            rclpy.try_shutdown(context=context)
+        self.told(strict, lambda text: line not in text)
+
+    def test_the_graph_is_asked_once_however_many_are_there(self):
+        """And of the others' only what concerns this node is compared."""
+        asked, told = [], []
+        fits, unfit = (
+            QoSProfile(depth=1, reliability=ReliabilityPolicy[kind])
+            for kind in ("RELIABLE", "BEST_EFFORT")
+        )
+
+        def end(number, name, qos, kind="a/msg/A"):
+            return TopicEndpointInfo(
+                node_name=name, node_namespace="/", topic_type=kind, qos_profile=qos,
+                endpoint_gid=[number],
+            )  # fmt: skip
+
+        speakers = [end(k, "other", fits) for k in range(200)]
+        speakers += [end(200, "other", unfit), end(201, "other", unfit, "a/msg/B")]
+        listeners = [end(k, "third", fits) for k in range(202, 255)] + [end(255, "own", fits)]
+
+        def ask(topic, ends):
+            asked.append(topic)
+            return ends
+
+        node = SimpleNamespace(
+            get_name=lambda: "own",
+            get_namespace=lambda: "/",
+            get_publishers_info_by_topic=lambda topic: ask(topic, speakers),
+            get_subscriptions_info_by_topic=lambda topic: ask(topic, listeners),
+            get_logger=lambda: SimpleNamespace(warning=lambda text: None),
+        )
+        own = Health(node, lambda: 0)
+        own.watch("~/x", told.append)
+        # A publisher on the same topic takes nothing from the subscription.
+        own.watch("~/x")
+        for _ in range(2):
+            own._look()
+        # The graph's calls expand and remap a name: one that has been would be twice.
+        assert asked == ["~/x"] * 4
+        assert sorted(told) == ["QoS: reliability", "message type: a/msg/B for a/msg/A"]
 
     def test_a_subscriber_that_does_not_fit_is_told(self, quick):
         node = quick.peer.node

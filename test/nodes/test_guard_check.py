@@ -3,12 +3,10 @@
 
 import json
 import signal
-import subprocess
-import sys
 
 import pytest
 
-from test.nodes.harness import DEADLINE, REPOSITORY
+from test.nodes.harness import ForkedCommand
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -27,24 +25,13 @@ def check(domain):
     """Start the command: a process with its output."""
     started = []
 
-    def run(*arguments):
-        process = subprocess.Popen(
-            [sys.executable, "-m", "pkm_twin.apps.cli", "guard-check", *map(str, arguments)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=REPOSITORY,
-            env=domain.environment(),
-            start_new_session=True,
-        )
-        started.append(process)
-        return process
+    def run(*words):
+        started.append(ForkedCommand(domain, "guard-check", *map(str, words)))
+        return started[-1]
 
     yield run
     for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+        process.close()
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +42,12 @@ def twin(peer, launch):
 
 
 def stream_until_end(twin, process):
-    """Joint states until the command has ended: its exit code and its JSON."""
+    """Joint states until the command has ended: its exit code, its JSON and its errors."""
     twin.peer.until(
-        lambda: process.poll() is not None,
+        lambda: not process.alive(),
         repeat=lambda: twin.send_state(state(twin.stamp())),
     )
-    out, err = process.communicate()
-    return process.returncode, json.loads(out) if out else {}, err
+    return process.wait(), json.loads(process.output or "{}"), process.errors
 
 
 def test_a_running_node_is_good(twin, check):
@@ -85,7 +71,7 @@ def test_a_deadline_that_the_node_does_not_promise_is_bad(twin, check):
     twin.peer.until(lambda: count(topic) > before)
     for _ in range(50):
         twin.settle()
-    process.send_signal(signal.SIGINT)
+    process.process.send_signal(signal.SIGINT)
     code, data, _ = stream_until_end(twin, process)
     assert code == 1
     verdicts = {item["what"]: item["verdict"] for item in data["items"]}
@@ -96,18 +82,16 @@ def test_a_deadline_that_the_node_does_not_promise_is_bad(twin, check):
 
 def test_where_nothing_comes_it_says_so(peer, check):
     process = check("nobody/joint_torques", "--wait", 0.5)
-    assert process.wait(DEADLINE) == 1
-    out, err = process.communicate()
-    assert "0" in out
-    assert err == ""
+    assert process.wait() == 1
+    assert "0" in process.output
+    assert process.errors == ""
 
 
 def test_plain_commands_cannot_be_judged(peer, check):
     peer.talk(Float64MultiArray, "/plain/commands")
     process = check("plain/commands", "--wait", 60)
-    assert process.wait(DEADLINE) == 1
-    _, err = process.communicate()
-    (line,) = err.strip().splitlines()
+    assert process.wait() == 1
+    (line,) = process.errors.strip().splitlines()
     assert "std_msgs/msg/Float64MultiArray" in line
     assert "delta_dynamics/joint_torques" in line
 
@@ -117,8 +101,8 @@ def test_plain_commands_cannot_be_judged(peer, check):
 )
 def test_a_bound_that_is_no_time_is_refused(check, option, value):
     process = check(option, value)
-    assert process.wait(DEADLINE) == 1
-    assert process.communicate()[1].startswith(f"pkm-twin: {option[2:]}: ")
+    assert process.wait() == 1
+    assert process.errors.startswith(f"pkm-twin: {option[2:]}: ")
 
 
 def test_it_matches_a_publisher_of_either_reliability(peer, check):
@@ -132,5 +116,5 @@ def test_it_matches_a_publisher_of_either_reliability(peer, check):
         message.header.stamp = peer.node.get_clock().now().to_msg()
         publisher.publish(message)
 
-    peer.until(lambda: process.poll() is not None, repeat=repeat)
-    assert json.loads(process.communicate()[0])["messages"] > 0
+    peer.until(lambda: not process.alive(), repeat=repeat)
+    assert json.loads(process.output)["messages"] > 0

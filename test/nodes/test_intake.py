@@ -17,8 +17,8 @@ from trajectory_msgs.msg import JointTrajectory
 
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
-from pkm_twin.ros.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
-from pkm_twin.ros.messages import COLUMNS, TrajectoryFields
+from pkm_twin.messages.intake import DoublesTemplate, JointStateDecoder, RawTrajectory
+from pkm_twin.messages.reading import COLUMNS, TrajectoryFields
 from test.nodes.harness import Maker, Ros
 
 MAKE = Maker(Ros())

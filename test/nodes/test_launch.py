@@ -20,7 +20,7 @@ import yaml
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.machine import rotations
-from pkm_twin.machine.robot_urdf import robot_urdf
+from pkm_twin.robot.robot_urdf import robot_urdf
 from test.nodes.harness import REPOSITORY, Command, Maker, Ros
 from test.support.robots import load
 
@@ -32,7 +32,7 @@ NODES = {
     "command_gate": "delta_dynamics/gate_node.py",
     "machine_state": "pkm_twin/state/node.py",
 }
-SHARED = "pkm_twin/ros/wrench.py"
+SHARED = ("pkm_twin/ros/wrench.py", "delta_dynamics/parameters_node.py")
 """Where nodes declare what they share."""
 
 
@@ -70,7 +70,7 @@ class TestText:
         parameters, arguments = literal("twin", "PARAMETERS"), literal("twin", "ARGUMENTS")
         assert set(parameters) == set(NODES) <= set(arguments)
         for node, names in parameters.items():
-            files = (NODES[node], SHARED)
+            files = (NODES[node], *SHARED)
             source = "".join((REPOSITORY / file).read_text(encoding="utf-8") for file in files)
             assert all(f'"{name}"' in source for name in names)
             assert set(names) <= set(arguments)

@@ -18,7 +18,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.simulation import MachineSettings, Simulation, WrenchSignal, tuned
-from pkm_twin.machine.variation import varied
+from pkm_twin.robot.variation import varied
 from test.nodes.harness import SECOND, counts_of, one_line_refusal, stamp_of
 from test.support.robots import load
 

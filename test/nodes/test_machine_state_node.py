@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.machine import rotations
-from pkm_twin.machine.robot_urdf import robot_urdf
+from pkm_twin.robot.robot_urdf import robot_urdf
 from pkm_twin.state.scene import Load, Scales, Scene
 from pkm_twin.state.state import MachineState
 from stiffness_monitor import compliance, strain_energy

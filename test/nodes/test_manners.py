@@ -113,7 +113,7 @@ class TestRequests:
         )
         assert not answer.result.successful
         assert twin.set(payload__mass=0.0).successful
-        array = twin.diagnostics(lambda a: int(values_of(a)["requests refused"]) >= 2)
+        array = twin.diagnostics(lambda a: int(values_of(a)["requests rejected"]) >= 2)
         assert values_of(array)["exceptions"] == "0"
         answered(twin)
 
@@ -307,7 +307,7 @@ class TestReset:
         assert call(twin, Trigger, "reset").success
 
 
-POINTS = 100_000
+POINTS = 30_000
 
 
 @pytest.fixture(scope="module")

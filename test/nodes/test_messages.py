@@ -10,18 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pkm_twin.errors import MessageError
-from pkm_twin.ros.messages import (
+from pkm_twin.messages.reading import (
     MAX_ACCELERATION,
-    MAX_DURATION,
     MAX_EFFORT,
     MAX_FORCE,
     MAX_POINTS,
     JointReader,
-    StampRules,
-    duration_of,
     read_wrench,
-    stamp_of,
 )
+from pkm_twin.messages.stamps import MAX_DURATION, StampRules, duration_of, stamp_of
 from test.nodes.harness import SECOND, Maker, Plain
 from test.support.robots import load
 

@@ -40,6 +40,8 @@ class Executor:
     def spin(self, ended):
         if not ended():
             signal.raise_signal(signal.SIGINT)
+    def close(self):
+        pass
 
 run._Executor = Executor
 run.gc = run.rclpy = SimpleNamespace(

@@ -16,7 +16,7 @@ from delta_dynamics.simulation import (
     tuned,
 )
 from pkm_twin.errors import MessageError, ParameterError
-from pkm_twin.machine.variation import varied
+from pkm_twin.robot.variation import varied
 from test.nodes.harness import SECOND
 from test.support.robots import load
 
@@ -197,7 +197,7 @@ def test_a_trajectory_of_the_future_waits_and_the_newest_command_is_obeyed(make)
 
 
 def test_points_between_are_the_polynomials_of_their_derivatives(make):
-    from pkm_twin.ros.messages import JointReader
+    from pkm_twin.messages.reading import JointReader
     from pkm_twin.streams.path import JointPath
 
     times, q, qd, qdd = path(points=11)

@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
-from pkm_twin.ros.messages import StampRules
+from pkm_twin.messages.stamps import StampRules
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from test.bags.test_recordings import FOLDER
 from test.nodes.harness import SECOND, counts_of, values_of
@@ -75,7 +75,7 @@ def greet(peer):
 
     def taken():
         # Before the first one nothing is counted.
-        return int(values_of(told[-1]).get("deflections taken", 0)) if told else 0
+        return int(values_of(told[-1]).get("deflections accepted", 0)) if told else 0
 
     peer.until(taken, repeat=send)
 
@@ -110,7 +110,7 @@ def test_a_joint_three_times_softer_is_found_by_name_live(peer, launch):
     told = peer.diagnostics("/stiffness_monitor", lambda a: "times the" in a.status[0].message)
     assert told.status[0].level == DiagnosticStatus.WARN
     assert " of 3U is " in told.status[0].message
-    assert int(values_of(told)["deflections taken"]) > 150
+    assert int(values_of(told)["deflections accepted"]) > 150
 
     bad = TransformStamped()
     bad.header.frame_id = "tool"

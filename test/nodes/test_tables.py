@@ -44,7 +44,11 @@ def node(request, peer, launch):
         ),
         "command_gate": ("on_stop:=gravity",),
         # The robot in whose file the masses are.
-        "stiffness_monitor": ("mechanism:=delta_cu", "correct_setpoint:=true"),
+        "stiffness_monitor": (
+            "mechanism:=delta_cu",
+            "correct_setpoint:=true",
+            "pair_torques:=true",
+        ),
         "machine_state": (),
         "machine_sim": (),
     }

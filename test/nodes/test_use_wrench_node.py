@@ -63,13 +63,14 @@ def test_torque_residual_and_stop(peer, launch):
     assert np.allclose(residual.effort, MEASURED - np.array(same[stamp_of(residual)].effort))
 
     def stopped():
+        # A state that was heard before the first wrench is a warning of the same name.
         array = peer.diagnostics("/bearing")
-        return array if "no wrench" in array.status[0].message else None
+        status = array.status[0]
+        return array if status.level == b"\x02" and "no wrench" in status.message else None
 
     array = peer.until(stopped, repeat=lambda: send(wrench=False))
-    assert array.status[0].level == b"\x02"
     assert counts_of(array, "stopped")["no wrench"] >= 1
-    assert int(values_of(array)["wrenches taken"]) > 3
+    assert int(values_of(array)["wrenches accepted"]) > 3
     # What is refused is counted, and no wrench.
     peer.until(
         lambda: counts_of(peer.diagnostics("/bearing"), "wrenches rejected").get("future stamp"),

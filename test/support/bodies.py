@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin import Robot
-from pkm_twin.codegen.kernels import STEPS
+from pkm_twin.codegen.code import STEPS
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.engine import Engine, Traced
+from pkm_twin.kinematics.engine import Engine
+from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import BASE, Joint
 from test.support.plain import PlainKernel
 

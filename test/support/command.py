@@ -64,26 +64,32 @@ def typed_line(twin: Callable[..., Result], line: str) -> Result:
     return Result(done.returncode, done.stdout, done.stderr)
 
 
-def forked(folder: Path, *arguments: Any, limit: int = resource.RLIM_INFINITY) -> Result:
+def forked(
+    folder: Path, *arguments: Any, limit: int = resource.RLIM_INFINITY, out: str = ""
+) -> Result:
     """What a command gives in a fork of this process: it may be ended, and need not import.
 
     :param folder: where it runs.
     :param limit: bytes at which its files end.
+    :param out: a device that takes what it prints.
     """
     outputs = [folder / "stdout.txt", folder / "stderr.txt"]
-    process = _FORK.Process(target=_run, args=(folder, arguments, outputs, limit))
+    outputs[0].touch()
+    opened = [Path(out) if out else outputs[0], outputs[1]]
+    process = _FORK.Process(target=_run, args=(folder, arguments, opened, limit))
     process.start()
     process.join()
-    out, err = (path.read_text() for path in outputs)
+    printed, err = (path.read_text() for path in outputs)
     for path in outputs:
         path.unlink()
     assert process.exitcode is not None
-    return Result(process.exitcode, out, err)
+    return Result(process.exitcode, printed, err)
 
 
 def _run(folder: Path, arguments: tuple[Any, ...], outputs: list[Path], limit: int) -> None:
     os.chdir(folder)
-    sys.stdout, sys.stderr = (path.open("w", buffering=1) for path in outputs)
+    # As a process has them that writes into files.
+    sys.stdout, sys.stderr = outputs[0].open("w"), outputs[1].open("w", buffering=1)
     # What a library writes past Python.
     for number, stream in enumerate((sys.stdout, sys.stderr), 1):
         os.dup2(stream.fileno(), number)

@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import NDArray
 
 from pkm_twin import Robot
-from pkm_twin.machine.catalogue import robot_of_data
+from pkm_twin.robot.catalogue import robot_of_data
 from test.support.robots import load, parameters_of
 
 Array = NDArray[np.float64]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 import pkm_twin
 from pkm_twin import Robot, robot_names
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.catalogue import config_folder
+from pkm_twin.robot.catalogue import config_folder
 
 Array = NDArray[np.float64]
 

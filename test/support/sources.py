@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package's sources, and which of its modules each imports when it runs."""
+"""The package's sources, and which of its modules each imports, for types alone too."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -26,12 +25,9 @@ def _module(path: Path) -> str:
 
 @cache
 def imports(module: str) -> frozenset[str]:
-    """What a module imports, wherever in it: modules, also where a name of one is imported.
-
-    Imports for types alone are left out.
-    """
+    """What a module imports, wherever in it: modules, also where a name of one is imported."""
     found = set()
-    for node in _running(ast.parse(sources()[module].read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(sources()[module].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -41,31 +37,14 @@ def imports(module: str) -> frozenset[str]:
     return frozenset(found)
 
 
-def _running(tree: ast.AST) -> Iterator[ast.AST]:
-    """Nodes of a source without those that stand for types alone."""
-    todo = [tree]
-    while todo:
-        node = todo.pop()
-        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
-            continue
-        yield node
-        todo += ast.iter_child_nodes(node)
-
-
 def within(module: str, package: str) -> bool:
     """Whether a module is a package or in it."""
     return module == package or module.startswith(package + ".")
 
 
-PURE = "pkm_twin.ros.messages"
-"""Messages to arrays, without ROS: a room of its own in the folder that it is in."""
-
-
 def room(module: str) -> str:
     """The folder that a module belongs to; nodes apart from theirs, as pkm_twin's own modules."""
     first, *rest = module.split(".")
-    if module == PURE:
-        return module
     if first != "pkm_twin":
         return f"{first}.node" if rest and rest[0].endswith("node") else first
     if not rest or not (ROOT / first / rest[0]).is_dir():

@@ -28,7 +28,10 @@ from stiffness_monitor.structure import (
     local_axes,
     structural_model,
 )
-from test.certificate.links import (
+from test.support.pages import numbers
+from test.support.robots import partly_long
+from tools.calculix import ABSENT, CCX, Mesh, disc_mesh, section_motion, solid_compliance
+from tools.certificate.links import (
     BOUND,
     FACTORS,
     FINITE_ELEMENTS,
@@ -43,9 +46,6 @@ from test.certificate.links import (
     rigid_joints,
     round_bar,
 )
-from test.support.pages import numbers
-from test.support.robots import partly_long
-from test.validation.calculix import ABSENT, CCX, Mesh, disc_mesh, section_motion, solid_compliance
 
 needs_calculix = pytest.mark.skipif(CCX is None, reason=ABSENT)
 

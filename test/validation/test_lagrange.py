@@ -12,8 +12,8 @@ from delta_dynamics.virtual_work import energy
 from test.support.robots import partly_long
 
 pytest.importorskip("mpmath")
-from test.certificate.lagrange import energies
-from test.certificate.machines import ROBOTS, friction, random_case
+from tools.certificate.lagrange import energies
+from tools.certificate.machines import ROBOTS, friction, random_case
 
 
 @pytest.mark.parametrize("machine", partly_long(range(3), 0))

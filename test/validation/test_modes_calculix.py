@@ -17,7 +17,7 @@ from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.structure import structural_model
 from test.support.pages import numbers
 from test.support.robots import parameters_of, partly_long
-from test.validation.calculix import ABSENT, CCX, frequencies
+from tools.calculix import ABSENT, CCX, frequencies
 
 CLOSE, CONTRACTED = numbers(
     "docs/validation.md",

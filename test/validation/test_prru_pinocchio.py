@@ -9,7 +9,7 @@ from test.support.robots import partly_long
 
 pytest.importorskip("pinocchio")
 from bags.recording.pinocchio_models import PrruEngine
-from test.certificate.machines import random_case
+from tools.certificate.machines import random_case
 
 MACHINES = 10
 STATES = 200

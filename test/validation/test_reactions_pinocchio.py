@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from delta_dynamics import reactions
-from test.certificate.machines import random_case
 from test.support.pages import numbers
 from test.support.robots import partly_long
+from tools.certificate.machines import random_case
 
 pytest.importorskip("pinocchio")
 

@@ -216,7 +216,7 @@ def colours(png):
         ("five_bar",),
         ("prru",),
         ("upr_rpu",),
-        (REPOSITORY / "test/machine/five_bar.urdf", "--platform", "platform"),
+        (REPOSITORY / "examples/machines/dual_scara.urdf",),
         ("delta_cu", "--bag", DELTA),
     ],
     ids=str,

@@ -19,6 +19,7 @@ from pkm_twin.apps.view.door import Door, listen
 from pkm_twin.apps.view.model import Model
 from pkm_twin.apps.view.page import Page, serving
 from pkm_twin.apps.view.panels import BagPanel
+from pkm_twin.apps.view.stage import framing
 from pkm_twin.apps.view.timeline import Timeline
 from test.support.robots import load
 
@@ -223,3 +224,14 @@ def test_a_change_that_fails_is_logged_once_and_the_page_goes_on(page, caplog, m
             page.step()
     assert len(caplog.records) == 1
     attack(page, [])
+
+
+def test_the_machine_fits_into_narrow_windows():
+    """As wide as in a square window, and in the upper part of a tall one."""
+    assert framing(1400, 757) == (1.0, 0.0)
+    sizes = np.linspace(0.3, 2.0, 200)
+    farther, up = np.array([framing(aspect, 1.0) for aspect in sizes]).T
+    assert (farther * sizes >= 1.0 - 1e-12).all()
+    assert (np.diff(up) <= 0.0).all()
+    # Its middle, and half of its height there, are inside the window.
+    assert (0.5 - up - 0.36 / farther > 0.0).all()

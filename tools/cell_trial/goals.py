@@ -33,7 +33,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
-from pkm_twin.machine.robot_urdf import robot_urdf
+from pkm_twin.robot.robot_urdf import robot_urdf
 
 CONTROLLER = "joint_trajectory_controller"
 STATUS = {

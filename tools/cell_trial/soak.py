@@ -26,7 +26,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Float64MultiArray
 
 from pkm_twin.bags.reader import inspect
-from pkm_twin.machine.catalogue import robot_path
+from pkm_twin.robot.catalogue import robot_path
 
 MACHINES = {
     "picker": ("delta_cu", "friction: {viscous: 0.1, coulomb: 0.5}"),
@@ -199,12 +199,12 @@ def stops(other: Peer, times: int) -> bool:
         watch.gate(topic)
     folder = Path(tempfile.mkdtemp())
     files = robots(folder)
-    sims = simulators(files, 0.004)
+    running = [*simulators(files, 0.004)]
     ends: Counter[str] = Counter()
     try:
         for _ in range(times):
             watch.commands.clear()
-            cell_ = launched(files)
+            running.append(cell_ := launched(files))
             other.until(
                 lambda: (
                     len(watch.commands) == len(topics)
@@ -226,10 +226,10 @@ def stops(other: Peer, times: int) -> bool:
             ends[", ".join(verdict)] += 1
             if "NOT CLEAN" in verdict or not zeros:
                 print(said[-3000:])
-            cell_.close()
+            running.pop().close()
     finally:
-        for sim in sims:
-            sim.close()
+        for process in reversed(running):
+            process.close()
         shutil.rmtree(folder, ignore_errors=True)
     print("Ctrl-C of a running cell: " + "; ".join(f"{n} {end}" for end, n in ends.items()))
     return set(ends) == {"clean, zeros"}

@@ -15,16 +15,16 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from test.certificate.compare import Figures, compare
-from test.certificate.links import POSES, Links, compare_links, paper_rows
-from test.certificate.machines import ROBOTS
-from test.certificate.report import conclude, document
-from test.certificate.swing import Swing, run, starts
-from test.validation.calculix import CCX
+from tools.calculix import CCX
+from tools.certificate.compare import Figures, compare
+from tools.certificate.links import POSES, Links, compare_links, paper_rows
+from tools.certificate.machines import ROBOTS
+from tools.certificate.report import conclude, document
+from tools.certificate.swing import Swing, run, starts
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m test.certificate", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tools.certificate", description=__doc__)
     parser.add_argument("--machines", type=int, default=50, help="random machines a robot")
     parser.add_argument("--states", type=int, default=20, help="random states a machine")
     parser.add_argument("--exact", type=int, default=10, help="of these by the Lagrange route")
@@ -79,7 +79,7 @@ def main() -> int:
     runs = [swing for k in sorted(swings) for swing in swings[k]]
     ordered = {name: links[name] for name in names}
     text, failures = document(
-        figures, runs, ordered, paper_rows(), "python -m test.certificate", options.seed
+        figures, runs, ordered, paper_rows(), "python -m tools.certificate", options.seed
     )
     return conclude(options.output, text, failures, console)
 

@@ -10,10 +10,10 @@ import numpy as np
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.reactions import reactions
 from delta_dynamics.virtual_work import energy
-from test.certificate.lagrange import energies
-from test.certificate.machines import Case, friction, random_case
-from test.certificate.mujoco_models import tree
-from test.certificate.swing import engine_of
+from tools.certificate.lagrange import energies
+from tools.certificate.machines import Case, friction, random_case
+from tools.certificate.mujoco_models import tree
+from tools.certificate.swing import engine_of
 
 ROUTES = ("Pinocchio", "MuJoCo", "Lagrange")
 BOUNDS = {"Pinocchio": 1e-9, "MuJoCo": 1e-6, "Lagrange": 1e-9}

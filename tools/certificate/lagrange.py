@@ -9,9 +9,6 @@ than 20 good ones:
 
     T(q, q') from the points' velocities, (X(q + h q') - X(q - h q')) / 2 h
     tau_j = d/dt (dT/dq'_j) - dT/dq_j + dV/dq_j - F . do/dq_j - M . turn_j
-
-May import: mpmath, numpy (for the start of Newton's method), the standard library; nothing of the
-twin.
 """
 
 from __future__ import annotations

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from pkm_twin import load
-from pkm_twin.machine.robot import Robot
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor import compliance
 from stiffness_monitor.structure import structural_model
 from test.support.robots import parameters_of
-from test.validation.calculix import Mesh, solid_compliance
 from test.validation.test_upr_rpu_paper import LOAD, TABLE_1
+from tools.calculix import Mesh, solid_compliance
 
 POSES = {
     "configuration 1": TABLE_1[0][0],

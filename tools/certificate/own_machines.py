@@ -21,9 +21,9 @@ from rich.progress import Progress
 from pkm_twin import load, robot_names
 from pkm_twin.apps.certify import BOUNDS, certificate_of
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.machine.catalogue import config_folder
-from test.certificate.report import conclude
+from pkm_twin.robot.catalogue import config_folder
 from test.machine.random_machines import NAMES, plain, variant
+from tools.certificate.report import conclude
 
 WHAT = tuple(name for name in BOUNDS if name not in ("round_trip", "batch"))
 TITLES = {

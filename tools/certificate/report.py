@@ -12,9 +12,11 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from test.certificate.compare import BALANCE_BOUNDS, BOUNDS, PLACE_BOUND, ROUTES, Figures
-from test.certificate.lagrange import DIGITS
-from test.certificate.links import (
+from test.validation.test_upr_rpu_paper import LOAD
+from tools.calculix import ABSENT, CCX, calculix_version
+from tools.certificate.compare import BALANCE_BOUNDS, BOUNDS, PLACE_BOUND, ROUTES, Figures
+from tools.certificate.lagrange import DIGITS
+from tools.certificate.links import (
     BOUND,
     FACTORS,
     FINE,
@@ -29,9 +31,9 @@ from test.certificate.links import (
     round_bar,
     with_rigid_joints,
 )
-from test.certificate.machines import AZIMUTH_ERROR, LEAST_MEASURE, THIN
-from test.certificate.mujoco_models import SPECK
-from test.certificate.swing import (
+from tools.certificate.machines import AZIMUTH_ERROR, LEAST_MEASURE, THIN
+from tools.certificate.mujoco_models import SPECK
+from tools.certificate.swing import (
     DELTA_DEVIATION,
     DELTA_REST,
     DURATION,
@@ -42,8 +44,6 @@ from test.certificate.swing import (
     TOOL,
     Swing,
 )
-from test.validation.calculix import ABSENT, CCX, calculix_version
-from test.validation.test_upr_rpu_paper import LOAD
 
 SWING_BOUNDS = {"drift": 1e-9, "closure": 1e-10, "DOP853": 1e-9, "its own step": 1e-7}
 """Greatest energy drift (relative), opening of a loop (m), and differences of the end states."""

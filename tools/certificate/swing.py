@@ -20,9 +20,9 @@ from bags.recording.pinocchio_models import DeltaEngine, LoopEngine, PrruEngine
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import forward_dynamics
 from pkm_twin import Robot
-from test.certificate.lagrange import energies
-from test.certificate.machines import build
 from test.support.robots import parameters_of
+from tools.certificate.lagrange import energies
+from tools.certificate.machines import build
 
 DURATION = 10.0
 SAMPLES = 20

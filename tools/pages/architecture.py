@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which folder imports which, as a picture: ``python -m test.docs.architecture OUT.png``."""
+"""Which folder imports which, as a picture: ``python -m tools.pages.architecture OUT.png``."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ PLACES = {
     "state.node": (6.6, 4.2),
     "atlas": (2.0, 4.2),
     "export": (-1.2, 4.9),
-    "design": (4.4, 5.1),
+    "design": (4.0, 4.7),
+    "identification": (5.6, 4.9),
     "paths": (-1.0, 3.4),
     "ros": (5.6, 3.3),
     "delta_dynamics": (0.6, 3.0),
     "stiffness_monitor": (3.4, 3.0),
     "state": (6.8, 2.9),
-    "streams": (5.0, 2.2),
-    "identification": (-0.6, 2.1),
-    "mechanisms": (2.0, 2.0),
-    "machine": (1.0, 1.0),
-    "kinematics": (3.0, 1.0),
-    "ros.messages": (5.2, 1.4),
+    "streams": (4.6, 2.5),
+    "messages": (5.6, 2.05),
+    "mechanisms": (0.6, 2.1),
+    "robot": (2.4, 1.75),
+    "kinematics": (3.2, 1.15),
+    "machine": (1.2, 0.6),
     "bags": (-1.2, 0.7),
     "codegen": (2.0, 0.0),
 }
-"""Where each folder stands; arrows go down, but between machine and kinematics."""
+"""Where each folder stands; arrows go down."""
 
 
 def name_of(room):

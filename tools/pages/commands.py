@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write docs/commands.md from the commands: ``python -m test.docs.commands docs/commands.md``."""
+"""Write docs/commands.md from the commands: ``python -m tools.pages.commands docs/commands.md``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of docs/engine.md: ``python -m test.docs.engine docs/engine.md`` writes it anew."""
+"""The table of docs/engine.md: ``python -m tools.pages.engine docs/engine.md`` writes it anew."""
 
 from __future__ import annotations
 

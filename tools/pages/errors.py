@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/errors.md from the classes: ``python -m test.docs.errors docs/errors.md``."""
+"""docs/errors.md from the classes: ``python -m tools.pages.errors docs/errors.md``."""
 
 from __future__ import annotations
 

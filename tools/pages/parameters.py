@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/parameters.md out of the schemas: ``python -m test.docs.parameters docs/parameters.md``."""
+"""docs/parameters.md from the schemas: ``python -m tools.pages.parameters docs/parameters.md``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pkm_twin.machine.members import Tube
 from pkm_twin.machine.schema import plain
 from pkm_twin.machine.sections import Payload, friction_of, limits_of
 from pkm_twin.machine.uncertainty import UncertaintyEntry
-from pkm_twin.mechanisms import delta, prru, upr_rpu
+from pkm_twin.mechanisms import delta, linear_delta, prru, upr_rpu
 
 HEAD = """# Robot files
 
@@ -47,6 +47,7 @@ Any machine as a graph of bodies, joints and rods, with every vector in base axe
 | `joint_map` |  | a mapping of names to entries | none |
 | `uncertainty` |  | a mapping of paths to entries | none |
 | `element_compliance` |  | a mapping of names to numbers, at least 1e-06, at most 1e+06 | none |
+| `modal_damping` |  | one number or more above 0, at most 0.99 | none |
 | `limbs` |  | one section or a list: `azimuths` (rad), `bodies`, `joints`, `rods` | none |
 
 The entries of `limbs` are given for azimuth 0. They are copied and rotated about base z by each
@@ -55,7 +56,8 @@ other bodies are shared."""
 
 
 FRICTION = """Friction of the actuated joints, opposite to the rate: viscous friction is
-proportional to the rate, Coulomb friction depends on its sign. `offset` is a constant effort."""
+proportional to the rate, Coulomb friction depends on its sign. `offset` is a constant effort.
+The other keys belong to further friction laws, see [friction.md](friction.md)."""
 LIMITS = "Nodes and commands reject values beyond these limits, or warn. The default is no limit."
 UNCERTAINTY = """The uncertainty of a number, by its dotted path in this file (`inertia.arm_mass`),
 or of all numbers below a name together (`joints_compliance`). Each entry is an independent cause;
@@ -78,7 +80,12 @@ ELEMENTS = """### `element_compliance`
 
 Factors on the compliance of elastic elements, by the names that `strain_energy` uses (members and
 joints); the default is 1. `{3U: 3.0}` makes a joint three times softer than in the other sections.
-Above 0, at most 1e6. `fit --what compliance` writes this section."""
+Above 0, at most 1e6. `fit --what compliance` writes this section.
+
+### `modal_damping`
+
+Damping ratios of the natural modes, from the lowest on; the last one is that of all further modes.
+`frf`, `lobes` and input shapers use it."""
 GRAVITY = """### `gravity`
 
 Acceleration of free fall in base axes, m/s2; default [0, 0, -9.81]."""
@@ -90,7 +97,7 @@ def default(field):
     value = field.metadata["default"]
     if value is dataclasses.MISSING:
         return "required"
-    if value is None:
+    if value is None or value == []:
         return "none"
     if value == {}:
         return "its own defaults" if field.metadata["section"] else "none"
@@ -122,7 +129,10 @@ def table(title, kind, text=None):
 def page():
     """The whole page."""
     parts = [HEAD.rstrip()]
-    for module, name in ((delta.Delta, "delta"), (prru.Prru, "prru"), (upr_rpu.UprRpu, "upr_rpu")):
+    for module, name in (
+        (delta.Delta, "delta"), (linear_delta.LinearDelta, "linear_delta"), (prru.Prru, "prru"),
+        (upr_rpu.UprRpu, "upr_rpu"),
+    ):  # fmt: skip
         fields = {f.name: f for f in dataclasses.fields(module) if "check" in f.metadata}
         parts.append(f"## `mechanism: {name}`")
         top = [f for f in fields.values() if f.metadata["section"] is None]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gallery's pictures of ``pkm-twin view``: ``python -m test.docs.view docs/gallery``.
+"""The gallery's pictures of ``pkm-twin view``: ``python -m tools.pages.view docs/gallery``.
 
 Needs a browser; where there is none it says so and leaves the pictures as they are.
 """

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Friction laws, torque constants and resonances of recordings; sweeps that show friction."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from delta_dynamics import inverse_dynamics
+from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.identification.excitation import Bounds, Judge
+from pkm_twin.identification.file_parameters import file_parameters
+from pkm_twin.identification.fit_signals import resonances_of
+from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
+from pkm_twin.identification.samples import Filtering
+from pkm_twin.identification.sweeps import sweeps
+from pkm_twin.identification.torque_constant import fitted_constants, given_constants
+from test.identification.machines import machine, noisy
+from test.support.robots import load, partly_long
+
+CASES = [f"{name} {law}" for name in ("five_bar", "delta_cu", "linear_delta")
+         for law in ("none", "stribeck", "load-dependent", "periodic")]  # fmt: skip
+
+
+def rubbing(m, law):
+    """The machine with a law beside its friction, of a size that matters."""
+    n, coulomb = len(m.size), m.truth.friction.coulomb
+    speed, travel = np.sqrt(np.mean(m.qd**2, 0)), np.ptp(m.q, axis=0)
+    laws = {
+        "none": {},
+        "stribeck": {"stribeck": 1.5 * coulomb, "stribeck_speed": 0.15 * speed},
+        "load-dependent": {"load_dependent": np.full(n, 0.1)},
+        "periodic": {
+            "cogging_cos": 0.05 * m.size, "cogging_sin": -0.03 * m.size,
+            "cogging_period": travel / 7.3,
+        },
+    }  # fmt: skip
+    values = {key: value.tolist() for key, value in laws[law].items()}
+    return m.truth.changed(friction=values), values
+
+
+@pytest.mark.parametrize("case", partly_long(CASES, "five_bar load-dependent"))
+def test_the_law_of_a_drive_is_found_by_what_was_held_out(case):
+    pytest.importorskip("cvxpy")
+    name, law = case.split()
+    rng = np.random.default_rng([7, *name.encode()])
+    m = machine(load(name), rng, 8.0 if name == "five_bar" else 16.0)
+    truth, values = rubbing(m, law)
+    effort = inverse_dynamics(truth, m.q, m.qd, m.qdd)
+    record = noisy(m.recorded(effort=effort), rng, 0.005)
+    result, choices = fit_with_laws(m.robot, [record], ("friction", "payload"))
+    taken = [one.law for one in choices if one.taken]
+    assert taken == ([] if law == "none" else [law])
+    assert result.verdict.answer == "explains"
+    for one in choices:
+        assert not one.taken or (one.sigmas > 4.5 and one.after < one.before)
+    found = {key: [] for key in values}
+    for number in result.numbers:
+        for key in found:
+            if key in number.key:
+                found[key].append((number.after, number.deviation))
+    for key, rows in found.items():
+        value, deviation = np.array(rows).T
+        assert (np.abs(value - values[key]) < 4.0 * deviation + 0.05 * np.abs(values[key])).all()
+
+
+def test_names_of_laws():
+    assert laws_of("auto") is None
+    assert laws_of("coulomb") == ()
+    assert laws_of("load-dependent, stribeck") == ("stribeck", "load-dependent")
+    with pytest.raises(UnknownNameError):
+        laws_of("stribek")
+
+
+@pytest.mark.parametrize("name", partly_long(["delta_cu", "five_bar", "prru"], "five_bar"))
+def test_torque_constants_follow_from_known_masses(name, rng):
+    m = machine(load(name), rng)
+    robot = m.truth
+    constants = rng.uniform(0.05, 2.0, len(m.size)) * rng.choice([-1.0, 1.0], len(m.size))
+    effort = inverse_dynamics(robot, m.q, m.qd, m.qdd)
+    record = noisy(m.recorded(effort=effort / constants), rng)
+    found = fitted_constants(robot, [record])
+    assert (np.abs(found.values - constants) < 4.0 * found.deviations).all()
+    assert (found.deviations < 0.02 * np.abs(constants)).all()
+    words = ",".join(str(value) for value in constants)
+    given = given_constants(robot, words).applied(record)
+    assert np.allclose(given.effort, record.effort * constants, rtol=1e-12)
+    noise = rng.normal(size=effort.shape)
+    with pytest.raises(PkmTwinError):
+        fitted_constants(robot, [m.recorded(effort=noise)])
+    for wrong in ("0", "nan", "a", "1,2,3,4,5,6,7"):
+        with pytest.raises(ParameterError):
+            given_constants(robot, wrong)
+
+
+def test_a_resonance_is_found_with_its_frequency_and_no_other(rng):
+    period, how = 1e-3, Filtering(7, (1e-6, 1e-6), 15.0, 10)
+    count = 12000
+    for _ in range(20):
+        noise = rng.normal(size=(count, 2)) * [0.1, 0.02]
+        assert resonances_of([noise], period, how) == ()
+    damping = 0.02
+    for frequency in (62.0, 140.0):
+        # A lightly damped oscillator that noise excites.
+        turn = 2.0 * np.pi * frequency * period
+        radius, ring = np.exp(-damping * turn), np.zeros((count, 2))
+        poles = [1.0, -2.0 * radius * np.cos(turn), radius**2]
+        ring[:, 1] = lfilter([1.0], poles, rng.normal(size=count))
+        ring *= 0.02 / ring[:, 1].std()
+        noise = rng.normal(size=(count, 2)) * [0.1, 0.02]
+        (found,) = resonances_of([noise + ring], period, how)
+        assert found.joint == 1
+        assert abs(found.frequency - frequency) < 3.0
+        assert found.rms == pytest.approx(0.02, rel=0.4)
+        assert not found.line
+
+
+@pytest.mark.parametrize("name", ["five_bar", "delta_cu"])
+def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
+    robot = load(name)
+    judge = Judge.of(robot, file_parameters(robot, ("friction",)))
+    found = sweeps(judge, 60.0, Bounds(share=1.0))
+    time = np.linspace(0.0, found.duration, 20001)
+    q, qd, qdd = found.at(time)
+    step = time[1]
+    assert np.abs(np.gradient(q, step, axis=0) - qd).max() < 0.02 * np.abs(qd).max()
+    assert np.abs(np.gradient(qd, step, axis=0) - qdd).max() < 0.2 * np.abs(qdd).max()
+    assert np.abs(q[[0, -1]] - found.centre).max() < 1e-9 and np.abs(qd[[0, -1]]).max() < 1e-9
+    assert ((np.abs(qd) > 0.0).sum(1) <= 1).all()
+    low, high = robot.limits.position.T
+    assert (q >= low - 1e-12).all() and (q <= high + 1e-12).all()
+    assert (np.abs(qd) <= robot.limits.velocity * (1.0 + 1e-12)).all()
+    assert (robot.singularity(q[::50]) > 0.1 * 0.99).all()
+    assert np.isfinite(found.condition)
+    # Both ways, at three speeds each.
+    for j, row in enumerate(found.speeds):
+        for speed in row:
+            for way in (1.0, -1.0):
+                assert (np.abs(qd[:, j] - way * speed) < 1e-9 * speed).any()

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines of the gallery: plausible, shown on their page, and right by other engines."""
+
+import numpy as np
+import pytest
+
+from pkm_twin import load
+from pkm_twin.apps.certify import certificate_of
+from pkm_twin.robot.outline import base_face, platform_face
+from pkm_twin.robot.plausibility import findings
+from stiffness_monitor import compliance
+from test.docs.test_docs import DOCS
+from test.support.robots import partly_long
+from tools.pages.robots import GALLERY, MACHINES
+
+NAMES = [path.name for path in GALLERY]
+PAGE = (DOCS / "gallery.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_its_numbers_are_plausible_and_its_page_complete(name):
+    robot = load(MACHINES / name)
+    assert findings(robot) == ()
+    picture = f"robot_{robot.name}.png"
+    assert (DOCS / "gallery" / picture).stat().st_size and f"gallery/{picture}" in PAGE
+    assert f"pkm-twin view examples/machines/{name}\n" in PAGE
+
+
+@pytest.mark.parametrize("name", partly_long(NAMES, "delta_1130.yaml"))
+def test_its_torques_are_those_of_another_engine(name):
+    """Of the Delta with its drives given as rotors and gears."""
+    result = certificate_of(load(MACHINES / name), states=1, engines=["maximal"])
+    assert result.good, [item for item in result.items if not item.good]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", NAMES)
+def test_every_engine_agrees(name):
+    result = certificate_of(load(MACHINES / name), states=5)
+    assert result.good, [item for item in result.items if not item.good]
+    assert not result.missing
+
+
+@pytest.mark.parametrize("name", ["tricept.yaml", "delta_1130.yaml"])
+def test_those_with_members_are_compliant(name):
+    robot = load(MACHINES / name)
+    found = compliance(robot, robot.home())
+    assert (np.linalg.eigvalsh((found + found.T) / 2) > 0.0).all()
+
+
+def test_the_large_delta_covers_its_circle():
+    """What the head of the file claims."""
+    robot, azimuth = load(MACHINES / "delta_1130.yaml"), np.linspace(0.0, 2 * np.pi, 37)
+    for z in (-0.70, -0.85):
+        circle = np.stack([0.565 * np.cos(azimuth), 0.565 * np.sin(azimuth), 0 * azimuth + z], -1)
+        q = robot.inverse(circle)
+        low, high = robot.limits.position.T
+        assert (low < q).all() and (q < high).all()
+
+
+def test_plates_are_convex_and_none_is_between_guides():
+    tricept = load(MACHINES / "tricept.yaml").graph
+    corners = base_face(tricept)  # the gimbal is amid the three feet
+    assert np.linalg.norm(corners, axis=1) == pytest.approx([0.5] * 3)
+    corners = platform_face(tricept)  # it slides through the gimbal, 1 m above
+    assert corners[:, 2] == pytest.approx([-1.0] * 3)

@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gallery's pictures of all robots: ``python -m tools.pages.robots docs/gallery``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from pkm_twin import load, robot_names
+from pkm_twin.apps.drawing import picture
+
+MACHINES = Path(__file__).parents[2] / "examples/machines"
+GALLERY = sorted(path for path in MACHINES.iterdir() if path.suffix in (".yaml", ".urdf"))
+"""Files of the gallery of machines."""
+
+
+if __name__ == "__main__":
+    for source in (*robot_names(), *GALLERY):
+        picture(load(source), Path(sys.argv[1]) / f"robot_{Path(source).stem}.png")
