@@ -25,6 +25,8 @@ OVERRUN_SHARE: Final = 100
 """One callback in so many may take longer than its period before the diagnostics warn."""
 MAX_TEXT: Final = 500
 """Characters of a line in the log or of a value in the diagnostics."""
+UNKNOWN_NODE: Final = "_NODE_NAME_UNKNOWN_"
+"""What rmw calls a node of which only an endpoint has been discovered."""
 
 
 class Health:
@@ -196,6 +198,13 @@ def misfit(speaker: TopicEndpointInfo, listener: TopicEndpointInfo) -> str:
         if qos_check_compatible(offered, alike)[0] == QoSCompatibility.ERROR:
             return f"QoS: {policy}"
     return "QoS: liveliness"
+
+
+def node_of(end: TopicEndpointInfo) -> str:
+    """The full name of an endpoint's node; the graph can know an endpoint before its node."""
+    if end.node_name == UNKNOWN_NODE:
+        return "a node whose name is not known yet"
+    return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 
 
 def cut(text: str) -> str:
