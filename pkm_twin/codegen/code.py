@@ -74,11 +74,6 @@ def _sources() -> str:
     return cache.digest(*(path.read_text(encoding="utf-8") for path in paths))
 
 
-def _strides(row: Array) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Number and bytes from one to the next, of samples and of machines."""
-    return (row.shape[1], row.strides[1]), (row.shape[0], row.strides[0])
-
-
 def _axes(array: Array) -> int:
     return array.ndim
 
@@ -383,7 +378,8 @@ class Code:
             own = prepared[begin:] if many else prepared
             words = [*size, steps, own.ctypes.data, prepared.shape[1]]
             for row in rows:
-                every, leap = (0 if n == 1 else step // 8 for n, step in _strides(row))
+                # One sample, or one machine, serves all.
+                leap, every = (row.strides[k] // 8 if row.shape[k] > 1 else 0 for k in (0, 1))
                 at = begin * (leap if many else every)
                 words += [row.ctypes.data + 8 * at, every, leap]
             at = begin * count if many else begin

@@ -52,7 +52,7 @@ def pivot_order(samples: Array, share: float = 0.1) -> Order:
 
     Of those that are large enough in every sample the one with the least fill is taken (Markowitz's
     rule with threshold pivoting; Duff, Erisman and Reid 1986). Where none holds in all samples, the
-    first alone decides.
+    first half of them decides.
 
     :param samples: the matrix in some states, shape (k, n, n).
     :param share: least part of a row's and a column's largest entry that a pivot may have.
@@ -69,7 +69,7 @@ def pivot_order(samples: Array, share: float = 0.1) -> Order:
         good = there & (block > np.maximum(share * large, 1e-12)).all(0)
         if not good.any():
             if len(samples) > 1:
-                return pivot_order(samples[:1], share)
+                return pivot_order(samples[: len(samples) // 2], share)
             raise SingularityError("the sample states", (), float(scale), share)
         fill = np.multiply.outer(there.sum(1) - 1, there.sum(0) - 1)
         # The first of the best: a finer choice would differ from machine to machine.

@@ -19,7 +19,9 @@ from pkm_twin.machine.graph import Array, Graph
 from pkm_twin.machine.tree import Tree
 
 SAMPLES: Final = 6
-"""States near home, beside it, in which pivots have to be good."""
+"""States around home, beside it, in which pivots have to be good."""
+REACH: Final = 0.6
+"""How far from home, rad or half the size: pivots that are good at home alone come near zero."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +96,8 @@ class Linkage:
         graph, home = self.graph, self.graph.home
         states = [(np.array(self.tree.home, float), home)]
         random = np.random.default_rng(0)
-        reach = np.array(
-            [0.15 * self.tree.size if self._drive_scale(n) != 1.0 else 0.3 for n in graph.actuated]
-        )
+        slides = np.array([graph.joints[name].slides for name in graph.actuated])
+        reach = np.where(slides, self.tree.size / 2, 1.0) * REACH
         for _ in range(4 * SAMPLES):
             if len(states) > SAMPLES:
                 break

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 BASE: Final = "base"
 """Name of the ground."""
+PLATFORM: Final = "platform"
+"""Name of the platform of a machine that a formula describes."""
 
 POSE: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Pose coordinates: the reference point, and R = Rz(yaw) Ry(pitch) Rx(roll) relative to home."""
@@ -33,6 +35,9 @@ def array(values: ArrayLike) -> Array:
     result = plain(values).copy()
     result.setflags(write=False)
     return result
+
+
+UP: Final = array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)

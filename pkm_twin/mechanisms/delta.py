@@ -45,7 +45,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, Rod, array
+from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, Rod, array
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure, disc
@@ -59,8 +59,6 @@ from pkm_twin.robot.robot import Robot
 Array = NDArray[np.float64]
 
 LIMBS: Final = ("I", "II", "III")
-UP: Final = array([0.0, 0.0, 1.0])
-PLATFORM: Final = "platform"
 MAX_ITERATIONS: Final = 12
 EVEN: Final = 0.02
 """Least of :meth:`Delta._evenness` at home, of 1."""

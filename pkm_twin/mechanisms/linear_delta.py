@@ -22,7 +22,7 @@ from pkm_twin.codegen.expressions import cos, plain, sin, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import BASE, Body, Graph, Joint, Rod, array
+from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Graph, Joint, Rod, array
 from pkm_twin.machine.members import disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass
@@ -32,8 +32,6 @@ from pkm_twin.robot.robot import Robot
 Array = NDArray[np.float64]
 
 LIMBS: Final = ("a", "b", "c")
-UP: Final = array([0.0, 0.0, 1.0])
-PLATFORM: Final = "platform"
 
 
 @dataclass(frozen=True, eq=False)

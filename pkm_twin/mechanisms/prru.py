@@ -53,7 +53,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
+from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.inertia import transport
 from pkm_twin.machine.members import Beam, Structure, Tube, disc
 from pkm_twin.machine.pose_grid import PoseGrid
@@ -73,8 +73,6 @@ from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 Array = NDArray[np.float64]
 
 LIMBS: Final = ("I", "II", "III")
-UP: Final = array([0.0, 0.0, 1.0])
-PLATFORM: Final = "platform"
 
 
 @dataclass(frozen=True, eq=False)

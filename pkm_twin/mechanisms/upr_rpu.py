@@ -50,7 +50,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph import BASE, Body, Direction, Graph, Joint, array
+from pkm_twin.machine.graph import BASE, PLATFORM, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.members import Beam, Section, Structure, disc
 from pkm_twin.machine.pose_grid import PoseGrid
@@ -62,7 +62,6 @@ from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
-PLATFORM: Final = "platform"
 FAR: Final = 1e5
 """Longest limb over the machine's size; beyond, rounding would lose the pose, or overflow."""
 LEVEL: Final = 1e-2

@@ -16,7 +16,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.ros.health import Health
+from pkm_twin.ros.health import QOS, RELIABILITY, Health, Misfit
 from pkm_twin.ros.parameters import ParameterNode
 from pkm_twin.ros.qos import EXPIRY, OVERRIDES, input_qos, latched_qos, output_qos
 from pkm_twin.ros.turns import SeldomGroup
@@ -262,9 +262,9 @@ class GuardedSubscription:
             node.failed(self._topic, error)
         statistics.handled(time.perf_counter() - began)
 
-    def _misfit(self, text: str) -> None:
+    def _misfit(self, what: Misfit) -> None:
         """From there on publishers of both kinds are taken."""
-        if text != "QoS: reliability" or self._best_effort or self._given or self._relaxed:
+        if what != (QOS, RELIABILITY) or self._best_effort or self._given or self._relaxed:
             return
         self._relaxed, node = True, self._node
         node.destroy_subscription(self._subscription)

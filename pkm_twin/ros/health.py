@@ -8,7 +8,7 @@ import traceback
 from collections.abc import Callable
 from copy import copy
 from itertools import product
-from typing import Final
+from typing import Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.lifecycle import LifecycleNode
@@ -27,6 +27,20 @@ MAX_TEXT: Final = 500
 """Characters of a line in the log or of a value in the diagnostics."""
 UNKNOWN_NODE: Final = "_NODE_NAME_UNKNOWN_"
 """What rmw calls a node of which only an endpoint has been discovered."""
+
+
+QOS: Final = "QoS"
+RELIABILITY: Final = "reliability"
+
+
+class Misfit(NamedTuple):
+    """Why a publisher and a subscriber exchange nothing: the policy of a QoS, or the types."""
+
+    kind: str
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {self.detail}"
 
 
 class Health:
@@ -48,8 +62,8 @@ class Health:
         self._last_exception = ""
         self._last_kind = ""
         self._reported = (0, 0, 0, 0)
-        self._watched: dict[str, list[Callable[[str], None]]] = {}
-        self._unfit: dict[str, dict[bytes, str]] = {}
+        self._watched: dict[str, list[Callable[[Misfit], None]]] = {}
+        self._unfit: dict[str, dict[bytes, Misfit]] = {}
         self._incompatible = 0
         self._last_clock = 0
 
@@ -71,11 +85,10 @@ class Health:
             self._logged[reason] = now
             self._node.get_logger().warning(cut(text))
 
-    def watch(self, topic: str, tell: Callable[[str], None] | None = None) -> None:
+    def watch(self, topic: str, tell: Callable[[Misfit], None] | None = None) -> None:
         """Tell of other nodes with which this one cannot exchange messages on a topic.
 
-        :param tell: called with what does not fit (``QoS: POLICY`` or ``message type: TYPE``), once
-            a publisher or subscriber.
+        :param tell: called with what does not fit, once a publisher or subscriber.
         """
         self._watched.setdefault(topic, []).extend([tell] if tell else [])
 
@@ -85,14 +98,14 @@ class Health:
             before, now = self._unfit.get(topic, {}), self._misfits(topic)
             self._unfit[topic] = now
             for end in now.keys() - before.keys():
-                self._incompatible += now[end].startswith("QoS")
+                self._incompatible += now[end].kind == QOS
                 self.log_throttled(
                     f"{topic} {now[end]}", f"another node on {topic} has an incompatible {now[end]}"
                 )
                 for tell in listeners:
                     tell(now[end])
 
-    def _misfits(self, topic: str) -> dict[bytes, str]:
+    def _misfits(self, topic: str) -> dict[bytes, Misfit]:
         """What does not fit at other nodes' publishers and subscribers, by their identity."""
         # The name as it was given: both calls remap it.
         speakers = self._node.get_publishers_info_by_topic(topic)
@@ -103,7 +116,7 @@ class Health:
         pairs = [(s, r, r) for s, r in product(speaking, listeners)]
         pairs += [(s, r, s) for s, r in product(strangers, listening)]
         found = {bytes(end.endpoint_gid): misfit(s, r) for s, r, end in pairs}
-        return {end: text for end, text in found.items() if text}
+        return {end: what for end, what in found.items() if what}
 
     def _is_own(self, end: TopicEndpointInfo) -> bool:
         node = self._node
@@ -118,7 +131,7 @@ class Health:
         found += [
             (WARN, f"another node on {topic} has an incompatible {text}")
             for topic, unfit in self._unfit.items()
-            for text in sorted(set(unfit.values()))
+            for text in sorted(map(str, set(unfit.values())))
         ]
         if self._node.get_parameter("use_sim_time").value:
             now = self._now()
@@ -185,19 +198,19 @@ class Health:
         return array
 
 
-def misfit(speaker: TopicEndpointInfo, listener: TopicEndpointInfo) -> str:
-    """Why a publisher's messages do not reach a subscriber; empty if they do."""
+def misfit(speaker: TopicEndpointInfo, listener: TopicEndpointInfo) -> Misfit | None:
+    """Why a publisher's messages do not reach a subscriber; None if they do."""
     if speaker.topic_type != listener.topic_type:
-        return f"message type: {speaker.topic_type} for {listener.topic_type}"
+        return Misfit("message type", f"{speaker.topic_type} for {listener.topic_type}")
     offered, requested = speaker.qos_profile, listener.qos_profile
     if qos_check_compatible(offered, requested)[0] != QoSCompatibility.ERROR:
-        return ""
-    for policy in ("reliability", "durability", "deadline"):
+        return None
+    for policy in (RELIABILITY, "durability", "deadline"):
         alike = copy(offered)
         setattr(alike, policy, getattr(requested, policy))
         if qos_check_compatible(offered, alike)[0] == QoSCompatibility.ERROR:
-            return f"QoS: {policy}"
-    return "QoS: liveliness"
+            return Misfit(QOS, policy)
+    return Misfit(QOS, "liveliness")
 
 
 def node_of(end: TopicEndpointInfo) -> str:

@@ -517,7 +517,7 @@ class TestNeighbours:
             own._look()
         # The graph's calls expand and remap a name: one that has been would be twice.
         assert asked == ["~/x"] * 4
-        assert sorted(told) == ["QoS: reliability", "message type: a/msg/B for a/msg/A"]
+        assert sorted(told) == [("QoS", "reliability"), ("message type", "a/msg/B for a/msg/A")]
 
     def test_a_subscriber_that_does_not_fit_is_told(self, quick):
         node = quick.peer.node
