@@ -30,15 +30,27 @@ Array = NDArray[np.float64]
 
 SHIPPED: Final = "shipped"
 RPM: Final = 2 * math.pi / 60
+UNLIKE: Final = 0.05
+"""Difference between a file's efforts and the model's, over the RMS, from which it is reported."""
 
 
 @dataclass(frozen=True)
 class Taken:
-    """A motion with the efforts that are sized, shape (k, n), and where these are from."""
+    """A motion with the efforts that are sized, shape (k, n), and where these are from.
+
+    ``model``: what the robot's model computes for the motion, shape (k, n).
+    """
 
     motion: Motion
     effort: Array
     source: str
+    model: Array
+
+    @property
+    def difference(self) -> Array:
+        """RMS difference between efforts and model over the model's RMS, shape (n,)."""
+        squares = ((self.effort - self.model) ** 2).mean(0)
+        return np.asarray(np.sqrt(squares / np.maximum((self.model**2).mean(0), 1e-24)))
 
 
 def loaded(name: str, platform: str | None) -> Robot:
@@ -62,15 +74,15 @@ def read_motion(
     :raises BagError: a bag without joint states or a trajectory.
     """
     motion = motion_of(path, robot, topics, carried)
-    given = motion.measured if motion.planned is None else motion.planned
-    if given is not None and efforts == "file":
-        return Taken(motion, given, "the file's")
-    effort = np.empty_like(motion.q)
+    model = np.empty_like(motion.q)
     for machine, part in by_load(motion.robot, motion.load, motion.time, 4096):
-        effort[part] = inverse_dynamics(
+        model[part] = inverse_dynamics(
             machine, motion.q[part], motion.qd[part], motion.qdd[part], motion.wrench[part]
         )
-    return Taken(motion, effort, "the model's")
+    given = motion.measured if motion.planned is None else motion.planned
+    if given is not None and efforts == "file":
+        return Taken(motion, given, "the file's", model)
+    return Taken(motion, model, "the model's", model)
 
 
 def duties(taken: Taken, motors: Sequence[Motor]) -> list[DriveDuty]:
@@ -150,7 +162,7 @@ def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], s
     total = [d.at_joint.energy for d in result]
     data = {
         "robot": m.robot.name, "duration_s": duration, "samples": len(m.time),
-        "efforts": taken.source,
+        "efforts": taken.source, "difference_from_model": taken.difference.tolist(),
         "payload": None if m.load is None else m.load.as_json(),
         "drives": {d.joint: d.as_json() for d in result},
         "energy_J": sum(total), "mean_power_W": sum(total) / duration,
@@ -181,6 +193,13 @@ def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], s
         f"mean power {data['mean_power_W']:.4g} W"
     )
     lines += list(m.notes)
+    if taken.difference.max() > UNLIKE:
+        worst = int(taken.difference.argmax())
+        lines.append(
+            f"the file's efforts of {m.robot.joint_names[worst]} differ from the model's by "
+            f"{100 * taken.difference[worst]:.3g} % RMS: the file may be of another robot, "
+            "load or rotor; --efforts model uses the model's"
+        )
     return data, "\n".join(lines)
 
 

@@ -94,7 +94,7 @@ def test_torques_takes_the_pose_in_place_of_the_joints(twin, tmp_path):
     result.one_line_error()
 
 
-def test_a_cycle_as_a_trajectory_that_size_reads(twin, tmp_path):
+def test_a_cycle_as_a_trajectory_that_size_reads(twin, tmp_path, geared):
     out = tmp_path / "cycle.mcap"
     good(twin(*CYCLE, "--out", out, "--no-picture", "--payload", "0.4"))
     (message,) = (m.message for m in read_messages(out))
@@ -113,6 +113,10 @@ def test_a_cycle_as_a_trajectory_that_size_reads(twin, tmp_path):
     result = json.loads(good(twin("size", "delta", out, "--json")).out)
     assert result["efforts"] == "the file's"
     assert result["payload"]["mass_kg"] == 0.4
+    np.testing.assert_allclose(result["difference_from_model"], 0.0, atol=1e-6)
+    # Planned without the rotors of another file.
+    other = json.loads(good(twin("size", geared, out, "--json")).out)
+    assert min(other["difference_from_model"]) > 0.05
     again = tmp_path / "torques.csv"
     good(twin("torques", "delta", out, "--out", again, "--no-picture"))
     np.testing.assert_allclose(of_joints(table(again), robot, "effort"), motion.effort, atol=1e-6)
