@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,6 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_gradient
 from stiffness_monitor.numbers import numbers_of
 from stiffness_monitor.programs import elastic_of
-
-if TYPE_CHECKING:
-    from pkm_twin.design.variants import Variants
 
 Array = NDArray[np.float64]
 
@@ -59,24 +56,40 @@ class NumberFunctions:
         return FileNumbers(self.robot, self.paths, lambda made: numbers_of(made.elastic))
 
 
-Asked = tuple[Kernel, Callable[["Variants"], Array]]
+class Rows(Protocol):
+    """What programs take of machines, a row each, shape (k, size)."""
+
+    @property
+    def geometry(self) -> Array:
+        """Of the joints, rods and bodies."""
+
+    @property
+    def masses(self) -> Array:
+        """Masses, centres of mass, inertias and rotors."""
+
+    @property
+    def elasticity(self) -> Array:
+        """Stiffness of members and joints."""
+
+
+Asked = tuple[Kernel, Callable[[Rows], Array]]
 """A program, and what it takes of the machines, shape (k, size)."""
 Ask = Callable[[Robot], Asked]
 
 
-def of_geometry(many: Variants) -> Array:
+def of_geometry(many: Rows) -> Array:
     """Geometry of the machines."""
-    return many._geometry
+    return many.geometry
 
 
-def of_masses(many: Variants) -> Array:
+def of_masses(many: Rows) -> Array:
     """Masses, then geometry."""
-    return np.concatenate([many._masses, many._geometry], 1)
+    return np.concatenate([many.masses, many.geometry], 1)
 
 
-def of_elasticity(many: Variants) -> Array:
+def of_elasticity(many: Rows) -> Array:
     """Geometry, then elasticity."""
-    return np.concatenate([many._geometry, many._elastic], 1)
+    return np.concatenate([many.geometry, many.elasticity], 1)
 
 
 def forward(robot: Robot) -> Asked:

@@ -237,15 +237,16 @@ class Variants:
         return made
 
     @cached_property
-    def _geometry(self) -> Array:
-        """NaN of a machine whose file's numbers are out of range."""
+    def geometry(self) -> Array:
+        """Geometry as programs take it, shape (k, size); NaN where a number is out of range."""
         found = self.functions.geometry(self.values)
         found[self._out_of_range] = np.nan
         return found
 
     @cached_property
-    def _masses(self) -> Array:
-        found = self.functions.rigid(self.values)[:, self._geometry.shape[1] :]
+    def masses(self) -> Array:
+        """Masses as programs take them, shape (k, size); NaN likewise."""
+        found = self.functions.rigid(self.values)[:, self.geometry.shape[1] :]
         found[self._out_of_range] = np.nan
         return found
 
@@ -260,8 +261,8 @@ class Variants:
         return np.asarray(self.functions.rigid.slopes_at(self.values[:1])[0])
 
     @cached_property
-    def _elastic(self) -> Array:
-        """Numbers of the elasticity."""
+    def elasticity(self) -> Array:
+        """What elasticity takes beside the geometry, shape (k, size)."""
         return self.functions.elastic(self.values)
 
     @cached_property
