@@ -30,6 +30,7 @@ from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, rate_doubt
+from pkm_twin.streams.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, setting
 from pkm_twin.streams.wrench import counting
 
 Array = NDArray[np.float64]
@@ -46,19 +47,40 @@ SLICE: Final = 256
 class Settings:
     """How the node answers; the robot's own values are in the robot."""
 
-    differentiate: bool = False
-    order: int = 2
-    window: int = 25
-    limit_policy: LimitPolicy = "warn"
-    stale_after: float = 0.1
-    future_tolerance: float = 0.1
-    accept_zero_stamp: bool = False
-    trip_count: int = 5
-    recovery_count: int = 5
-    extra_joints: ExtraJoints = "refuse"
-    on_stop: OnStop = "nothing"
-    singularity_warn: float = 0.05
-    singularity_stop: float = 0.01
+    differentiate: bool = setting(
+        False, "for messages without velocities or accelerations: trajectory rejects them, "
+        "differentiate computes them",
+        name="acceleration", choices={"trajectory": False, "differentiate": True},
+    )  # fmt: skip
+    order: int = setting(
+        2, "polynomial degree of the velocity", name="differentiator.order", low=1, high=4
+    )
+    window: int = setting(
+        25, "samples in the window", name="differentiator.window", low=3, high=1000
+    )
+    limit_policy: LimitPolicy = setting(
+        "warn", "efforts beyond effort_limits: warn publishes, reject rejects, clamp limits them",
+        choices=("warn", "reject", "clamp"),
+    )  # fmt: skip
+    stale_after: float = setting(
+        0.1, "largest age of a joint state, and longest gap before the stream stops", **LATE
+    )
+    future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
+    accept_zero_stamp: bool = setting(False, ZERO_STAMP)
+    trip_count: int = setting(5, "rejected joint states in a row that stop the stream", **COUNT)
+    recovery_count: int = setting(5, "accepted joint states in a row that restart it", **COUNT)
+    extra_joints: ExtraJoints = setting(
+        "refuse", "joints of a trajectory that the model does not have: reject the trajectory, or "
+        "give them zero effort",
+        choices=("refuse", "zero"),
+    )  # fmt: skip
+    on_stop: OnStop = setting(
+        "nothing",
+        "command sent once when the stream stops",
+        choices=("nothing", "zeros", "gravity"),
+    )
+    singularity_warn: float = setting(0.05, "warn below this singularity index", **SHARE)
+    singularity_stop: float = setting(0.01, "stop below this singularity index", **SHARE)
 
     def __post_init__(self) -> None:
         if not self.singularity_stop <= self.singularity_warn:

@@ -20,6 +20,7 @@ from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.settings import COUNT, FUTURE, LATE, SECONDS, setting
 from pkm_twin.streams.wrench import counting
 
 Array = NDArray[np.float64]
@@ -34,14 +35,15 @@ WAITING: Final = "waiting"
 class GateSettings:
     """When the gate closes, and what it sends while it is closed."""
 
-    on_stop: OnStop = "zeros"
-    deadline: float = 0.1
-    """Longest age of a torque by its stamp, and longest silence, s."""
-    future_tolerance: float = 0.1
-    """How far a stamp may be ahead of the clock, s."""
-    trip_count: int = 1
-    recovery_count: int = 5
-    """Refused messages in a row that close the gate, good ones in a row that open it."""
+    on_stop: OnStop = setting(
+        "zeros", "command while no torques arrive", choices=("zeros", "gravity")
+    )
+    deadline: float = setting(
+        0.1, "largest age of a torque, and longest gap between torques", **LATE
+    )
+    future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
+    trip_count: int = setting(1, "rejected torques in a row that close the gate", **COUNT)
+    recovery_count: int = setting(5, "accepted torques in a row that open the gate", **COUNT)
 
 
 @dataclass

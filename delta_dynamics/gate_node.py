@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any
+from typing import Final
 
 import numpy as np
 from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
 
-from delta_dynamics.gate import Gate, GateSettings, effort_limits
+from delta_dynamics.gate import Gate, GateSettings
+from delta_dynamics.parameters_node import changed, declare_changes
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
@@ -19,17 +20,13 @@ from pkm_twin.errors import MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.intake import JointStateDecoder
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.joints import CommandPublisher, JointPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 
-PAYLOAD = {
-    "payload.mass": ("mass", "kg"),
-    "payload.com": ("com", "m, from the platform's reference point"),
-}
+PAYLOAD: Final = ("payload.mass", "payload.com")
 """What of the payload may change while the gate runs: the part that has a weight."""
 TORQUES = "delta_dynamics/joint_torques"
 MAX_DEADLINE = 3600.0
@@ -51,7 +48,7 @@ class CommandGate(TwinNode):
                 "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
             )
         )
-        settings = self._declare_settings()
+        settings = self.declare_settings(GateSettings, fixed=True)
         self._gate = Gate(robot, settings)
         self._closed = True
         self._commands = CommandPublisher(self, robot, "~/commands")
@@ -78,7 +75,7 @@ class CommandGate(TwinNode):
         follow_changes(
             self,
             ["effort_limits", *PAYLOAD],
-            lambda values: _changed(self._gate.robot, values),
+            lambda values: changed(self._gate.robot, values),
             self._gate.change_robot,
         )
         self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._watch)
@@ -155,52 +152,12 @@ class CommandGate(TwinNode):
                 )
         return ""
 
-    def _declare_settings(self) -> GateSettings:
-        d = GateSettings()
-        counts: dict[str, Any] = {"low": 1, "high": 10**6, "read_only": True}
-        seconds: dict[str, Any] = {"unit": "s", "high": 3600.0, "read_only": True}
-        return GateSettings(
-            on_stop=self.declare(
-                "on_stop", d.on_stop, "command while no torques "
-                "arrive", choices=("zeros", "gravity"),
-                read_only=True,
-            ),
-            deadline=self.declare(
-                "deadline", d.deadline, "largest age of a torque, and longest gap between torques",
-                low=1e-3, **seconds,
-            ),
-            future_tolerance=self.declare(
-                "future_tolerance", d.future_tolerance, "how far time stamps may be ahead of the "
-                "clock",
-                low=0.0, **seconds,
-            ),
-            trip_count=self.declare(
-                "trip_count", d.trip_count, "rejected torques in a row that close the "
-                "gate", **counts
-            ),
-            recovery_count=self.declare(
-                "recovery_count", d.recovery_count, "accepted torques in a row that open the "
-                "gate", **counts
-            ),
-        )  # fmt: skip
-
     def _declare_robot(self, settings: GateSettings) -> None:
         """Effort limits of every robot; the payload where its weight is borne."""
         robot = self._gate.robot
-        limits = effort_limits(robot)
-        text = "largest effort that is forwarded"
-        unit = "N m or N, one per joint"
-        values = {"effort_limits": self.declare("effort_limits", limits.tolist(), text, unit=unit)}
-        if settings.on_stop == "gravity":
-            payload: Any = getattr(robot, "payload")  # noqa: B009
-            for name, (key, unit) in PAYLOAD.items():
-                value = getattr(payload, key)
-                default = value.tolist() if isinstance(value, np.ndarray) else value
-                text = f"{name} of the robot; default: the robot file's"
-                values[name] = self.declare(name, default, text, unit=unit)
+        names = ["effort_limits", *(PAYLOAD if settings.on_stop == "gravity" else ())]
         # Not every robot's file has a place for what is not given.
-        given = {k: v for k, v in values.items() if k in self.given}
-        robot = _changed(robot, given)
+        robot = changed(robot, declare_changes(self, robot, names))
         if settings.on_stop == "gravity":
             # Refused here where the robot has no masses; and compiled before it is needed.
             zeros = np.zeros(len(robot.joint_names))
@@ -254,20 +211,6 @@ class CommandGate(TwinNode):
     def _send(self, command: ControllerNumbers) -> None:
         self._commands.publish(command)
         self._stamped.publish(self.now(), command)
-
-
-def _changed(robot: Robot, values: dict[str, Any]) -> Robot:
-    """The robot with the gate's parameters in place of its file's.
-
-    :raises ParameterError: a value is refused.
-    """
-    sections: dict[str, Any] = {}
-    if "effort_limits" in values:
-        sections["limits"] = {"effort": list(values["effort_limits"])}
-    payload = {key: values[name] for name, (key, _) in PAYLOAD.items() if name in values}
-    if payload:
-        sections["payload"] = {k: v if k == "mass" else list(v) for k, v in payload.items()}
-    return robot.changed(**sections)
 
 
 def main() -> None:

@@ -18,14 +18,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
-from delta_dynamics.parameters_node import (
-    CHANGES,
-    SETTINGS,
-    changed,
-    declare_changes,
-    declare_settings,
-    prepared,
-)
+from delta_dynamics.parameters_node import CHANGES, changed, declare_changes
 from delta_dynamics.reactions import reactions
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
@@ -39,9 +32,10 @@ from pkm_twin.ros.joints import CommandPublisher, JointPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.turns import Task
-from pkm_twin.ros.wrench import SECONDS, declare_mounts, declare_wrench
+from pkm_twin.ros.wrench import declare_mounts
 from pkm_twin.streams.matched import WrenchWindow
-from pkm_twin.streams.wrench import WrenchReader
+from pkm_twin.streams.settings import SECONDS, changeable, with_parameters
+from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 
 LAST_WORD: Final = 0.5
 """How long the end waits for the controller to acknowledge the last command, s."""
@@ -60,10 +54,7 @@ class DeltaDynamics(TwinNode):
         # Before there is a topic to be found by: the first start compiles for many seconds.
         warm_up(robot)
         robot = changed(robot, declare_changes(self, robot))
-        settings = declare_settings(self)
-        self._base_frame = self.declare(
-            "base_frame", "base_link", "name of the fixed frame", read_only=True
-        )
+        settings = self.declare_settings(Settings)
         self._feedforward = Feedforward(robot, settings, self._create_wrenches(settings))
         commands = self.declare("publish_commands", False, "publish ~/commands", read_only=True)
         if commands and "on_stop" not in self.given:
@@ -104,8 +95,8 @@ class DeltaDynamics(TwinNode):
         self._action = self._create_action()
         follow_changes(
             self,
-            [*CHANGES, *SETTINGS],
-            lambda values: prepared(values, self._feedforward.robot, self._feedforward.settings),
+            [*CHANGES, *changeable(Settings)],
+            self._prepare,
             self._take,
         )
         self._last_heard = 0
@@ -270,13 +261,14 @@ class DeltaDynamics(TwinNode):
             "stops the stream",
             choices=("ignore", "stop"), read_only=True,
         )  # fmt: skip
-        wrench = declare_wrench(
-            self,
-            read_only=True,
-            base_frame=self._base_frame,
+        wrench = self.declare_settings(
+            WrenchSettings,
+            fixed=True,
+            max_state_age=age,
             future_tolerance=settings.future_tolerance,
             accept_zero_stamp=settings.accept_zero_stamp,
         )
+        self._base_frame = wrench.base_frame
         mounts = declare_mounts(self)
         if not wanted:
             return None
@@ -433,6 +425,12 @@ class DeltaDynamics(TwinNode):
         self._torques.publish(self.now(), effort)
         if self._commands is not None:
             self._commands.publish(effort)
+
+    def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
+        """The robot and the settings with new values of parameters."""
+        core, own = self._feedforward, {k: v for k, v in values.items() if k in CHANGES}
+        robot = changed(core.robot, own) if own else core.robot
+        return robot, with_parameters(core.settings, values)
 
     def _take(self, prepared: tuple[Robot, Settings]) -> None:
         robot, settings = prepared

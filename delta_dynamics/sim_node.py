@@ -184,15 +184,15 @@ class MachineSim(TwinNode):
     def _declare_settings(self, robot: Robot) -> MachineSettings:
         """Drives and sensors by the model: who tunes them does not know what was drawn."""
         fixed: dict[str, Any] = {"read_only": True}
-        seconds: dict[str, Any] = {"unit": "s", "high": 10.0, "read_only": True}
         bandwidth = self.declare(
             "bandwidth", 10.0, "bandwidth of the position control, critically damped", unit="Hz",
             low=0.01, high=1000.0, **fixed,
         )  # fmt: skip
         stiffness, damping = tuned(robot, bandwidth)
         home = robot.inverse(robot.home())
-        period = self.declare("period", 1e-3, "sampling period of the sensors", low=1e-4, **seconds)
-        return MachineSettings(
+        return self.declare_settings(
+            MachineSettings,
+            fixed=True,
             start=self._row("start", home, "joint positions at the start, rad or m"),
             effort_limits=self._row(
                 "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N", 0.0
@@ -202,22 +202,9 @@ class MachineSim(TwinNode):
             ),
             damping=self._row("damping", damping, "of the position control; default: from "
             "bandwidth", 0.0),
-            period=period,
-            substeps=self.declare(
-                "substeps", 1, "integration steps per period", low=1, high=100, **fixed
-            ),
             resolution=self._row(
                 "encoder_resolution", np.zeros(len(home)), "resolution of the encoders, rad or "
                 "m; 0: exact", 0.0
-            ),
-            delay=self.declare("command_delay", 0.0, "delay of every effort "
-            "command", low=0.0, **seconds),
-            deadline=self.declare(
-                "deadline", 0.1, "longest gap between effort commands", low=1e-3, **seconds
-            ),
-            on_silence=self.declare(
-                "on_silence", "zeros", "efforts of the drives after that gap",
-                choices=("zeros", "hold"), **fixed,
             ),
             payloads=self._declare_payloads(robot),
             wrench=WrenchSignal(

@@ -22,6 +22,7 @@ from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.path import JointPath
+from pkm_twin.streams.settings import setting
 from pkm_twin.streams.wrench import counting
 
 Array = NDArray[np.float64]
@@ -70,17 +71,19 @@ class MachineSettings:
     stiffness: Array
     damping: Array
     """Of the position control that goes trajectories, N m/rad and N m s/rad (N/m and N s/m)."""
-    period: float = 1e-3
-    """Of sensors and position control, s."""
-    substeps: int = 1
-    """Steps of the integration in a period."""
+    period: float = setting(1e-3, "sampling period of the sensors", unit="s", low=1e-4, high=10.0)
+    substeps: int = setting(1, "integration steps per period", low=1, high=100)
     resolution: Array = field(default_factory=lambda: np.zeros(1))
     """Encoder step, rad or m; 0 is none."""
-    delay: float = 0.0
-    """From a command to the drive's effort, s."""
-    deadline: float = 0.1
-    """Longest silence of effort commands, s."""
-    on_silence: OnSilence = "zeros"
+    delay: float = setting(
+        0.0, "delay of every effort command", name="command_delay", unit="s", low=0.0, high=10.0
+    )
+    deadline: float = setting(
+        0.1, "longest gap between effort commands", unit="s", low=1e-3, high=10.0
+    )
+    on_silence: OnSilence = setting(
+        "zeros", "efforts of the drives after that gap", choices=("zeros", "hold")
+    )
     payloads: tuple[PayloadEvent, ...] = ()
     wrench: WrenchSignal = field(default_factory=WrenchSignal)
 

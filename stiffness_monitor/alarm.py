@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import one_vector
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.settings import setting
 from stiffness_monitor.compliance import strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from stiffness_monitor.response import element_response
@@ -63,9 +64,18 @@ class AlarmSettings:
     ``directions``: the measured ones of x y z rx ry rz.
     """
 
-    sigmas: float = 6.0
-    least: float = 0.1
-    window: float = 20.0
+    sigmas: float = setting(
+        6.0, "alarm threshold in standard deviations of model and noise together",
+        name="alarm.sigmas", low=1.0, high=1e3,
+    )  # fmt: skip
+    least: float = setting(
+        0.1, "smallest change of an element's compliance factor that raises an alarm",
+        name="alarm.least", low=0.0, high=10.0,
+    )  # fmt: skip
+    window: float = setting(
+        20.0, "time span of the deflections that are evaluated together",
+        name="alarm.window", unit="s", low=1.0, high=3600.0,
+    )  # fmt: skip
     directions: tuple[bool, ...] = (True,) * 6
 
 

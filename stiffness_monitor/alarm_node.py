@@ -20,6 +20,7 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
+from pkm_twin.streams.settings import SECONDS
 from stiffness_monitor.alarm import AlarmSettings, Departure
 from stiffness_monitor.monitor import Answer
 from stiffness_monitor.watch import StiffnessWatch
@@ -49,18 +50,17 @@ class StiffnessAlarmTopics:
             read_only=True,
         )
         settings = self._declare_settings()
-        seconds: dict[str, Any] = {"unit": "s", "high": 3600.0, "read_only": True}
         age = node.declare(
             "alarm.wrench_age", 0.02, "largest time between a deflection and the wrenches before "
             "and after it",
-            low=0.0, **seconds,
+            read_only=True, **SECONDS,
         )  # fmt: skip
         period = node.declare(
             "alarm.period",
             0.1,
             "shortest time between two deflections that are used",
-            low=0.0,
-            **seconds,
+            read_only=True,
+            **SECONDS,
         )
         if not wanted:
             return
@@ -74,22 +74,7 @@ class StiffnessAlarmTopics:
         node.create_service(Trigger, "~/reset_stiffness", self._on_reset)
 
     def _declare_settings(self) -> AlarmSettings:
-        node, d = self._node, AlarmSettings()
-        sigmas = node.declare(
-            "alarm.sigmas", d.sigmas, "alarm threshold in standard deviations of model and noise "
-            "together",
-            low=1.0, high=1e3, read_only=True,
-        )  # fmt: skip
-        least = node.declare(
-            "alarm.least", d.least, "smallest change of an element's compliance factor that "
-            "raises an alarm",
-            low=0.0, high=10.0, read_only=True,
-        )  # fmt: skip
-        window = node.declare(
-            "alarm.window", d.window, "time span of the deflections that are evaluated "
-            "together", unit="s", low=1.0,
-            high=3600.0, read_only=True,
-        )  # fmt: skip
+        node = self._node
         words = node.declare(
             "alarm.directions", list(DIRECTIONS), "measured directions, of x y z rx ry rz",
             read_only=True,
@@ -100,7 +85,7 @@ class StiffnessAlarmTopics:
         if not words:
             raise ParameterError("alarm.directions", [], "at least one of x y z rx ry rz")
         measured = tuple(word in words for word in DIRECTIONS)
-        return AlarmSettings(sigmas, least, window, measured)
+        return node.declare_settings(AlarmSettings, fixed=True, directions=measured)
 
     @property
     def departures(self) -> tuple[Departure, ...]:

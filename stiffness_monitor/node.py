@@ -28,14 +28,9 @@ from pkm_twin.ros import health
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
-from pkm_twin.ros.wrench import (
-    WRENCH_CHANGES,
-    changed,
-    declare_mounts,
-    declare_stamps,
-    declare_wrench,
-)
+from pkm_twin.ros.wrench import declare_mounts
 from pkm_twin.streams.pace import Pace
+from pkm_twin.streams.settings import changeable, with_parameters
 from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from stiffness_monitor.compliance import kernels
@@ -61,7 +56,7 @@ class StiffnessMonitor(TwinNode):
         )
         for kernel in kernels(robot):
             kernel.warm_up()
-        settings = self._declare_settings()
+        settings = self.declare_settings(Settings)
         given = self.declare(
             "platform_frame",
             "",
@@ -117,8 +112,8 @@ class StiffnessMonitor(TwinNode):
         self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
         follow_changes(
             self,
-            WRENCH_CHANGES,
-            lambda values: changed(self._monitor.settings, values),
+            changeable(Settings),
+            lambda values: with_parameters(self._monitor.settings, values),
             self._change_settings,
         )
         self.start()
@@ -161,13 +156,6 @@ class StiffnessMonitor(TwinNode):
         """No pose from before."""
         self._monitor.reset()
         self._alarm.reset()
-
-    def _declare_settings(self) -> Settings:
-        base = self.declare(
-            "base_frame", Settings().base_frame, "frame id of the base", read_only=True
-        )
-        stamps = declare_stamps(self, "a wrench and the nearest joint state")
-        return declare_wrench(self, base_frame=base, **stamps)
 
     def _change_settings(self, settings: Settings) -> None:
         """What the stamps of set points and deflections have to keep to, too."""

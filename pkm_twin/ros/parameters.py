@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -19,6 +20,12 @@ from rclpy.parameter import Parameter
 
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.ros.internals import parameter_overrides
+from pkm_twin.streams.settings import settings_of
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+S = TypeVar("S", bound="DataclassInstance")
 
 
 class UnknownParametersError(PkmTwinError):
@@ -98,6 +105,22 @@ class ParameterNode(LifecycleNode):
         if not read_only:
             self._changeable.add(name)
         return value
+
+    def declare_settings(self, kind: type[S], *, fixed: bool = False, **given: Any) -> S:
+        """Declare the parameters of a settings class and return its settings.
+
+        :param fixed: none of them can be changed. ``given``: fields that are no parameters here.
+        :raises ParameterError: a value that is rejected.
+        """
+        defaults = {field.name: field.default for field in dataclasses.fields(kind)}
+        for name, (field, row) in settings_of(kind).items():
+            if field not in given:
+                value = self.declare(
+                    name, row.parameter(defaults[field]), row.text, unit=row.unit, low=row.low,
+                    high=row.high, choices=tuple(row.choices), read_only=fixed or row.fixed,
+                )  # fmt: skip
+                given[field] = row.value(value)
+        return kind(**given)
 
     def check_parameter(self, name: str, value: Any) -> None:
         """Refuse what a parameter's declaration does not allow.

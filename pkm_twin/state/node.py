@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
@@ -26,17 +25,11 @@ from pkm_twin.ros import health, outputs
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
-from pkm_twin.ros.wrench import (
-    WRENCH_CHANGES,
-    changed,
-    declare_mounts,
-    declare_stamps,
-    declare_wrench,
-    triple,
-)
+from pkm_twin.ros.wrench import declare_mounts, triple
 from pkm_twin.state.scene import Load, Scales, Scene
 from pkm_twin.state.state import MachineState, State
 from pkm_twin.streams.pace import Pace
+from pkm_twin.streams.settings import changeable, with_parameters
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
 from stiffness_monitor.compliance import kernels, member_deflections, platform_response
 
@@ -54,7 +47,7 @@ class MachineStateNode(TwinNode):
                 "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
             )
         )
-        settings = self._declare_settings()
+        settings = self.declare_settings(WrenchSettings)
         self._frames = {
             "platform": self._declare_frame(
                 "platform_frame", PLATFORM, "of the platform, at its reference point"
@@ -81,7 +74,7 @@ class MachineStateNode(TwinNode):
                 unit="Hz", low=0.0, high=1e4, read_only=True,
             )
         )  # fmt: skip
-        self._scene = Scene(robot, self._declare_scales())
+        self._scene = Scene(robot, self.declare_settings(Scales, fixed=True))
         self._elastic = _is_elastic(robot)
         _warm_up(robot)
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
@@ -107,8 +100,8 @@ class MachineStateNode(TwinNode):
         self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
         follow_changes(
             self,
-            WRENCH_CHANGES,
-            lambda values: changed(self._core.settings, values),
+            changeable(WrenchSettings),
+            lambda values: with_parameters(self._core.settings, values),
             self._core.change_settings,
         )
         self.start()
@@ -157,28 +150,6 @@ class MachineStateNode(TwinNode):
         if not frame:
             raise ParameterError(name, frame, "a frame's name")
         return frame
-
-    def _declare_settings(self) -> WrenchSettings:
-        base = self._declare_frame("base_frame", WrenchSettings().base_frame, "of the base")
-        stamps = declare_stamps(self, "a joint state and the nearest wrench")
-        return declare_wrench(self, base_frame=base, **stamps)
-
-    def _declare_scales(self) -> Scales:
-        d = Scales()
-        large: dict[str, Any] = {"low": 0.0, "high": 1e9, "read_only": True}
-        return Scales(
-            self.declare(
-                "deflection_scale", d.deflection, "factor by which deflections are "
-                "enlarged", **large
-            ),
-            self.declare("force_scale", d.force, "length of force arrows", unit="m/N", **large),
-            self.declare("moment_scale", d.moment, "length of moment "
-            "arrows", unit="m/(N m)", **large),
-            self.declare(
-                "ellipsoid_force", d.ellipsoid_force,
-                "force whose deflections the compliance ellipsoid shows", unit="N", **large,
-            ),
-        )  # fmt: skip
 
     def _create_transforms(self) -> outputs.Transforms | None:
         """Publishers of ``/tf`` and ``/tf_static``, where they are asked for and tf2 is there."""

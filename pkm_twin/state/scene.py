@@ -18,6 +18,7 @@ from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import Posture, robot_bars
 from pkm_twin.robot.robot import Robot
 from pkm_twin.state.state import State
+from pkm_twin.streams.settings import LARGE, setting
 
 Array = NDArray[np.float64]
 Kind = Literal["cylinder", "sphere", "arrow", "line", "text"]
@@ -64,10 +65,16 @@ class Scales:
     ``ellipsoid_force``: the force whose deflections, in all directions, the ellipsoid shows, N.
     """
 
-    deflection: float = 1000.0
-    force: float = 1e-3
-    moment: float = 1e-2
-    ellipsoid_force: float = 100.0
+    deflection: float = setting(
+        1000.0, "factor by which deflections are enlarged", name="deflection_scale", **LARGE
+    )
+    force: float = setting(1e-3, "length of force arrows", name="force_scale", unit="m/N", **LARGE)
+    moment: float = setting(
+        1e-2, "length of moment arrows", name="moment_scale", unit="m/(N m)", **LARGE
+    )
+    ellipsoid_force: float = setting(
+        100.0, "force whose deflections the compliance ellipsoid shows", unit="N", **LARGE
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from pkm_twin.machine import rotations
 from pkm_twin.messages.reading import WrenchSample, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.settings import FUTURE, SECONDS, ZERO_STAMP, setting
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -61,16 +62,27 @@ class WrenchSettings:
     ``sensor_xyz``, ``sensor_rpy``: the fixed :class:`Mount`, m and rad.
     """
 
-    wrench_frame: str = PLATFORM
-    base_frame: str = "base_link"
-    accept_empty_frame: bool = False
-    max_state_age: float = 0.1
-    future_tolerance: float = 0.1
-    accept_zero_stamp: bool = False
-    sensor_xyz: Triple = ZERO
-    sensor_rpy: Triple = ZERO
+    wrench_frame: str = setting(PLATFORM, "frame of the wrench", fixed=True)
+    base_frame: str = setting("base_link", "frame id of the base", fixed=True)
+    accept_empty_frame: bool = setting(False, "accept an empty frame id as wrench_frame")
+    max_state_age: float = setting(
+        0.1, "largest time between a wrench and the nearest joint state", **SECONDS
+    )
+    future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
+    accept_zero_stamp: bool = setting(False, ZERO_STAMP)
+    sensor_xyz: Triple = setting(
+        ZERO, "position of the sensor from the platform's reference point, platform axes",
+        name="sensor.xyz", unit="m",
+    )  # fmt: skip
+    sensor_rpy: Triple = setting(
+        ZERO, "roll, pitch and yaw of the sensor relative to the platform",
+        name="sensor.rpy", unit="rad",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
+        for name in ("wrench_frame", "base_frame"):
+            if not getattr(self, name):
+                raise ParameterError(name, "", "a frame's name")
         bounds = {"sensor.xyz": MAX_OFFSET, "sensor.rpy": 4.0 * math.pi}
         for name, values in (("sensor.xyz", self.sensor_xyz), ("sensor.rpy", self.sensor_rpy)):
             bound = bounds[name]

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of a node as fields of a class: what declares, changes and documents its parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+S = TypeVar("S", bound="DataclassInstance")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The parameter of a field.
+
+    ``name``: of the parameter, by default the field's. ``choices``: the words that are allowed, or
+    the field's value for each. ``fixed``: not changeable while the node runs.
+    """
+
+    text: str
+    name: str = ""
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    choices: Collection[str] | Mapping[str, Any] = ()
+    fixed: bool = False
+
+    def value(self, given: Any) -> Any:
+        """The field's value for a parameter's."""
+        if isinstance(self.choices, Mapping):
+            return self.choices[given]
+        return tuple(given) if hasattr(given, "__iter__") and not isinstance(given, str) else given
+
+    def parameter(self, value: Any) -> Any:
+        """The parameter's value for a field's."""
+        if isinstance(self.choices, Mapping):
+            return next(word for word, own in self.choices.items() if own == value)
+        return list(value) if isinstance(value, tuple) else value
+
+
+SECONDS: Final[Mapping[str, Any]] = {"unit": "s", "low": 0.0, "high": 3600.0}
+LATE: Final[Mapping[str, Any]] = {**SECONDS, "low": 1e-3}
+COUNT: Final[Mapping[str, Any]] = {"low": 1, "high": 10**6}
+SHARE: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1.0}
+LARGE: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1e9}
+"""Bounds of settings of one kind."""
+FUTURE: Final = "how far time stamps may be ahead of the clock"
+ZERO_STAMP: Final = "accept a zero stamp, as the arrival time"
+
+
+def setting(default: Any, text: str, **more: Any) -> Any:
+    """A field that is a parameter; ``more``: further attributes of :class:`Setting`."""
+    return field(default=default, metadata={"setting": Setting(text, **more)})
+
+
+def settings_of(kind: type[DataclassInstance]) -> dict[str, tuple[str, Setting]]:
+    """By the parameter's name: the field's name, and its setting."""
+    found = {f.name: f.metadata["setting"] for f in dataclasses.fields(kind) if f.metadata}
+    return {row.name or name: (name, row) for name, row in found.items()}
+
+
+def changeable(kind: type[DataclassInstance]) -> list[str]:
+    """The parameters that may change while the node runs."""
+    return [name for name, (_, row) in settings_of(kind).items() if not row.fixed]
+
+
+def with_parameters(settings: S, values: Mapping[str, Any]) -> S:
+    """Settings with new values of their parameters; of other parameters nothing is taken.
+
+    :raises ParameterError: what the settings reject.
+    """
+    rows = settings_of(type(settings))
+    fields = {rows[name][0]: rows[name][1].value(values[name]) for name in rows.keys() & values}
+    return dataclasses.replace(settings, **fields)
