@@ -63,7 +63,10 @@ class Settings:
         choices=("warn", "reject", "clamp"),
     )  # fmt: skip
     stale_after: float = setting(
-        0.1, "largest age of a joint state, and longest gap before the stream stops", **LATE
+        0.1,
+        "largest age of a joint state, and longest gap before the stream stops; also lifespan "
+        "and deadline of the published torques, so at most deadline of command_gate",
+        **LATE,
     )
     future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
     accept_zero_stamp: bool = setting(False, ZERO_STAMP)
@@ -76,7 +79,7 @@ class Settings:
     )  # fmt: skip
     on_stop: OnStop = setting(
         "nothing",
-        "command sent once when the stream stops",
+        "command sent once when the stream stops; must be set with publish_commands",
         choices=("nothing", "zeros", "gravity"),
     )
     singularity_warn: float = setting(0.05, "warn below this singularity index", **SHARE)

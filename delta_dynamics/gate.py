@@ -36,10 +36,17 @@ class GateSettings:
     """When the gate closes, and what it sends while it is closed."""
 
     on_stop: OnStop = setting(
-        "zeros", "command while no torques arrive", choices=("zeros", "gravity")
+        "zeros",
+        "command while no torques arrive: zeros, or gravity, the effort against gravity "
+        "at the measured position; zeros too where that position is older than deadline, or the "
+        "effort is beyond effort_limits",
+        choices=("zeros", "gravity"),
     )
     deadline: float = setting(
-        0.1, "largest age of a torque, and longest gap between torques", **LATE
+        0.1,
+        "largest age of a torque, and longest gap between torques, checked four times per "
+        "deadline; stale_after of delta_dynamics must not exceed it",
+        **LATE,
     )
     future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
     trip_count: int = setting(1, "rejected torques in a row that close the gate", **COUNT)

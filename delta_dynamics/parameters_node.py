@@ -13,16 +13,25 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.node import TwinNode
 
 CHANGES: Final = {
-    "payload.mass": ("payload", "mass", "kg"),
-    "payload.com": ("payload", "com", "m, from the platform's reference point"),
-    "payload.inertia": ("payload", "inertia", "kg m2 about the com, 3 or 9 numbers"),
-    "friction.viscous": ("friction", "viscous", "N m s or N s/m, one per joint"),
-    "friction.coulomb": ("friction", "coulomb", "N m or N, one per joint"),
-    "friction.offset": ("friction", "offset", "N m or N, one per joint"),
-    "gravity": ("gravity", "", "m/s2"),
-    "effort_limits": ("limits", "effort", "N m or N, one per joint"),
-}
-"""Their section, key and unit."""
+    "payload.mass": ("payload", "mass", "kg", "mass of the payload"),
+    "payload.com": (
+        "payload", "com", "m", "centre of mass of the payload, from the platform's reference point",
+    ),
+    "payload.inertia": (
+        "payload", "inertia", "kg m2", "inertia of the payload about its com, 3 or 9 numbers",
+    ),
+    "friction.viscous": (
+        "friction", "viscous", "N m s or N s/m", "viscous friction, one per joint",
+    ),
+    "friction.coulomb": ("friction", "coulomb", "N m or N", "Coulomb friction, one per joint"),
+    "friction.offset": ("friction", "offset", "N m or N", "constant effort, one per joint"),
+    "gravity": ("gravity", "", "m/s2", "gravity in base axes"),
+    "effort_limits": (
+        "limits", "effort", "N m or N", "largest effort of each joint; efforts beyond it are "
+        "rejected, or as limit_policy says",
+    ),
+}  # fmt: skip
+"""Their section, key, unit and meaning."""
 
 
 def declare_changes(
@@ -31,7 +40,7 @@ def declare_changes(
     """Declare these parameters; what is given beside the robot's file."""
     changes = {}
     for name in names:
-        section, key, unit = CHANGES[name]
+        section, key, unit, text = CHANGES[name]
         value = getattr(robot, section)
         value = getattr(value, key) if key else value
         if value is None:
@@ -43,7 +52,7 @@ def declare_changes(
         given = node.declare(
             name,
             default,
-            f"{name} of the robot; default: the robot file's",
+            f"{text}; default: the robot file's",
             unit=unit,
             **bounds,
         )
@@ -56,7 +65,7 @@ def changed(robot: Robot, values: dict[str, Any]) -> Robot:
     """The robot with new values of :data:`CHANGES`."""
     sections: dict[str, Any] = {}
     for name, value in values.items():
-        section, key, _ = CHANGES[name]
+        section, key, *_ = CHANGES[name]
         plain = list(value) if hasattr(value, "__len__") else value
         if name == "payload.inertia" and len(plain) == 9:
             plain = [plain[0:3], plain[3:6], plain[6:9]]

@@ -193,9 +193,12 @@ class MachineSim(TwinNode):
         return self.declare_settings(
             MachineSettings,
             fixed=True,
-            start=self._row("start", home, "joint positions at the start, rad or m"),
+            start=self._row(
+                "start", home, "joint positions at the start, rad or m; default: the robot's home"
+            ),
             effort_limits=self._row(
-                "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N", 0.0
+                "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N; "
+                "default: the robot's", 0.0,
             ),
             stiffness=self._row(
                 "stiffness", stiffness, "of the position control; default: from bandwidth", 0.0
@@ -204,7 +207,7 @@ class MachineSim(TwinNode):
             "bandwidth", 0.0),
             resolution=self._row(
                 "encoder_resolution", np.zeros(len(home)), "resolution of the encoders, rad or "
-                "m; 0: exact", 0.0
+                "m; velocities are then differences of steps; 0: exact", 0.0
             ),
             payloads=self._declare_payloads(robot),
             wrench=WrenchSignal(
@@ -225,11 +228,16 @@ class MachineSim(TwinNode):
             self.declare(name, default, text, read_only=True)
             for name, default, text in (
                 ("payload.times", [0.0], "times at which the payload changes, s after the start"),
-                ("payload.masses", [own.mass], "payload from each time on, kg"),
+                (
+                    "payload.masses",
+                    [own.mass],
+                    "payload from each time on, kg; default: the robot's",
+                ),
                 (
                     "payload.coms",
                     own.com.tolist(),
-                    "its centre of mass, m from the platform's reference point, three per time",
+                    "its centre of mass, m from the platform's reference point, three per time; "
+                    "default: the robot's",
                 ),
             )
         )

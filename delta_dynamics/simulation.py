@@ -71,18 +71,28 @@ class MachineSettings:
     stiffness: Array
     damping: Array
     """Of the position control that goes trajectories, N m/rad and N m s/rad (N/m and N s/m)."""
-    period: float = setting(1e-3, "sampling period of the sensors", unit="s", low=1e-4, high=10.0)
+    period: float = setting(
+        1e-3, "sampling period of sensors and position control", unit="s", low=1e-4, high=10.0
+    )
     substeps: int = setting(1, "integration steps per period", low=1, high=100)
     resolution: Array = field(default_factory=lambda: np.zeros(1))
     """Encoder step, rad or m; 0 is none."""
     delay: float = setting(
-        0.0, "delay of every effort command", name="command_delay", unit="s", low=0.0, high=10.0
+        0.0,
+        "delay of every effort command, in whole periods",
+        name="command_delay",
+        unit="s",
+        low=0.0,
+        high=10.0,
     )
     deadline: float = setting(
         0.1, "longest gap between effort commands", unit="s", low=1e-3, high=10.0
     )
     on_silence: OnSilence = setting(
-        "zeros", "efforts of the drives after that gap", choices=("zeros", "hold")
+        "zeros",
+        "efforts of the drives after that gap: zeros, or hold, the last effort, as most "
+        "effort controllers do",
+        choices=("zeros", "hold"),
     )
     payloads: tuple[PayloadEvent, ...] = ()
     wrench: WrenchSignal = field(default_factory=WrenchSignal)

@@ -86,7 +86,7 @@ class SetpointCorrection:
             "pair_torques",
             False,
             "also publish ~/setpoint_with_torques: the corrected set point, and the torques of the "
-            "same stamp",
+            "same stamp; needs correct_setpoint, and delta_dynamics needs the set points as well",
             read_only=True,
         )
         self._waiting: dict[int, tuple[str, Any]] = {}

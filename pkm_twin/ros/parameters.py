@@ -20,7 +20,7 @@ from rclpy.parameter import Parameter
 
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.ros.internals import parameter_overrides
-from pkm_twin.streams.settings import settings_of
+from pkm_twin.streams.settings import Setting, settings_of
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -48,7 +48,8 @@ class ParameterNode(LifecycleNode):
     def __init__(self, name: str) -> None:
         self.followed: set[str] = set()
         """Parameters whose changes are taken while the node runs."""
-        self._changeable: set[str] = set()
+        self.rows: dict[str, tuple[Any, Setting]] = {}
+        """Declared parameters: the default, and what it means."""
         super().__init__(name)
 
     @property
@@ -79,6 +80,9 @@ class ParameterNode(LifecycleNode):
         :param low: least value, ``high``: greatest; ``choices``: the words that are allowed.
         :raises ParameterError: the given value has another type or is out of range, naming both.
         """
+        self.rows[name] = (
+            default, Setting(description, name, unit, low, high, tuple(choices), read_only)
+        )  # fmt: skip
         constraints = f"one of {', '.join(choices)}" if choices else ""
         descriptor = ParameterDescriptor(
             description=description + (f"; {unit}" if unit else ""),
@@ -102,8 +106,6 @@ class ParameterNode(LifecycleNode):
             value = given.value if given is not None else None
             raise ParameterError(name, value, constraints or f"a value like {default!r}") from error
         self.check_parameter(name, value)
-        if not read_only:
-            self._changeable.add(name)
         return value
 
     def declare_settings(self, kind: type[S], *, fixed: bool = False, **given: Any) -> S:
@@ -145,7 +147,8 @@ class ParameterNode(LifecycleNode):
         unknown = [name for name in self.given if name not in declared]
         if unknown:
             raise UnknownParametersError(unknown, declared)
-        deaf = sorted(self._changeable - self.followed)
+        changeable = {name for name, (_, row) in self.rows.items() if not row.fixed}
+        deaf = sorted(changeable - self.followed)
         if deaf:
             # A set of it would be answered as taken.
             raise NotImplementedError(f"nothing follows a change of {', '.join(deaf)}")

@@ -18,7 +18,8 @@ def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | N
     :raises ParameterError: transforms are asked for and tf2_ros is not installed.
     """
     wanted = node.declare(
-        "use_tf", False, "take the sensor's pose from /tf in place of sensor.xyz and sensor.rpy",
+        "use_tf", False, "take the sensor's pose from /tf in place of sensor.xyz and sensor.rpy, "
+        "between wrench_frame and platform_frame at the wrench's stamp; needs tf2_ros",
         read_only=True,
     )  # fmt: skip
     if not wanted:

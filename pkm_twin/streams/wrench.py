@@ -62,7 +62,12 @@ class WrenchSettings:
     ``sensor_xyz``, ``sensor_rpy``: the fixed :class:`Mount`, m and rad.
     """
 
-    wrench_frame: str = setting(PLATFORM, "frame of the wrench", fixed=True)
+    wrench_frame: str = setting(
+        PLATFORM,
+        "the only accepted frame of the wrench; every name except base_frame is "
+        "a frame that moves with the platform",
+        fixed=True,
+    )
     base_frame: str = setting("base_link", "frame id of the base", fixed=True)
     accept_empty_frame: bool = setting(False, "accept an empty frame id as wrench_frame")
     max_state_age: float = setting(
@@ -75,7 +80,8 @@ class WrenchSettings:
         name="sensor.xyz", unit="m",
     )  # fmt: skip
     sensor_rpy: Triple = setting(
-        ZERO, "roll, pitch and yaw of the sensor relative to the platform",
+        ZERO, "roll, pitch and yaw of the sensor relative to the platform; zeros for a wrench in "
+        "base_frame",
         name="sensor.rpy", unit="rad",
     )  # fmt: skip
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from delta_dynamics.feedforward import Settings
 from pkm_twin.codegen import program
 from pkm_twin.codegen.code import STEPS
 from pkm_twin.codegen.lu import pivot_order
@@ -39,11 +38,3 @@ def test_newtons_judgement():
 def test_pivots():
     share = pivot_order.__defaults__[0]
     assert word("at least a {} of the largest entry") == share
-
-
-def test_bounds_of_the_stream():
-    pattern = r"`singularity_warn`, `singularity_stop` \| (\S+), (\S+) \|"
-    assert numbers("docs/nodes.md", pattern) == [
-        Settings().singularity_warn,
-        Settings().singularity_stop,
-    ]

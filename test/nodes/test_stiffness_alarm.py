@@ -133,6 +133,9 @@ class Quiet:
     def declare(self, _, default, *__, **___):
         return default
 
+    def declare_settings(self, kind, **given):
+        return kind(**{name: value for name, value in given.items() if name != "fixed"})
+
     def nothing(self, *_, **__):
         pass
 

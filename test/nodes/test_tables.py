@@ -2,6 +2,8 @@
 """The tables of docs/nodes.md of topics and parameters are those of the running nodes."""
 
 import re
+import subprocess
+import sys
 from importlib.util import find_spec
 from xml.etree import ElementTree
 
@@ -95,9 +97,16 @@ def test_parameters(node, peer):
     request = ListParameters.Request()
     found = peer.call(ListParameters, f"/{node}/list_parameters", request).result.names
     known = {name for name in found if not MIDDLEWARE.fullmatch(name)}
-    table = list(rows(node))
-    begin = next(i for i, cells in enumerate(table) if cells[0] == "parameter")
-    assert {name for cells in table[begin:] for name in re.findall(r"`([^`]+)`", cells[0])} == known
+    table = [cells[0] for part in (node, "All nodes") for cells in rows(part) if len(cells) == 5]
+    assert {cell.strip("`") for cell in table} - {"parameter", "---"} == known
+
+
+def test_the_tables_are_those_that_nodes_declare(tmp_path):
+    page = tmp_path / "nodes.md"
+    page.write_text(PAGE)
+    # In a process of its own: it makes every node for a moment.
+    subprocess.run([sys.executable, "-m", "tools.pages.nodes", page], check=True, cwd=REPOSITORY)
+    assert page.read_text() == PAGE
 
 
 def allowed(node, what, how):
