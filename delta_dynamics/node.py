@@ -17,9 +17,10 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics.estimates_node import Estimates
-from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
+from delta_dynamics.feedforward import Feedforward, Torques, warm_up
 from delta_dynamics.parameters_node import CHANGES, changed, declare_changes
 from delta_dynamics.reactions import reactions
+from delta_dynamics.settings import Settings
 from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError

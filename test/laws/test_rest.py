@@ -11,8 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.feedforward import Feedforward, Settings
+from delta_dynamics.feedforward import Feedforward
 from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
+from delta_dynamics.settings import Settings
 from pkm_twin import Robot
 from pkm_twin.apps.torques import motion_of_csv, table
 from pkm_twin.streams.differentiator import Differentiator

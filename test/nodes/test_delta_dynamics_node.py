@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.feedforward import Feedforward, Settings
+from delta_dynamics.feedforward import Feedforward
+from delta_dynamics.settings import Settings
 from test.nodes.harness import (
     SECOND,
     counts_of,

@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, assume, event, example, given, settings
 from hypothesis import strategies as st
 
 from delta_dynamics import feedforward, inverse_dynamics
-from delta_dynamics.feedforward import SLICE, Feedforward, Settings
+from delta_dynamics.feedforward import SLICE, Feedforward
+from delta_dynamics.settings import Settings
 from pkm_twin.errors import MessageError, ParameterError, SingularityError
 from test.nodes.harness import SECOND, Maker, Plain
 from test.support.robots import load

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.feedforward import Feedforward, Settings
+from delta_dynamics.feedforward import Feedforward
 from delta_dynamics.gate import Gate, GateSettings, effort_limits
+from delta_dynamics.settings import Settings
 from delta_dynamics.simulation import MachineSettings, Simulation, tuned
 from pkm_twin.apps.view.live import Live
 from pkm_twin.errors import MessageError
