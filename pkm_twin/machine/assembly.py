@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.rotations import skew
 from pkm_twin.machine.urdf_file import Joint, Urdf
 from pkm_twin.machine.urdf_loops import Closure
@@ -131,19 +132,20 @@ class Assembly:
             first, second = a.rotation @ closure.axes[0], b.rotation @ closure.axes[1]
             across = np.eye(3) - np.outer(first, first)
         rows: list[tuple[Array, Array]] = []
-        if closure.type in ("prismatic", "cylindrical"):
-            # The line turns with the first link.
-            arm = np.cross(wa.T, apart).T
-            rows.append((across @ apart, across @ (slip - arm)))
-        elif closure.type != "translation":
-            rows.append((apart, slip))
-        if closure.type in ("fixed", "prismatic", "translation"):
-            rows.append((_angle(a.rotation.T, b.rotation), turn))
-        elif closure.type in ("revolute", "cylindrical"):
-            rows.append((_between(first, second), across @ turn))
-        elif closure.type == "universal":
-            normal = np.cross(second, first)
-            rows.append((np.array([first @ second - closure.cosine]), (normal @ turn)[None]))
+        for held in TYPES[closure.type].holds:
+            if held == "point":
+                rows.append((apart, slip))
+            elif held in ("line", "flat"):
+                # It turns with the first link.
+                kept = across if held == "line" else first[None]
+                rows.append((kept @ apart, kept @ (slip - np.cross(wa.T, apart).T)))
+            elif held == "turns":
+                rows.append((_angle(a.rotation.T, b.rotation), turn))
+            elif held == "direction":
+                rows.append((_between(first, second), across @ turn))
+            else:
+                normal = np.cross(second, first)
+                rows.append((np.array([first @ second - closure.cosine]), (normal @ turn)[None]))
         return np.concatenate([r for r, _ in rows]), np.vstack([j for _, j in rows])
 
     def residuals(self, rates: bool = True) -> tuple[Array, Array]:

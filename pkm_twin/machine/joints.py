@@ -122,6 +122,7 @@ HELD: Final[dict[str, Callable[[Array, float], Sequence[Constraint]]]] = {
         Constraint("angle", UNITS[i], UNITS[(i + 1) % 3]) for i in range(3)
     ],
     "line": lambda axes, _: [Constraint("plane", e) for e in across(axes[0])],
+    "flat": lambda axes, _: [Constraint("plane", axes[0])],
     "direction": lambda axes, _: [Constraint("angle", e, axes[0]) for e in across(axes[0])],
     "crossing": lambda axes, _: [Constraint("angle", axes[0], axes[1], axes=(0, 1))],
     "thread": lambda axes, pitch: [
@@ -186,10 +187,23 @@ class Helical(JointType):
     cost = 0
 
 
+class Planar(JointType):
+    """Slides along two axes across its axis and turns about it."""
+
+    name, steps, holds = "planar", ("slide", "slide", "turn"), ("flat", "direction")
+    cost = 3
+
+    @classmethod
+    def freedoms(cls, axes: Array, pitch: float) -> tuple[Freedom, ...]:
+        """Slides first."""
+        slides = (Freedom(axis, turns=False, slide=1.0) for axis in across(axes[0]))
+        return (*slides, Freedom(axes[0]))
+
+
 TYPES: Final = {
     kind.name: kind
     for kind in (
-        Fixed, Revolute, Prismatic, Cylindrical, Universal, Spherical, Translation, Helical,
+        Fixed, Revolute, Prismatic, Cylindrical, Universal, Spherical, Translation, Helical, Planar,
     )
 }  # fmt: skip
 """Joint types by name."""

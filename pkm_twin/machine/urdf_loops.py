@@ -20,19 +20,14 @@ from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import urdf_xml
+from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.urdf_xml import Pose
 
 Array = NDArray[np.float64]
 
 CONSTRAINTS: Final = {
-    "revolute": "revolute",
+    **{name: name for name, kind in TYPES.items() if not kind.threaded()},
     "continuous": "revolute",
-    "prismatic": "prismatic",
-    "cylindrical": "cylindrical",
-    "universal": "universal",
-    "spherical": "spherical",
-    "translation": "translation",
-    "fixed": "fixed",
     "link": "fixed",  # a link that was cut in two
 }
 PARTS: Final = (
@@ -174,5 +169,5 @@ def _closure(
 ) -> Closure:
     if links[0] == links[1]:
         raise ParameterError(name, links[0], "a closure between two links")
-    bare = kind in ("spherical", "fixed", "translation")
-    return Closure(name, kind, (links[0], links[1]), (frames[0], frames[1]), None if bare else axes)
+    axes = axes if TYPES[kind].count else None
+    return Closure(name, kind, (links[0], links[1]), (frames[0], frames[1]), axes)

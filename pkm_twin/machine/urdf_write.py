@@ -32,16 +32,6 @@ PLATFORM: Final = "platform"
 """The link that stands on the platform's reference point."""
 NAMED: Final = ("link", "joint", "constraint", "ros2_control")
 """Elements whose name is of one machine; those of interfaces and parameters are not."""
-CLOSURES: Final = {
-    "revolute": "revolute_joint",
-    "prismatic": "prismatic_joint",
-    "cylindrical": "cylindrical_joint",
-    "universal": "universal_joint",
-    "spherical": "spherical_joint",
-    "translation": "translation_joint",
-    "fixed": "link",
-}
-"""Types of closures, as a description has them and as ``<constraint>`` has them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +239,8 @@ def _dynamics(element: ET.Element, drive: UrdfDrive) -> None:
 
 
 def _closure(robot: ET.Element, closure: UrdfClosure, places: dict[str, Array]) -> None:
-    element = ET.SubElement(robot, "constraint", name=closure.name, type=CLOSURES[closure.type])
+    kind = "link" if closure.type == "fixed" else f"{closure.type}_joint"
+    element = ET.SubElement(robot, "constraint", name=closure.name, type=kind)
     for i, (end, link) in enumerate((("parent", closure.parent), ("child", closure.child))):
         ET.SubElement(element, end, link=link)
         at = number_text(closure.point - places[link])
