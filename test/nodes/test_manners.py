@@ -42,6 +42,7 @@ from test.nodes.twin import (
     state,
     trajectory,
 )
+from test.support.robots import often
 
 STRANGE = [10, 99, 255]
 """Types of parameter values that do not exist."""
@@ -477,11 +478,10 @@ def test_what_is_wrong_at_the_start_is_told_one_a_line(refused, parameters, line
         assert expected in line
 
 
-def test_a_full_stream_of_states_leaves_nothing_behind(twin):
+@pytest.mark.parametrize("sent", often(1000, 3000))
+def test_a_full_stream_of_states_leaves_nothing_behind(twin, sent):
     """States come and go in thousands: what is counted is what was sent."""
-
     before = count_of(twin.even())
-    sent = 3000
     for _ in range(sent):
         twin.send_state(state(twin.stamp()))
         twin.peer.spin()
