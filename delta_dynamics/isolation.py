@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import NDArray
-from scipy.special import log_ndtr  # type: ignore[import-untyped]
 
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -398,6 +398,6 @@ def _evidence(squares: Array, parts: Array, sizes: Array, *, one_sided: bool = F
     logs = 0.5 * (parts**2 / precision - np.log(precision) - 2 * np.log(sizes)[:, None, None])
     logs = logs.sum(-1)
     if one_sided:
-        logs = logs + math.log(2.0) + log_ndtr((parts / np.sqrt(precision))[..., 0])
+        logs = logs + math.log(2.0) + scipy.special.log_ndtr((parts / np.sqrt(precision))[..., 0])
     top = logs.max(0)
     return np.asarray(top + np.log(np.exp(logs - top).mean(0)), np.float64)

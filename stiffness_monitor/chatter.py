@@ -15,9 +15,8 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag  # type: ignore[import-untyped]
-from scipy.optimize import brentq  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
@@ -180,7 +179,7 @@ class _Plane:
         # Only displacements at which a tooth cuts come back. They are smooth: polynomials of time.
         cut = np.flatnonzero(np.abs(force).max((1, 2)) > 1e-12 * milling.tangential)
         parts = np.split(cut, np.flatnonzero(np.diff(cut) > 1) + 1)
-        basis = block_diag(*(_polynomials(len(part), waves / count) for part in parts))
+        basis = scipy.linalg.block_diag(*(_polynomials(len(part), waves / count) for part in parts))
         own = 2 * len(self.turn)
         n, b = own + 2 * basis.shape[1], depths[:, None, None]
         before = np.zeros((count, 2, n))
@@ -220,7 +219,7 @@ class _Plane:
             bad = self.growth(milling, speed, tried[part]) >= 1.0
             if bad.any():
                 k = int(part[bad.argmax()])
-                return float(brentq(margin, tried[k - 1], tried[k], rtol=CLOSE))
+                return float(scipy.optimize.brentq(margin, tried[k - 1], tried[k], rtol=CLOSE))
         return np.inf
 
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cholesky, eigh, solve_triangular  # type: ignore[import-untyped]
 
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
@@ -158,7 +158,7 @@ def stiffness_root(system: System, index: tuple[int, ...]) -> Array:
     """
     measure = 0.0
     try:
-        root: Array = cholesky(system.stiffness, lower=True, check_finite=False)
+        root: Array = scipy.linalg.cholesky(system.stiffness, lower=True, check_finite=False)
         measure = float((np.diag(root) ** 2 / np.diag(system.stiffness)).min())
     except np.linalg.LinAlgError:
         pass
@@ -179,16 +179,18 @@ def solve_modes(
     if not 1 <= count <= size:
         raise ValueError(f"count is {count}; the frame has {size} modes")
     root = stiffness_root(system, index)
-    half = solve_triangular(root, system.mass, lower=True, check_finite=False)
-    matrix = solve_triangular(root, half.T, lower=True, check_finite=False)
+    half = scipy.linalg.solve_triangular(root, system.mass, lower=True, check_finite=False)
+    matrix = scipy.linalg.solve_triangular(root, half.T, lower=True, check_finite=False)
     chosen = (size - count, size - 1)
     if not vectors:
-        values = eigh(
+        values = scipy.linalg.eigh(
             matrix, eigvals_only=True, subset_by_index=chosen, check_finite=False, driver="evr"
         )
         return _frequencies(values), np.empty((size, 0))
-    values, own = eigh(matrix, subset_by_index=chosen, check_finite=False, driver="evr")
-    found = solve_triangular(root, own, lower=True, trans=1, check_finite=False)
+    values, own = scipy.linalg.eigh(
+        matrix, subset_by_index=chosen, check_finite=False, driver="evr"
+    )
+    found = scipy.linalg.solve_triangular(root, own, lower=True, trans=1, check_finite=False)
     return _frequencies(values), (found / np.sqrt(np.maximum(values, 1e-300)))[:, ::-1]
 
 

@@ -99,6 +99,8 @@ class StiffnessMonitor(TwinNode):
             unit="Hz", low=0.0, high=1000.0, read_only=True,
         )  # fmt: skip
         if rate > 0.0 and has_modes(robot):
+            # What the first call loads and compiles is not waited for in a callback.
+            natural_frequencies(robot, robot.home())
             self._frequencies = self.create_guarded_publisher(
                 Float64MultiArray, "~/natural_frequencies"
             )

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import cho_solve  # type: ignore[import-untyped]
 
 from pkm_twin.codegen.arrays import one_vector
 from pkm_twin.errors import ParameterError
@@ -76,7 +76,7 @@ def tool_modes(
     shapes = (moved @ vectors[:6]).T
     loads = np.zeros((len(system.mass), 6))
     loads[:6] = moved.T
-    whole = loads.T @ cho_solve((stiffness_root(system, ()), True), loads)
+    whole = loads.T @ scipy.linalg.cho_solve((stiffness_root(system, ()), True), loads)
     rest = whole - (shapes.T / (2.0 * np.pi * frequencies) ** 2) @ shapes
     return ToolModes(frequencies, ratios, shapes, rest, rotation)
 

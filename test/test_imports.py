@@ -2,11 +2,13 @@
 """Who may import whom, read from the sources; imports for types alone count."""
 
 import re
+import subprocess
+import sys
 from graphlib import TopologicalSorter
 
 import pytest
 
-from test.support.sources import arrows, imports, room, sources, within
+from test.support.sources import ROOT, arrows, imports, room, sources, within
 
 OWN = {"pkm_twin.errors", "pkm_twin.files", "pkm_twin.threads"}
 """Modules without a folder that all may import."""
@@ -80,3 +82,14 @@ def test_only_nodes_and_the_ros_package_import_ros():
         if not (module.endswith("node") or own or module in APPS_WITH_ROS):
             for name in imports(module):
                 assert not ROS.fullmatch(name.split(".")[0]), f"{module} imports {name}"
+
+
+def test_a_command_and_a_node_start_without_what_they_may_never_need():
+    """Parts of scipy take longer to load than all the rest of a command."""
+    code = (
+        "import pkm_twin.apps.cli, delta_dynamics, stiffness_monitor, pkm_twin.state, sys;"
+        "print(*sorted(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=True)
+    parts = ("linalg", "optimize", "signal", "special", "stats")
+    assert not {f"scipy.{part}" for part in parts} & set(done.stdout.decode().split())

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d  # type: ignore[import-untyped]
 
 from delta_dynamics.regressor import law_columns, law_keys, parameter_values, regressor
 from pkm_twin.errors import PkmTwinError
@@ -310,7 +310,9 @@ def _drop_outliers(
         away = np.abs(part.target - told)
         bound = OUTLIER * 1.4826 * np.median(away, axis=0)
         # Where friction turns over, an effort that is some samples late is no outlier.
-        near = maximum_filter1d(np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0)
+        near = scipy.ndimage.maximum_filter1d(
+            np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0
+        )
         far = (away > bound + LATE * near) & (bound > 1e-6 * np.abs(part.target).max(0))
         if far.mean() > 0.05:
             continue

@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator  # type: ignore[import-untyped]
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, UnknownNameError
@@ -49,7 +49,7 @@ class Phase:
 
     @cached_property
     def _curve(self) -> Any:
-        return PchipInterpolator(self.times, self.rate)
+        return scipy.interpolate.PchipInterpolator(self.times, self.rate)
 
     @cached_property
     def _whole(self) -> Any:

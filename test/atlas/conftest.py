@@ -39,6 +39,7 @@ WHOLE = "whole"
 """Of as many heights as a command's atlas, in the name of one."""
 MAKE = {
     "strain-energy": lambda robot: strain_energy_sweep(robot, "P1"),
+    "coarse-energy": lambda robot: strain_energy_sweep(robot, "P1", 4000),
     "isotropy": lambda robot: isotropy_sweep(robot, 8000),
     "workspace": lambda robot: workspace_sweep(robot, 4000),
     "modes": lambda robot: modes_sweep(robot, 60),

@@ -18,14 +18,14 @@ from test.support.robots import partly_long
 MODES = partly_long(["modes prru", "modes delta_cu", "modes upr_rpu"], "modes upr_rpu")
 KINDS = partly_long(
     [
-        "strain-energy upr_rpu",
+        "coarse-energy upr_rpu",
         "isotropy prru",
         "isotropy delta_cu",
         "workspace prru",
         "workspace delta_cu",
         "workspace upr_rpu",
     ],
-    "strain-energy upr_rpu",
+    "coarse-energy upr_rpu",
     "isotropy prru",
     "workspace delta_cu",
 )
@@ -52,8 +52,8 @@ LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 @pytest.mark.parametrize(
     ("name", "draw"),
     [
-        ("strain-energy upr_rpu", strain_energy.figures.plane),
-        LONG("strain-energy upr_rpu", strain_energy.figures.global_factors),
+        ("coarse-energy upr_rpu", strain_energy.figures.plane),
+        LONG("coarse-energy upr_rpu", strain_energy.figures.global_factors),
         ("isotropy prru", isotropy.figures.spheres),
         LONG("isotropy delta_cu", isotropy.figures.spread_over_poses),
         LONG("workspace prru", workspace.figures.section),
@@ -77,7 +77,7 @@ def test_functions_draw_on_given_axes_or_their_own(name, draw, small_atlases):
 @pytest.mark.parametrize(
     ("name", "draw"),
     [
-        ("strain-energy upr_rpu", strain_energy.figures.stack),
+        ("coarse-energy upr_rpu", strain_energy.figures.stack),
         ("modes prru", modes.figures.mode_shape),
     ],
 )
@@ -141,7 +141,7 @@ def test_a_sphere_is_seen_from_its_side():
 
 
 def test_kinds_without_pictures_are_refused(small_atlases):
-    with open_atlas(small_atlases["strain-energy upr_rpu"]) as data:
+    with open_atlas(small_atlases["coarse-energy upr_rpu"]) as data:
         data.attrs["kind"] = "weather"
         with pytest.raises(UnknownNameError):
             kinds.draw(data)

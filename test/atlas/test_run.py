@@ -74,6 +74,7 @@ def test_a_resumed_run_is_an_uninterrupted_one(strain, tmp_path):
     assert not Parts(out, sweep).folder.exists()
 
 
+@pytest.mark.long
 def test_processes_are_one_process(strain, tmp_path):
     sweep, path = strain
     assert same(path, run(sweep, tmp_path / "a.nc", workers=2))
@@ -127,6 +128,7 @@ def cluster():
         yield made
 
 
+@pytest.mark.long
 def test_a_cluster_is_one_process(strain, tmp_path, cluster):
     sweep, path = strain
     out = run(sweep, tmp_path / "a.nc", scheduler=cluster.scheduler_address)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`pkm-twin fit` and `pkm-twin excite` as a user runs them."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from test.support.command import command
 from test.support.robots import load, parameters_of
 
 HEAD = ("five_bar", "friction,payload")
+LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 
 
 def table(path, robot, seconds=6.0, efforts=True):
@@ -179,9 +181,11 @@ def test_copies_that_would_lose_elastic_members_are_refused_by_name(capsys, tmp_
     ("column", "how", "text"),
     [
         ("time", lambda v: v * 1e-300, "time: 'not rising'"),
-        ("time", lambda v: v * 1e300, "1e+06 s in all"),
+        LONG("time", lambda v: v * 1e300, "1e+06 s in all"),
         ("effort", lambda v: v * 1e3, "times what the robot's file makes of the motion: units?"),
-        ("effort", lambda v: v * 1e-3, "times what the robot's file makes of the motion: units?"),
+        LONG(
+            "effort", lambda v: v * 1e-3, "times what the robot's file makes of the motion: units?"
+        ),
         ("effort", lambda v: v * 1e-300, "nothing was measured"),
         ("position", lambda v: v + 3.0, "--beyond-limits"),
     ],

@@ -14,6 +14,7 @@ from test.support.robots import load, massless
 
 TERMS = ("gravity", "inertia", "velocity", "payload", "friction", "external")
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
+TABLE = "torques", "--no-picture"
 PNG = b"\x89PNG"
 
 
@@ -202,7 +203,7 @@ class TestBeyondLimits:
         outside = (columns["arm_2.position"] > high) | (columns["arm_2.position"] < low)
         assert 0 < outside.sum() < len(outside)
         command = (
-            "torques",
+            *TABLE,
             "delta",
             write(tmp_path / "m.csv", columns),
             "--out",
@@ -217,7 +218,7 @@ class TestBeyondLimits:
     def test_a_motion_within_has_no_column(self, twin, tmp_path):
         source = write(tmp_path / "m.csv", motion("delta"))
         out = tmp_path / "t.csv"
-        assert twin("torques", "delta", source, "--out", out, "--beyond-limits").code == 0
+        assert twin(*TABLE, "delta", source, "--out", out, "--beyond-limits").code == 0
         assert "beyond_limits" not in columns_of(out)
 
     def test_a_bags_samples_are_not_dropped_in_silence(self, twin, tmp_path):
@@ -227,7 +228,7 @@ class TestBeyondLimits:
             return message
 
         bag = rewrite(DELTA, tmp_path / "far.mcap", far, seconds=0.2)
-        command = "torques", "delta_cu", bag, "--out", tmp_path / "t.csv"
+        command = *TABLE, "delta_cu", bag, "--out", tmp_path / "t.csv"
         assert "arm_1.position" in twin(*command).one_line_error()
         assert twin(*command, "--beyond-limits").code == 0
         assert columns_of(tmp_path / "t.csv")["beyond_limits"].sum() == 1
@@ -243,7 +244,7 @@ class TestPayload:
             "later": ("--payload", "0.3", "--load-times", "0.5,2"),
         }.items():
             out = tmp_path / f"{name}.csv"
-            assert twin("torques", "delta", source, "--out", out, *options).code == 0
+            assert twin(*TABLE, "delta", source, "--out", out, *options).code == 0
             tables[name] = columns_of(out)
         bare, always, later = (joined(t, "delta", "effort") for t in tables.values())
         held = tables["bare"]["time"] >= 0.5
@@ -254,7 +255,7 @@ class TestPayload:
         source = write(tmp_path / "m.csv", motion("prru"))
         outs = [tmp_path / "a.csv", tmp_path / "b.csv"]
         for out, payload in zip(outs, ("3", "3,0.1,0,0"), strict=True):
-            assert twin("torques", "prru", source, "--out", out, "--payload", payload).code == 0
+            assert twin(*TABLE, "prru", source, "--out", out, "--payload", payload).code == 0
         one, other = (joined(columns_of(out), "prru", "effort") for out in outs)
         assert not np.allclose(one, other)
 
@@ -264,7 +265,7 @@ class TestPayload:
         for name, options in (("told", ()), ("none", ("--payload", "0"))):
             out = tmp_path / f"{name}.csv"
             times = ("--load-times", "0,1") if options else ()
-            assert twin("torques", "delta_cu", bag, "--out", out, *options, *times).code == 0
+            assert twin(*TABLE, "delta_cu", bag, "--out", out, *options, *times).code == 0
         told, none = (columns_of(tmp_path / f"{name}.csv") for name in ("told", "none"))
         assert np.allclose(told["arm_1.effort"], none["arm_1.effort"])
 

@@ -12,11 +12,11 @@ from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import random_states
 from pkm_twin.apps.certify import effort_differences, relative
-from pkm_twin.codegen.code import compiled
 from pkm_twin.errors import ParameterError, PkmTwinError
 from test.machine.random_machines import NAMES, plain, variant
 from test.support.robots import load, partly_long
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 VARIANTS = int(os.environ.get("PKM_TWIN_VARIANTS", "1"))
 """Machines of other dimensions for each of the folder; hundreds for a long run."""
 STATES = 2
@@ -45,20 +45,6 @@ CASES = [(n, k) for n in NAMES for k in range(VARIANTS + 1)]
 PLAIN = ("bolted", "delta_rcu", "hinged_platform", "platform_motor", "rccc", "rrr3_spherical")
 VARIED = ("five_bar", "four_bar", "gantry", "prru3", "rcuu", "rps3")
 """By default some as they are, some of other dimensions: every type of joint, of every kind."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quickly_compiled():
-    """Programs of a few states each, as gradients are compiled; stored under names of their own."""
-    if compiled():
-        from pkm_twin.codegen import llvm, native
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(native, "OPTIMISATION", native.QUICK)
-            patch.setattr(llvm, "IDENTITY", f"{llvm.IDENTITY} quick")
-            yield
-    else:
-        yield
 
 
 @pytest.fixture(

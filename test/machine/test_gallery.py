@@ -13,6 +13,7 @@ from test.docs.test_docs import DOCS
 from test.support.robots import partly_long
 from tools.pages.robots import GALLERY, MACHINES
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 NAMES = [path.name for path in GALLERY]
 PAGE = (DOCS / "gallery.md").read_text(encoding="utf-8")
 

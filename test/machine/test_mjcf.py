@@ -16,6 +16,7 @@ from pkm_twin.robot.urdf_read import read_urdf
 
 mujoco = pytest.importorskip("mujoco")
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 FIVE_BAR = """<mujoco model="five_bar">
 <option gravity="0 -9.81 0"/>
 <worldbody>

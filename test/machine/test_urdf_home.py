@@ -20,6 +20,7 @@ import pinocchio as pin
 
 from .sketches import SKETCHES, delta, five_bar, palletizer, rrr3, stewart
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 DRAWINGS = (palletizer, five_bar, SKETCHES["four_bar"])
 
 

@@ -22,6 +22,7 @@ import pinocchio as pin
 
 from .sketches import SKETCHES, Z, closure_rows, five_bar
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 NEAR = ("rrr3",)
 """Sketches that have no assembly with their actuated joints at zero."""
 

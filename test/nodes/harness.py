@@ -10,6 +10,7 @@ import fcntl
 import importlib
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -324,6 +325,7 @@ class Peer:
         self._executor.add_node(self.node)
         self._publishers = {}
         self._received = {}
+        self._since = {}
 
     def now(self):
         return self.node.get_clock().now().nanoseconds
@@ -333,7 +335,12 @@ class Peer:
 
     def hear(self, kind, topic):
         received = self._received[topic] = []
-        self.node.create_subscription(kind, topic, received.append, 100)
+
+        def take(message, info):
+            if info["source_timestamp"] >= self._since.get(topic, 0):
+                received.append(message)
+
+        self.node.create_subscription(kind, topic, take, 100)
 
     def send(self, topic, message):
         self._publishers[topic].publish(message)
@@ -342,16 +349,23 @@ class Peer:
         return self._received[topic]
 
     def clear(self):
-        for received in self._received.values():
-            received.clear()
+        for topic in self._received:
+            self.clear_topic(topic)
+
+    def clear_topic(self, topic):
+        """Forget what was received, and what was sent before now and is still on its way."""
+        self._since[topic] = time.time_ns()
+        self._received[topic].clear()
 
     def matched(self):
         """Every publisher has a subscriber."""
         return all(p.get_subscription_count() >= 1 for p in self._publishers.values())
 
     def diagnostics(self, node, condition=lambda array: True):
-        """The next diagnostics of a node, by its full name, that meet the condition."""
-        self._received["/diagnostics"].clear()
+        """The first diagnostics that a node, by its full name, sends from now on and that meet
+        the condition.
+        """
+        self.clear_topic("/diagnostics")
         return self.until(lambda: next(filter(condition, self.told(node)), None))
 
     def told(self, node):
@@ -421,6 +435,12 @@ def values_of(array):
     """A DiagnosticArray's only status: its values as a dict."""
     (status,) = array.status
     return {pair.key: pair.value for pair in status.values}
+
+
+def silence_of(array):
+    """How long there was no joint state, s, by the status of a stream that it stopped."""
+    text = array.status[0].message
+    return float(re.fullmatch(r"stopped: stale input: no joint state for ([\d.]+) s.*", text)[1])
 
 
 def text_of(array):

@@ -27,9 +27,12 @@ JOINTS = {
 }
 
 
+KEPT = (MACHINES / "slider_crank.yaml", "five_bar", "linear_delta", "stewart")
+
+
 @pytest.fixture(
     scope="module",
-    params=partly_long(JOINTS, *(name for name in JOINTS if name != "upr_rpu")),
+    params=partly_long(JOINTS, *KEPT),
     ids=lambda name: getattr(name, "stem", name),
 )
 def robot(request):

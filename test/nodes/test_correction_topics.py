@@ -58,7 +58,7 @@ def test_set_points_are_corrected_by_the_measured_wrench(peer, launch):
         peer.send("/wrench", load_case)
         peer.send("/setpoint", state(peer, Q + 1e-3))
 
-    peer.until(lambda: peer.received(CORRECTED), repeat=push)
+    peer.until(lambda: peer.received(CORRECTED) and peer.received(OFFSET), repeat=push)
     rotation = ROBOT.platform(Q)[1]
     wrench = np.concatenate([rotation @ FORCE, np.zeros(3)])
     energy = strain_energy(ROBOT, ROBOT.forward(Q), wrench)

@@ -100,8 +100,8 @@ class TestComputedTorque:
             launch_alone, "computed_torque.py", "--deadline", "2", "--seconds", "1000",
             parameters=(SIM_TIME,),
         )  # fmt: skip
-        peer.until(lambda: len(commands) > 50, PATIENCE)
-        assert controller.alive() and any(any(c.data) for c in commands)
+        peer.until(lambda: len(commands) > 50 and any(any(c.data) for c in commands), PATIENCE)
+        assert controller.alive()
         sim.process.kill()
         peer.until(lambda: not controller.alive(), PATIENCE)
         assert controller.wait() == 1, controller.output

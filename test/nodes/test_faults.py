@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from test.nodes.harness import SECOND, Domain, Peer, counts_of, stamp_of, text_of, values_of
+from test.nodes.harness import (
+    SECOND,
+    Domain,
+    Peer,
+    counts_of,
+    silence_of,
+    stamp_of,
+    text_of,
+    values_of,
+)
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
@@ -389,9 +398,8 @@ class TestClocks:
         self.tick(timed, self.start)
         timed.peer.until(lambda: torques)
         assert [is_zeros(m) for m in torques] == [True]
-        array = timed.diagnostics()
+        array = timed.diagnostics(lambda a: "/clock stands still" in text_of(a))
         assert array.status[0].message.startswith("stopped: clock jump: the clock jumped forward")
-        assert "/clock stands still" in text_of(array)
         assert counts_of(array, "stopped") == {"clock jump": 1}
         assert self.stream(timed, self.start, 20) == list(range(AGAIN - 1, 20))
 
@@ -411,7 +419,7 @@ class TestClocks:
         self.tick(timed, begin)
         self.stream(timed, begin, 20)
         array = timed.diagnostics(lambda a: "stale input" in counts_of(a, "stopped"))
-        assert "stopped: stale input: no joint state for 5." in array.status[0].message
+        assert silence_of(array) >= 5.0
 
 
 class TestNeighbours:
@@ -577,5 +585,5 @@ class TestNeighbours:
         sender.process.kill()
         sender.wait()
         quick.peer.until(lambda: is_zeros(torques[-1]))
-        array = quick.diagnostics(lambda a: a.status[0].level == b"\x02")
-        assert array.status[0].message.startswith("stopped: stale")
+        array = quick.diagnostics(lambda a: a.status[0].message.startswith("stopped: stale"))
+        assert array.status[0].level == b"\x02"

@@ -55,12 +55,12 @@ def test_torque_residual_and_stop(peer, launch):
     assert np.abs(exact - inverse_dynamics(ROBOT, Q, REST, REST)).max() > 10.0
 
     def borne():
-        return torques and residuals and np.allclose(torques[-1].effort, exact, atol=1e-6)
+        """The torque that bears the wrench, and the residual of its stamp."""
+        right = {stamp_of(m) for m in torques if np.allclose(m.effort, exact, atol=1e-6)}
+        return next((m for m in residuals if stamp_of(m) in right), None)
 
-    peer.until(borne, repeat=send)
-    same = {stamp_of(m): m for m in torques}
-    residual = next(m for m in reversed(residuals) if stamp_of(m) in same)
-    assert np.allclose(residual.effort, MEASURED - np.array(same[stamp_of(residual)].effort))
+    residual = peer.until(borne, repeat=send)
+    assert np.allclose(residual.effort, MEASURED - exact, atol=1e-6)
 
     def stopped():
         # A state that was heard before the first wrench is a warning of the same name.

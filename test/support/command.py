@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import multiprocessing
 import os
 import resource
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
 from pkm_twin.apps import cli
 
@@ -22,6 +24,9 @@ REPOSITORY = Path(__file__).parents[2]
 SHELL = (">", ">>", "<", "|", "&&", ";", "2>")
 """Words of a line that are the shell's."""
 _FORK = multiprocessing.get_context("fork")
+
+# The tree of all commands takes longer to build than most commands to run.
+typer.main.get_command = functools.cache(typer.main.get_command)
 
 
 @dataclass(frozen=True)
