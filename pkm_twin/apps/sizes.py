@@ -21,7 +21,7 @@ from pkm_twin.apps.torques import Motion, motion_of_bag, motion_of_csv
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.machine import schema
-from pkm_twin.paths.sizing import DriveDuty, Motor, size_drives
+from pkm_twin.paths.sizing import DriveDuty, Gear, Motor, size_drives
 from pkm_twin.paths.worst import worst_over_workspace
 from pkm_twin.robot.catalogue import config_folder
 from pkm_twin.robot.robot import Robot
@@ -85,11 +85,11 @@ def read_motion(
     return Taken(motion, model, "the model's", model)
 
 
-def duties(taken: Taken, motors: Sequence[Motor]) -> list[DriveDuty]:
+def duties(taken: Taken, motors: Sequence[Motor], gear: Gear | None = None) -> list[DriveDuty]:
     """What each drive gives."""
     m = taken.motion
     robot = m.robot if m.load is None else m.load.on(m.robot)
-    return size_drives(robot, m.time, m.q, m.qd, m.qdd, taken.effort, motors)
+    return size_drives(robot, m.time, m.q, m.qd, m.qdd, taken.effort, motors, gear)
 
 
 @dataclass(frozen=True, eq=False)
