@@ -23,8 +23,8 @@ from pkm_twin.apps.drive_friction import drive_friction_command
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.feed import feed
 from pkm_twin.apps.fit import fit
-from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.apps.groups import Tasks, greet
+from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.apps.joint_loads import loads
 from pkm_twin.apps.options import (
     BagPath,

@@ -40,7 +40,7 @@ def size(
             max=1e6,
             show_default=False,
         ),
-    ] = None,  # fmt: skip
+    ] = None,
     lead: Annotated[
         Optional[float],  # noqa: UP045
         typer.Option(
@@ -50,7 +50,7 @@ def size(
             max=1e6,
             show_default=False,
         ),
-    ] = None,  # fmt: skip
+    ] = None,
     efficiency: Annotated[
         float, typer.Option(help="efficiency of --ratio and --lead", min=1e-3, max=1.0)
     ] = 1.0,

@@ -206,7 +206,7 @@ def size_drives(
 
     :param time: rising times (k,), s; q, qd, qdd and effort, shape (k, n).
     :param motors: candidates; each replaces the rotor of the robot's file.
-    :param gear: of joints without a ``drive`` in the file; the file's ``rotor_inertia`` is behind it.
+    :param gear: of joints without a ``drive`` in the file; its ``rotor_inertia`` is behind it.
     :raises ParameterError: fewer than two samples; motors for a joint without a gear; a gear for a
         joint that has one, or of another type.
     """
