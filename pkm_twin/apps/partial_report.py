@@ -125,7 +125,7 @@ def print_partial(result: PartialCalibration) -> None:
     if result.scale is not None:
         typer.echo(fill(scale_text(result.scale), WIDTH))
     for line in outlier_texts(result):
-        typer.echo(f"outlier, hardly counted: {line}")
+        typer.echo(f"outlier, with a small weight: {line}")
 
 
 def plan_table(robot: Robot, plan: Plan) -> list[str]:
