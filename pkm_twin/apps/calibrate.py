@@ -71,7 +71,8 @@ def calibrate_command(
         Path, typer.Option(help="the calibrated robot, a YAML", callback=file_name)
     ] = Path("calibrated.yaml"),
     only: Annotated[
-        list[str], typer.Option(help="fit only numbers whose path begins with this; may be repeated")
+        list[str],
+        typer.Option(help="fit only numbers whose path begins with this; may be repeated"),
     ] = [],  # noqa: B006  typer copies it
     offsets: Annotated[
         bool, typer.Option("--offsets/--no-offsets", help="fit the joints' sensor offsets")
@@ -341,7 +342,7 @@ def _print_errors(result: Calibration) -> None:
 def _print_open(result: Estimate) -> None:
     open_lines = result.undetermined
     if open_lines:
-        typer.echo("the poses do not determine, and the file's values stay:")
+        typer.echo("the poses do not determine these numbers; the file's values stay:")
     for line in open_lines:
         typer.echo(fill(line, WIDTH, initial_indent="  ", subsequent_indent="    "))
 
