@@ -377,8 +377,8 @@ def certify(
     states inside the limits. It also checks the round trip from joint positions to pose and back.
 
     --variants N repeats this for N machines whose masses, inertias, friction and lengths are drawn
-    at random, with a relative standard deviation of 2 %. The lengths of a machine that only closes
-    with the file's own lengths are kept. The results are the worst over all machines.
+    at random, with a relative standard deviation of 2 %. If a machine
+    closes only with the file's lengths, they are kept. The results are the worst over all machines.
 
     Exit code 0: all differences are within their bounds. 1: one is not, or the machine cannot be
     checked.

@@ -100,7 +100,7 @@ class Parts:
             sweep's; what no run wrote is never dropped.
         """
         if self.folder.exists() and not self.folder.is_dir():
-            raise AtlasError(self.folder, "is no folder; chunks go into one of that name")
+            raise AtlasError(self.folder, "is not a folder; the chunks need a folder of this name")
         while self._lock < 0:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._refuse_foreign()
