@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import click
+import typer
 from typer.core import TyperGroup
 
 WIDE: Final = 200
@@ -52,8 +52,8 @@ class Tasks(TyperGroup):
                     formatter.write_dl(rows)
 
 
-def greet(ctx: click.Context) -> None:
+def greet(ctx: typer.Context) -> None:
     """Three things to try, where no command is given: wrong usage, as scripts see it."""
     if ctx.invoked_subcommand is None:
-        click.echo(GREETING)
-        ctx.exit(2)
+        typer.echo(GREETING)
+        raise typer.Exit(2)

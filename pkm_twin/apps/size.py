@@ -98,6 +98,7 @@ def size(
     with a JointTrajectory.
     """
     from pkm_twin.apps import sizes
+    from pkm_twin.paths.sizing import Gear
 
     if efforts not in ("file", "model"):
         raise typer.BadParameter(f"--efforts {efforts}: file or model")
@@ -111,7 +112,7 @@ def size(
     geared = ratio is not None or lead is not None
     if over_workspace is not None and (geared or motors):
         raise typer.BadParameter("--over-workspace reports joints: no --drives, --ratio, --lead")
-    gear = sizes.Gear(ratio, lead, efficiency) if geared else None
+    gear = Gear(ratio, lead, efficiency) if geared else None
     if over_workspace is not None:
         speed, change = numbers(over_workspace, 2, "SPEED,ACCELERATION")
         if speed < 0.0 or change < 0.0:
