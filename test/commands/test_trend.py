@@ -9,12 +9,12 @@ import sqlite3
 import numpy as np
 import pytest
 
-from examples.nights import night
 from pkm_twin.apps.history import Measured, Series, append, measure, read_history
 from pkm_twin.apps.recorded import read_recording
 from pkm_twin.apps.trend import judged
 from test.commands.conftest import DELTA
 from test.support.command import command
+from test.support.nights import night
 from test.support.robots import load, often
 
 DAY = 86400.0
