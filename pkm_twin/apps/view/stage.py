@@ -25,7 +25,7 @@ LIFT: Final = 0.28
 """How far up the machine is in a tall window, where a sheet of sliders covers the lower part, in
 parts of the window's height."""
 
-TALLEST: Final = 2.5
+TALLEST: Final = 3.5
 """Height per width of a window for which the camera moves away; a phone's is 2.2."""
 
 
