@@ -174,8 +174,8 @@ Revolutions a metre, with standard deviations:
 |---|---|---|---|
 {ratios}
 
-Calibrated with the half of the grid at x < 0, leg lengths of the other half, less one offset a
-leg: {halves}.
+Calibrated with the half of the grid at x < 0. Error of the leg lengths
+at the other half, without one offset per leg: {halves}.
 
 It does not show: other heights, tilts above 2 degrees, loads, or how the machine changes from day
 to day. The standard deviations assume independent errors; the poses of a grid share some.

@@ -71,7 +71,8 @@ def calibrate_command(
         Path, typer.Option(help="the calibrated robot, a YAML", callback=file_name)
     ] = Path("calibrated.yaml"),
     only: Annotated[
-        list[str], typer.Option(help="fit only numbers whose path begins so; may be repeated")
+        list[str],
+        typer.Option(help="fit only numbers whose path begins with this; may be repeated"),
     ] = [],  # noqa: B006  typer copies it
     offsets: Annotated[
         bool, typer.Option("--offsets/--no-offsets", help="fit the joints' sensor offsets")
@@ -146,17 +147,16 @@ def calibrate_command(
 ) -> None:
     """Fit a robot's geometry and joint offsets to poses that an instrument measured.
 
-    Robust least squares on the machine's own closures, by their exact derivatives. A pose that does
-    not fit the others hardly counts and is named by its line. What the poses do not determine stays
-    as the file has it and is named. Every fourth pose is held out: the error there, before and
-    after, is the calibration's accuracy.
+    A robust least-squares fit with the machine's closures. A pose that does not fit the others gets
+    a small weight, and the report names its line. Numbers that the poses do not determine keep the
+    file's values and are listed. The fit does not use every fourth pose: the error there, before
+    and after, is the calibration's accuracy.
 
-    Poses that this machine cannot have been in are rejected with the reason, and so are poses in
-    another frame than the base's without --frame; --accept calibrates anyway and marks the
-    file.
+    Poses that this machine cannot reach are rejected with the reason, and without --frame so are
+    poses in another frame than the base's. --accept calibrates anyway and marks the file.
 
-    With --measure any quantities of the poses are enough: cells may be empty. Each measurement is
-    then compared with the fit to all others, and the report says whether the scale is determined.
+    With --measure, parts of the poses are enough, and cells may be empty. Each measurement is then
+    compared with the fit to all others, and the report says whether the scale is determined.
     --plan chooses the most informative poses.
     """
     from pkm_twin import load
@@ -239,7 +239,7 @@ def calibrate_command(
         outliers = outlier_texts(result)
     else:
         outliers = [_outlier_text(one) for one in result.outliers]
-    head += [f"Outlier, hardly counted: {line}." for line in outliers]
+    head += [f"Outlier, with a small weight: {line}." for line in outliers]
     write_edited(out, [*head, *marks], edited_yaml(machine, robot, values))
     if as_json:
         about = {
@@ -334,7 +334,7 @@ def _print_errors(result: Calibration) -> None:
         noise += f", {1e3 * result.noise_angle:.4f} mrad"
     typer.echo(f"noise that is left, an axis: {noise}; condition number {result.condition:.3g}")
     for one in result.outliers[:MOST_SHOWN]:
-        typer.echo(f"outlier, hardly counted: {_outlier_text(one)}")
+        typer.echo(f"outlier, with a small weight: {_outlier_text(one)}")
     if len(result.outliers) > MOST_SHOWN:
         typer.echo(f"{len(result.outliers) - MOST_SHOWN} more outliers: see --json")
 
@@ -342,7 +342,7 @@ def _print_errors(result: Calibration) -> None:
 def _print_open(result: Estimate) -> None:
     open_lines = result.undetermined
     if open_lines:
-        typer.echo("the poses do not determine, and the file's values stay:")
+        typer.echo("the poses do not determine these numbers; the file's values stay:")
     for line in open_lines:
         typer.echo(fill(line, WIDTH, initial_indent="  ", subsequent_indent="    "))
 

@@ -43,9 +43,9 @@ class Bounds:
     gap: float = 5.0
     """Longest time between joint states, in median periods."""
     rejected: float = 0.0
-    """Messages that a node would refuse, part of all."""
+    """Messages that a node would reject, part of all."""
     singularity: float = 1e-3
-    """Least distance to a singularity, 0 in one, 1 at best."""
+    """Least singularity index, 0 in a singularity, 1 at best."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def _file(r: Recording, bounds: Bounds) -> list[Item]:
     value = f"{refused} of {total}" + (f" ({reasons}; first: {r.first_reject})" if refused else "")
     items.append(
         _item(
-            "messages that a node refuses",
+            "messages that a node rejects",
             value,
             f"at most {100 * bounds.rejected:g} %",
             refused <= bounds.rejected * total,
@@ -215,7 +215,7 @@ def _limits(r: Recording) -> list[Item]:
 
 
 def _singularity(r: Recording, bounds: Bounds) -> Item:
-    what = "distance to singularity"
+    what = "singularity index"
     bound = f"{bounds.singularity:g} or more"
     try:
         measure = r.robot.singularity(r.q)

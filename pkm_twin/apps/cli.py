@@ -23,6 +23,7 @@ from pkm_twin.apps.drive_friction import drive_friction_command
 from pkm_twin.apps.excite import excite
 from pkm_twin.apps.feed import feed
 from pkm_twin.apps.fit import fit
+from pkm_twin.apps.groups import Tasks, greet
 from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.apps.joint_loads import loads
 from pkm_twin.apps.options import (
@@ -61,7 +62,8 @@ from pkm_twin.files import STANDARD, open_standard_streams
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
 app = typer.Typer(
-    no_args_is_help=True,
+    cls=Tasks,
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -82,19 +84,21 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def _application(
+    context: typer.Context,
     _asked: Annotated[
         bool,
         typer.Option("--version", help="print the version", callback=_version, is_eager=True),
     ] = False,
 ) -> None:
-    """Digital twin of parallel kinematic machines.
+    """Compute torques and stiffness of parallel robots, and compare recordings with the model.
 
     Start with `pkm-twin robots`, then `pkm-twin info delta_cu`; or check a recording with
-    `pkm-twin check BAG`. SI units, world z up. Only play, guard-check and view --live need ROS.
+    `pkm-twin check BAG`. SI units, world z up. Only play, monitor-torques and view --live need ROS.
 
     Exit codes: 0 good, 1 bad or invalid, 2 wrong usage, 3 recovered with loss. An error is one line
     on stderr. Results go to stdout, with --json as JSON only.
     """
+    greet(context)
 
 
 @app.command()
@@ -373,8 +377,8 @@ def certify(
     states inside the limits. It also checks the round trip from joint positions to pose and back.
 
     --variants N repeats this for N machines whose masses, inertias, friction and lengths are drawn
-    at random, with a relative standard deviation of 2 %. The lengths of a machine that only closes
-    with the file's own lengths are kept. The results are the worst over all machines.
+    at random, with a relative standard deviation of 2 %. If a machine
+    closes only with the file's lengths, they are kept. The results are the worst over all machines.
 
     Exit code 0: all differences are within their bounds. 1: one is not, or the machine cannot be
     checked.
@@ -422,7 +426,8 @@ app.command()(tables(size))
 app.command()(tables(loads))
 app.command()(frf)
 app.command()(lobes)
-app.command()(guard_check)
+app.command("monitor-torques")(guard_check)
+app.command("guard-check", hidden=True, help="The older name of `monitor-torques`.")(guard_check)
 app.command()(tables(check))
 app.command()(trend)
 app.command()(view)

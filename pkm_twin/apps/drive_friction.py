@@ -21,7 +21,8 @@ def drive_friction_command(
     table: Annotated[
         Path,
         typer.Argument(
-            help="CSV, a row a weight: mass_kg or torque_nm, iq_up_A, iq_down_A, perhaps speed",
+            help="CSV with one row per weight: mass_kg or torque_nm, iq_up_A, iq_down_A; "
+            "optional: speed",
             show_default=False,
         ),
     ],

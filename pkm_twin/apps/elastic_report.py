@@ -228,7 +228,7 @@ def _deflections(result: ElasticFit, number: int) -> Any:
                     color=COLOURS[k % 3], lw=0.8,
                     label=f"{AXES[k]}, {'before' if style == ':' else 'now'}",
                 )  # fmt: skip
-        ax.set_title(f"{judged.name}: measured less predicted, held out")
+        ax.set_title(f"{judged.name}: measured minus predicted, held out")
         ax.set_xlabel("time (s)")
         ax.set_ylabel(f"deflection (u{UNITS[int(kind[0])]})")
         ax.legend(loc="upper right", fontsize=8)

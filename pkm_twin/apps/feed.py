@@ -50,7 +50,10 @@ def bend_per_feed(robot: Robot, force: float, q: Array, way: Array) -> Array:
 def feed(
     robot: RobotName,
     waypoints: Annotated[
-        Path, typer.Argument(help="CSV of waypoints as of `pkm-twin path`", show_default=False)
+        Path,
+        typer.Argument(
+            help="CSV of waypoints, in the format of `pkm-twin path`", show_default=False
+        ),
     ],
     force: Annotated[
         float,

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin guard-check``: a subscriber that reports what a controller must notice of torques."""
+"""``pkm-twin monitor-torques``: a subscriber that reports what a controller must notice of torques.
+
+``guard-check`` is its older name.
+"""
 
 from __future__ import annotations
 

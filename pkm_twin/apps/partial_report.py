@@ -113,7 +113,7 @@ def partial_data(result: PartialCalibration) -> dict[str, Any]:
 
 def print_partial(result: PartialCalibration) -> None:
     """The residuals of each kind, the scale, outliers."""
-    table = Table(title=Text("measured less computed, root mean square"))
+    table = Table(title=Text("measured minus computed, root mean square"))
     for column in ("measurement", "count", "before", "after", "left out", "worst", "noise", "unit"):
         table.add_column(column)
     for a in result.agreements:
@@ -121,11 +121,11 @@ def print_partial(result: PartialCalibration) -> None:
         sizes = (a.before, a.after, a.held_out, a.worst, a.noise)
         table.add_row(a.name, str(a.rows), *(f"{factor * size:.4f}" for size in sizes), unit)
     table_console().print(table)
-    typer.echo("left out: each measurement by the fit to all others")
+    typer.echo("left out: each measurement, predicted by the fit to all others")
     if result.scale is not None:
         typer.echo(fill(scale_text(result.scale), WIDTH))
     for line in outlier_texts(result):
-        typer.echo(f"outlier, hardly counted: {line}")
+        typer.echo(f"outlier, with a small weight: {line}")
 
 
 def plan_table(robot: Robot, plan: Plan) -> list[str]:

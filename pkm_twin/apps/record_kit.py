@@ -76,7 +76,7 @@ def record_kit(
 ) -> None:
     """Prepare the recording of a real machine, or remove names and dates from one.
 
-    Writes into a folder: the exciting motion and slow friction sweeps as of `pkm-twin excite`
+    Writes into a folder: the exciting motion and slow friction sweeps of `pkm-twin excite`
     (excitation.mcap, friction.mcap, and a CSV of each), NOTES.md with what to note, and README.md
     with the commands that record and judge.
 

@@ -31,6 +31,29 @@ def size(
     motor: Annotated[
         list[str], typer.Option(help="compare only this motor of the drives file; may be repeated")
     ] = [],  # noqa: B006  typer copies it
+    ratio: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(
+            help="gear of the joints that turn, where the file has no drive: turns of the motor "
+            "per turn of the joint",
+            min=1e-6,
+            max=1e6,
+            show_default=False,
+        ),
+    ] = None,
+    lead: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(
+            help="screw or belt of the joints that slide, where the file has no drive: m per turn "
+            "of the motor",
+            min=1e-6,
+            max=1e6,
+            show_default=False,
+        ),
+    ] = None,
+    efficiency: Annotated[
+        float, typer.Option(help="efficiency of --ratio and --lead", min=1e-3, max=1.0)
+    ] = 1.0,
     over_workspace: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
@@ -65,7 +88,8 @@ def size(
 
     Prints for each drive: peak and RMS effort (RMS heats the motor), speed, power, energy supplied
     and regenerated, and the machine's inertia at the joint. If the robot's file has a section drive
-    (inertia, ratio or lead, efficiency), it prints the same at the motor, and the inertia ratio.
+    (inertia, ratio or lead, efficiency), or with --ratio or --lead, it prints the same at the
+    motor, and the inertia ratio. The shipped robots have no gear in their files.
 
     --drives compares each motor of a file with the needs of each drive: torque curve, continuous
     torque against RMS torque, and speed. The motor's rotor replaces the one in the robot's file.
@@ -74,6 +98,7 @@ def size(
     with a JointTrajectory.
     """
     from pkm_twin.apps import sizes
+    from pkm_twin.paths.sizing import Gear
 
     if efforts not in ("file", "model"):
         raise typer.BadParameter(f"--efforts {efforts}: file or model")
@@ -84,6 +109,10 @@ def size(
     carried = load_of(payload, load_times)
     machine = sizes.loaded(robot, platform)
     motors = [] if drives is None else sizes.read_motors(drives, motor)
+    geared = ratio is not None or lead is not None
+    if over_workspace is not None and (geared or motors):
+        raise typer.BadParameter("--over-workspace reports joints: no --drives, --ratio, --lead")
+    gear = Gear(ratio, lead, efficiency) if geared else None
     if over_workspace is not None:
         speed, change = numbers(over_workspace, 2, "SPEED,ACCELERATION")
         if speed < 0.0 or change < 0.0:
@@ -94,7 +123,7 @@ def size(
     else:
         assert motion is not None  # noqa: S101  one of the two is given
         taken = sizes.read_motion(motion, machine, topic, carried, efforts)
-        result = sizes.duties(taken, motors)
+        result = sizes.duties(taken, motors, gear)
         data, text = sizes.report(taken, result)
         if picture is not None:
             try:

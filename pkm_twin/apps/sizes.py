@@ -21,7 +21,7 @@ from pkm_twin.apps.torques import Motion, motion_of_bag, motion_of_csv
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.machine import schema
-from pkm_twin.paths.sizing import DriveDuty, Motor, size_drives
+from pkm_twin.paths.sizing import DriveDuty, Fit, Gear, Motor, size_drives
 from pkm_twin.paths.worst import worst_over_workspace
 from pkm_twin.robot.catalogue import config_folder
 from pkm_twin.robot.robot import Robot
@@ -85,11 +85,11 @@ def read_motion(
     return Taken(motion, model, "the model's", model)
 
 
-def duties(taken: Taken, motors: Sequence[Motor]) -> list[DriveDuty]:
+def duties(taken: Taken, motors: Sequence[Motor], gear: Gear | None = None) -> list[DriveDuty]:
     """What each drive gives."""
     m = taken.motion
     robot = m.robot if m.load is None else m.load.on(m.robot)
-    return size_drives(robot, m.time, m.q, m.qd, m.qdd, taken.effort, motors)
+    return size_drives(robot, m.time, m.q, m.qd, m.qdd, taken.effort, motors, gear)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,6 +244,13 @@ def worst_report(
     return data, "\n".join(lines)
 
 
+def near(duty: DriveDuty) -> list[Fit]:
+    """The motors to draw: the smallest that fits, or the largest, and the three below it."""
+    fits = sorted(duty.fits, key=lambda fit: fit.motor.continuous)
+    first = next((k for k, fit in enumerate(fits) if fit.good), len(fits) - 1)
+    return fits[max(first - 3, 0) : first + 1]
+
+
 def draw(taken: Taken, result: Sequence[DriveDuty], path: Path) -> None:
     """Torque against speed, an axes for each drive, with the curves of motors."""
     from pkm_twin.atlas import plots
@@ -259,13 +266,18 @@ def draw(taken: Taken, result: Sequence[DriveDuty], path: Path) -> None:
             side, speeds, torques = "joint", m.qd[:, k], taken.effort[:, k]
             unit = m.robot.joint_units[k]
             labels = f"speed of the joint ({unit}/s)", f"effort ({m.robot.effort_units[k]})"
-        ax.plot(speeds, torques, color="black", lw=1, label="motion")
-        for colour, fit in zip(plots.COLOURS, d.fits[:6], strict=False):
+        ax.plot(speeds, torques, color="black", lw=1.5, label="motion")
+        most = float(np.abs(torques).max())
+        for colour, fit in zip(plots.COLOURS, near(d), strict=False):
+            most = max(most, float(fit.motor.curve[:, 1].max()))
             speed, torque = fit.motor.curve.T
             for sign in (1.0, -1.0):
                 for way in (1.0, -1.0):
                     label = fit.motor.name if sign == way == 1.0 else None
                     ax.plot(way * speed / RPM, sign * torque, color=colour, lw=1, label=label)
+        if d.fits:
+            fastest = 1.3 * float(np.abs(speeds).max())
+            ax.set(xlim=(-fastest, fastest), ylim=(-1.1 * most, 1.1 * most))
         ax.set_title(f"{m.robot.name}: is the drive of {d.joint} strong enough? ({side})")
         ax.set_xlabel(labels[0])
         ax.set_ylabel(labels[1])

@@ -77,7 +77,7 @@ def motion_of_bag(
 
     Of a bag without joint states, the motion of its JointTrajectory as it is.
 
-    Messages that a node refuses are left out, but not those beyond the robot's limits: see
+    Messages that a node rejects are left out, but not those beyond the robot's limits: see
     :func:`pkm_twin.apps.limits.beyond_limits`.
 
     :raises BagError: the bag is damaged, or has too few joint states in a row.

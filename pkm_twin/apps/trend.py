@@ -137,12 +137,12 @@ def trend(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the picture")] = False,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Report what of a machine drifts from night to night.
+    """Report which values of a machine drift from night to night.
 
     Residuals, friction, payload, compliance factors and frequencies of all recordings of a history,
     each against control limits from its first recordings, and for a change of its mean.
 
-    Exit code 0: nothing drifts. 1: something does, or it is no history.
+    Exit code 0: nothing drifts. 1: something does, or the file is not a history.
     """
     if picture is not None:
         refuse_existing(picture, overwrite, history)

@@ -71,6 +71,8 @@ def write_page(atlas: Dataset, path: Path) -> Path:
     kind = kind_of(atlas)
     with reading(source(atlas)):
         drawn = kind.page(atlas)
+    scenes = list(drawn.select_scenes())
+    fits = len(scenes) == 1 and scenes[0].camera.projection.type != "orthographic"
     plot = drawn.to_html(
         include_plotlyjs=True,
         full_html=False,
@@ -78,12 +80,13 @@ def write_page(atlas: Dataset, path: Path) -> Path:
         default_width="100%",
         default_height="100%",
         auto_play=False,
+        post_script=pages.NARROW if fits else None,
     )
     text = pages.SHELL.format(
         title=html.escape(kind.title(atlas)),
         plot=plot,
         help=html.escape(kind.help),
-        width=pages.LEAST[len(list(drawn.select_scenes())) > 1],
+        width=pages.FITTED if fits else pages.LEAST[len(scenes) > 1],
     )
     with writing(path):
         replace_file(path, text.encode())

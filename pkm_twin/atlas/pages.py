@@ -29,6 +29,28 @@ MENU: Final = {"x": 0.0, "y": 1.0, "xanchor": "left", "yanchor": "bottom", "pad"
 LEAST: Final = (760, 1000)
 """Widths below which titles and labels would overlap, pixels: of one scene and of two. Narrower
 windows scroll sideways."""
+FITTED: Final = 400
+"""The same for a scene that fits itself into a narrow window."""
+NARROW: Final = """
+const plot = document.getElementById('{plot_id}');
+const eye = plot.layout.scene.camera.eye;
+let last = false;
+function fit() {
+  const narrow = plot.clientWidth < 760;
+  if (narrow === last) return;
+  last = narrow;
+  const far = narrow ? 1.5 : 1;
+  Plotly.relayout(plot, {
+    'title.font.size': narrow ? 13 : 17,
+    'coloraxis.colorbar.thickness': narrow ? 10 : 30,
+    'coloraxis.colorbar.title.side': narrow ? 'right' : 'top',
+    'scene.camera.eye': {x: far * eye.x, y: far * eye.y, z: far * eye.z},
+  });
+}
+addEventListener('resize', fit);
+fit();
+"""
+"""Of a scene in perspective: narrow windows have a narrow bar of colours, its title along it."""
 MARGIN: Final = {"l": 20, "r": 20, "t": 110, "b": 20}
 # The text below the plot comes first: the plot takes the room that is left when it is drawn.
 SHELL: Final = """<!DOCTYPE html>

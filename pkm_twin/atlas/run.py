@@ -87,7 +87,7 @@ def run(
         if out.exists() and not overwrite:
             raise AtlasError(out, "exists; give --overwrite to replace it")
         if out.exists() and not out.is_file():
-            raise AtlasError(out, "is no regular file, so it is not replaced")
+            raise AtlasError(out, "is not a regular file, so it is not replaced")
         parts = Parts(out, sweep)
         parts.open(overwrite)
         try:

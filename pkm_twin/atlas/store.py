@@ -100,7 +100,7 @@ class Parts:
             sweep's; what no run wrote is never dropped.
         """
         if self.folder.exists() and not self.folder.is_dir():
-            raise AtlasError(self.folder, "is no folder; chunks go into one of that name")
+            raise AtlasError(self.folder, "is not a folder; the chunks need a folder of this name")
         while self._lock < 0:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._refuse_foreign()
@@ -150,7 +150,7 @@ class Parts:
         except BlockingIOError:
             owner = os.read(lock, 200).decode(errors="replace").strip() or "another process"
             os.close(lock)
-            raise AtlasError(self.folder, f"{owner} works on this atlas") from None
+            raise AtlasError(self.folder, f"{owner} works on this map") from None
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(lock), os.stat(path)):
                 os.ftruncate(lock, 0)
@@ -363,7 +363,7 @@ def _opened(xarray: Any, path: Path) -> Dataset:
 
 def _damage(error: Exception) -> str:
     what = " ".join(str(error).split())[:200]
-    return f"damaged or no atlas: {type(error).__name__}: {what}"
+    return f"damaged or no map: {type(error).__name__}: {what}"
 
 
 def open_atlas(path: Path) -> Dataset:
@@ -388,7 +388,7 @@ def open_atlas(path: Path) -> Dataset:
     try:
         missing = [name for name in _ATTRIBUTES if name not in data.attrs]
         if missing:
-            what = f"no atlas, or one of another version: it has no {missing[0]!r}"
+            what = f"no map, or one of another version: it has no {missing[0]!r}"
             raise AtlasError(path, what)
         if whole is None and SEALED.keys() <= data.attrs.keys():
             what = "damaged, or written by another program: its checksum is missing"
@@ -396,7 +396,7 @@ def open_atlas(path: Path) -> Dataset:
         with reading(path):
             wrong = nonsense(data)
         if wrong:
-            raise AtlasError(path, f"damaged or no atlas: {wrong}")
+            raise AtlasError(path, f"damaged or no map: {wrong}")
     except AtlasError:
         data.close()
         raise

@@ -133,7 +133,7 @@ class Sweep:
         """Global attributes of the file: everything that made it."""
         grid = self.robot.grid()
         return {
-            "title": f"{self.kind} atlas of {self.robot.name}",
+            "title": f"{self.kind} map of {self.robot.name}",
             "Conventions": "CF-1.10",
             "kind": self.kind,
             "robot": self.robot.name,

@@ -140,7 +140,7 @@ def _checked_name(type_name: str) -> str:
     """The short name of a type that a file names."""
     if not _HELD_NAME.fullmatch(type_name):
         raise BagError(
-            f"{brief(type_name)} is no type name; expected package/msg/Type", reason="schema"
+            f"{brief(type_name)} is not a type name; expected package/msg/Type", reason="schema"
         )
     return _short_name(type_name)
 

@@ -196,7 +196,9 @@ class BagWriter:
         """
         self._require_open()
         if topic in self._codecs:
-            raise BagError(f"topic {topic} is there already", path=self._path, reason="topic")
+            raise BagError(
+                f"topic {topic} already exists in this bag", path=self._path, reason="topic"
+            )
         if not topic.startswith("/") or topic.endswith("/"):
             text = f"{topic!r} is not a full topic name, such as /joint_states"
             raise BagError(text, path=self._path, reason="topic")

@@ -63,12 +63,12 @@ class Variants:
         arrays = [np.asarray(value, np.float64) for value in numbers.values()]
         for path, array in zip(self.paths, arrays, strict=True):
             if array.ndim > 1:
-                raise ParameterError(path, list(array.shape), "a number, or one a machine")
+                raise ParameterError(path, list(array.shape), "a number, or one per machine")
         try:
             rows = np.broadcast_arrays(*arrays) if arrays else [np.zeros(1)]
         except ValueError:
             sizes = {path: len(a) for path, a in zip(self.paths, arrays, strict=True) if a.ndim}
-            raise ParameterError("numbers", sizes, "as many of each, one a machine") from None
+            raise ParameterError("numbers", sizes, "as many of each, one per machine") from None
         self.values: Array = np.stack([np.atleast_1d(row) for row in rows], -1)
         """Of the paths, shape (k, paths)."""
         self.functions = programs.NumberFunctions.of(robot, self.paths)

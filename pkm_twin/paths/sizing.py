@@ -12,6 +12,7 @@ with load = effort - J N^2 qdd, what goes through the gear.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -132,6 +133,32 @@ class Fit:
 
 
 @dataclass(frozen=True)
+class Gear:
+    """A gear for joints that turn, a screw or belt for joints that slide, where the file has none.
+
+    ``ratio``: turns of the motor per turn of the joint; ``lead``: m per turn of the motor;
+    ``efficiency``: of both.
+    """
+
+    ratio: float | None = None
+    lead: float | None = None
+    efficiency: float = 1.0
+
+    def drive(self, joint: str, slides: bool, rotor: float, own: DriveSpec | None) -> DriveSpec:
+        """The drive of a joint whose rotor has this inertia at the joint, kg m2 or kg.
+
+        :raises ParameterError: the file has a drive, or this has no gear of the joint's type.
+        """
+        if own is not None:
+            raise ParameterError(f"drive of {joint}", "in the file", "no other ratio or lead")
+        way, name = (self.lead, "lead") if slides else (self.ratio, "ratio")
+        if way is None:
+            raise ParameterError(f"drive of {joint}", None, f"--{name}, for this type of joint")
+        made = DriveSpec(0.0, efficiency=self.efficiency, **{name: way})
+        return dataclasses.replace(made, inertia=rotor / made.turns**2)
+
+
+@dataclass(frozen=True)
 class DriveDuty:
     """What one drive gives: at its joint, and at its motor where the file has a ``drive``.
 
@@ -173,12 +200,15 @@ def size_drives(
     qdd: Array,
     effort: Array,
     motors: Sequence[Motor] = (),
+    gear: Gear | None = None,
 ) -> list[DriveDuty]:
     """What each drive must supply for a motion.
 
     :param time: rising times (k,), s; q, qd, qdd and effort, shape (k, n).
     :param motors: candidates; each replaces the rotor of the robot's file.
-    :raises ParameterError: fewer than two samples; or motors for a joint without a ``drive``.
+    :param gear: of joints without a ``drive`` in the file; its ``rotor_inertia`` is behind it.
+    :raises ParameterError: fewer than two samples; motors for a joint without a gear; a gear for a
+        joint that has one, or of another type.
     """
     if len(time) < LEAST:
         raise ParameterError("motion", f"{len(time)} samples", f"{LEAST} or more")
@@ -191,11 +221,14 @@ def size_drives(
         load = masses[:, i] - rotor
         span = (float(load.min()), float(load.max()))
         at_joint = Duty.of(time, effort[:, i], qd[:, i])
+        if gear is not None:
+            drive = gear.drive(joint, slides, rotor, drive)
         if drive is None:
             if motors:
+                need = "lead, m per turn of the motor" if slides else "ratio, turns of the motor"
                 raise ParameterError(
-                    f"{robot.name}: drive of {joint}", None,
-                    "a section drive with ratio or lead, to compare it with motors",
+                    f"{robot.name}: drive of {joint}", "no gear in the file",
+                    f"--{need}, or a section drive in the file, to compare motors",
                 )  # fmt: skip
             result.append(DriveDuty(joint, slides, at_joint, span))
             continue

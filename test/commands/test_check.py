@@ -99,11 +99,11 @@ def test_a_cut_out_part_is_good(twin, sample):
         (scaled_efforts, "torque residual of arm_1", "% of"),
         (one_effort_reversed, "torque residual of arm_2", "N m"),
         (hole, "longest gap", " ms at 1.0"),
-        (stamps_backwards, "messages that a node refuses", "stamp order"),
-        (not_a_number, "messages that a node refuses", "position of arm_1 is nan"),
-        (beyond_a_limit, "messages that a node refuses", "allowed -0.9 to 1.3"),
+        (stamps_backwards, "messages that a node rejects", "stamp order"),
+        (not_a_number, "messages that a node rejects", "position of arm_1 is nan"),
+        (beyond_a_limit, "messages that a node rejects", "allowed -0.9 to 1.3"),
         (beyond_an_effort_limit, "effort limits", "-0.5 N m"),
-        (doubled_joint, "messages that a node refuses", "arm_1"),
+        (doubled_joint, "messages that a node rejects", "arm_1"),
     ],
 )
 def test_a_fault_is_bad_and_named(twin, tmp_path, change, what, value):
@@ -156,7 +156,7 @@ def test_a_bad_wrench_is_bad(twin, tmp_path):
         return message
 
     bag = rewrite(STIFFNESS, tmp_path / "w.mcap", nameless, seconds=0.2)
-    item = items_of(twin("check", bag, "--json"))["messages that a node refuses"]
+    item = items_of(twin("check", bag, "--json"))["messages that a node rejects"]
     assert item["verdict"] == "bad"
     assert item["value"].startswith("100 of 200 ")
     assert "frame" in item["value"]

@@ -11,6 +11,7 @@ from scipy.integrate import trapezoid
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.bags.reader import read_messages
+from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.paths import cycle, fastest
 from test.support.robots import load, parameters_of
 
@@ -166,6 +167,39 @@ def test_sizes_are_a_readers_own_sums(twin, tmp_path, geared):
         assert own["good"]
         small = next(d for d in result["drives"][joint]["drives"] if d["motor"] == "SGMAH-A5A")
         assert not small["good"]
+
+
+@pytest.mark.parametrize(
+    ("name", "motion", "option"),
+    [("five_bar", ("--cycle", "30,100"), {"ratio": 10.0}),
+     ("linear_delta", ("--cycle", "20,80"), {"lead": 0.04})],
+)  # fmt: skip
+def test_a_gear_on_the_command_line_is_the_files_drive(twin, tmp_path, name, motion, option):
+    data, share = parameters_of(name), 0.9
+    section = data["joints"] if name == "five_bar" else data["limbs"]["joints"]
+    for joint in section.values():
+        if joint.get("actuated"):
+            given = DriveSpec(1.0, **option)
+            rotor = joint.pop("rotor_inertia") / given.turns**2
+            joint["drive"] = {"inertia": rotor, "efficiency": share, **option}
+    path, out = tmp_path / f"{name}.yaml", tmp_path / "cycle.csv"
+    path.write_text(yaml.safe_dump(data))
+    good(twin("path", name, *motion, "--out", out, "--no-picture"))
+    ((key, value),) = option.items()
+    given = (f"--{key}", value, "--efficiency", share)
+    compared = ("--drives", "shipped", "--json")
+    own = json.loads(good(twin("size", path, out, *compared)).out)["drives"]
+    same = json.loads(good(twin("size", name, out, *given, *compared)).out)["drives"]
+    assert own.keys() == same.keys()
+    for joint, entry in own.items():
+        assert same[joint]["motor"] == pytest.approx(entry["motor"])
+        assert same[joint]["inertia_ratio"] == pytest.approx(entry["inertia_ratio"])
+        for one, other in zip(entry["drives"], same[joint]["drives"], strict=True):
+            assert other == pytest.approx(one)
+    # A file's drive is not replaced; a gear does not fit a joint of the other type.
+    assert twin("size", path, out, *given).code == 1
+    other = {"ratio": "--lead", "lead": "--ratio"}[key]
+    assert twin("size", name, out, other, value).code == 1
 
 
 def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):

@@ -22,7 +22,7 @@ from pkm_twin.apps.view.panels import BagPanel
 from pkm_twin.apps.view.timeline import Timeline
 from test.atlas.browser import Browser, find_browser
 
-SIZE = (1440, 900)
+SIZE = (1100, 900)
 CLOSE = "document.querySelectorAll('[class*=Notification] button').forEach(b => b.click())"
 TAB = "[...document.querySelectorAll('[role=tab]')].find(t => t.innerText === 'Move').focus()"
 SETTLED = 10.0

@@ -211,7 +211,7 @@ def read(description: Description) -> Machine:
     rods = tuple(_rod(name, entry, known) for name, entry in data["rods"].items())
     platform = str(data.get("platform", "platform"))
     if platform not in bodies:
-        raise UnfitError(f"platform {platform!r} is no body")
+        raise UnfitError(f"no body is named {platform!r}, the platform")
     origin = vector(data.get("origin", bodies[platform].com))
     load = data.get("payload") or {}
     payload = None

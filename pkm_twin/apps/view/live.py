@@ -129,7 +129,7 @@ class Live:
         move, turn = message.transform.translation, message.transform.rotation
         numbers = np.array([move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w])
         if not np.isfinite(numbers).all() or not np.any(numbers[3:]):
-            raise MessageError("not finite", "the transform is none")
+            raise MessageError("not finite", "the transform is not finite")
         vector = Rotation.from_quat(numbers[3:]).as_rotvec()
         self._deflection = np.concatenate([numbers[:3], vector])
 

@@ -25,13 +25,17 @@ LIFT: Final = 0.28
 """How far up the machine is in a tall window, where a sheet of sliders covers the lower part, in
 parts of the window's height."""
 
+TALLEST: Final = 3.5
+"""Height per width of a window for which the camera moves away; a phone's is 2.2."""
+
 
 def framing(width: float, height: float) -> tuple[float, float]:
     """How much farther away the camera is in a narrow window, and how far up the machine is.
 
     :returns: factor of the distance, and part of the window's height.
     """
-    aspect = width / height
+    # While a page is laid out its scene may be a few pixels wide.
+    aspect = 1.0 / min(height / width, TALLEST)
     farther = max(1.0, 1.0 / aspect, min(1.3 / aspect, 2.0))
     return farther, LIFT * min(max((1.0 - aspect) / 0.3, 0.0), 1.0)
 

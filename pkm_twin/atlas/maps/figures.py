@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,8 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
-MOST: int = 5
-"""Planes in a row of a picture."""
+WIDE: float = 9.0
+"""Of a picture, inches."""
+LETTERS: int = 100
+"""In a line of a picture's title."""
 
 
 def answers(atlas: Dataset) -> list[dict[str, Any]]:
@@ -78,10 +81,11 @@ def _planes(atlas: Dataset) -> Figure:
     rows = []
     for k, answer in enumerate(answers(atlas)):
         rows.append(planes.planes(by_case, [f"value {k}"], answer["pose"]))
-    columns = min(len(rows[0]), MOST if len(rows[0]) > 4 else 3)
+    columns = min(len(rows[0]), 3 if len(rows[0]) > 4 else 2)
     lines = math.ceil(len(rows[0]) / columns)
+    high = max(0.8 * WIDE / columns, 3.0)
     figure, axes = figures.subplots(
-        lines * len(rows), columns, figsize=(5.2 * columns, 4.2 * lines * len(rows)),
+        lines * len(rows), columns, figsize=(WIDE, min(high, 4.5) * lines * len(rows)),
         layout="constrained", squeeze=False,
     )  # fmt: skip
     for ax in axes.ravel():
@@ -98,7 +102,11 @@ def _planes(atlas: Dataset) -> Figure:
                 turns = [math.degrees if unit == "deg" else float for unit in one.units]
                 at = [turn(answer["pose"][n]) for turn, n in zip(turns, one.names, strict=True)]
                 ax.plot(*at, "*", color="red", mec="white", ms=13)
-    figure.suptitle("\n".join([question(atlas), *map(sentence, answers(atlas))]), fontsize=11)
+    star = "slice" not in atlas.dims
+    text = [f"{question(atlas)} (star: the worst pose)" if star else question(atlas)]
+    for answer in answers(atlas):
+        text += textwrap.wrap(sentence(answer), LETTERS)
+    figure.suptitle("\n".join(text), fontsize=11)
     return figure
 
 

@@ -68,11 +68,11 @@ def global_factors(atlas: Dataset, ax: Axes | None = None) -> Axes:
     """Global strain-energy factors, compared with the paper's where it prints them."""
     ax = figures.axes_or_new(ax)
     names = [str(name) for name in atlas.element.values]
-    bars = [("this atlas", atlas.global_factor.values, plots.COLOURS[0])]
+    bars = [("this map", atlas.global_factor.values, plots.COLOURS[0])]
     printed = table_2(wrench_of(atlas))
     if printed is not None:
         bars.append(("paper, table 2", np.array(printed), plots.COLOURS[4]))
-    bars.append(("this atlas, mean over the volume", atlas.volume_factor.values, plots.COLOURS[2]))
+    bars.append(("this map, mean over the volume", atlas.volume_factor.values, plots.COLOURS[2]))
     width = 0.8 / len(bars)
     for k, (label, values, colour) in enumerate(bars):
         place = np.arange(len(names)) + (k - (len(bars) - 1) / 2) * width

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``pkm-twin`` alone and ``--help``: every command once, by task, its purpose whole."""
+
+import re
+
+from typer.main import get_command
+
+from pkm_twin.apps.cli import app
+from pkm_twin.apps.groups import TASKS, WIDE
+from test.support.command import typed_line
+
+
+def test_every_command_has_one_task():
+    shown = [name for name, one in get_command(app).commands.items() if not one.hidden]
+    listed = [name for names in TASKS.values() for name in names]
+    assert sorted(listed) == sorted(shown)
+
+
+def test_help_lists_every_purpose_whole(twin):
+    words = " ".join(twin("--help").out.split())
+    for name, command in get_command(app).commands.items():
+        if not command.hidden:
+            assert f" {name} {command.get_short_help_str(WIDE)}" in words
+    assert "..." not in words.split("Robots:")[1]
+
+
+def test_each_line_of_the_greeting_is_a_command_that_runs(twin, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    alone = twin()
+    lines = re.findall(r"^  (pkm-twin (?:\S+ )*\S+?)(?:  .*)?$", alone.out, re.MULTILINE)
+    assert len(lines) == 3
+    assert alone.code == 2
+    for line in lines:
+        # The page serves until a signal: its help is enough here.
+        result = typed_line(twin, f"{line} --help" if " view " in line else line)
+        assert result.code == 0, result.err
+
+
+def test_an_older_name_runs_the_same_command(twin):
+    names = ("monitor-torques", "guard-check")
+    new, old = (twin(name, "--help").out.partition("Arguments:")[2] for name in names)
+    assert new == old != ""

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A hook of MkDocs: a search index that opens fast, and docstrings without Sphinx's roles.
+
+Every page and every heading stay findable. The index has text without markup and without code
+blocks; of reference pages it has names, and the first paragraph under each heading.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+BRIEF = {
+    "benchmarks", "certificate", "commands", "engine", "faults", "identification", "latency",
+    "parameters", "scale",
+}  # fmt: skip
+"""Pages of long tables and lists: a section's first paragraph and its names are indexed."""
+ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):<code>(~?)([\w.]+)</code>")
+"""A reference of a docstring, which Markdown does not know."""
+LARGEST = 300_000
+"""Of the index, bytes."""
+
+
+def brief(text: str) -> str:
+    """First paragraph, and the names in it and after it: what stands in backquotes."""
+    return " ".join([paragraph(text), *dict.fromkeys(re.findall(r"<code>[^<]*</code>", text))])
+
+
+def paragraph(text: str) -> str:
+    """First paragraph."""
+    first = re.search(r"<p>.*?</p>", text, re.DOTALL)
+    return first[0] if first else ""
+
+
+def entry_text(page: str, text: str) -> str:
+    """The indexed text of a section of a page (its file's stem), without markup.
+
+    :param text: HTML of the search plugin.
+    """
+    text = re.sub(r"<pre>.*?</pre>", " ", text, flags=re.DOTALL)
+    if page == "api":
+        text = paragraph(text)
+    elif page in BRIEF:
+        text = brief(text)
+    return " ".join(re.sub(r"<[^>]+>", " ", text).split())
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """A page's HTML with each reference as a name, the last part alone after ``~``."""
+    return ROLE.sub(lambda m: f"<code>{m[2].split('.')[-1] if m[1] else m[2]}</code>", html)
+
+
+def on_post_build(config: Any) -> None:
+    """Shorten the index that the search plugin wrote.
+
+    Logs a warning if it is still too large: an error in a strict build.
+    """
+    path = Path(config["site_dir"]) / "search" / "search_index.json"
+    index = json.loads(path.read_text(encoding="utf-8"))
+    for entry in index["docs"]:
+        page = entry["location"].split("#")[0].removesuffix(".html")
+        entry["text"] = entry_text(page, entry["text"])
+        entry["title"] = " ".join(re.sub(r"<[^>]+>", "", entry["title"]).split())
+    data = json.dumps(index, ensure_ascii=False, separators=(",", ":")).encode()
+    path.write_bytes(data)
+    if len(data) > LARGEST:
+        logging.getLogger("mkdocs").warning("search index: %d bytes, above %d", len(data), LARGEST)
