@@ -313,7 +313,8 @@ class ContactLocator:
         a, b = self._pairs
         way = (self._at[a] - self._at[b]).T
         way = way / np.sqrt((way * way).sum(0))
-        return np.einsum("nip,ip->np", jacobian.take(a, 2) - jacobian.take(b, 2), way)
+        apart = jacobian.take(a, 2) - jacobian.take(b, 2)
+        return np.asarray(np.einsum("nip,ip->np", apart, way), np.float64)
 
     @np.errstate(all="ignore")
     def place(self) -> ContactPlace | None:
