@@ -272,8 +272,9 @@ In the recorded collision of another engine (`bags/`) more than 95 % of the samp
 class. A load that the model does not know is a force on the platform.
 
 Each sample is checked for a contact. The place is computed every 4 ms, and every 10 ms from 40 ms
-after the beginning on. At 500 Hz a sample during a contact takes {cost} times the processor time
-of one without.
+after the beginning on. At 500 Hz a sample during a contact takes
+{cost}
+times the processor time of one without.
 
 ## {contacts} simulated contacts
 
