@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -39,9 +40,14 @@ CLIPPED: Final = 9.0
 SHARE: Final = 1e-3
 """Least standard deviation of an effort, as a share of the greatest that the stream has shown."""
 PLACED: Final = 0.004
-"""Time between two estimates of a contact's place, s."""
+"""Time between two estimates of a contact's place, s, up to ``EARLY`` after its beginning."""
+EARLY: Final = 0.04
+LATER: Final = 0.01
+"""The same from then on: the errors of the efforts last longer, and so does the force."""
 MOST_DRAG: Final = 0.2
 """Friction that may be learnt, as a share of the greatest effort of the motion."""
+ONSET: Final = 0.1
+"""Time of motion in a direction before its friction is known at all, s."""
 
 
 @dataclass(frozen=True)
@@ -66,24 +72,39 @@ class Drag:
 
     A push does so in one direction at most. So it is learnt at all times, also while the estimate
     looks like a contact.
+
+    Before a joint has moved in both directions, friction is what one of them shows, learnt while
+    nothing touches; where a joint has just begun to move for the first time, friction is unknown.
     """
 
     def __init__(self, joints: int) -> None:
         # By joint and direction, [backwards, forwards]: the mean, and the time of the motion.
         self._known = [[[0.0, 0.0], [0.0, 0.0]] for _ in range(joints)]
+        # Up to the last sample without contact.
+        self._alone = [[0.0, 0.0] for _ in range(joints)]
 
-    def learn(self, step: float, external: Array, qd: Array) -> Array:
-        """Take external efforts and rates, zero at rest, shape (n,); the friction known by now."""
+    def learn(self, step: float, external: Array, qd: Array, *, touching: bool = False) -> Array:
+        """Take external efforts and rates, zero at rest, shape (n,).
+
+        :returns: the friction known by now, (n,); infinite where it is unknown.
+        """
         known = []
-        for (means, times), effort, rate in zip(
-            self._known, external.tolist(), qd.tolist(), strict=True
+        for (means, times), alone, effort, rate in zip(
+            self._known, self._alone, external.tolist(), qd.tolist(), strict=True
         ):
             if rate != 0.0:
                 k = int(rate > 0.0)
                 times[k] += step
                 opposing = -effort if k else effort
                 means[k] += min(1.0, step / min(times[k], AVERAGED)) * (opposing - means[k])
-            known.append(max(0.0, min(means)) if min(times) > LEARNING else 0.0)
+                if not touching:
+                    alone[k] = means[k]
+            if min(times) > LEARNING:
+                known.append(max(0.0, min(means)))
+            elif max(times) > ONSET:
+                known.append(max(0.0, alone[int(times[1] > times[0])]))
+            else:
+                known.append(math.inf if rate != 0.0 else 0.0)
         return np.array(known)
 
 
@@ -177,7 +198,7 @@ class ContactMonitor:
                 # It was the brake that took the weight.
                 self._touching = False
             return self._verdict(q, external, idle)
-        drag = self._drag.learn(step, external, np.where(still, 0.0, qd))
+        drag = self._drag.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
         friction = np.minimum(drag, MOST_DRAG * self._greatest) + np.where(
             still, self._reach + holds, 0.0
         )
@@ -200,15 +221,30 @@ class ContactMonitor:
         self, time: float, step: float, q: Array, qd: Array, external: Array, *, begins: bool
     ) -> None:
         """Follow a contact: the body that it strikes."""
-        if self._locator is None:
-            self._locator = ContactLocator(self.robot)
+        locator = self.prepare()
         if begins:
             self._since = time
-            self._locator.reset()
+            locator.reset()
+        else:
+            wait = PLACED if time - self._since < EARLY else LATER
+            since = time - self._placed
+            if since < wait - 0.5 * step:
+                return
+            step = since
         deviation = np.hypot(self._spread(), 0.5 * (self._friction + self._impulse))
-        self._locator.push(step, q, qd, external, deviation)
-        if begins or time - self._placed >= PLACED:
-            self._place, self._placed = self._locator.place(), time
+        locator.push(step, q, qd, external, deviation)
+        self._place, self._placed = locator.place(), time
+
+    def prepare(self) -> ContactLocator:
+        """Compile what a contact needs, before there is one."""
+        if self._locator is None:
+            self._locator = ContactLocator(self.robot)
+            n = self.robot.joints_count
+            ones = np.ones(n)
+            q = self.robot.inverse(self.robot.home())
+            self._locator.push(1e-3, q, 0.0 * ones, ones, ones)
+            self._locator.place()
+        return self._locator
 
     def _deviation(self, parts: EffortParts, *motion: Any) -> Array:
         """Standard deviation of the model's efforts, shape (n,)."""

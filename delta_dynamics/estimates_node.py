@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 
 from delta_dynamics.contact import SIGMAS, Contact, ContactMonitor
 from delta_dynamics.feedforward import Torques
-from delta_dynamics.isolation import ContactLocator, ContactPlace
+from delta_dynamics.isolation import ContactPlace
 from delta_dynamics.payload import PayloadEstimator
 from delta_dynamics.uncertainty import FRICTION, MASSES
 from pkm_twin.messages.stamps import SECOND
@@ -62,9 +62,7 @@ class Estimates:
             if self._contact is not None:
                 contact.push(float(k), motion, still)
         if self._contact is not None:
-            locator = ContactLocator(robot)
-            locator.push(1e-3, motion[0], still, still + 1.0, still + 0.1)
-            locator.place()
+            self._contact.prepare()
 
     def _create_payload(self, robot: Robot) -> PayloadEstimator | None:
         node = self._node

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
@@ -52,8 +52,10 @@ CLOSING: Final = 0.02
 """Least rate at which they approach, as a share of the greatest approach in the machine."""
 COARSE: Final = 0.15
 """Standard deviation of a clamping's efforts as a share of them: its places are as far apart."""
-SIZES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)
+SIZES: Final = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
 """Forces that are compared, relative to the one that a usual place needs."""
+BASE_PLACED: Final = np.append(np.eye(3), np.zeros(3))
+"""Rotation and origin of the ground."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,10 @@ class Places:
     on a thin bar. ``prior``: its probability, even along a limb's bars and over the platform's.
     ``pairs``: numbers of two places that may clamp something, (pairs,) each: on different limbs, or
     on a limb and the platform where no joint joins the two bodies. None with three joints or fewer.
+
+    ``classes``: platform and limbs; ``bodies``: all of ``parts``; ``couples``: two bodies each. Of
+    class and body 1 where a place is of it, (classes, P) and (bodies, P); ``couple_of``: the number
+    of each pair's couple.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -146,20 +152,24 @@ class Places:
                 found.append((body, only, only))
         blocks = _blocks(graph)
         self.parts: list[str] = []
-        rows, lengths = [], []
-        for part, start, end in found:
+        ends, mix, lengths = [], [], []
+        for k, (part, start, end) in enumerate(found):
             length = float(np.linalg.norm(end[1] - start[1]))
-            arms = [point - (at[body] if body != BASE else 0.0) for body, point in (start, end)]
+            for body, point in (start, end):
+                ends.append((bodies.index(body), point - (at[body] if body != BASE else 0.0)))
             number = PLACES if length else 1
             for i in range(number):
                 # Of the platform's bars the ends count, too: it is wide there.
                 s = i / (PLACES - 1) if part == graph.platform else (i + 0.5) / PLACES
-                rows.append((bodies.index(start[0]), bodies.index(end[0]), *arms, s * (number > 1)))
+                mix.append((k, s * (number > 1)))
                 lengths.append(length / number)
                 self.parts.append(part)
-        self._start, self._end, self._arm, self._far, self._s = map(
-            np.array, zip(*rows, strict=True)
-        )
+        self._body, self._arm = map(np.array, zip(*ends, strict=True))
+        self._bar = np.array([k for k, _ in mix])
+        # Each place as a mean of its bar's two ends.
+        self._mix = np.zeros((len(ends), len(mix)))
+        for i, (k, s) in enumerate(mix):
+            self._mix[2 * k : 2 * k + 2, i] = 1.0 - s, s
         self.limbs = [limbs[part] for part in self.parts]
         size = np.maximum(lengths, 1e-3 * graph.size)
         self.thin = np.array([part not in blocks for part in self.parts]) & (np.array(lengths) > 0)
@@ -173,8 +183,17 @@ class Places:
             (self.parts[a], self.parts[b]) not in joined for a, b in zip(one, other, strict=True)
         ]
         self.pairs = one[apart], other[apart]
+        self.classes = (PLATFORM, *self.names)
+        self.of_class = np.array([owners == name for name in self.classes], float)
+        self.bodies = tuple(dict.fromkeys(self.parts))
+        names = np.array(self.parts)
+        self.of_body = np.array([names == name for name in self.bodies], float)
+        keys = [(self.parts[a], self.parts[b]) for a, b in zip(*self.pairs, strict=True)]
+        self.couples = tuple(dict.fromkeys(keys))
+        numbers = {key: k for k, key in enumerate(self.couples)}
+        self.couple_of = np.array([numbers[key] for key in keys], np.intp)
         self.prior = np.empty(len(owners))
-        for name in (PLATFORM, *self.names):
+        for name in self.classes:
             own = owners == name
             whole = PRIOR[PLATFORM] if name == PLATFORM else PRIOR["limbs"] / len(self.names)
             self.prior[own] = whole * size[own] / max(size[own].sum(), 1e-300)
@@ -188,24 +207,24 @@ class Places:
             (flat,), status = _kernel(robot)(none, q)
             if status is not None:
                 robot.refuse_joints(status, q)
-        placed = flat[: 12 * count].reshape(count, 12)
-        rotation = np.concatenate([placed[:, :9].reshape(-1, 3, 3), np.eye(3)[None]])
-        origin = np.concatenate([placed[:, 9:], np.zeros((1, 3))])
-        twist = np.zeros((count + 1, n, 6))
-        twist[:count] = flat[12 * count :].reshape(n, count, 6).swapaxes(0, 1)
-
-        def of(body: Indices, arm: Array) -> tuple[Array, Array]:
-            lever = np.einsum("pij,pj->pi", rotation[body], arm)
-            own = twist[body]
-            turned = np.cross(own[:, :, 3:], lever[:, None])
-            return origin[body] + lever, own[:, :, :3] + turned
-
-        (a, ja), (b, jb) = of(self._start, self._arm), of(self._end, self._far)
-        way = b - a
-        length = np.linalg.norm(way, axis=1)[:, None]
-        way = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)
-        s = self._s[:, None]
-        return a + s * (b - a), ja + s[..., None] * (jb - ja), way
+        placed = np.concatenate([flat[: 12 * count], BASE_PLACED]).reshape(count + 1, 12)
+        rates = np.zeros((n, count + 1, 6))
+        rates[:, :count] = flat[12 * count :].reshape(n, count, 6)
+        placed, rates = placed[self._body], rates[:, self._body]
+        lever = (placed[:, :9].reshape(-1, 3, 3) @ self._arm[:, :, None])[..., 0]
+        ends = placed[:, 9:] + lever
+        rows = np.empty((n + 1, 3, len(ends)))
+        rows[0] = ends.T
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            # Of omega x lever.
+            rows[1:, i] = rates[..., i] + rates[..., 3 + j] * lever[:, k]
+            rows[1:, i] -= rates[..., 3 + k] * lever[:, j]
+        found = (rows.reshape(-1, len(ends)) @ self._mix).reshape(n + 1, 3, -1)
+        way = ends[1::2] - ends[::2]
+        length = np.sqrt((way * way).sum(1))[:, None]
+        way = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)[self._bar]
+        # Places are last in memory: there are many more of them than of joints and axes.
+        return found[0].T, found[1:].transpose(2, 0, 1), way
 
 
 def _blocks(graph: Graph) -> set[str]:
@@ -223,7 +242,7 @@ class ContactLocator:
     Over a contact the place on the body and the direction of the force in base axes are one and
     the same; so while the machine moves each sample narrows both. The force grows as the external
     efforts do. Errors of the efforts last for longer than a contact's beginning, so all samples
-    together are as exact as one.
+    together are as exact as one, and some of a stream's samples show as much as all.
 
     With n joint efforts a contact with the platform explains all directions of them if the
     platform has n freedoms: it then has less evidence than a limb that explains them by fewer.
@@ -231,11 +250,13 @@ class ContactLocator:
 
     def __init__(self, robot: Robot) -> None:
         self.places = Places(robot)
+        # Thin bars pass little of a force along them on.
+        self._slim = np.where(self.places.thin, 1.0 - GRIP, 0.0)
         self.reset()
 
     def reset(self) -> None:
         """Begin a contact."""
-        self._state: list[Array] = []
+        self._sums: Array | None = None
 
     @np.errstate(all="ignore")
     def push(self, step: float, q: Array, qd: Array, external: Array, deviation: Array) -> None:
@@ -249,110 +270,99 @@ class ContactLocator:
         y = external * sure
         if not y.any():
             return
-        self._at, jacobian, way = self.places.at(q)
-        if not self._state:
+        self._at, turned, along = self.places.at(q)
+        # Places are last: jacobian (n, 3, P), way (3, P).
+        jacobian, way = turned.transpose(1, 2, 0), along.T
+        if self._sums is None:
             self._begin(jacobian, sure, qd)
         # The force grows with the efforts, in the units of the first sample.
-        size = float(np.linalg.norm(external * self._unit))
+        sure = float(np.linalg.norm(external * self._unit)) * sure
         fade = math.exp(-step / MEMORY)
         weight = min(1.0, step / CORRELATION)
-        # Thin bars pass little of a force along them on.
-        slim = np.where(self.places.thin, 1.0 - GRIP, 0.0)[:, None, None]
-        along = jacobian @ way[:, :, None]
-        one = size * (jacobian - slim * along * way[:, None]) * sure[:, None]
-        pair = size * sure * self._approach(jacobian)
-        free = size * sure * self._usual
+        one = jacobian * sure[:, None, None]
+        one -= (self._slim * np.einsum("nip,ip->np", one, way))[:, None] * way
+        pair = sure[:, None] * self._approach(jacobian)
+        free = sure * self._usual
         sums = (
-            np.array([len(q), y @ y]), one.swapaxes(1, 2) @ one, y @ one,
-            (pair * pair).sum(1), pair @ y, free * free, free * y,
+            np.array([len(q), y @ y]), np.einsum("nip,njp->ijp", one, one).ravel(),
+            np.einsum("n,nip->ip", y, one).ravel(), np.einsum("np,np->p", pair, pair), y @ pair,
+            free * free, free * y,
         )  # fmt: skip
-        self._state = [
-            fade * old + weight * new for old, new in zip(self._state, sums, strict=True)
-        ]
+        new = weight * np.concatenate(sums)
+        self._sums = new if self._sums is None else fade * self._sums + new
 
     def _begin(self, jacobian: Array, sure: Array, qd: Array) -> None:
         """The usual force, and which bodies can clamp something: those that approach."""
         self._unit = sure
-        whole = np.linalg.norm(jacobian * sure[:, None], axis=(1, 2))
-        self._force = (
-            1.0 / float(np.median(whole[whole > 0.0])) if (whole > 0.0).any() else math.inf
-        )
+        whole = np.sqrt(((jacobian * sure[:, None, None]) ** 2).sum((0, 1)))
+        felt = whole[whole > 0.0]
+        self._force = 1.0 / float(np.median(felt)) if len(felt) else math.inf
         # Efforts that no place explains: any of the sizes that others have.
-        self._usual = self._force * np.sqrt(np.mean(jacobian**2, (0, 2)))
-        near = np.linalg.norm(self._between(self.places.pairs), axis=1)
-        reach = REACH * self.places.robot.graph.size
-        self._pairs = self._those((near > 0.0) & (near < reach), self.places.pairs)
-        rate = self._approach(jacobian) @ qd
-        closing = rate < -CLOSING * np.abs(rate).max(initial=0.0)
-        self._pairs = self._those(closing, self._pairs)
-        count, pairs, n = len(self._at), int(closing.sum()), len(qd)
-        self._state = [
-            np.zeros(2), np.zeros((count, 3, 3)), np.zeros((count, 3)),
-            np.zeros(pairs), np.zeros(pairs), np.zeros(n), np.zeros(n),
-        ]  # fmt: skip
-
-    @staticmethod
-    def _those(which: Any, pairs: tuple[Indices, Indices]) -> tuple[Indices, Indices]:
-        return pairs[0][which], pairs[1][which]
-
-    def _between(self, pairs: tuple[Indices, Indices]) -> Array:
-        return np.asarray(self._at[pairs[0]] - self._at[pairs[1]], np.float64)
+        self._usual = self._force * np.sqrt(np.mean(jacobian**2, (1, 2)))
+        a, b = self.places.pairs
+        apart = self._at[a] - self._at[b]
+        far = np.sqrt((apart * apart).sum(1))
+        velocity = (qd @ jacobian.swapaxes(0, 1)).T
+        rate = ((velocity[a] - velocity[b]) * apart).sum(1) / far
+        near = (far > 0.0) & (far < REACH * self.places.robot.graph.size)
+        closing = near & (rate < -CLOSING * np.abs(rate[near]).max(initial=0.0))
+        self._pairs, self._couple = (a[closing], b[closing]), self.places.couple_of[closing]
 
     def _approach(self, jacobian: Array) -> Array:
-        """Rates of the distances of the pairs' places by the joints' rates, (pairs, n)."""
+        """Rates of the distances of the pairs' places by the joints' rates, (n, pairs)."""
         a, b = self._pairs
-        way = self._between(self._pairs)
-        way = way / np.linalg.norm(way, axis=1)[:, None]
-        return np.asarray(((jacobian[a] - jacobian[b]) @ way[:, :, None])[..., 0], np.float64)
+        way = (self._at[a] - self._at[b]).T
+        way = way / np.sqrt((way * way).sum(0))
+        apart = jacobian.take(a, 2) - jacobian.take(b, 2)
+        return np.asarray(np.einsum("nip,ip->np", apart, way), np.float64)
 
     @np.errstate(all="ignore")
     def place(self) -> ContactPlace | None:
         """What is known by now; None before the first sample, or where nothing finite is known."""
-        if not self._state:
+        if self._sums is None:
             return None
-        known = (*self._state, self._usual, self._at)
-        if not all([np.isfinite(numbers).all() for numbers in known]):
+        if not np.isfinite(np.concatenate([self._sums, self._usual, self._at.ravel()])).all():
             # Nothing that is added to it makes it finite.
             self.reset()
             return None
-        found = self._found()
+        found = self._found(self._sums)
         finite = np.isfinite([*found.point, found.deviation, *found.classes.values()]).all()
         return found if finite else None
 
-    def _found(self) -> ContactPlace:
+    def _found(self, sums: Array) -> ContactPlace:
         """The same from finite sums; finite but where they are beyond the range of doubles."""
+        n, count, pairs = len(self._usual), len(self._at), len(self._couple)
         # Errors of the model last: more samples show more directions, none of them more exactly.
-        share = 1.0 / max(self._state[0][0] / len(self._usual), 1.0)
-        (counted, square), matrix, vector, line, sides, other, others = (
-            share * one for one in self._state
-        )
+        sums = sums / max(sums[0] / n, 1.0)
+        counted, square = sums[:2]
+        ends = 2 + 12 * count
+        forces = sums[2:ends].reshape(4, 3, count)
+        line, sides = sums[ends : ends + 2 * pairs].reshape(2, pairs)
+        other, others = sums[-2 * n :].reshape(2, n)
         places = self.places
-        squares, axes = np.linalg.eigh(matrix)
-        parts = np.einsum("pji,pj->pi", axes, vector)
-        sizes = self._force * np.array(SIZES)
-        one = _evidence(np.maximum(squares, 0.0), parts, sizes)
-        noise = 1.0 + COARSE**2 * square * len(other) / counted
-        pair = _evidence(line[:, None] / noise, sides[:, None] / noise, sizes, one_sided=True)
+        precision = ((self._force * SIZES) ** -2.0)[:, None]
+        one = _mean(_of_force(forces[:3], forces[3], precision))
+        noise = 1.0 + COARSE**2 * square * n / counted
+        pair = _mean(_of_numbers(line / noise, sides / noise, precision, one_sided=True))
         pair += 0.5 * (square * (1.0 - 1.0 / noise) - counted * math.log(noise))
-        nothing = _evidence(other[None], others[None], np.array(SIZES))
-        top = max(one.max(), pair.max(initial=-np.inf), nothing.max())
+        nothing = float(_mean(_of_numbers(other, others, SIZES[:, None] ** -2.0).sum(-1)))
+        top = max(one.max(), pair.max(initial=-np.inf), nothing)
         likely = places.prior * np.exp(one - top)
         # The fewer places can clamp, the less likely they do.
         clamped = PRIOR[CLAMPING] * np.exp(pair - top) / max(len(pair), PLACES**2)
-        odd = float(PRIOR[UNKNOWN] * np.exp(nothing[0] - top))
-        total = float(likely.sum() + clamped.sum() + odd)
-        limbs = np.array(places.limbs)
-        classes = {
-            name: float(likely[limbs == name].sum()) / total for name in (PLATFORM, *places.names)
-        }
-        classes |= {CLAMPING: float(clamped.sum()) / total, UNKNOWN: odd / total}
+        odd = float(PRIOR[UNKNOWN] * np.exp(nothing - top))
+        by_class = places.of_class @ likely
+        shares = np.array([*by_class, clamped.sum(), odd])
+        shares /= shares.sum()
+        classes = dict(zip((*places.classes, CLAMPING, UNKNOWN), shares.tolist(), strict=True))
         best = max(classes, key=lambda name: classes[name])
         if best == CLAMPING:
             body, point, deviation = self._pair(clamped)
             where = f"{CLAMPING} {body}"
         else:
-            body, point, deviation = self._one(likely if best == UNKNOWN else
-                                               np.where(limbs == best, likely, 0.0))  # fmt: skip
+            if best != UNKNOWN:
+                likely = likely * places.of_class[places.classes.index(best)]
+            body, point, deviation = self._one(likely)
             where = best
         confidence = classes[best]
         return ContactPlace(
@@ -361,43 +371,70 @@ class ContactLocator:
 
     def _one(self, likely: Array) -> tuple[str, Array, float]:
         """The most likely body, the mean of its places, and their standard deviation."""
-        places = self.places
-        names = np.array(places.parts)
-        body = max(dict.fromkeys(places.parts), key=lambda name: float(likely[names == name].sum()))
-        share = np.where(names == body, likely, 0.0)
-        share = share / share.sum()
-        point = share @ self._at
-        return body, point, math.sqrt(float(share @ ((self._at - point) ** 2).sum(1)))
+        best = int(np.argmax(self.places.of_body @ likely))
+        point, deviation = _middle(likely * self.places.of_body[best], self._at)
+        return self.places.bodies[best], point, deviation
 
     def _pair(self, clamped: Array) -> tuple[str, Array, float]:
         """The same of two bodies: the middle between them."""
-        parts = self.places.parts
         a, b = self._pairs
-        sums: dict[tuple[str, str], float] = {}
-        keys = [(parts[i], parts[j]) for i, j in zip(a, b, strict=True)]
-        for key, value in zip(keys, clamped.tolist(), strict=True):
-            sums[key] = sums.get(key, 0.0) + value
-        best = max(sums, key=lambda key: sums[key])
-        share = np.where([key == best for key in keys], clamped, 0.0)
-        share = share / share.sum()
-        middle = 0.5 * (self._at[a] + self._at[b])
-        point = share @ middle
-        spread = math.sqrt(float(share @ ((middle - point) ** 2).sum(1)))
-        return f"{best[0]} and {best[1]}", point, spread
+        best = int(np.argmax(np.bincount(self._couple, clamped)))
+        between = 0.5 * (self._at[a] + self._at[b])
+        point, deviation = _middle(np.where(self._couple == best, clamped, 0.0), between)
+        return " and ".join(self.places.couples[best]), point, deviation
 
 
-def _evidence(squares: Array, parts: Array, sizes: Array, *, one_sided: bool = False) -> Array:
-    """Logarithm of the marginal likelihood, mean over the sizes of the force, (hypotheses,).
+def _middle(weights: Array, points: Array) -> tuple[Array, float]:
+    """Mean of points, (3,), and their standard deviation."""
+    share = weights / weights.sum()
+    point = share @ points
+    return point, math.sqrt(float(share @ ((points - point) ** 2).sum(1)))
 
-    Of y = B f + noise with f normal of mean zero, less what all hypotheses share.
 
-    :param squares: eigenvalues of B' B, (hypotheses, k); ``parts``: of B' y on its eigenvectors.
-    :param one_sided: f is positive, k = 1.
+def _of_force(matrix: Array, vector: Array, precision: Array) -> Array:
+    """Logarithms of marginal likelihoods, (sizes, hypotheses), less what all of them share.
+
+    Of y = B f + noise with f normal of mean zero, by the factors of B' B + precision.
+
+    :param matrix: B' B, (3, 3, hypotheses); ``vector``: B' y, (3, hypotheses).
+    :param precision: inverse variance of f, (sizes, 1).
     """
-    precision = sizes[:, None, None] ** -2.0 + squares
-    logs = 0.5 * (parts**2 / precision - np.log(precision) - 2 * np.log(sizes)[:, None, None])
-    logs = logs.sum(-1)
+    (a, b, c), (_, d, e), (_, _, f) = matrix
+    x, y, z = vector
+    # B' B has no negative eigenvalue, whatever rounding says.
+    first = a + precision
+    left, far = b / first, c / first
+    second = np.maximum(d + precision - left * b, precision)
+    below = e - left * c
+    low = below / second
+    third = np.maximum(f + precision - far * c - low * below, precision)
+    y = y - left * x
+    z = z - far * x - low * y
+    square = x * x / first + y * y / second + z * z / third
+    size = (first / precision) * (second / precision) * (third / precision)
+    return np.asarray(0.5 * (square - np.log(size)), np.float64)
+
+
+def _of_numbers(
+    squares: Array, parts: Array, precision: Array, *, one_sided: bool = False
+) -> Array:
+    """The same of forces with one number, (sizes, hypotheses).
+
+    :param squares: B' B, (hypotheses,); ``parts``: B' y.
+    :param one_sided: f is positive.
+    """
+    whole = squares + precision
+    logs = 0.5 * (parts / whole * parts - np.log(whole / precision))
     if one_sided:
-        logs = logs + math.log(2.0) + scipy.special.log_ndtr((parts / np.sqrt(precision))[..., 0])
+        at = parts / np.sqrt(whole)
+        # The normal distribution's logarithm, log 2 more, without underflow.
+        tail = scipy.special.erfcx(np.abs(at) / math.sqrt(2.0))
+        density = np.exp(-0.5 * at * at)
+        logs += np.where(at > 0.0, np.log(2.0 - tail * density), np.log(tail) - 0.5 * at * at)
+    return np.asarray(logs, np.float64)
+
+
+def _mean(logs: Array) -> Array:
+    """Logarithm of the mean over the sizes of the force, (hypotheses,)."""
     top = logs.max(0)
     return np.asarray(top + np.log(np.exp(logs - top).mean(0)), np.float64)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,14 @@ from pkm_twin import Robot
 from pkm_twin.apps.cli import app
 from pkm_twin.apps.pose_table import parse_columns, read_poses
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.calibration import calibrate
+from pkm_twin.identification.calibration import HELD_OUT, calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.transmission import Transmission
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.messages.reading import JointReader
-from pkm_twin.robot.entries import data_of
-from test.support.robots import load, random_joints
+from pkm_twin.robot.entries import data_of, with_entries
+from test.support.robots import load, partly_long, random_joints
+from tools.reality import BALL, FOOT, fit_a_leg, leg_poses
 
 Array = NDArray[np.float64]
 
@@ -74,6 +76,41 @@ def test_ratios_are_found_within_their_deviations(how: str) -> None:
             change = by[f"{path}.ratio_change"]
             assert abs(change.value - changes[k] / at_centre) < 4.0 * change.deviation < 0.2
             assert by[f"{path}.ratio"].unit == "rev/m"
+
+
+@pytest.mark.parametrize(
+    "case",
+    partly_long([(60, 0), (108, 0), (108, 5)], (60, 0)),
+    ids=lambda case: f"{case[0]}, {case[1]} wrong",
+)
+def test_a_measured_hexapod_is_predicted_as_well_as_by_a_fit_of_each_leg(
+    case: tuple[int, int],
+) -> None:
+    """Nodes, zeros and transmissions of the example are off; motion capture has noise."""
+    (count, wrong), rng = case, np.random.default_rng(1)
+    robot = load(EXAMPLES / "hexapod.yaml")
+    nodes = [f"joints.{end}_{k}.at[{i}]"
+             for end, k, i in product((FOOT, BALL), range(1, 7), range(3))]  # fmt: skip
+    real = with_entries(robot, {n: robot.number(n) + 4e-3 * rng.normal() for n in nodes})
+    box = np.array([0.12, 0.12, 0.09, 0.15, 0.15, 0.15])
+    q = real.inverse(robot.home() + [0, 0, 0.1, 0, 0, 0] + box * rng.uniform(-1, 1, (count, 6)))
+    factors = robot.controller.factors * rng.uniform(0.93, 0.99, 6)
+    position, rotation = real.platform(q)
+    position = position + 2.5e-4 * rng.normal(size=position.shape)
+    rotation = (Rotation.from_rotvec(5e-4 * rng.normal(size=(count, 3)))
+                * Rotation.from_matrix(rotation)).as_matrix()  # fmt: skip
+    learnt = np.arange(count) % HELD_OUT != HELD_OUT - 1
+    position[rng.choice(np.flatnonzero(learnt), wrong, replace=False)] += 0.02
+    motors = q * factors + robot.controller.offsets + 0.2 * rng.normal(size=6)
+    poses = Poses(motors, position, rotation)
+    found = calibrate(robot, poses, geometric(robot, robot.controller.positions(motors)))
+    legs, _ = fit_a_leg(robot, poses.part(learnt))
+    away = np.sqrt(np.mean(leg_poses(legs, poses.part(~learnt)) ** 2))
+    assert found.held_out[1].rms < 1.02 * away
+    by = {p.name: p for p in found.parameters}
+    for joint, factor in zip(robot.joint_names, factors, strict=True):
+        ratio = by[f"joint_map.{joint}.ratio"]
+        assert abs(ratio.value - factor) < 4.0 * ratio.deviation < 0.02 * factor
 
 
 def test_a_ratio_that_changes_converts_positions_both_ways_and_nothing_else() -> None:

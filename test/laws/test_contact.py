@@ -16,8 +16,8 @@ from pkm_twin.apps.recorded import Recording, read_recording
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.machine.places import given
 from pkm_twin.robot.catalogue import robot_of_data
-from test.laws.contacts import OFF, REST, measured, moves, pushed, seen_after
-from test.support.robots import load, partly_long
+from test.laws.contacts import OFF, RATE, REST, Stream, measured, moves, pushed, seen_after
+from test.support.robots import load, massive, partly_long
 
 Array = NDArray[np.float64]
 
@@ -125,7 +125,7 @@ class TestDepartures:
         """Of a third of the peak effort, in motion."""
         robot, rng = load(name), np.random.default_rng(seed)
         motion = moves(robot, rng, 5, 0.7)
-        begin = rng.uniform(REST + 0.4, REST + 1.0)
+        begin = rng.uniform(REST + 0.15, REST + 1.0)
         wrench = pushed(robot, rng, motion, 0.35, begin)
         stream = measured(robot, rng, motion, wrench=wrench, masses=0.03, friction=0.03)
         assert seen_after(stream, robot, begin) < 0.06
@@ -136,6 +136,31 @@ class TestDepartures:
         stream = measured(robot, rng, moves(robot, rng, 14, 0.7), friction=0.1)
         touching = stream.watched(robot)
         assert not touching[len(touching) // 2 :].any()
+
+
+@pytest.mark.parametrize("rest", [0.0, 0.5])
+@pytest.mark.parametrize("what", ["as the model", "both, 3 % each"])
+@massive
+def test_free_motion_touches_nothing_from_the_first_sample_on(
+    name: str, what: str, rest: float
+) -> None:
+    """Also where the friction is large beside the efforts so far: the fastest moves come later."""
+    robot, rng = load(name), np.random.default_rng([30, *name.encode()])
+    stream = measured(robot, rng, moves(robot, rng, 40, 0.7, rest), **OFF[what])
+    first = Stream(*(part[: round((rest + 2.0) * RATE)] for part in vars(stream).values()))
+    assert not first.watched(robot).any()
+
+
+@pytest.mark.parametrize("name", ["stewart", "upr_rpu"])
+def test_a_push_as_a_machine_begins_to_move_is_seen(name: str) -> None:
+    """Before a joint has moved both ways, and though it opposes the motion."""
+    robot, rng = load(name), np.random.default_rng(6)
+    motion = moves(robot, rng, 3, 0.7, 0.5)
+    begin = 0.7
+    wrench = pushed(robot, rng, motion, 0.5, begin)
+    for way in (1.0, -1.0):
+        stream = measured(robot, rng, motion, wrench=way * wrench, friction=0.03)
+        assert seen_after(stream, robot, begin) < 0.06
 
 
 def test_a_push_that_lasts_is_no_friction() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from delta_dynamics import ContactMonitor, inverse_dynamics
 from delta_dynamics.isolation import (
     CLAMPING,
     PLATFORM,
@@ -159,3 +160,34 @@ def test_what_two_limbs_clamp_is_told_from_a_collision(
             named[what].append(place.where.split()[0])
     assert np.mean([one == CLAMPING for one in named["both"]]) >= 0.6
     assert np.mean([one == CLAMPING for one in named["one"]]) <= 0.2
+
+
+def test_a_contact_is_located_some_times_and_free_motion_never(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At 1 kHz no more than every fourth sample, each detected; the first one at once."""
+    robot = load("stewart")
+    located: list[float] = []
+    push = ContactLocator.push
+    monkeypatch.setattr(
+        ContactLocator, "push",
+        lambda self, step, *rest: (located.append(step), push(self, step, *rest))[1],
+    )  # fmt: skip
+    monitor, still = ContactMonitor(robot), np.zeros(6)
+    monitor.prepare()
+    located.clear()
+    q = robot.inverse(robot.home())
+    held = inverse_dynamics(robot, q, still, still)
+    rng, touched = np.random.default_rng(0), 0
+    for k in range(700):
+        effort = held + 1e-3 * np.abs(held).max() * rng.normal(size=6)
+        effort[0] += 9.0 * np.abs(held).max() * (k >= 400)
+        found = monitor.push(1e-3 * k, (q, still, still), effort)
+        touching = found is not None and found.touching
+        touched += touching
+        assert touching or not located
+        assert not touching or (found is not None and found.place is not None)
+    assert touched > 250
+    assert 0.08 * touched < len(located) <= 0.25 * touched
+    # Each one stands for the time since the one before.
+    assert sum(located[1:]) == pytest.approx(1e-3 * touched, abs=0.02)
