@@ -30,6 +30,8 @@ MAX_CLOCK = 2**31 - 1
 _MIN_DEPTH = 1000
 # How long the last messages may take to reach reliable subscribers, s.
 _DELIVERY_TIME = 1.0
+# How long lockstep waits for a subscriber to know its publisher, s.
+_MATCH_TIME = 60.0
 # A wait of the operating system overshoots by less than this, s; the rest is short sleeps.
 _COARSE = 0.002
 _FINE = 0.0001
@@ -262,12 +264,15 @@ def _await_subscribers(publishers: Mapping[str, Any], seconds: float, stop: _Sto
 
 def _await_delivery(publishers: Mapping[str, Any]) -> None:
     """Give reliable subscribers time to get the last messages before the publishers are gone."""
-    from rclpy.duration import Duration
-
     give_up = time.monotonic() + _DELIVERY_TIME
     for publisher in publishers.values():
-        left = max(0.0, give_up - time.monotonic())
-        publisher.wait_for_all_acked(Duration(seconds=left))
+        _await_acknowledged(publisher, max(0.0, give_up - time.monotonic()))
+
+
+def _await_acknowledged(publisher: Any, seconds: float) -> None:
+    from rclpy.duration import Duration
+
+    publisher.wait_for_all_acked(Duration(seconds=seconds))
 
 
 @contextmanager
@@ -318,6 +323,9 @@ class _Replay:
         self._clock_period = math.inf
         self._messages = 0
         self._late = 0.0
+        # A subscriber that does not know its publisher yet gets the first messages later than
+        # those of other topics that were sent after them.
+        self._unmatched = set(publishers if pace is not None else ())
 
     def add_clock(self, publisher: Any, frequency: float) -> None:
         """Publish bag time ``frequency`` times a second of wall time."""
@@ -364,7 +372,11 @@ class _Replay:
                 self._pace(message)
             elif not self._sleep_until(due):
                 return
-            self._publishers[message.topic].publish(message.data)
+            publisher = self._publishers[message.topic]
+            publisher.publish(message.data)
+            if message.topic in self._unmatched:
+                self._unmatched.discard(message.topic)
+                _await_acknowledged(publisher, _MATCH_TIME)
             now = time.monotonic()
             self._messages += 1
             self._late = max(self._late, now - due)

@@ -25,8 +25,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from pkm_twin.bags.reader import BagWriter
+from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.errors import BagError, ParameterError
+from pkm_twin.ros import player as player_module
 from pkm_twin.ros.player import play
 from test.nodes.harness import DEADLINE, Domain, end_with_parent
 from test.support.waiting import wait_until
@@ -271,3 +272,36 @@ def test_log_times_that_no_clock_can_tell_are_refused(tmp_path: Path) -> None:
         writer.write("/note", String(data="late"), 2**31 * 10**9)
     with pytest.raises(BagError, match="do not fit a /clock"):
         play(path, clock=100.0, progress=False)
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_in_lockstep_a_topics_first_message_is_acknowledged_before_the_next_goes_out(
+    bag: Path, monkeypatch: pytest.MonkeyPatch, lockstep: bool
+) -> None:
+    events: list[tuple[str, str]] = []
+
+    class Recorded:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def publish(self, _: bytes) -> None:
+            events.append(("sent", self.name))
+
+    monkeypatch.setattr(
+        player_module,
+        "_await_acknowledged",
+        lambda publisher, _: events.append(("acknowledged", publisher.name)),
+    )
+    opened = open_bag(bag)
+    publishers = {name: Recorded(name) for name in opened.report.topics}
+    pace = (lambda _: None) if lockstep else None
+    replay = player_module._Replay(opened, publishers, 1e3, player_module._Stop(), pace)
+    replay.run(loop=False, update=lambda _seconds, _messages: None)
+    sent = [name for what, name in events if what == "sent"]
+    assert len(sent) == len(list(opened.messages(list(publishers))))
+    for name in publishers:
+        first = events.index(("sent", name))
+        count = events.count(("acknowledged", name))
+        assert count == lockstep
+        if lockstep:
+            assert events[first + 1] == ("acknowledged", name)
