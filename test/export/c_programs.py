@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -157,7 +158,11 @@ class Package:
         rows = np.ascontiguousarray(np.concatenate(inputs, 1), np.float64)
         number = list(self.heads).index(name)
         command = [str(program), str(number), str(len(rows))]
-        found = subprocess.run(command, input=rows.tobytes(), capture_output=True, check=False)
+        # The sanitizers' runtime has to be the first library.
+        environment = {k: v for k, v in os.environ.items() if k != "LD_PRELOAD"}
+        found = subprocess.run(
+            command, input=rows.tobytes(), env=environment, capture_output=True, check=False
+        )
         assert not found.returncode, found.stderr.decode()
         table = np.frombuffer(found.stdout).reshape(len(rows), -1)
         return table[:, 0], table[:, 1:]
