@@ -201,16 +201,19 @@ def run(bags: Path, out: Path, console: Console) -> list[Finding]:
     recording = out / "demo.mcap"
     context = Context()
     rclpy.init(args=middleware_arguments([]), context=context)
+    executor = SingleThreadedExecutor(context=context)
+    node = rclpy.create_node("demo_recorder", context=context)
+    executor.add_node(node)
     try:
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(rclpy.create_node("demo_recorder", context=context))
         with BagWriter(recording, overwrite=True) as writer:
-            recorder = Recorder(executor.get_nodes()[0], writer)
+            recorder = Recorder(node, writer)
             for stage in STAGES:
                 run_stage(stage, bags / f"{stage.bag}.mcap", recorder, executor, console)
             for spread in demo_tracking.SPREADS:
                 demo_tracking.run(spread, recorder, executor, console)
     finally:
+        executor.shutdown()
+        node.destroy_node()
         rclpy.try_shutdown(context=context)
     findings: list[Finding] = []
     series = {}

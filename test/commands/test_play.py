@@ -9,6 +9,7 @@ from mcap.writer import Writer
 from pkm_twin.bags.reader import inspect
 from test.bags.folders import make_folder
 from test.commands.conftest import DELTA, rewrite
+from test.nodes.harness import Domain
 
 pytest.importorskip("rclpy")
 
@@ -34,10 +35,12 @@ def offered(path, topic, qos):
 def test_a_folder_is_played_whole(monkeypatch, tmp_path, short, mode):
     from pkm_twin.ros.player import play
 
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    domain = Domain()
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain.number))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     folder = make_folder(tmp_path / "rec", short, mode=mode)
     assert play(folder, progress=False).messages == inspect(short).message_count
+    domain.close()
 
 
 @pytest.mark.parametrize(

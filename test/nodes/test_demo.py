@@ -38,8 +38,12 @@ def executor(monkeypatch):
     context = Context()
     rclpy.init(context=context, domain_id=domain.number)
     executor = SingleThreadedExecutor(context=context)
-    executor.add_node(rclpy.create_node("demo_recorder", context=context))
+    node = rclpy.create_node("demo_recorder", context=context)
+    executor.add_node(node)
     yield executor
+    # Else the node stays in the domain, which another test's nodes may be the next in.
+    executor.shutdown()
+    node.destroy_node()
     rclpy.try_shutdown(context=context)
     domain.close()
 

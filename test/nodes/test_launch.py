@@ -177,7 +177,11 @@ class TestRunning:
             assert process.alive(), process.output
             return self.nodes(peer) == sorted(names)
 
-        peer.until(so)
+        try:
+            peer.until(so)
+        except AssertionError as error:
+            said = f"{names} are not all: {self.nodes(peer)}\n{process.output}"
+            raise AssertionError(said) from error
 
     def parameter(self, peer, node, name):
         from rcl_interfaces.srv import GetParameters

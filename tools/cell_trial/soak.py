@@ -1,26 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """A cell for a while: two machines with all nodes and a recorder; one machine at 1 kHz; Ctrl-C.
 
-    python3 tools/cell_trial/soak.py [--minutes 10] [--stops 20] [--part cell|kilohertz|stops]
+    python3 tools/cell_trial/soak.py [--minutes 10] [--stops 20] [--part cell|kilohertz|stops|one]
 
 cell: cell.launch.py with all nodes and gates of two machines, a machine_sim for each at 250 Hz, and
 `ros2 bag record`. kilohertz: one machine's delta_dynamics, command_gate and machine_sim. stops: how
-often Ctrl-C ends a running cell cleanly, with zeros as each gate's last command. Needs a sourced
-Jazzy workspace with pkm_twin and rosbag2; the figures mean something on an idle machine.
+often Ctrl-C, twice, ends a running cell cleanly, with zeros as each gate's last command; one: as
+stops, with twin.launch.py and one machine. Needs a sourced Jazzy workspace with pkm_twin and
+rosbag2; the figures mean something on an idle machine.
 """
 
 from __future__ import annotations
 
 import argparse
+import random
 import shutil
 import signal
 import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import yaml
 from cell import Peer, Process, node, peer
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Float64MultiArray
@@ -34,6 +38,7 @@ MACHINES = {
 }
 """Namespace: robot and its friction. Efforts of a model alone do not hold a machine without any."""
 WARM = 15.0
+PARTS = ("cell", "kilohertz", "stops", "one")
 FAULTS = ("lost: ", " rejected: ", "stopped: ", "closed: ", "exceptions", "times behind")
 
 
@@ -100,6 +105,31 @@ def launched(files: dict[str, Path], *extra: str) -> Process:
         "ros2", "launch", "pkm_twin", "cell.launch.py", f"machines:={machines}",
         "command_gate:=true", "machine_state:=true", *extra,
     )  # fmt: skip
+
+
+def launched_alone(files: dict[str, Path], *extra: str) -> Process:
+    """twin.launch.py of the only machine, with all nodes."""
+    ((space, robot),) = files.items()
+    return Process(
+        "ros2", "launch", "pkm_twin", "twin.launch.py", f"robot:={robot}", f"namespace:={space}",
+        "command_gate:=true", "machine_state:=true", *extra,
+    )  # fmt: skip
+
+
+def patient(spaces: Iterable[str], folder: Path) -> str:
+    """An argument of a launch: torques flow on a busy machine, too."""
+    given = {"delta_dynamics": {"stale_after": 1.0}, "command_gate": {"deadline": 1.0}}
+    file = folder / "patient.yaml"
+    file.write_text(
+        yaml.safe_dump(
+            {
+                f"/{space}/{name}": {"ros__parameters": parameters}
+                for space in spaces
+                for name, parameters in given.items()
+            }
+        )
+    )
+    return f"params_file:={file}"
 
 
 def watched(watch: Watch, processes: dict[str, int], seconds: float) -> bool:
@@ -191,34 +221,38 @@ def kilohertz(other: Peer, seconds: float) -> bool:
             process.close()
 
 
-def stops(other: Peer, times: int) -> bool:
-    """Ctrl-C in the terminal of a running cell."""
+def stops(other: Peer, times: int, *, one: bool) -> bool:
+    """Ctrl-C, twice, in the terminal of a running cell or of one machine."""
     watch = Watch(other)
-    topics = {space: f"/{space}/command_gate/commands" for space in MACHINES}
+    folder = Path(tempfile.mkdtemp())
+    files = dict(list(robots(folder).items())[: 1 if one else None])
+    topics = {space: f"/{space}/command_gate/commands" for space in files}
     for topic in topics.values():
         watch.gate(topic)
-    folder = Path(tempfile.mkdtemp())
-    files = robots(folder)
+    extra = patient(files, folder)
+    launch_of = launched_alone if one else launched
     running = [*simulators(files, 0.004)]
     ends: Counter[str] = Counter()
     try:
         for _ in range(times):
             watch.commands.clear()
-            running.append(cell_ := launched(files))
+            running.append(launch := launch_of(files, extra))
             other.until(
                 lambda: (
                     len(watch.commands) == len(topics)
                     and all(any(command) for command in watch.commands.values())
                 ),
-                f"torques through the gates\n{cell_.output[-2000:]}",
+                f"torques through the gates\n{launch.output[-2000:]}",
             )
-            other.spin(1.0)
-            count = len(_children(cell_))
+            other.spin(random.uniform(0.5, 1.5))
+            count = len(_children(launch))
             # A terminal signals the whole group; launch then signals its processes once more.
-            cell_.signal(signal.SIGINT, group=True)
-            other.until(lambda p=cell_: not p.alive(), "the launch's end")
+            launch.signal(signal.SIGINT, group=True)
+            time.sleep(10.0 ** random.uniform(-5, -0.7))
+            launch.signal(signal.SIGINT, group=True)
+            other.until(lambda p=launch: not p.alive(), "the launch's end")
             other.spin(1.0)
-            said = cell_.output
+            said = launch.output
             verdict = ["clean" if said.count("finished cleanly") == count else "NOT CLEAN"]
             verdict += ["traceback"] if "Traceback" in said else []
             zeros = all(not any(command) for command in watch.commands.values())
@@ -231,7 +265,8 @@ def stops(other: Peer, times: int) -> bool:
         for process in reversed(running):
             process.close()
         shutil.rmtree(folder, ignore_errors=True)
-    print("Ctrl-C of a running cell: " + "; ".join(f"{n} {end}" for end, n in ends.items()))
+    what = "one machine" if one else "a cell"
+    print(f"Ctrl-C of {what}: " + "; ".join(f"{n} {end}" for end, n in ends.items()))
     return set(ends) == {"clean, zeros"}
 
 
@@ -240,9 +275,9 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--stops", type=int, default=20)
     parser.add_argument("--composed", action="store_true", help="cell: with composed:=true")
-    parser.add_argument("--part", choices=("cell", "kilohertz", "stops"), action="append")
+    parser.add_argument("--part", choices=PARTS, action="append")
     given = parser.parse_args()
-    parts: Any = given.part or ("cell", "kilohertz", "stops")
+    parts: Any = given.part or PARTS
     good = True
     extra = ("composed:=true",) if given.composed else ()
     for part in parts:
@@ -252,7 +287,7 @@ def main() -> int:
             elif part == "kilohertz":
                 good &= kilohertz(other, 60.0 * given.minutes)
             else:
-                good &= stops(other, given.stops)
+                good &= stops(other, given.stops, one=part == "one")
     return 0 if good else 1
 
 
