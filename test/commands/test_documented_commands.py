@@ -42,7 +42,7 @@ INLINE_NAMES = r"ROBOT|FILE|BAG|TOPIC|COMMAND|KIND|HOST| N\b"
 
 
 def pages():
-    """Markdown files that a clone has and that people read as they are."""
+    """Markdown files that people read as they are: of a clone, or of sources without git."""
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "*.md"],
         cwd=REPOSITORY,
@@ -50,10 +50,13 @@ def pages():
         check=False,
         text=True,
     ).stdout.split("\0")
+    if listed == [""]:
+        folders = ("", "docs", "bags", "examples")
+        found = [path for name in folders for path in (REPOSITORY / name).glob("*.md")]
+        listed = [path.relative_to(REPOSITORY).as_posix() for path in found]
     # Made from the commands themselves.
     own = ("test/", "docs/commands.md")
-    found = sorted(name for name in listed if name and not name.startswith(own))
-    return found or ["README.md"]
+    return sorted(name for name in listed if name and not name.startswith(own))
 
 
 def typed(text):
