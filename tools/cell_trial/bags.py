@@ -52,7 +52,7 @@ def played(other: Peer, bag: Path, robot: str, name: str, rate: float) -> dict[s
     parameters = (f"mechanism:={robot}", "use_sim_time:=true", *NODES[name][2])
     twin = node(name, parameters=parameters)
     with closing(twin):
-        other.until(lambda: told, f"{name}'s diagnostics\n{twin.output}")
+        other.until(lambda: told, lambda: f"{name}'s diagnostics\n{twin.output}")
         player = Process(
             "ros2", "bag", "play", str(bag), "--clock", "200", "--rate", str(rate), "--delay", "3",
             "--disable-keyboard-controls",

@@ -124,7 +124,7 @@ class Peer:
     def until(
         self,
         condition: Callable[[], Any],
-        what: str,
+        what: str | Callable[[], str],
         timeout: float = DEADLINE,
         every: float = 0.005,
     ) -> Any:
@@ -135,7 +135,7 @@ class Peer:
         end = time.monotonic() + timeout
         while not (found := condition()):
             if time.monotonic() > end:
-                raise TimeoutError(what)
+                raise TimeoutError(what if isinstance(what, str) else what())
             self._executor.spin_once(timeout_sec=every)
         return found
 

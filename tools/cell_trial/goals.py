@@ -105,7 +105,7 @@ class Cell:
             "joint_state_broadcaster", CONTROLLER, "--param-file", str(self._file),
         )  # fmt: skip
         self.states.clear()
-        self.other.until(lambda: self.states, f"the controller\n{self.manager.output}")
+        self.other.until(lambda: self.states, lambda: f"the controller\n{self.manager.output}")
 
     def start_twin(self) -> None:
         """delta_dynamics between the client and the controller."""
@@ -116,7 +116,9 @@ class Cell:
                 f"controller_action:=/{CONTROLLER}/follow_joint_trajectory",
             ),
         )
-        self.other.until(self.client.server_is_ready, f"the twin's action\n{self.twin.output}")
+        self.other.until(
+            self.client.server_is_ready, lambda: f"the twin's action\n{self.twin.output}"
+        )
 
     def stop(self) -> None:
         """All processes."""

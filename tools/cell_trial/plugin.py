@@ -116,7 +116,7 @@ class Chain:
 
     def start(self) -> Any:
         """Wait for both controllers; the model's joint positions."""
-        self.other.until(lambda: self.states, f"the controller\n{self.process.output}")
+        self.other.until(lambda: self.states, lambda: f"the controller\n{self.process.output}")
         self.other.until(self.send.get_subscription_count, TRAJECTORIES)
         # They become active one after the other.
         self.other.spin(5.0)

@@ -184,7 +184,9 @@ def cell(other: Peer, seconds: float, extra: tuple[str, ...]) -> bool:
     recorder = Process("ros2", "bag", "record", "--storage", "mcap", "-o", str(bag), *topics)
     try:
         names = [f"/{s}/{n}" for s in MACHINES for n in ("delta_dynamics", "command_gate")]
-        other.until(lambda: all(name in watch.values for name in names), f"nodes\n{cell_.output}")
+        other.until(
+            lambda: all(name in watch.values for name in names), lambda: f"nodes\n{cell_.output}"
+        )
         processes = _children(cell_) | {
             f"machine_sim {space}": sim.process.pid
             for space, sim in zip(MACHINES, sims, strict=True)
@@ -242,7 +244,7 @@ def stops(other: Peer, times: int, *, one: bool) -> bool:
                     len(watch.commands) == len(topics)
                     and all(any(command) for command in watch.commands.values())
                 ),
-                f"torques through the gates\n{launch.output[-2000:]}",
+                lambda: f"torques through the gates\n{launch.output[-2000:]}",
             )
             other.spin(random.uniform(0.5, 1.5))
             count = len(_children(launch))
