@@ -123,7 +123,7 @@ def patient(spaces: Iterable[str], folder: Path) -> str:
     file.write_text(
         yaml.safe_dump(
             {
-                f"/{space}/{name}": {"ros__parameters": parameters}
+                f"/{space}/{name}": {"ros__parameters": dict(parameters)}
                 for space in spaces
                 for name, parameters in given.items()
             }
