@@ -82,6 +82,18 @@ def leave_at_once() -> None:
         signal.signal(number, lambda *_: os._exit(0))
 
 
+def leave_interrupts_to_launch() -> None:
+    """For a launch file's function, which a running launch service calls: no KeyboardInterrupt.
+
+    A launch service takes SIGINT from a socket that Python writes to in any case. The exception
+    that Python raises as well, and that the service ignores, can end the taking between reading
+    the socket and beginning the shutdown: of two signals in a row both were lost, and nodes that
+    had ended by them were started again.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, lambda *_: None)
+
+
 class NodeSignals:
     """The signals of a node's process: noted from here to its end, and raised while it is made.
 

@@ -138,3 +138,27 @@ def test_a_signal_in_an_import_ends_a_node_quietly(domain, loaded, number):
         process.kill()
         process.wait()
     assert (process.returncode, said) == (0, "")
+
+
+LAUNCH = """
+import os
+import signal
+import socket
+from pkm_twin.ros.signals import leave_interrupts_to_launch
+reads, writes = socket.socketpair()
+writes.setblocking(False)
+signal.set_wakeup_fd(writes.fileno())
+leave_interrupts_to_launch()
+for _ in range(2):
+    os.kill(os.getpid(), signal.SIGINT)
+print(list(reads.recv(9)))
+own = lambda *_: None
+signal.signal(signal.SIGINT, own)
+leave_interrupts_to_launch()
+print(signal.getsignal(signal.SIGINT) is own)
+"""
+
+
+def test_an_interrupt_of_a_launch_is_in_its_socket_and_nowhere_else():
+    done = subprocess.run([sys.executable, "-c", LAUNCH], capture_output=True, text=True)
+    assert done.stdout.splitlines() == [f"{[int(signal.SIGINT)] * 2}", "True"], done.stderr
