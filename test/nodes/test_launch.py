@@ -32,8 +32,11 @@ NODES = {
     "command_gate": "delta_dynamics/gate_node.py",
     "machine_state": "pkm_twin/state/node.py",
 }
-SHARED = ("pkm_twin/ros/wrench.py", "delta_dynamics/parameters_node.py")
-"""Where nodes declare what they share."""
+SHARED = (
+    "pkm_twin/ros/wrench.py", "pkm_twin/streams/wrench.py", "delta_dynamics/parameters_node.py",
+    "delta_dynamics/settings.py",
+)  # fmt: skip
+"""Where nodes declare what they share, and what their settings are."""
 
 
 def literal(name, variable):
@@ -72,7 +75,7 @@ class TestText:
         for node, names in parameters.items():
             files = (NODES[node], *SHARED)
             source = "".join((REPOSITORY / file).read_text(encoding="utf-8") for file in files)
-            assert all(f'"{name}"' in source for name in names)
+            assert all(re.search(rf"\b{name}\b", source) for name in names)
             assert set(names) <= set(arguments)
 
     def test_what_a_cell_passes_on_a_twin_takes(self):
