@@ -211,7 +211,7 @@ def test_wrong_qos(tmp_path: Path, options: dict[str, object], text: str) -> Non
 
 def test_wrong_use(tmp_path: Path) -> None:
     with text_writer(tmp_path / "w.mcap") as writer:
-        for topic, text in (("/text", "there already"), ("text", "full topic name")):
+        for topic, text in (("/text", "/text already"), ("text", "full topic name")):
             with pytest.raises(BagError, match=text):
                 writer.add_topic(topic, TEXT, definition="string data")
         with pytest.raises(BagError, match=r"/other was not added; topics: /text"):
