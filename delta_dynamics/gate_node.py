@@ -14,7 +14,6 @@ from sensor_msgs.msg import JointState
 from delta_dynamics.gate import Gate, GateSettings
 from delta_dynamics.parameters_node import changed, declare_changes
 from delta_dynamics.virtual_work import inverse_dynamics
-from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
@@ -43,11 +42,7 @@ class CommandGate(TwinNode):
 
     def __init__(self) -> None:
         super().__init__("command_gate")
-        robot = load(
-            self.declare(
-                "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
-            )
-        )
+        robot = self.declare_robot()
         settings = self.declare_settings(GateSettings, fixed=True)
         self._gate = Gate(robot, settings)
         self._closed = True

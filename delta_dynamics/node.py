@@ -21,7 +21,6 @@ from delta_dynamics.feedforward import Feedforward, Torques, warm_up
 from delta_dynamics.parameters_node import CHANGES, changed, declare_changes
 from delta_dynamics.reactions import reactions
 from delta_dynamics.settings import Settings
-from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.messages.intake import JointStateDecoder, RawTrajectory
@@ -47,11 +46,7 @@ class DeltaDynamics(TwinNode):
 
     def __init__(self) -> None:
         super().__init__("delta_dynamics")
-        robot = load(
-            self.declare(
-                "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
-            )
-        )
+        robot = self.declare_robot()
         # Before there is a topic to be found by: the first start compiles for many seconds.
         warm_up(robot)
         robot = changed(robot, declare_changes(self, robot))

@@ -52,8 +52,9 @@ def declare_changes(
         given = node.declare(
             name,
             default,
-            f"{text}; default: the robot file's",
+            text,
             unit=unit,
+            usual="the robot file's",
             **bounds,
         )
         if name in node.given:

@@ -29,7 +29,6 @@ from delta_dynamics.simulation import (
     WrenchSignal,
     tuned,
 )
-from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.intake import DoublesTemplate, RawTrajectory
@@ -67,11 +66,7 @@ class MachineSim(TwinNode):
 
     def __init__(self) -> None:
         super().__init__("machine_sim")
-        robot = load(
-            self.declare(
-                "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
-            )
-        )
+        robot = self.declare_robot()
         robot.massive()
         self._variation = self._declare_spread(robot)
         self._declare_clock()
@@ -194,17 +189,16 @@ class MachineSim(TwinNode):
             MachineSettings,
             fixed=True,
             start=self._row(
-                "start", home, "joint positions at the start, rad or m; default: the robot's home"
+                "start", home, "joint positions at the start, rad or m", usual="the robot's home"
             ),
             effort_limits=self._row(
-                "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N; "
-                "default: the robot's", 0.0,
+                "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N",
+                0.0, "the robot's",
             ),
             stiffness=self._row(
-                "stiffness", stiffness, "of the position control; default: from bandwidth", 0.0
+                "stiffness", stiffness, "of the position control", 0.0, "from bandwidth"
             ),
-            damping=self._row("damping", damping, "of the position control; default: from "
-            "bandwidth", 0.0),
+            damping=self._row("damping", damping, "of the position control", 0.0, "from bandwidth"),
             resolution=self._row(
                 "encoder_resolution", np.zeros(len(home)), "resolution of the encoders, rad or "
                 "m; velocities are then differences of steps; 0: exact", 0.0
@@ -225,22 +219,19 @@ class MachineSim(TwinNode):
         """Events as three lists; by default the robot's own payload from the start."""
         own = robot.payload
         times, masses, coms = (
-            self.declare(name, default, text, read_only=True)
-            for name, default, text in (
-                ("payload.times", [0.0], "times at which the payload changes, s after the start"),
+            self.declare(name, default, text, usual=usual, read_only=True)
+            for name, default, text, usual in (
                 (
-                    "payload.masses",
-                    [own.mass],
-                    "payload from each time on, kg; default: the robot's",
+                    "payload.times", [0.0], "times at which the payload changes, s after the "
+                    "start", "",
                 ),
+                ("payload.masses", [own.mass], "payload from each time on, kg", "the robot's"),
                 (
-                    "payload.coms",
-                    own.com.tolist(),
-                    "its centre of mass, m from the platform's reference point, three per time; "
-                    "default: the robot's",
+                    "payload.coms", own.com.tolist(), "its centre of mass, m from the platform's "
+                    "reference point, three per time", "the robot's",
                 ),
             )
-        )
+        )  # fmt: skip
         if len(masses) != len(times) or len(coms) != 3 * len(times):
             raise ParameterError(
                 "payload.masses",
@@ -257,9 +248,11 @@ class MachineSim(TwinNode):
             robot.changed(payload={"mass": event.mass, "com": list(event.com)})
         return events
 
-    def _row(self, name: str, default: Array, text: str, low: float | None = None) -> Array:
+    def _row(
+        self, name: str, default: Array, text: str, low: float | None = None, usual: str = ""
+    ) -> Array:
         """A parameter of one number a joint (or component); one stands for all."""
-        given = self.declare(name, default.tolist(), text, read_only=True)
+        given = self.declare(name, default.tolist(), text, usual=usual, read_only=True)
         values = np.asarray(given, np.float64)
         if len(values) not in (1, len(default)):
             raise ParameterError(name, list(given), f"{len(default)} numbers, or one for all")

@@ -17,6 +17,7 @@ from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.node import TwinNode
+from pkm_twin.ros.wrench import triple
 from pkm_twin.streams.wrench import counting
 from stiffness_monitor.correction import setpoint_correction
 from stiffness_monitor.monitor import Answer
@@ -53,17 +54,13 @@ class SetpointCorrection:
             read_only=True,
         )
         self._tool = np.array(
-            node.declare(
+            triple(
+                node,
                 "tool.xyz",
-                [0.0, 0.0, 0.0],
                 "position of the tool point from the platform's reference point, platform axes",
-                unit="m",
-                read_only=True,
-            ),
-            float,
+                "m",
+            )
         )
-        if self._tool.shape != (3,):
-            raise ParameterError("tool.xyz", self._tool.tolist(), "3 numbers, m")
         self._bound = node.declare(
             "correction_bound",
             1e-3,

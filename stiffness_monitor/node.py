@@ -20,7 +20,6 @@ from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
-from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.messages.intake import JointStateDecoder
@@ -49,11 +48,7 @@ class StiffnessMonitor(TwinNode):
 
     def __init__(self) -> None:
         super().__init__("stiffness_monitor")
-        robot = load(
-            self.declare(
-                "mechanism", "upr_rpu", "robot: a name, or the path of a file", read_only=True
-            )
-        )
+        robot = self.declare_robot("upr_rpu")
         for kernel in kernels(robot):
             kernel.warm_up()
         settings = self.declare_settings(Settings)

@@ -47,7 +47,7 @@ def robot_text(name: str, *, per_copy: bool = False) -> tuple[str, Robot]:
 
 
 def _elastic(robot: Robot) -> bool:
-    """Whether its file tells of elasticity."""
+    """Whether its file has elastic members or joints."""
     try:
         robot.structure()
     except ParameterError:

@@ -66,7 +66,7 @@ def compiled() -> bool:
 
 @remembered
 def _sources() -> str:
-    """What the package's formulas hang on: a changed file compiles anew."""
+    """Digest of all sources that write programs: after a change they are compiled again."""
     root = Path(__file__).resolve().parents[1]
     folders = [root / name for name in _WRITERS]
     folders += [root.parent / name for name in ("delta_dynamics", "stiffness_monitor")]

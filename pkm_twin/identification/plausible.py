@@ -34,9 +34,9 @@ POOR: Final = 0.3
 NAMED: Final = 0.8
 """A fault is named if without it no more than this part is left."""
 FAR: Final = 0.1
-"""What is left from which other positions and times are tried, which costs more,"""
+"""What is left from which other positions and times are tried, which costs more."""
 BESIDE_NOISE: Final = 0.03
-"""and what is left beside noise where the efforts have a fault: it may not be theirs."""
+"""The same, above noise, where the efforts have a fault: positions or times may be its cause."""
 RANGE: Final = 2.0
 """How many times as heavy as its file a machine may be, and the inverse."""
 LATEST: Final = 0.05

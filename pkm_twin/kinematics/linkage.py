@@ -19,7 +19,7 @@ from pkm_twin.machine.graph import Array, Graph
 from pkm_twin.machine.tree import Tree
 
 SAMPLES: Final = 6
-"""States around home, beside it, in which pivots have to be good."""
+"""States around home, besides home, in which pivots must not be small."""
 REACH: Final = 0.6
 """How far from home, rad or half the size: pivots that are good at home alone come near zero."""
 
@@ -154,7 +154,7 @@ def rank_of(matrix: Array) -> int:
 _firsts: Final[WeakValueDictionary[str, Linkage]] = WeakValueDictionary()
 """The first linkage of a graph that something still holds."""
 _recent: Final[deque[Linkage]] = deque(maxlen=16)
-"""Held although no machine may: loading a file again takes no engine anew."""
+"""Kept so that a file that is loaded again uses the same engine."""
 
 
 def hold(linkage: Linkage) -> None:

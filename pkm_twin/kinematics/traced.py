@@ -92,7 +92,7 @@ class Traced:
         """Unknowns along the tangent at home: nearer than home itself."""
         motion, jq, lu = self._at_home
         away = self.q - self.graph.home
-        # Solved by joint: what is left to a sample are products with what is prepared.
+        # Solved per joint: a sample then only multiplies by what is prepared.
         columns = snapped_all([-lu.solve(jq[:, j]) for j in range(self.joints)])
         return motion.retracted(self.tree.home, columns.T @ away)
 

@@ -143,9 +143,11 @@ class Assembly:
                 rows.append((_angle(a.rotation.T, b.rotation), turn))
             elif held == "direction":
                 rows.append((_between(first, second), across @ turn))
-            else:
+            elif held == "crossing":
                 normal = np.cross(second, first)
                 rows.append((np.array([first @ second - closure.cosine]), (normal @ turn)[None]))
+            else:
+                raise NotImplementedError(f"a closure that holds {held!r}")
         return np.concatenate([r for r, _ in rows]), np.vstack([j for _, j in rows])
 
     def residuals(self, rates: bool = True) -> tuple[Array, Array]:

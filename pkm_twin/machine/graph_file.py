@@ -131,8 +131,9 @@ class JointSpec:
     ``home`` at home (0 where left out). ``axes``: of a universal joint, the first fixed in the
     inner body, the second in the outer one. ``lead``: how far a ``helical`` joint goes along its
     axis in a turn, m; its number is the turn, and a left-handed thread has a lead below zero. A
-    ``translation`` is three slides along base axes. ``limits``: of a passive joint its ``position``
-    and ``swivel`` bound the workspace; the others are those of actuated joints.
+    ``translation`` is three slides along base axes, a ``planar`` joint two slides across its axis
+    and a turn about it. ``limits``: of a passive joint its ``position`` and ``swivel`` bound the
+    workspace; the others are those of actuated joints.
     ``rotor_inertia``: of the drive, reflected to the joint, inertia without weight; or ``drive``,
     which reflects the rotor's by a gear's ``ratio`` (joints that turn) or a screw's or belt's
     ``lead`` (joints that slide). ``compliance``: in the joint's own axes.

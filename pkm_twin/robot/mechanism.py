@@ -194,7 +194,7 @@ class Mechanism:
         raise ParameterError("members", None, "a section with the elastic members")
 
     def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """What its file tells of elasticity at bodies, joints and rods: plain data, kind and name.
+        """The elastic numbers of its file at bodies, joints and rods: plain data, kind and name.
 
         Empty where the file has other words for it, which a file of those has not.
         """

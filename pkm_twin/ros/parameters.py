@@ -19,6 +19,8 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.robot.catalogue import load
+from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.internals import parameter_overrides
 from pkm_twin.streams.settings import Setting, settings_of
 
@@ -73,21 +75,35 @@ class ParameterNode(LifecycleNode):
         low: float | None = None,
         high: float | None = None,
         choices: Sequence[str] = (),
+        usual: str = "",
         read_only: bool = False,
     ) -> Any:
         """Declare a parameter and return its value; a whole number is taken for a float.
 
         :param low: least value, ``high``: greatest; ``choices``: the words that are allowed.
+        :param usual: words for a default that depends on the robot.
         :raises ParameterError: the given value has another type or is out of range, naming both.
         """
-        self.rows[name] = (
-            default, Setting(description, name, unit, low, high, tuple(choices), read_only)
-        )  # fmt: skip
-        constraints = f"one of {', '.join(choices)}" if choices else ""
+        row = Setting(description, name, unit, low, high, tuple(choices), read_only, usual)
+        return self._declare(default, row)
+
+    def declare_robot(self, default: str = "delta_cu") -> Robot:
+        """Declare the parameter ``mechanism`` and load its robot.
+
+        :raises PkmTwinError: there is no such robot, or its file is rejected.
+        """
+        text = "robot: a name, or the path of a file"
+        return load(self.declare("mechanism", default, text, read_only=True))
+
+    def _declare(self, default: Any, row: Setting) -> Any:
+        self.rows[row.name] = default, row
+        name, unit, low, high = row.name, row.unit, row.low, row.high
+        constraints = f"one of {', '.join(row.choices)}" if row.choices else ""
+        usual = f"default: {row.usual}" if row.usual else ""
         descriptor = ParameterDescriptor(
-            description=description + (f"; {unit}" if unit else ""),
+            description="; ".join(part for part in (row.text, usual, unit) if part),
             additional_constraints=constraints,
-            read_only=read_only,
+            read_only=row.fixed,
         )
         if low is not None and high is not None:
             if isinstance(default, float):
@@ -117,11 +133,8 @@ class ParameterNode(LifecycleNode):
         defaults = {field.name: field.default for field in dataclasses.fields(kind)}
         for name, (field, row) in settings_of(kind).items():
             if field not in given:
-                value = self.declare(
-                    name, row.parameter(defaults[field]), row.text, unit=row.unit, low=row.low,
-                    high=row.high, choices=tuple(row.choices), read_only=fixed or row.fixed,
-                )  # fmt: skip
-                given[field] = row.value(value)
+                own = dataclasses.replace(row, name=name, fixed=fixed or row.fixed)
+                given[field] = row.value(self._declare(row.parameter(defaults[field]), own))
         return kind(**given)
 
     def check_parameter(self, name: str, value: Any) -> None:

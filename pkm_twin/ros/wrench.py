@@ -29,15 +29,13 @@ def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | N
     return TransformMounts(node, platform_frame)
 
 
-def triple(
-    node: TwinNode, name: str, text: str, unit: str, read_only: bool = True
-) -> tuple[float, float, float]:
+def triple(node: TwinNode, name: str, text: str, unit: str) -> tuple[float, float, float]:
     """Declare a parameter of three numbers, zeros by default.
 
     :raises ParameterError: not three.
     """
-    values = node.declare(name, [0.0, 0.0, 0.0], text, unit=unit, read_only=read_only)
+    values = node.declare(name, [0.0, 0.0, 0.0], text, unit=unit, read_only=True)
     if len(values) != 3:
-        raise ParameterError(name, list(values), "3 numbers")
+        raise ParameterError(name, list(values), f"3 numbers, {unit}")
     x, y, z = values
     return float(x), float(y), float(z)

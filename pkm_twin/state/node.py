@@ -13,7 +13,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
-from pkm_twin import load
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
@@ -42,11 +41,7 @@ class MachineStateNode(TwinNode):
 
     def __init__(self) -> None:
         super().__init__("machine_state")
-        robot = load(
-            self.declare(
-                "mechanism", "delta_cu", "robot: a name, or the path of a file", read_only=True
-            )
-        )
+        robot = self.declare_robot()
         settings = self.declare_settings(WrenchSettings)
         self._frames = {
             "platform": self._declare_frame(

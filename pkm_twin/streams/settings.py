@@ -19,7 +19,8 @@ class Setting:
     """The parameter of a field.
 
     ``name``: of the parameter, by default the field's. ``choices``: the words that are allowed, or
-    the field's value for each. ``fixed``: not changeable while the node runs.
+    the field's value for each. ``fixed``: not changeable while the node runs. ``usual``: words for
+    a default that depends on the robot.
     """
 
     text: str
@@ -29,6 +30,7 @@ class Setting:
     high: float | None = None
     choices: Collection[str] | Mapping[str, Any] = ()
     fixed: bool = False
+    usual: str = ""
 
     def value(self, given: Any) -> Any:
         """The field's value for a parameter's."""

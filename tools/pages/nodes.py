@@ -52,10 +52,9 @@ def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
 
 def row(name: str, default: Any, setting: Setting) -> str:
     """A parameter's line of the table."""
-    text, _, own = setting.text.partition("; default: ")
     cells = [
-        f"`{name}`", own or _value(default), _values(setting),
-        "" if setting.fixed else "yes", text,
+        f"`{name}`", setting.usual or _value(default), _values(setting),
+        "" if setting.fixed else "yes", setting.text,
     ]  # fmt: skip
     return f"| {' | '.join(cells)} |\n"
 

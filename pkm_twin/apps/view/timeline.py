@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded bag as a time line: where the robot stood, and the twin's torques beside it."""
+"""A recorded bag as a time line: poses, measured efforts and the torques of the model."""
 
 from __future__ import annotations
 
