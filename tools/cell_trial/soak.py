@@ -32,11 +32,11 @@ from std_msgs.msg import Float64MultiArray
 from pkm_twin.bags.reader import inspect
 from pkm_twin.robot.catalogue import robot_path
 
-MACHINES = {
-    "picker": ("delta_cu", "friction: {viscous: 0.1, coulomb: 0.5}"),
-    "head": ("prru", "friction: {viscous: 300.0, coulomb: 80.0}"),
-}
-"""Namespace: robot and its friction. Efforts of a model alone do not hold a machine without any."""
+MACHINES = {"picker": ("delta_cu", 0.1, 0.5), "head": ("prru", 300.0, 80.0)}
+"""Namespace: robot, its viscous and its dry friction as the nodes know them."""
+SIMULATED = 4.0
+"""Friction of the simulated machines over that: they hold themselves without efforts, and come to
+rest. Efforts that compensate all friction would keep a machine moving that has begun to."""
 WARM = 15.0
 PARTS = ("cell", "kilohertz", "stops", "one")
 FAULTS = ("lost: ", " rejected: ", "stopped: ", "closed: ", "exceptions", "times behind")
@@ -48,12 +48,14 @@ class Watch:
     def __init__(self, other: Peer) -> None:
         self.other = other
         self.values: dict[str, dict[str, str]] = {}
+        self.messages: dict[str, str] = {}
         self.commands: dict[str, list[float]] = {}
         other.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnosed, 1000)
 
     def _diagnosed(self, array: DiagnosticArray) -> None:
         for status in array.status:
             self.values[status.name] = {pair.key: pair.value for pair in status.values}
+            self.messages[status.name] = status.message
 
     def gate(self, topic: str) -> None:
         """Keep the last command of a gate."""
@@ -77,24 +79,26 @@ class Watch:
         return found
 
 
-def robots(folder: Path) -> dict[str, Path]:
-    """A parameter file for each namespace."""
+def robots(folder: Path, factor: float = 1.0) -> dict[str, Path]:
+    """A parameter file for each namespace, with so many times the friction."""
     files = {}
-    for space, (robot, friction) in MACHINES.items():
-        files[space] = folder / f"{robot}.yaml"
+    for space, (robot, viscous, dry) in MACHINES.items():
+        files[space] = folder / f"{robot}_{factor:g}.yaml"
+        friction = f"friction: {{viscous: {factor * viscous}, coulomb: {factor * dry}}}"
         files[space].write_text(f"{robot_path(robot).read_text()}\n{friction}\n")
     return files
 
 
-def simulators(files: dict[str, Path], period: float) -> list[Process]:
+def simulators(spaces: Iterable[str], folder: Path, period: float) -> list[Process]:
     """A machine for each namespace, moved by the efforts of its gate."""
+    files = robots(folder, SIMULATED)
     return [
         node(
             "machine_sim",
-            parameters=(f"mechanism:={robot}", f"period:={period}"),
+            parameters=(f"mechanism:={files[space]}", f"period:={period}"),
             remap=(f"__ns:=/{space}", f"~/commands:=/{space}/command_gate/commands"),
         )
-        for space, robot in files.items()
+        for space in spaces
     ]
 
 
@@ -178,7 +182,7 @@ def cell(other: Peer, seconds: float, extra: tuple[str, ...]) -> bool:
     folder = Path(tempfile.mkdtemp())
     bag = folder / "bag"
     files = robots(folder)
-    sims = simulators(files, 0.004)
+    sims = simulators(files, folder, 0.004)
     cell_ = launched(files, *extra)
     topics = [f"/{s}/{t}" for s in MACHINES for t in ("joint_states", "wrench")]
     recorder = Process("ros2", "bag", "record", "--storage", "mcap", "-o", str(bag), *topics)
@@ -209,10 +213,11 @@ def cell(other: Peer, seconds: float, extra: tuple[str, ...]) -> bool:
 def kilohertz(other: Peer, seconds: float) -> bool:
     """delta_dynamics, gate and machine_sim of one machine at 1 kHz."""
     watch = Watch(other)
-    nodes = {
-        "machine_sim": node("machine_sim", remap=("~/commands:=/command_gate/commands",)),
-        "delta_dynamics": node("delta_dynamics"),
-        "command_gate": node("command_gate"),
+    folder = Path(tempfile.mkdtemp())
+    space, file = next(iter(robots(folder).items()))
+    nodes = {"machine_sim": simulators([space], folder, 0.001)[0]} | {
+        name: node(name, parameters=(f"mechanism:={file}",), remap=(f"__ns:=/{space}",))
+        for name in ("delta_dynamics", "command_gate")
     }
     try:
         other.until(lambda: len(watch.values) >= 3, "diagnostics of three nodes")
@@ -221,6 +226,7 @@ def kilohertz(other: Peer, seconds: float) -> bool:
     finally:
         for process in nodes.values():
             process.close()
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def stops(other: Peer, times: int, *, one: bool) -> bool:
@@ -233,18 +239,22 @@ def stops(other: Peer, times: int, *, one: bool) -> bool:
         watch.gate(topic)
     extra = patient(files, folder)
     launch_of = launched_alone if one else launched
-    running = [*simulators(files, 0.004)]
+    running = [*simulators(files, folder, 0.004)]
     ends: Counter[str] = Counter()
     try:
         for _ in range(times):
             watch.commands.clear()
+            watch.messages.clear()
             running.append(launch := launch_of(files, extra))
             other.until(
                 lambda: (
                     len(watch.commands) == len(topics)
                     and all(any(command) for command in watch.commands.values())
                 ),
-                lambda: f"torques through the gates\n{launch.output[-2000:]}",
+                lambda: (
+                    f"torques through the gates; commands {watch.commands}, nodes "
+                    f"{watch.messages}\n{launch.output[-2000:]}"
+                ),
             )
             other.spin(random.uniform(0.5, 1.5))
             count = len(_children(launch))
