@@ -57,6 +57,11 @@ class GuardedNode(ParameterNode):
             "queue_depth", 1000, "messages of a topic that can wait for the node",
             low=1, high=100_000, read_only=True,
         )  # fmt: skip
+        self.thread_priority: int = self.declare(
+            "thread_priority", 0,
+            "real-time priority (SCHED_FIFO) of the process, with its memory locked; 0: none",
+            low=0, high=99, read_only=True,
+        )  # fmt: skip
         # The diagnostics run on the steady clock: they have to tell that the ROS clock stands.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
 

@@ -58,6 +58,8 @@ class Health:
         self.statistics: dict[str, TopicStatistics] = {}
         self.awaited: list[str] = []
         """Topics of which the diagnostics warn until the first message."""
+        self.limitations: list[str] = []
+        """What the node was asked for at start and could not have."""
         self._logged: dict[str, float] = {}
         self._last_exception = ""
         self._last_kind = ""
@@ -127,6 +129,7 @@ class Health:
         found: list[tuple[bytes, str]] = []
         if self.seen["exceptions"]:
             found.append((ERROR, f"a callback raised an exception: {self._last_kind}"))
+        found += [(WARN, text) for text in self.limitations]
         self._look()
         found += [
             (WARN, f"another node on {topic} has an incompatible {text}")

@@ -20,6 +20,7 @@ from pkm_twin.errors import PkmTwinError, plain_warnings
 from pkm_twin.ros.context import middleware_arguments
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.parameters import UnknownParametersError
+from pkm_twin.ros.priority import set_priority
 from pkm_twin.ros.signals import NodeSignals, ignore_signals
 from pkm_twin.threads import one_blas_thread
 
@@ -64,6 +65,18 @@ class _Executor:
         self._executor.shutdown()
 
 
+def _prioritise(nodes: Sequence[TwinNode]) -> None:
+    """The highest priority that a node asks for is the process's; without permission it runs on."""
+    node = max(nodes, key=lambda n: n.thread_priority)
+    if node.thread_priority:
+        try:
+            set_priority(node.thread_priority)
+        except OSError as error:
+            text = f"thread_priority: {node.thread_priority} is not possible here: {error}"
+            node.health.limitations.append(text)
+            node.get_logger().warning(text)
+
+
 def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = None) -> int:
     """Run a node, or several in one executor, until SIGINT, SIGTERM or SIGHUP.
 
@@ -89,6 +102,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
                 for factory in factories:
                     nodes.append(factory())
             one_blas_thread()
+            _prioritise(nodes)
             # What is loaded by now stays: the collector need not look at it again.
             gc.collect()
             gc.freeze()

@@ -16,7 +16,7 @@ from typing import Any, Final
 from pkm_twin.apps.nodes import MODULES
 from pkm_twin.streams.settings import Setting
 
-COMMON: Final = ("autostart", "executor", "queue_depth")
+COMMON: Final = ("autostart", "executor", "queue_depth", "thread_priority")
 """Parameters of every node, in a table of their own."""
 GIVEN: Final = {"command_gate": ("on_stop:=gravity",)}
 """Without it the gate has no payload."""
