@@ -2,6 +2,7 @@
 """A cell for a while: two machines with all nodes and a recorder; one machine at 1 kHz; Ctrl-C.
 
     python3 tools/cell_trial/soak.py [--minutes 10] [--stops 20] [--part cell|kilohertz|stops|one]
+        [--composed] [--priority 50]
 
 cell: cell.launch.py with all nodes and gates of two machines, a machine_sim for each at 250 Hz, and
 `ros2 bag record`. kilohertz: one machine's delta_dynamics, command_gate and machine_sim. stops: how
@@ -89,13 +90,19 @@ def robots(folder: Path, factor: float = 1.0) -> dict[str, Path]:
     return files
 
 
-def simulators(spaces: Iterable[str], folder: Path, period: float) -> list[Process]:
+def simulators(
+    spaces: Iterable[str], folder: Path, period: float, priority: int = 0
+) -> list[Process]:
     """A machine for each namespace, moved by the efforts of its gate."""
     files = robots(folder, SIMULATED)
     return [
         node(
             "machine_sim",
-            parameters=(f"mechanism:={files[space]}", f"period:={period}"),
+            parameters=(
+                f"mechanism:={files[space]}",
+                f"period:={period}",
+                f"thread_priority:={priority}",
+            ),
             remap=(f"__ns:=/{space}", f"~/commands:=/{space}/command_gate/commands"),
         )
         for space in spaces
@@ -120,16 +127,22 @@ def launched_alone(files: dict[str, Path], *extra: str) -> Process:
     )  # fmt: skip
 
 
-def patient(spaces: Iterable[str], folder: Path) -> str:
-    """An argument of a launch: torques flow on a busy machine, too."""
-    given = {"delta_dynamics": {"stale_after": 1.0}, "command_gate": {"deadline": 1.0}}
-    file = folder / "patient.yaml"
+PATIENT: dict[str, dict[str, float]] = {
+    "delta_dynamics": {"stale_after": 1.0},
+    "command_gate": {"deadline": 1.0},
+}
+"""Torques flow on a busy machine, too."""
+
+
+def parameters(spaces: Iterable[str], folder: Path, given: dict[str, dict[str, Any]]) -> str:
+    """An argument of a launch: parameters by a node's name, in each namespace."""
+    file = folder / "parameters.yaml"
     file.write_text(
         yaml.safe_dump(
             {
-                f"/{space}/{name}": {"ros__parameters": dict(parameters)}
+                f"/{space}/{name}": {"ros__parameters": dict(values)}
                 for space in spaces
-                for name, parameters in given.items()
+                for name, values in given.items()
             }
         )
     )
@@ -176,18 +189,20 @@ def _children(process: Process) -> dict[str, int]:
     return found
 
 
-def cell(other: Peer, seconds: float, extra: tuple[str, ...]) -> bool:
-    """Two machines at 250 Hz and a recorder."""
+def cell(other: Peer, seconds: float, extra: tuple[str, ...], priority: int) -> bool:
+    """Two machines at 250 Hz and a recorder; what torques pass through has the priority."""
     watch = Watch(other)
     folder = Path(tempfile.mkdtemp())
     bag = folder / "bag"
     files = robots(folder)
-    sims = simulators(files, folder, 0.004)
-    cell_ = launched(files, *extra)
+    sims = simulators(files, folder, 0.004, priority)
+    path = ("delta_dynamics", "command_gate")
+    given = {name: {"thread_priority": priority} for name in path}
+    cell_ = launched(files, parameters(files, folder, given), *extra)
     topics = [f"/{s}/{t}" for s in MACHINES for t in ("joint_states", "wrench")]
     recorder = Process("ros2", "bag", "record", "--storage", "mcap", "-o", str(bag), *topics)
     try:
-        names = [f"/{s}/{n}" for s in MACHINES for n in ("delta_dynamics", "command_gate")]
+        names = [f"/{s}/{n}" for s in MACHINES for n in path]
         other.until(
             lambda: all(name in watch.values for name in names), lambda: f"nodes\n{cell_.output}"
         )
@@ -210,13 +225,14 @@ def cell(other: Peer, seconds: float, extra: tuple[str, ...]) -> bool:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def kilohertz(other: Peer, seconds: float) -> bool:
+def kilohertz(other: Peer, seconds: float, priority: int) -> bool:
     """delta_dynamics, gate and machine_sim of one machine at 1 kHz."""
     watch = Watch(other)
     folder = Path(tempfile.mkdtemp())
     space, file = next(iter(robots(folder).items()))
-    nodes = {"machine_sim": simulators([space], folder, 0.001)[0]} | {
-        name: node(name, parameters=(f"mechanism:={file}",), remap=(f"__ns:=/{space}",))
+    given = (f"mechanism:={file}", f"thread_priority:={priority}")
+    nodes = {"machine_sim": simulators([space], folder, 0.001, priority)[0]} | {
+        name: node(name, parameters=given, remap=(f"__ns:=/{space}",))
         for name in ("delta_dynamics", "command_gate")
     }
     try:
@@ -237,7 +253,7 @@ def stops(other: Peer, times: int, *, one: bool) -> bool:
     topics = {space: f"/{space}/command_gate/commands" for space in files}
     for topic in topics.values():
         watch.gate(topic)
-    extra = patient(files, folder)
+    extra = parameters(files, folder, PATIENT)
     launch_of = launched_alone if one else launched
     running = [*simulators(files, folder, 0.004)]
     ends: Counter[str] = Counter()
@@ -287,6 +303,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--stops", type=int, default=20)
     parser.add_argument("--composed", action="store_true", help="cell: with composed:=true")
+    parser.add_argument("--priority", type=int, default=0, help="cell, kilohertz: thread_priority")
     parser.add_argument("--part", choices=PARTS, action="append")
     given = parser.parse_args()
     parts: Any = given.part or PARTS
@@ -295,9 +312,9 @@ def main() -> int:
     for part in parts:
         with peer() as other:
             if part == "cell":
-                good &= cell(other, 60.0 * given.minutes, extra)
+                good &= cell(other, 60.0 * given.minutes, extra, given.priority)
             elif part == "kilohertz":
-                good &= kilohertz(other, 60.0 * given.minutes)
+                good &= kilohertz(other, 60.0 * given.minutes, given.priority)
             else:
                 good &= stops(other, given.stops, one=part == "one")
     return 0 if good else 1
