@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array
+
 States = NDArray[np.int8]
 """By row: 0 a force that holds the row, 1 the greatest force, -1 the least one."""
 

@@ -16,12 +16,9 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import SearchError
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 RESOLUTION: Final = 1e-6
 """How much lower, of itself, a value may be that is not looked for."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.isolation import ContactLocator, ContactPlace
 from delta_dynamics.noise import AVERAGED, Noise
@@ -23,13 +22,11 @@ from delta_dynamics.uncertainty import (
     usual_effort,
 )
 from delta_dynamics.virtual_work import mass_matrix
-from pkm_twin.codegen.arrays import later, one_vector
+from pkm_twin.codegen.arrays import Array, later, one_vector
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import RELEASE, DriveWatch
 from pkm_twin.streams.rest import RestWatch
-
-Array = NDArray[np.float64]
 
 SIGMAS: Final = 6.0
 """Standard deviations of model and noise together that are a contact."""

@@ -12,16 +12,15 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics.reactions import Balance, Reactions, balance, known_alone
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import reaction_directions
 from pkm_twin.machine.graph import BASE, Joint
 from pkm_twin.machine.members import Beam, Section
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 SOFT: Final = 1e-9
 """Part of the largest energy of a self-stress below which another stores none."""

@@ -10,11 +10,11 @@ from operator import gt
 from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.rest import friction_reach, moving_rates
 from delta_dynamics.settings import LimitPolicy, Settings
 from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.reading import (
@@ -31,8 +31,6 @@ from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, rate_doubt
 from pkm_twin.streams.wrench import counting
-
-Array = NDArray[np.float64]
 
 STOPPING: Final = ("non-finite result", "singular", "jump", "no wrench")
 """Reasons for which one sample stops the stream: it is none that the model describes."""

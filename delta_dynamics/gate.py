@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.reading import JointReader
@@ -22,8 +22,6 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.settings import COUNT, FUTURE, LATE, SECONDS, setting
 from pkm_twin.streams.wrench import counting
-
-Array = NDArray[np.float64]
 
 OnStop = Literal["zeros", "gravity"]
 

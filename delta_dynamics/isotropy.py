@@ -18,18 +18,16 @@ import itertools
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics.cones import largest
 from delta_dynamics.least_form import least_direction
 from delta_dynamics.terms import frictionless
 from delta_dynamics.virtual_work import body_mass_matrix, mass_matrix
-from pkm_twin.codegen.arrays import doubles, finite, vectors
+from pkm_twin.codegen.arrays import Array, doubles, finite, vectors
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.pose_grid import zero_torsion
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 ENERGY: Final = 100.0
 """The platform's kinetic energy in the paper's equation 48, J."""

@@ -12,11 +12,9 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.cones import largest, lowest
-
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array
 
 _STARTS: Final = 256
 """Directions that a descent begins from, best first, where no solution in closed form is known."""

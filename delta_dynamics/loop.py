@@ -3,14 +3,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from delta_dynamics.virtual_work import torques
 from pkm_twin.codegen.kernels import BoundCall
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class TorqueLoop:

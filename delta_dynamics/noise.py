@@ -6,9 +6,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array
 
 AVERAGED: Final = 1.0
 """Time over which the noise is averaged, s."""

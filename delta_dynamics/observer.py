@@ -6,13 +6,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
-from pkm_twin.codegen.arrays import finite, later, one_vector, vectors
+from pkm_twin.codegen.arrays import Array, finite, later, one_vector, vectors
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 RANK: Final = 1e-9
 """Singular values below this share of the greatest are directions that the joints do not feel."""

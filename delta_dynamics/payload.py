@@ -9,19 +9,16 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.noise import Noise
 from delta_dynamics.regressor import PAYLOAD, parameter_names, regressor
 from delta_dynamics.rest import LoadShare, beyond_friction, friction_reach, moving_rates
 from delta_dynamics.virtual_work import inverse_dynamics
-from pkm_twin.codegen.arrays import later, one_vector
+from pkm_twin.codegen.arrays import Array, later, one_vector
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import DriveWatch
 from pkm_twin.streams.rest import RestWatch
-
-Array = NDArray[np.float64]
 
 FOUND: Final = ("mass", "mx", "my", "mz")
 """What is estimated: mass and first moments about the platform's reference point."""

@@ -12,14 +12,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.equations import Terms
 from delta_dynamics.resistance import Law, Resistance
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 CHANGES: Final = 60
 """Changes of what sticks or slides in a step that are followed one by one."""

@@ -11,19 +11,15 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 
 from delta_dynamics.complementarity import States, first_fall, independent, resisting
 from delta_dynamics.equations import Equations, Terms
 from delta_dynamics.exponential import Stepper, damped, undamped
+from pkm_twin.codegen.arrays import Array, Indices, Mask
 from pkm_twin.machine.friction import bounds, friction_values, parts, potential
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 
 STILL: Final = 1e-12
 """Rate that is none, part of what the joints add to it."""
@@ -41,7 +37,7 @@ class Law:
 
     pull: Array
     """Constant dry friction of all rows, shape (n + k,)."""
-    still: Flags
+    still: Mask
     """Rows that do not move, shape (n + k,)."""
     slides: Indices
     signs: Array
@@ -332,7 +328,7 @@ class Resistance:
 
     def change(
         self, here: Terms, end: Terms, law: Law, span: float, exact: float
-    ) -> tuple[float, Flags | None]:
+    ) -> tuple[float, Mask | None]:
         """When a law ends, s after its start, and by which signals; the span and None: it lasts.
 
         Signals fall to zero where it ends: distances of joints to their stops above and below,
@@ -390,7 +386,7 @@ class Resistance:
         rates = np.abs(rows) @ np.abs(here.qd) + span * own
         return STILL * np.concatenate([q, q, rates, force, force])
 
-    def settle(self, end: Terms, law: Law, hit: Flags | None, passed: bool) -> Terms:
+    def settle(self, end: Terms, law: Law, hit: Mask | None, passed: bool) -> Terms:
         """The state at a part's end: what came to rest rests, a joint at a stop stands there.
 
         :param hit: the signals that have ended the law.

@@ -10,15 +10,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.friction import LoadDependent, friction_values, load_of, parts
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 SLOW: Final = 1e-6
 """A rate that is of one sign and nothing else, rad/s or m/s."""
@@ -82,12 +79,12 @@ class LoadShare:
         return effort - share * np.abs(load) * way, holds
 
 
-def moving_rates(qd: Array, still: Flags, reach: Array) -> Array:
+def moving_rates(qd: Array, still: Mask, reach: Array) -> Array:
     """Rates (..., n) with those of joints at rest zero where the joint has dry friction."""
     return np.where(still & (reach > 0.0), 0.0, qd)
 
 
-def beyond_friction(residual: Array, still: Flags, reach: Array) -> Array:
+def beyond_friction(residual: Array, still: Mask, reach: Array) -> Array:
     """What friction of joints at rest does not explain of residuals (..., n), N m or N."""
     slack = np.where(still, reach, 0.0)
     return np.asarray(np.sign(residual) * np.maximum(np.abs(residual) - slack, 0.0), np.float64)

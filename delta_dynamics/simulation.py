@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.plant import Plant
 from delta_dynamics.virtual_work import mass_matrix
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.messages.reading import MAX_RATE, JointReader, as_message_error, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
@@ -25,7 +25,6 @@ from pkm_twin.streams.path import JointPath
 from pkm_twin.streams.settings import setting
 from pkm_twin.streams.wrench import counting
 
-Array = NDArray[np.float64]
 OnSilence = Literal["zeros", "hold"]
 
 SINGULAR: Final = 1e-3

@@ -6,13 +6,12 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics.derivatives import torque_effects
 from delta_dynamics.virtual_work import inverse_dynamics, mass_matrix
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 MASSES: Final = 0.015
 """Default standard deviation of what masses need, as a share of gravity's, inertia's and the

@@ -19,17 +19,14 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pkm_twin.codegen.arrays import one_vector
+from pkm_twin.codegen.arrays import Array, Indices, one_vector
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.settings import setting
 from stiffness_monitor.compliance import strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from stiffness_monitor.response import element_response
-
-Array = NDArray[np.float64]
 
 LEAST_SAMPLES: Final = 20
 """Fewer loaded ones tell nothing."""
@@ -133,7 +130,7 @@ class _Window:
     (k, d, c + d). ``residual``: measured less predicted, (k, d). ``prior``: (c + d,), of both.
     """
 
-    owner: NDArray[np.intp]
+    owner: Indices
     reach: Array
     rest: Array
     carried: Array

@@ -13,13 +13,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.members import Section
 from stiffness_monitor.frame import PLANES, Frame, bent, deformations, rigid_offset
 from stiffness_monitor.structure import RigidBody, StructuralModel
-
-Array = NDArray[np.float64]
 
 
 @lru_cache(maxsize=64)

@@ -18,11 +18,11 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.vibration import ToolModes, tool_modes
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 SHARE: Final = 0.01
@@ -117,7 +117,7 @@ class Lobes:
 
     speeds: Array
     depths: Array
-    open: NDArray[np.bool_]
+    open: Mask
     safe: float
 
     @property

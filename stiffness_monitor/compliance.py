@@ -15,14 +15,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.arrays import doubles, vectors
+from pkm_twin.codegen.arrays import Array, Mask, doubles, vectors
 from pkm_twin.codegen.code import NOT_FINITE
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import SingularityError
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.programs import NONE, PARTS, elastic_of
-
-Array = NDArray[np.float64]
 
 HELD: Final = 1e-10
 """Least measure of a frame that holds: it goes with the square of the way to where it does not."""
@@ -52,7 +50,7 @@ class PlatformResponse:
     total: Array | float
     deflection: Array
     dominant: str | NDArray[np.str_]
-    tie: bool | NDArray[np.bool_]
+    tie: bool | Mask
 
 
 StrainEnergy = PlatformResponse

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pkm_twin.codegen.arrays import doubles, finite, vectors
+from pkm_twin.codegen.arrays import Array, Mask, doubles, finite, vectors
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 REACH: Final = 0.02
 """Directions in which the joints move the tool point less than this share of their best are left
@@ -32,7 +30,7 @@ class Correction:
     offset: Array
     before: Array
     left: Array
-    bounded: NDArray[np.bool_]
+    bounded: Mask
 
 
 def setpoint_correction(

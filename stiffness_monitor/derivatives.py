@@ -9,8 +9,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.gradients import gradient_program
@@ -20,8 +21,6 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import compliance
 from stiffness_monitor.numbers import numbers_of
 from stiffness_monitor.programs import NONE, Elastic, Solved, elastic_of
-
-Array = NDArray[np.float64]
 
 Write = Callable[[Solved], Program]
 Chosen = tuple[int, ...] | None

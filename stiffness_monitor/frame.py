@@ -19,8 +19,8 @@ from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.lu import independent_rows, is_zero
 from pkm_twin.machine.graph import BASE
 from stiffness_monitor.structure import (
@@ -32,7 +32,6 @@ from stiffness_monitor.structure import (
     Support,
 )
 
-Array = NDArray[np.float64]
 Row = dict[int, Any]
 """Entries of a linear form of the coordinates that are not zero."""
 

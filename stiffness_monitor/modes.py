@@ -12,14 +12,13 @@ from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 from stiffness_monitor.beams import System, assemble
 from stiffness_monitor.structure import structural_model
-
-Array = NDArray[np.float64]
 
 ELEMENTS: Final = 8
 """Beam elements a member: the first six frequencies of the shipped robots to 0.1 %."""

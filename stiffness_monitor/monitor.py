@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import WrenchSample, as_message_error
 from pkm_twin.messages.stamps import SECOND
@@ -17,7 +17,6 @@ from pkm_twin.streams.pairing import PairingCore
 from pkm_twin.streams.wrench import Mount, Recent, WrenchSettings
 from stiffness_monitor.compliance import PlatformResponse, platform_response
 
-Array = NDArray[np.float64]
 Settings = WrenchSettings
 """How the node pairs and accepts messages."""
 

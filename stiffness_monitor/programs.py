@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.expressions import GEOMETRY, absolute, maximum, minimum, sqrt
@@ -30,8 +29,6 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.frame import PLATFORM, Column, Frame, Row, bent, combined
 from stiffness_monitor.numbers import numbers_of, pattern_of, structure_on
 from stiffness_monitor.structure import FREE, plan_of, posed
-
-Array = NDArray[np.float64]
 
 PARTS: Final = 4
 """Parts that a member is divided into where its deflection is drawn."""

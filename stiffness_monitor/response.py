@@ -17,16 +17,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pkm_twin.codegen.arrays import one_vector, vectors
+from pkm_twin.codegen.arrays import Array, Indices, one_vector, vectors
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import platform_response
 from stiffness_monitor.frame import PLATFORM
 from stiffness_monitor.programs import NONE, elastic_of
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,9 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import maximum, reference, references, sign, sqrt
 from pkm_twin.kinematics.motion import reaction_directions
 from pkm_twin.machine.graph import BASE, Graph, Joint
@@ -29,7 +30,6 @@ from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.robot.outline import Posture
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Vector = Any
 """In a plan the body and the vector at home, in a pose three numbers or expressions."""
 Turn = Callable[[str, Array], Any]

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_effects
-
-Array = NDArray[np.float64]
 
 
 def compliance_deviation(robot: Robot, pose: ArrayLike) -> Array:

@@ -14,13 +14,12 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.arrays import one_vector
+from pkm_twin.codegen.arrays import Array, one_vector
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.frame import rigid_offset
 from stiffness_monitor.modes import ELEMENTS, frame_system, solve_modes, stiffness_root
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 COUNT: Final = 24

@@ -8,9 +8,6 @@ from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.messages.reading import shown
 from pkm_twin.messages.stamps import SECOND, StampRules
@@ -19,8 +16,6 @@ from pkm_twin.streams.deflection import DeflectionSample, in_base_axes, read_def
 from pkm_twin.streams.wrench import Recent, check_order, counting
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessAlarm
 from stiffness_monitor.monitor import Answer
-
-Array = NDArray[np.float64]
 
 WAITING: Final = 64
 """Deflections that wait for the wrench after them; of more the latest by their stamps go."""

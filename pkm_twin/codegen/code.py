@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen import cache
-from pkm_twin.codegen.arrays import doubles
+from pkm_twin.codegen.arrays import Array, doubles
 from pkm_twin.codegen.parts import in_parts
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
-from pkm_twin.codegen.rooms import Array, Space, aligned, caller, take_none
+from pkm_twin.codegen.rooms import Space, aligned, caller, take_none
 
 SWITCH: Final = "PKM_TWIN_PLAIN"
 """Set to 1: plain Python, as on a machine without llvmlite."""

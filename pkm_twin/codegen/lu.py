@@ -6,12 +6,10 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Objects
 from pkm_twin.errors import SingularityError
-
-Array = NDArray[np.float64]
 
 ZERO: Final = 1e-13
 """Part of the largest entry below which one is zero in all states: rounding left it."""

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.expressions import GEOMETRY, OPERATIONS, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.program import (
     CHANGE,
@@ -27,8 +27,6 @@ from pkm_twin.codegen.program import (
     ahead,
     progress,
 )
-
-Array = NDArray[np.float64]
 
 _LONGEST: Final = 200
 """Characters of an expression that is written into another one."""
@@ -247,7 +245,7 @@ class PlainCode:
 
     def _solve_many(
         self, named: dict[str, Any], count: int, steps: int
-    ) -> tuple[Array, NDArray[np.bool_], Array]:
+    ) -> tuple[Array, Mask, Array]:
         q = self.program.equations
         assert q is not None and self._correction is not None  # noqa: S101
         correction, goal = self._correction[1], named[q.target]

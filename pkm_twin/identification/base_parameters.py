@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics.regressor import (
     DRIVE,
@@ -24,10 +24,9 @@ from delta_dynamics.regressor import (
     parameter_values,
     regressor,
 )
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.schema import frozen
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 RANK: Final = 1e-8
 """Least pivot, of columns of norm one, that counts."""

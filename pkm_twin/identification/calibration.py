@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.design import programs
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
@@ -56,8 +56,6 @@ from pkm_twin.robot.derivatives import geometry_numbers
 from pkm_twin.robot.entries import entries, with_entries
 from pkm_twin.robot.numbers import file_numbers
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 MOVES: Final = 1e-6
 """A number that moves the platform less than this, per unit, is no number of the geometry."""
@@ -245,7 +243,7 @@ def _place(state: State) -> Fault:
     return place_fault(tool.place, tool.frame.as_rotvec())
 
 
-def _learnt(poses: Poses) -> NDArray[np.bool_]:
+def _learnt(poses: Poses) -> Mask:
     """Which poses are learnt from."""
     return np.asarray(np.arange(len(poses.joints)) % HELD_OUT != HELD_OUT - 1)
 

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, one_line
 from pkm_twin.identification.calibration_state import FRAME, TARGET
 from pkm_twin.identification.robust import OUTLIER, Weighed, distances
-
-Array = NDArray[np.float64]
 
 WRONG: Final = 0.02
 """Part of the machine's size that no fit may leave over: such poses are not its own."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.calibration_state import (
     FRAME,
@@ -24,8 +24,6 @@ from pkm_twin.identification.robust import Weighed, weighed
 from pkm_twin.identification.transmission import by_map
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 KNOWN: Final = 0.5
 """A parameter whose deviation stays above this part of its prior one was not observed."""

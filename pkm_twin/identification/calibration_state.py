@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.transmission import centred, changed
@@ -19,7 +19,6 @@ from pkm_twin.robot.robot import Robot
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
-Array = NDArray[np.float64]
 
 FRAME: Final = tuple(f"frame.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 TARGET: Final = ("target.x", "target.y", "target.z")
@@ -45,7 +44,7 @@ class Poses:
     position: Array
     rotation: Array | None = None
 
-    def part(self, rows: NDArray[np.bool_]) -> Poses:
+    def part(self, rows: Mask) -> Poses:
         """Some of them."""
         turned = None if self.rotation is None else self.rotation[rows]
         return Poses(self.joints[rows], self.position[rows], turned)

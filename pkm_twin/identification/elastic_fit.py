@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.elastic_verdict import elastic_verdict, put_right
 from pkm_twin.identification.estimation import Estimate, estimate
@@ -24,8 +24,6 @@ from pkm_twin.identification.verdict import Verdict
 from pkm_twin.machine.shared import above_zero
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.response import ElementResponse, element_response
-
-Array = NDArray[np.float64]
 
 AXES: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
 """Directions of a deflection, as the columns of a table call them: m, then rad."""
@@ -111,7 +109,7 @@ class ElasticFit:
     groups: tuple[Group, ...]
     judged: tuple[Judged, ...]
     zeros: Array
-    measured: NDArray[np.bool_]
+    measured: Mask
     samples: int
     told: int
     """How many combinations of factors are known."""
@@ -131,7 +129,7 @@ class _Part:
 
     recording: Deflected
     response: ElementResponse
-    measured: NDArray[np.bool_]
+    measured: Mask
 
     @property
     def split(self) -> int:

@@ -11,15 +11,14 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.estimation import Estimate
 from pkm_twin.identification.judge import Evidence, judge
 from pkm_twin.identification.verdict import Suspect, Verdict
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.response import ElementResponse
 
-Array = NDArray[np.float64]
 Model = tuple[ElementResponse, Array, Array]
 """The elements in the poses of a recording; its joints (k, n) and wrenches (k, 6)."""
 

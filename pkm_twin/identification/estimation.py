@@ -15,11 +15,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, install
 
-Array = NDArray[np.float64]
 Cones = Sequence[tuple[slice, Array]]
 
 HUBER: Final = 1.5

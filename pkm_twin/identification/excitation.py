@@ -13,17 +13,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.regressor import regressor
 from delta_dynamics.virtual_work import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.base_parameters import independent, random_states
 from pkm_twin.identification.file_parameters import FileParameters
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import reachable
-
-Array = NDArray[np.float64]
 
 SAMPLES: Final = 120
 """States of a trial at which the information is taken."""

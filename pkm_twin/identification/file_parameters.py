@@ -9,15 +9,13 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.regressor import TEN, parameter_names
 from delta_dynamics.virtual_work import mass_matrix
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.inertia import transport
 from pkm_twin.machine.shared import KINDS, Kind, Shared
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

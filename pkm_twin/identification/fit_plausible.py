@@ -9,8 +9,8 @@ from itertools import combinations, product
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.file_parameters import FileParameters
 from pkm_twin.identification.fit_rows import Recorded, Rows, calm_table, rows_of
@@ -18,8 +18,6 @@ from pkm_twin.identification.plausible import Problem, Retold, fault_of
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 OFFSET: Final = 0.1
 """Part of the efforts that a current sensor is off by."""

@@ -8,9 +8,9 @@ from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import NDArray
 
 from delta_dynamics.regressor import law_columns, law_keys, parameter_values, regressor
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.file_parameters import FileParameters
@@ -34,8 +34,6 @@ from pkm_twin.identification.samples import (
 from pkm_twin.machine.friction import linear_keys
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.rest import SIGMAS
-
-Array = NDArray[np.float64]
 
 BLOCK: Final = 2048
 OUTLIER: Final = 8.0
@@ -95,7 +93,7 @@ class Rows:
         cut = ("time", "table", "target", "rest", "counts", "change")
         return replace(self, **{name: getattr(self, name)[rows] for name in cut})
 
-    def only(self, columns: NDArray[np.bool_], values: Array) -> Rows:
+    def only(self, columns: Mask, values: Array) -> Rows:
         """With some of the parameters, the others at these values, (parameters,)."""
         stay = self.table[..., ~columns] @ values[~columns]
         return replace(
@@ -264,7 +262,7 @@ def _columns(
     return own, rest
 
 
-def _of_drives(robot: Robot, parameters: FileParameters) -> NDArray[np.bool_]:
+def _of_drives(robot: Robot, parameters: FileParameters) -> Mask:
     """Which parameters are friction of the drives."""
     keys, drives = linear_keys(robot.laws), set(robot.joint_names)
     pairs = [name.rpartition(".")[::2] for name in parameters.names]

@@ -9,13 +9,12 @@ from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.samples import DEGREE, Filtering, Track, low_pass
 from pkm_twin.identification.verdict import Suspect
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Efforts = Callable[[Array, Array, Array], Array]
 """Of positions, rates and accelerations (k, n) at the rows of a recording, shape (k, n)."""
 

@@ -8,13 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.file_parameters import FileParameters
 from pkm_twin.identification.fit_rows import LATE, Rows, prior_scales
-
-Array = NDArray[np.float64]
 
 HELD_OUT: Final = 1 / 3
 """Part of each recording, its end, that is judged and not fitted."""

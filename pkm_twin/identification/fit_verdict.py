@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.identification.file_parameters import FileParameters
 from pkm_twin.identification.fit_lengths import GEOMETRY, Lengths
 from pkm_twin.identification.fit_rows import Recorded, Rows, calm_table, efforts_of
@@ -26,8 +27,6 @@ from pkm_twin.identification.judge import SIGMAS, Evidence, judge
 from pkm_twin.identification.verdict import Finding, Suspect, Verdict
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 OF_THE_FILE: Final = {
     "friction": "friction other than the file's",
@@ -48,7 +47,7 @@ sensors, within their priors, take up three quarters."""
 
 def verdict_of(
     robot: Robot, recordings: Sequence[Recorded], everything: FileParameters,
-    chosen: NDArray[np.bool_], rows: Sequence[Rows], solved: Solved,
+    chosen: Mask, rows: Sequence[Rows], solved: Solved,
 ) -> Verdict:  # fmt: skip
     """Whether the fitted model explains its recordings.
 
@@ -148,7 +147,7 @@ class _Court:
 
     robot: Robot
     everything: FileParameters
-    chosen: NDArray[np.bool_]
+    chosen: Mask
     values: Array
     solved: Solved
     recordings: Sequence[_Recording]
@@ -160,7 +159,7 @@ class _Court:
         """Of all parameters of the file."""
         return np.array([group.kind for group in self.everything.groups for _ in group.names])
 
-    def judged(self, free: NDArray[np.bool_]) -> Verdict:
+    def judged(self, free: Mask) -> Verdict:
         """With some parameters free to explain the residual, the others as the file has them."""
         kinds, file = self.kinds, self.everything
         suspects = [*self.suspects]
@@ -197,7 +196,7 @@ class _Court:
             count += float(case.counts.sum())
         return square > RATE**2 and part > INERTIA**2 * count
 
-    def _evidence(self, i: int, free: NDArray[np.bool_]) -> Evidence:
+    def _evidence(self, i: int, free: Mask) -> Evidence:
         """Of one recording; the suspects' columns, then those of what is not free."""
         one = self.recordings[i]
         rows, effort = one.rows, one.rows.effort

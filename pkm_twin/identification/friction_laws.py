@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, UnknownNameError
 from pkm_twin.identification.file_parameters import file_parameters
 from pkm_twin.identification.fit import Fit, Number, fit
@@ -27,8 +27,6 @@ from pkm_twin.identification.samples import Filtering, low_pass, tracks
 from pkm_twin.machine.friction import BASIC, LAWS, taken
 from pkm_twin.machine.shared import KINDS, Kind
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 AUTO: Final = "auto"
 SPEEDS: Final = np.geomspace(0.01, 1.0, 17)

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-
-Array = NDArray[np.float64]
 
 LEVEL: Final = 0.05
 """Probability by chance below which a law with one number more is accepted."""

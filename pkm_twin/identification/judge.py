@@ -23,11 +23,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.verdict import Answer, Blind, Channel, Finding, Suspect, Verdict
-
-Array = NDArray[np.float64]
 
 SIGMAS: Final = 4.5
 """Standard deviations from which a suspect is a finding."""

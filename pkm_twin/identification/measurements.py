@@ -9,16 +9,13 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.identification.calibration_fit import derivatives
 from pkm_twin.identification.calibration_state import State
 from pkm_twin.identification.robust import CLEAR, FINEST
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
-Places = NDArray[np.intp]
 
 BELIEVED: Final = 4.0
 """Measurements that the usual noise of a kind counts for against the residuals."""
@@ -230,10 +227,10 @@ class Readings:
     """
 
     kind: Kind
-    first: Places
-    second: Places | None
+    first: Indices
+    second: Indices | None
     values: Array
-    lines: Places
+    lines: Indices
 
     def seen(self, state: State) -> tuple[Array, Array]:
         """Positions (m, 3), of pairs their differences, and rotations (m, 3, 3)."""
@@ -358,7 +355,7 @@ def left_over(slopes: Sequence[Array], noise: Sequence[float], prior: Array) -> 
 
 
 def partial_of(
-    joints: Array, second: Array | None, values: Mapping[str, Array], lines: Places,
+    joints: Array, second: Array | None, values: Mapping[str, Array], lines: Indices,
     noise: Mapping[str, float],
 ) -> Partial:  # fmt: skip
     """Measurements of a table: a value that is NaN was not measured.

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.calibration import Estimate, parameters_of
 from pkm_twin.identification.calibration_faults import (
     Outlier,
@@ -29,8 +29,6 @@ from pkm_twin.identification.robust import OUTLIER, Weighed
 from pkm_twin.identification.transmission import Transmission
 from pkm_twin.robot.entries import with_entries
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 SCALED: Final = 0.5
 """Part of its deviation before below which a scale is known; part of a number's variance from

@@ -19,7 +19,7 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array, Mask
 
 GOOD: Final = 0.015
 """Part of the efforts' variation that a sound model may leave."""
@@ -81,7 +81,7 @@ class Problem:
     high: Array
     prior: Array
     usual: Array
-    friction: NDArray[np.bool_]
+    friction: Mask
     counts: Array
     noise: Array
     period: float

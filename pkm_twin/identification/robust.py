@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array, Mask
 
 HUBER: Final = 1.5
 """Distance up to which a pose counts with its square."""
@@ -81,7 +80,7 @@ def weighed(parts: Sequence[Array], parameters: int, moved: Array | None = None)
     return Weighed(tuple(noise), np.asarray(weights, np.float64), whitening)
 
 
-def _whitening(residual: Array, drives: Array, good: NDArray[np.bool_]) -> Array:
+def _whitening(residual: Array, drives: Array, good: Mask) -> Array:
     """Of poses, (k, a, a), by the variances of the instrument and of the drives that are likeliest.
 
     :param residual: over the noise, (k, a). ``drives``: covariance by drives of variance one,

@@ -19,9 +19,8 @@ from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array
 
 DEGREE: Final = 4
 """Of the local polynomial."""

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.excitation import SHRINK, Bounds, Judge, clear, position_range
-
-Array = NDArray[np.float64]
 
 SPEEDS: Final = (1.0, 4.0, 16.0)
 """Of the sweeps, over the slowest."""

@@ -13,16 +13,14 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.fit_rows import Recorded, next_window
 from pkm_twin.identification.samples import low_pass, tracks
 from pkm_twin.machine.friction import all_keys
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 FIT: Final = "fit"
 KNOWN: Final = 0.1

@@ -13,13 +13,11 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 SHARED: Final = "joint_map.*.ratio"
 SURE: Final = 0.05

@@ -15,10 +15,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.places import keys_of
-
-Array = NDArray[np.float64]
 
 LINES: Final = 10
 INSIDE: Final = 0.8

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array
+
 Answer = Literal["explains", "explains partly", "does not explain"]
 Deviations = Literal["as estimated", "widened", "withheld"]
 

@@ -13,12 +13,13 @@ from typing import Final
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MobilityError, ParameterError
 from pkm_twin.kinematics.conditions import Condition, Conditions
 from pkm_twin.kinematics.iterations import RANK
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.spins import idle_bodies, null
-from pkm_twin.machine.graph import Array, Graph
+from pkm_twin.machine.graph import Graph
 
 TOLERANCES: Final = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 1e-2)
 """Deviations up to which conditions are made to hold, rad and parts of the machine's size."""

@@ -6,9 +6,8 @@ from __future__ import annotations
 import operator
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array
 
 
 def sphere_directions(count: int) -> Array:

@@ -15,6 +15,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -33,7 +34,7 @@ from pkm_twin.kinematics.programs import (
 )
 from pkm_twin.kinematics.scheme import Branch, Closed, Scheme
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import Array, Graph
+from pkm_twin.machine.graph import Graph
 
 _NO_PARAMETERS: Final = np.zeros(0)
 MET: Final = 1e-9

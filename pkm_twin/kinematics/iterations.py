@@ -10,9 +10,9 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array
+
 Look = Callable[[Array], tuple[Array, Array]]
 """Of a state the values, shape (rows,), and their derivatives, shape (rows, rates)."""
 Move = Callable[[Array, Array], Array]

@@ -12,10 +12,11 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers
 from pkm_twin.kinematics.iterations import RANK, newton
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
-from pkm_twin.machine.graph import Array, Graph
+from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.tree import Tree
 
 SAMPLES: Final = 6

@@ -7,10 +7,11 @@ import math
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import matrices, numbers
 from pkm_twin.kinematics.scheme import Scheme
-from pkm_twin.machine.graph import BASE, Array, Graph
+from pkm_twin.machine.graph import BASE, Graph
 
 
 def check_masses(scheme: Scheme, graph: Graph) -> None:

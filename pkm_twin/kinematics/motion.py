@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import (
     Numbers,
     Objects,
@@ -24,7 +25,7 @@ from pkm_twin.codegen.expressions import (
     snapped_all,
     sqrt,
 )
-from pkm_twin.machine.graph import BASE, Array, Direction, Joint, Rod
+from pkm_twin.machine.graph import BASE, Direction, Joint, Rod
 from pkm_twin.machine.joints import UNITS, Constraint, across, unit
 from pkm_twin.machine.tree import Link, Step, Tree
 

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects, atan2, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import Array, Rod
+from pkm_twin.machine.graph import Rod
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.tree import Link
 

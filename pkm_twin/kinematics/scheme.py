@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects
 from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
 from pkm_twin.errors import ParameterError
@@ -19,7 +20,7 @@ from pkm_twin.kinematics.linkage import Linkage, rank_of
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.machine.geometry import geometry_of, pattern_of
-from pkm_twin.machine.graph import Array, Graph
+from pkm_twin.machine.graph import Graph
 
 
 @dataclass(frozen=True, eq=False)

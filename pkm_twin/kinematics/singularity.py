@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.cholesky import traces_over
 from pkm_twin.codegen.expressions import Objects, maximum, minimum, norm, plain, sqrt
 from pkm_twin.codegen.kernels import Kernel
@@ -49,7 +50,7 @@ from pkm_twin.kinematics.motion import (
     numbers,
 )
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import BASE, Array, Graph, Rod
+from pkm_twin.machine.graph import BASE, Graph, Rod
 from pkm_twin.machine.tree import Tree
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.derivatives import adjoints
 from pkm_twin.codegen.expressions import GEOMETRY, Expression, Numbers, Objects, Tape, snapped_all
 from pkm_twin.codegen.lu import SparseLU
@@ -16,7 +17,6 @@ from pkm_twin.codegen.program import UNKNOWNS, Equations
 from pkm_twin.kinematics.motion import Motion, cross, matrices
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.geometry import graph_on
-from pkm_twin.machine.graph import Array
 from pkm_twin.machine.tree import Tree
 
 NO_NUMBERS: Final = np.zeros(0)

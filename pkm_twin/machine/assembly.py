@@ -11,17 +11,14 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.rotations import skew
 from pkm_twin.machine.urdf_file import Joint, Urdf
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 ROUNDS: Final = 100
 """Corrections of one closing, and steps towards the zeros."""

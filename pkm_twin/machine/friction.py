@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import absolute, cos, maximum, minimum, references, sign, sin
 from pkm_twin.errors import ParameterError
 
-Array = NDArray[np.float64]
 Values = Mapping[str, Any]
 """A law's parameters by key: a number, an expression or an array."""
 

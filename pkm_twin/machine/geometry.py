@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, plain, snapped
-from pkm_twin.machine.graph import Array, Graph, array
+from pkm_twin.machine.graph import Graph, array
 from pkm_twin.machine.tree import Tree
 
 

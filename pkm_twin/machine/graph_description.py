@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pkm_twin.machine.graph import Array, Body, Graph, Joint
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.machine.graph import Body, Graph, Joint
 from pkm_twin.machine.joints import TURN
 
 

@@ -9,14 +9,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.friction import all_keys
 from pkm_twin.machine.graph import Graph, array
 from pkm_twin.machine.graph_file import FrictionSpec, JointSpec, LimitSpec
 from pkm_twin.machine.sections import friction_of, limits_of
-
-Array = NDArray[np.float64]
 
 
 def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:

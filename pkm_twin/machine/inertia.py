@@ -12,9 +12,10 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.codegen.expressions import plain
 from pkm_twin.machine.friction import keys_of
-from pkm_twin.machine.graph import Array, Graph, Joint
+from pkm_twin.machine.graph import Graph, Joint
 from pkm_twin.machine.tree import Tree
 
 Objects = NDArray[Any]
@@ -138,7 +139,7 @@ class Layout:
         return slice(int(a), int(b))
 
     @property
-    def friction(self) -> NDArray[np.intp]:
+    def friction(self) -> Indices:
         """Indices of all friction that efforts are linear in, that of passive joints too."""
         starts, keys = self.starts, keys_of(self.tree.graph.laws).values()
         passive = np.arange(starts[8], starts[9])

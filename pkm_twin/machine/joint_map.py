@@ -22,12 +22,11 @@ from dataclasses import dataclass
 from typing import Any, NewType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 
-Array = NDArray[np.float64]
 ControllerNumbers = NewType("ControllerNumbers", np.ndarray[Any, np.dtype[np.float64]])
 """Joint numbers as a controller has them, shape (..., n), in the robot's order."""
 

@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import norm, plain, reference
-
-Array = NDArray[np.float64]
 
 UNITS: Final = np.eye(3)
 

@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import maximum, number, reference, sign, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
-
-Array = NDArray[np.float64]
 
 Place = tuple[str, Array]
 """A point of a body, given at home."""

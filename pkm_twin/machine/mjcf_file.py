@@ -15,16 +15,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, install, warn
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.rotations import about, from_quaternion
 from pkm_twin.machine.urdf_file import Joint, Link, Urdf
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
-
-Array = NDArray[np.float64]
 
 _ENDLESS: Final = re.compile(
     r"(?:^|\s)[-+]?(?:nan(?:\(\S*\))?|inf|infinity)(?:\s|$)", re.IGNORECASE

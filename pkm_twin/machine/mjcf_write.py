@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.simulated import Hung, hang, sound, split
 from pkm_twin.machine.urdf_write import (
     GROUND,
@@ -23,8 +23,6 @@ from pkm_twin.machine.urdf_write import (
     UrdfTree,
     number_text,
 )
-
-Array = NDArray[np.float64]
 
 TIMESTEP: Final = 1e-3
 """s."""

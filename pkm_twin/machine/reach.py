@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import BASE, Array, Graph
+from pkm_twin.machine.graph import BASE, Graph
 
 
 @dataclass(frozen=True, eq=False)

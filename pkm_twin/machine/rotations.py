@@ -6,9 +6,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from pkm_twin.codegen.arrays import Array
 
 
 def about(axis: Array, angle: ArrayLike) -> Array:

@@ -15,14 +15,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 
 MAX_SIZE: Final = 1e18
 """Beyond every quantity of a machine in SI units; products of such numbers stay finite."""
 
-Array = NDArray[np.float64]
 Check = Callable[[str, Any], Any]
 T = TypeVar("T")
 

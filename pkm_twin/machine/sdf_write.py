@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.simulated import hang, row_of
 from pkm_twin.machine.urdf_write import (
     GROUND,
@@ -25,8 +25,6 @@ from pkm_twin.machine.urdf_write import (
     number_text,
     rpy_along,
 )
-
-Array = NDArray[np.float64]
 
 VERSION: Final = "1.9"
 SMALL: Final = 1e-6

@@ -10,15 +10,11 @@ from dataclasses import dataclass
 from functools import cache as remembered
 from typing import Any, Final, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
 from pkm_twin.machine.friction import BASIC, all_keys, check_laws
 from pkm_twin.machine.graph import MIN_LENGTH
-
-Array = NDArray[np.float64]
 
 MAX_LENGTH: Final = 100.0
 MAX_MASS: Final = 1e5

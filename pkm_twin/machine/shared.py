@@ -15,8 +15,9 @@ from typing import Final, Literal
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.friction import all_keys
-from pkm_twin.machine.graph import Array, Body, Graph
+from pkm_twin.machine.graph import Body, Graph
 from pkm_twin.machine.inertia import TEN, matrix_of, ten_numbers, transport
 
 Kind = Literal["friction", "rotor", "payload", "inertia"]

@@ -10,12 +10,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.urdf_write import GROUND, UrdfBody, UrdfClosure, UrdfJoint, UrdfTree
-
-Array = NDArray[np.float64]
 
 SPECK: Final = 1e-12
 """Inertia that is added about every axis, part of the body's."""

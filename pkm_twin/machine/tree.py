@@ -15,14 +15,12 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import atan2, norm, plain, reference, snapped, snapped_all
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import BASE, Graph, rotation_about_z
 from pkm_twin.machine.joints import Freedom, across, unit
-
-Array = NDArray[np.float64]
 
 BALL: Final = (1.0, 0.0, 0.0, 0.0)
 FREE: Final = (*BALL, 0.0, 0.0, 0.0)

@@ -11,15 +11,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import urdf_loops, urdf_xml
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import UNLIMITED, Pose
-
-Array = NDArray[np.float64]
 
 _PLACES: Final = ("axis", "parent_axis", "child_axis")
 LARGE: Final = 10.0

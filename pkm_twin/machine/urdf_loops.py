@@ -15,15 +15,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.urdf_xml import Pose
-
-Array = NDArray[np.float64]
 
 CONSTRAINTS: Final = {
     **{name: name for name, kind in TYPES.items() if not kind.threaded()},

@@ -17,12 +17,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations
 from pkm_twin.machine.urdf_xml import UNLIMITED
-
-Array = NDArray[np.float64]
 
 GROUND: Final = "base_link"
 """The root link's name."""

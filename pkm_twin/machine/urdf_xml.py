@@ -14,14 +14,12 @@ from typing import Final
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.files import decimal
 from pkm_twin.machine import schema
 from pkm_twin.machine.rotations import from_rpy
-
-Array = NDArray[np.float64]
 
 MAX_FILE_SIZE: Final = 4 * 1024 * 1024
 """Largest URDF that is read, bytes."""

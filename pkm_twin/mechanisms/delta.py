@@ -25,8 +25,8 @@ from itertools import pairwise
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import (
     Expression,
     Numbers,
@@ -55,8 +55,6 @@ from pkm_twin.machine.shared import Key, Shared, above_zero, bar, point_mass, sh
 from pkm_twin.mechanisms.delta_file import Geometry, Inertia, Members
 from pkm_twin.robot.mechanism import Inverse
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 LIMBS: Final = ("I", "II", "III")
 MAX_ITERATIONS: Final = 12

@@ -5,15 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
 from pkm_twin.machine.members import Tube
 from pkm_twin.machine.sections import check_azimuths, length, mass
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

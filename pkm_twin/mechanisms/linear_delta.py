@@ -16,8 +16,8 @@ from functools import cached_property
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import cos, plain, sin, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
@@ -28,8 +28,6 @@ from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass
 from pkm_twin.machine.shared import Shared, point_mass, shared_number
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 LIMBS: Final = ("a", "b", "c")
 

@@ -35,8 +35,8 @@ from functools import cached_property
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import (
     Numbers,
     Objects,
@@ -69,8 +69,6 @@ from pkm_twin.machine.shared import (
 )
 from pkm_twin.robot.mechanism import Inverse
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
-
-Array = NDArray[np.float64]
 
 LIMBS: Final = ("I", "II", "III")
 

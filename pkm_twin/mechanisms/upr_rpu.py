@@ -31,8 +31,9 @@ from functools import cached_property
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import (
     Numbers,
     Objects,
@@ -59,8 +60,6 @@ from pkm_twin.machine.shared import Shared, shared_body, shared_number
 from pkm_twin.mechanisms.upr_rpu_file import Geometry, Inertia, JointsCompliance, Limits, Members
 from pkm_twin.robot.mechanism import Inverse
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 FAR: Final = 1e5
 """Longest limb over the machine's size; beyond, rounding would lose the pose, or overflow."""

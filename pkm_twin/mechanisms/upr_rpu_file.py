@@ -7,16 +7,12 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import MIN_LENGTH
 from pkm_twin.machine.members import compliances, modulus
 from pkm_twin.machine.sections import length, mass
-
-Array = NDArray[np.float64]
 
 FREE: Final = {
     "upr_revolute": (4,),

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.bags.cdr import MessageCodec
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.reading import COLUMNS, Ragged, TrajectoryFields
-
-Array = NDArray[np.float64]
 
 HEAD: Final = 4
 """Bytes of the encapsulation; everything is aligned from behind it."""

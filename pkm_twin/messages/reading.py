@@ -18,12 +18,11 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.machine.joint_map import ControllerNumbers, JointMap
 from pkm_twin.messages.stamps import MAX_DURATION, SECOND, StampRules, stamp_of
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 TINY: Final = sys.float_info.min
 """Smallest normal number: a value below it and not zero is a damaged one, not a measurement."""

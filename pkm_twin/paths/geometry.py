@@ -14,13 +14,13 @@ from typing import Final, Literal
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.pieces import Arc, Corner, Line, Piece, Smooth, arc_through
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Space = Literal["pose", "joint"]
 
 SHORTEST: Final = 1e-9
@@ -148,7 +148,7 @@ class _Lines:
 
     def __init__(
         self, robot: Robot, space: Space, points: Array, blends: Array, dwells: Array,
-        arcs: NDArray[np.bool_],
+        arcs: Mask,
     ) -> None:  # fmt: skip
         self.robot, self.space = robot, space
         self.points, self.blends, self.dwells, self.arcs = points, blends, dwells, arcs

@@ -18,11 +18,11 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.constraints import Limits, Rows
 from pkm_twin.paths.joint_path import JointPath
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 PROGRAMS: Final = 20

@@ -9,11 +9,9 @@ from typing import Protocol
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-
-Array = NDArray[np.float64]
 
 
 class Piece(Protocol):

@@ -18,9 +18,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.constraints import Rows
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 STEPS: Final = 50

@@ -19,14 +19,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics import mass_matrix
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 LEAST: Final = 2
 """Samples of a motion."""

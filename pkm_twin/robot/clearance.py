@@ -13,8 +13,9 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import maximum, minimum, sqrt
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -22,8 +23,6 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 _TINY = 1e-300
 

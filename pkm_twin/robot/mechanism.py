@@ -14,8 +14,9 @@ from functools import cached_property
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.kinematics.motion import Motion
@@ -43,7 +44,6 @@ from pkm_twin.machine.uncertainty import (
     causes_of,
 )
 
-Array = NDArray[np.float64]
 R = TypeVar("R", bound="Mechanism")
 
 

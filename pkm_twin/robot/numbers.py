@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.derivatives import tangents
 from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape, references
 from pkm_twin.codegen.plain import functions
@@ -22,8 +22,6 @@ from pkm_twin.machine.geometry import geometry_of
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.tree import Tree
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class FileNumbers:

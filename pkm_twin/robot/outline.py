@@ -13,11 +13,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 BAR: Final = 0.01
 """Radius of the bars that stand for bodies, per size of the machine; of rods the half."""

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.machine.graph import BASE
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 def passive_values(robot: Robot, q: ArrayLike) -> Array:
@@ -52,7 +51,7 @@ def passive_values(robot: Robot, q: ArrayLike) -> Array:
     return np.stack(values, -1)
 
 
-def within_passive_limits(robot: Robot, q: ArrayLike) -> NDArray[np.bool_]:
+def within_passive_limits(robot: Robot, q: ArrayLike) -> Mask:
     """Whether passive joints keep their limits, shape (...); a robot without any keeps them.
 
     :param q: joint positions with an assembly, shape (..., n).

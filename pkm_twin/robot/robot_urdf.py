@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import warn
 from pkm_twin.kinematics.passive import single_joints
 from pkm_twin.machine import schema
@@ -21,8 +21,6 @@ from pkm_twin.machine.sdf_write import write_sdf
 from pkm_twin.machine.urdf_write import MOCK, UrdfBody, UrdfDrive, UrdfTree, write_urdf
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.urdf_tree import urdf_tree
-
-Array = NDArray[np.float64]
 
 
 def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:

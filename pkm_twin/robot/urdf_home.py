@@ -15,12 +15,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics.conditions import Conditions
 from pkm_twin.kinematics.diagnosis import is_clear, is_right
 from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.kinematics.spins import hold, without_spins
-from pkm_twin.machine.assembly import EXACT, Array, Assembly
+from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.graph_file import graph_of_entries, written_out
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
@@ -18,8 +18,6 @@ from pkm_twin.machine.urdf_file import Joint, Link, Urdf
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
 from pkm_twin.robot.urdf_home import Home, HomeSearch
-
-Array = NDArray[np.float64]
 
 PLATFORMS: Final = (
     "platform",

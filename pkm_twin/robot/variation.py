@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.places import given
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Distribution = Literal["normal", "uniform"]
 
 MAX_SPREAD: Final = 0.3

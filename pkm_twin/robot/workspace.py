@@ -11,14 +11,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pkm_twin.codegen.arrays import doubles, vectors
+from pkm_twin.codegen.arrays import Array, Mask, doubles, vectors
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.passive_limits import within_passive_limits
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 RAYS: Final = 360
 """Rays of a circle about the axis."""

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.stream import stream_kernel
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 MAX_MOVE: Final = 0.25
 """Largest move between two samples, in platform radii: beyond it, another assembly is likely."""

@@ -10,13 +10,11 @@ import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import TINY
 from pkm_twin.messages.stamps import StampRules, stamp_of
-
-Array = NDArray[np.float64]
 
 MAX_SHIFT: Final = 0.1
 MAX_TURN: Final = 0.1

@@ -18,16 +18,14 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.expressions import Objects, Tape, sqrt
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.stamps import SECOND
-
-Array = NDArray[np.float64]
 
 LEAST_PIVOT: Final = 1e-4
 """Least diagonal entry of the normal equations' Cholesky factor; even stamps stay above 1e-2."""

@@ -14,10 +14,8 @@ from operator import sub
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from pkm_twin.codegen.arrays import Array, Mask
 
 FROZEN: Final = 0.1
 """Time without any change of the efforts after which they are no measurement, s."""
@@ -52,7 +50,7 @@ class DriveWatch:
         self._frozen, self.repeated = 0.0, 0
         self._released = -math.inf
 
-    def push(self, time: float, still: Flags, effort: Array, expected: Array) -> bool:
+    def push(self, time: float, still: Mask, effort: Array, expected: Array) -> bool:
         """Take a sample; whether its efforts are to be left out.
 
         :param time: s, later than the last one's.
@@ -93,7 +91,7 @@ class DriveWatch:
         return off and time - self._released < RELEASE
 
 
-def idle_samples(time: Array, still: Flags, effort: Array, expected: Array) -> Flags:
+def idle_samples(time: Array, still: Mask, effort: Array, expected: Array) -> Mask:
     """The samples of a recording whose efforts are to be left out, shape (k,).
 
     As :class:`DriveWatch` finds them forwards and backwards in time.

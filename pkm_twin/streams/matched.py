@@ -17,15 +17,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointSample, WrenchSample
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.wrench import Mount, Recent, WrenchReader, counting
 
-Array = NDArray[np.float64]
 NoWrench = Literal["ignore", "stop"]
 
 

@@ -7,11 +7,9 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.messages.reading import Trajectory
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

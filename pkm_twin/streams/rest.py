@@ -17,12 +17,9 @@ from operator import mul
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.messages.stamps import SECOND
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 SIGMAS: Final = 4.0
 """Standard deviations of its noise below which a rate counts as zero."""

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine import rotations
 from pkm_twin.messages.reading import WrenchSample, read_wrench
@@ -22,7 +22,6 @@ from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.settings import FUTURE, SECONDS, ZERO_STAMP, setting
 
-Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 V = TypeVar("V")
 
