@@ -9,10 +9,10 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics.virtual_work import torque_program
-from pkm_twin.codegen.arrays import doubles, vectors
+from pkm_twin.codegen.arrays import Array, doubles, vectors
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -20,8 +20,6 @@ from pkm_twin.kinematics.gradients import gradient_program
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.robot.numbers import cause_slopes, file_numbers, geometry_and_masses
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 MOTION: Final = ("q", "qd", "qdd")
 
@@ -76,10 +74,7 @@ def _derivatives(
     by: Sequence[str], *, rows: bool,
 ) -> TorqueDerivatives:  # fmt: skip
     inputs = _inputs(robot, motion, wrench, weights, rows=rows)
-    outputs, status = motion_gradient(robot)(robot.inertial, *inputs)
-    if status is not None:
-        robot.refuse_joints(status, inputs[0], inputs)
-    by_q, by_qd, by_qdd = outputs
+    by_q, by_qd, by_qdd = robot.evaluate(motion_gradient(robot), robot.inertial, *inputs)
     return TorqueDerivatives(by_q, by_qd, by_qdd, _by_paths(robot, inputs, by))
 
 
@@ -96,9 +91,7 @@ def torque_effects(
         kept = robot.calls["torque effects"] = kernel, causes.slopes, np.eye(robot.joints_count)
     kernel, slopes, weights = kept
     inputs = _inputs(robot, (q, qd, qdd), wrench, weights, rows=True)
-    (table,), status = kernel(robot.inertial, *inputs)
-    if status is not None:
-        robot.refuse_joints(status, inputs[0], inputs)
+    (table,) = robot.evaluate(kernel, robot.inertial, *inputs)
     return np.asarray(table @ slopes, np.float64)
 
 
@@ -140,10 +133,7 @@ def torques_by_numbers(
 
 def _by_numbers_table(robot: Robot, inputs: Sequence[Array]) -> Array:
     """By geometry and masses, in a row."""
-    (of_geometry, of_masses), status = numbers_gradient(robot)(robot.inertial, *inputs)
-    if status is not None:
-        robot.refuse_joints(status, inputs[0], inputs)
-    return np.concatenate([of_geometry, of_masses], -1)
+    return np.concatenate(robot.evaluate(numbers_gradient(robot), robot.inertial, *inputs), -1)
 
 
 def motion_gradient(robot: Robot) -> Kernel:

@@ -10,16 +10,14 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.virtual_work import Forces, begun, mass_entries, potential
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class Terms(NamedTuple):
@@ -61,11 +59,7 @@ class Equations:
         :raises ValueError: a value that is not finite.
         """
         robot = self.robot
-        flat = robot.call_one("motion", lambda: motion_kernel(robot), robot.inertial, q, qd)
-        if flat is None:
-            (flat,), status = motion_kernel(robot)(robot.inertial, q, qd)
-            if status is not None:
-                robot.refuse_joints(status, q, (q, qd))
+        flat = robot.first_output("motion", lambda: motion_kernel(robot), robot.inertial, q, qd)
         mass, bias, energies, twists, rows, drift = self._parts
         n, _ = self._shapes[0]
         kinetic, height = flat[energies].tolist()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics.transmission import (
     Transmitter,
@@ -23,7 +23,7 @@ from delta_dynamics.transmission import (
     transmitters,
 )
 from delta_dynamics.virtual_work import Forces
-from pkm_twin.codegen.arrays import finite
+from pkm_twin.codegen.arrays import Array, Mask, finite
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -32,9 +32,6 @@ from pkm_twin.kinematics.motion import cross, reaction_directions
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 SMALL: Final = 1e-6
 """Part of the machine's size below which joints stand in one point."""
@@ -189,9 +186,7 @@ def balance(
 ) -> Balance:
     """The balances of a motion, solved; arguments and errors as :func:`reactions`."""
     load = np.zeros(6) if wrench is None else wrench
-    loads, status = loads_kernel(robot)(robot.inertial, q, qd, qdd, load)
-    if status is not None:
-        robot.refuse_joints(status, q, (q, qd, qdd, load))
+    loads = robot.evaluate(loads_kernel(robot), robot.inertial, q, qd, qdd, load)
     found = balanced(robot, loads)
     finite(found.value, "the motion or the wrench")
     return found

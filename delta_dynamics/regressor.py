@@ -13,9 +13,10 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics.virtual_work import Forces
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.traced import Traced
@@ -24,8 +25,6 @@ from pkm_twin.machine.graph import Joint, Rod
 from pkm_twin.machine.inertia import TEN, loaded_joints, ten_numbers, transport
 from pkm_twin.machine.shared import TEN_UNITS, drive_units
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 DRIVE: Final = ("viscous", "coulomb", "offset", "rotor_inertia")
 """An actuated joint's parameters; a passive one that is loaded has no offset.
@@ -95,11 +94,8 @@ def regressor(
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
     load = np.zeros(6) if wrench is None else wrench
-    (bodies, others), status = robot.massive().kernel("regressor", _regressor)(
-        np.ascontiguousarray(robot.gravity), q, qd, qdd, load
-    )
-    if status is not None:
-        robot.refuse_joints(status, q, (q, qd, qdd, load))
+    kernel, gravity = robot.massive().kernel("regressor", _regressor), robot.gravity
+    bodies, others = robot.evaluate(kernel, np.ascontiguousarray(gravity), q, qd, qdd, load)
     n, batch, graph = robot.joints_count, bodies.shape[:-1], robot.graph
     links = robot.engine.tree.links
     ten = _body_columns(bodies.reshape(*batch, len(links), 3 + 2 * n, 3), n)

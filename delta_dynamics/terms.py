@@ -6,14 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics.virtual_work import torques
-from pkm_twin.codegen.arrays import vectors
+from pkm_twin.codegen.arrays import Array, Indices, vectors
 from pkm_twin.machine.inertia import GRAVITY, Layout
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -51,14 +49,10 @@ def frictionless(
     p = _without(robot.inertial, layout.friction)
     if not weight:
         p = _without(p, layout.part(GRAVITY))
-    kernel = torques(robot)
-    (tau,), status = kernel(p, q, qd, qdd, np.zeros(6))
-    if status is not None:
-        robot.refuse_joints(status, q, (qd, qdd))
-    return tau
+    return robot.evaluate(torques(robot), p, q, qd, qdd, np.zeros(6))[0]
 
 
-def _without(p: Array, part: slice | NDArray[np.intp]) -> Array:
+def _without(p: Array, part: slice | Indices) -> Array:
     """Inputs with some of them zero."""
     result = p.copy()
     result[part] = 0.0
@@ -97,10 +91,7 @@ def dynamics_terms(
     none = np.zeros(6)
 
     def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-        (tau,), status = kernel(p, place, qd, qdd, wrench)
-        if status is not None:
-            robot.refuse_joints(status, place, (qd, qdd, wrench))
-        return tau
+        return robot.evaluate(kernel, p, place, qd, qdd, wrench)[0]
 
     layout = Layout(robot.massive().tree)
 

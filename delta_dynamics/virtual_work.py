@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pkm_twin.codegen.arrays import vectors
+from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.expressions import (
     PARAMETERS,
@@ -29,8 +29,6 @@ from pkm_twin.machine import friction
 from pkm_twin.machine.graph import BASE, Joint, Rod
 from pkm_twin.machine.inertia import LAW_VALUES, ROTORS, Layout, loaded_joints
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 _NO_WRENCH: Final = np.zeros(6)
 MASSLESS: Final = 1e-12
@@ -66,10 +64,7 @@ def inverse_dynamics(
         tau = None
     if tau is not None:
         return tau
-    (efforts,), status = torques(robot)(robot.inertial, q, qd, qdd, load)
-    if status is not None:
-        robot.refuse_joints(status, q, (q, qd, qdd, load))
-    return efforts
+    return robot.evaluate(torques(robot), robot.inertial, q, qd, qdd, load)[0]
 
 
 def torques(robot: Robot) -> Kernel:
@@ -83,10 +78,8 @@ def torques(robot: Robot) -> Kernel:
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Generalised mass matrix on the actuated joints, payload included, shape (..., n, n)."""
     # A simulation asks for one sample, several thousand times a second.
-    flat = robot.call_one("mass matrix", lambda: masses_kernel(robot), robot.inertial, q)
-    if flat is not None:
-        return flat.reshape(robot.joints_count, -1)
-    return _mass_matrix(robot, q, robot.inertial)
+    flat = robot.first_output("mass matrix", lambda: masses_kernel(robot), robot.inertial, q)
+    return _square(robot, flat)
 
 
 def masses_kernel(robot: Robot) -> Kernel:
@@ -94,12 +87,8 @@ def masses_kernel(robot: Robot) -> Kernel:
     return robot.massive().kernel("mass matrix", _masses)
 
 
-def _mass_matrix(robot: Robot, q: ArrayLike, p: Array) -> Array:
-    (flat,), status = masses_kernel(robot)(p, q)
-    if status is not None:
-        robot.refuse_joints(status, q, (q,))
-    n = robot.joints_count
-    return flat.reshape(*flat.shape[:-1], n, n)
+def _square(robot: Robot, flat: Array) -> Array:
+    return flat.reshape(*flat.shape[:-1], robot.joints_count, -1)
 
 
 def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
@@ -108,7 +97,7 @@ def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
     p = np.zeros_like(robot.inertial)
     where = layout.body(body)
     p[where] = robot.inertial[where]
-    return _mass_matrix(robot, q, p)
+    return _square(robot, robot.evaluate(masses_kernel(robot), p, q)[0])
 
 
 def forward_dynamics(
@@ -125,12 +114,8 @@ def forward_dynamics(
     one = robot.call_one("accelerations", lambda: accelerations(robot), p, q, qd, tau, load)
     if one is not None:
         return one
-    (qdd,), status = accelerations(robot)(
-        p, q, qd, vectors(tau, robot.joints_count, "efforts"), load
-    )
-    if status is not None:
-        robot.refuse_joints(status, q, (q, qd, tau, load))
-    return qdd
+    efforts = vectors(tau, robot.joints_count, "efforts")
+    return robot.evaluate(accelerations(robot), p, q, qd, efforts, load)[0]
 
 
 def accelerations(robot: Robot) -> Kernel:
@@ -153,9 +138,8 @@ class Energy:
 
 def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
     """Mechanical energy of all bodies and rotors, payload included."""
-    (both,), status = robot.massive().kernel("energy", _energy)(robot.inertial, q, qd)
-    if status is not None:
-        robot.refuse_joints(status, q, (q, qd))
+    kernel = robot.massive().kernel("energy", _energy)
+    (both,) = robot.evaluate(kernel, robot.inertial, q, qd)
     return Energy(both[..., 0].copy(), both[..., 1].copy())
 
 
@@ -202,7 +186,10 @@ class Forces:
         is in it.
         """
         m = self.motion
-        a, b = m.acceleration(rod.inner, rod.ends[0]), m.acceleration(rod.outer, rod.ends[1])
+        self._shared(rod, mass, m.acceleration)
+
+    def _shared(self, rod: Rod, mass: Any, motion: Callable[[str, Array], Any]) -> None:
+        a, b = motion(rod.inner, rod.ends[0]), motion(rod.outer, rod.ends[1])
         sixth = mass * (1.0 / 6.0)
         self.push(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
         self.push(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
@@ -218,10 +205,7 @@ class Forces:
             spin = turned @ (_matrix(ten) @ (turned.T @ w))
             self.moment[name] = self.moment[name] + cross(first, v) + spin
         for mass, rod in zip(rods, m.graph.rods.values(), strict=True):
-            a, b = m.velocity(rod.inner, rod.ends[0]), m.velocity(rod.outer, rod.ends[1])
-            sixth = mass * (1.0 / 6.0)
-            self.push(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
-            self.push(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
+            self._shared(rod, mass, m.velocity)
 
     def passive(self, values: Objects) -> None:
         """What passive joints rub, and what their rotors resist: three numbers a joint."""

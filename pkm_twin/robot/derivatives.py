@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pkm_twin.codegen.arrays import vectors
+from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.kinematics.gradients import platform_gradient
 from pkm_twin.machine.geometry import geometry_of
 from pkm_twin.robot.numbers import cause_slopes, file_numbers
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 _NONE = np.zeros(0)
 
@@ -114,10 +112,7 @@ def position_effects(robot: Robot, q: ArrayLike) -> Array:
 
 def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
     states = vectors(q, robot.joints_count, "q")[..., None, :]
-    (found,), status = platform_gradient(robot.engine)(_NONE, states, rows)
-    if status is not None:
-        robot.refuse_joints(status, states, (states,))
-    return found
+    return robot.evaluate(platform_gradient(robot.engine), _NONE, states, rows)[0]
 
 
 def geometry_numbers(robot: Robot) -> list[Any]:

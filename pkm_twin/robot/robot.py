@@ -12,8 +12,9 @@ from importlib import import_module
 from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.code import NOT_FINITE
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -40,9 +41,6 @@ from pkm_twin.machine.shared import (
     shared_payload,
 )
 from pkm_twin.robot.mechanism import Mechanism
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 SINGULARITY_BOUND: Final = 1e-9
 """Least singularity index (0 singular, 1 best) at which a Jacobian is inverted."""
@@ -154,6 +152,25 @@ class Robot(Mechanism):
             # A batch, a list, numbers of another kind, or a wrong length.
             return None
         return result
+
+    def first_output(
+        self, name: str, kernel: Callable[[], Kernel], p: Array, q: ArrayLike, *inputs: ArrayLike
+    ) -> Array:
+        """First output of a program; one sample as fast as can be. Errors as :meth:`evaluate`."""
+        one = self.call_one(name, kernel, p, q, *inputs)
+        return self.evaluate(kernel(), p, q, *inputs)[0] if one is None else one
+
+    def evaluate(self, kernel: Kernel, p: Array, q: ArrayLike, *inputs: ArrayLike) -> list[Array]:
+        """Outputs of a program of joint positions and other inputs.
+
+        :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
+        :raises SingularityError: a singularity on the way from home.
+        :raises ValueError: a wrong last axis, or a value that is not finite.
+        """
+        outputs, status = kernel(p, q, *inputs)
+        if status is not None:
+            self.refuse_joints(status, q, inputs)
+        return outputs
 
     @cached_property
     def inertial(self) -> Array:
@@ -294,8 +311,7 @@ class Robot(Mechanism):
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a singularity on the way from home.
         """
-        pose = self.call_one("forward", self._forward_kernel, _NONE, q)
-        return self._placed(q)[0] if pose is None else pose
+        return self.first_output("forward", self._forward_kernel, _NONE, q)
 
     def _forward_kernel(self) -> Kernel:
         return self.engine.forward
@@ -311,23 +327,15 @@ class Robot(Mechanism):
 
         Base axes; the rotation is relative to home. Errors as :meth:`forward`.
         """
-        _, position, rotation = self._placed(q)
+        _, position, rotation = self.evaluate(self.engine.forward, _NONE, q)
         return position, rotation.reshape(*rotation.shape[:-1], 3, 3)
-
-    def _placed(self, q: ArrayLike) -> list[Array]:
-        outputs, status = self.engine.forward(_NONE, q)
-        if status is not None:
-            self.refuse_joints(status, q)
-        return outputs
 
     def placements(self, q: ArrayLike) -> tuple[dict[str, Array], dict[str, Array]]:
         """Rotation from home (..., 3, 3) and position of the frame's origin (..., 3) of each body.
 
         ``engine.tree.at`` has the origins at home. Errors as :meth:`forward`.
         """
-        (flat,), status = self.engine.placement(_NONE, q)
-        if status is not None:
-            self.refuse_joints(status, q)
+        (flat,) = self.evaluate(self.engine.placement, _NONE, q)
         rows = flat.reshape(*flat.shape[:-1], len(self.graph.bodies), 12)
         rotations, origins = {}, {}
         for k, name in enumerate(self.graph.bodies):
@@ -355,11 +363,9 @@ class Robot(Mechanism):
         return self._jacobians(q)[1]
 
     def _jacobians(self, q: ArrayLike) -> list[Array]:
-        (rates, twist), status = self.engine.jacobian(_NONE, q)
-        if status is not None:
-            self.refuse_joints(status, q)
         n = self.joints_count
-        return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in (rates, twist)]
+        tables = self.evaluate(self.engine.jacobian, _NONE, q)
+        return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in tables]
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Pose rates per joint rate (..., m, n), NaN where there is no assembly; which are good."""
@@ -370,10 +376,7 @@ class Robot(Mechanism):
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Second derivative of the pose in time, shape (..., m)."""
-        (second,), status = self.engine.acceleration(_NONE, q, qd, qdd)
-        if status is not None:
-            self.refuse_joints(status, q, (q, qd, qdd))
-        return second
+        return self.evaluate(self.engine.acceleration, _NONE, q, qd, qdd)[0]
 
     def singularity(self, q: ArrayLike) -> Array:
         """The singularity index of joint positions: 0 in a singularity, 1 at best, shape (...).
@@ -383,12 +386,7 @@ class Robot(Mechanism):
         edge of the workspace); see ``kinematics.singularity``. It is dimensionless and independent
         of the machine's scale. Errors as :meth:`forward`.
         """
-        one = self.call_one("singularity", self.singularity_kernel, _NONE, q)
-        if one is not None:
-            return np.asarray(one[0])
-        (measure,), status = self.singularity_kernel()(_NONE, q)
-        if status is not None:
-            self.refuse_joints(status, q)
+        measure = self.first_output("singularity", self.singularity_kernel, _NONE, q)
         return np.asarray(measure[..., 0], np.float64)
 
     def singularity_kernel(self) -> Kernel:
@@ -417,26 +415,21 @@ class Robot(Mechanism):
 
     def passive(self, q: ArrayLike) -> Array:
         """Values of the passive joints, shape (..., k), rad or m, in a URDF's convention."""
-        (flat,), status = self.engine.kernel("passive", passive_program)(_NONE, q)
-        if status is not None:
-            self.refuse_joints(status, q)
-        return flat
+        return self.evaluate(self.engine.kernel("passive", passive_program), _NONE, q)[0]
 
     def passive_rates(self, q: ArrayLike, qd: ArrayLike) -> Array:
         """Rates of the passive joints, shape (..., k), rad/s or m/s, as :meth:`passive` has them.
 
         :param qd: joint rates, shape (..., n), rad/s or m/s.
         """
-        (flat,), status = self.engine.kernel("passive rates", passive_rates_program)(_NONE, q, qd)
-        if status is not None:
-            self.refuse_joints(status, q, (q, qd))
-        return flat
+        kernel = self.engine.kernel("passive rates", passive_rates_program)
+        return self.evaluate(kernel, _NONE, q, qd)[0]
 
     def refuse_joints(self, status: Array, q: ArrayLike, inputs: Sequence[ArrayLike] = ()) -> None:
         """Raise the typed error of the first rejected sample, if there is one.
 
         :param status: of a kernel, shape (..., 2).
-        :param inputs: everything that the kernel was given.
+        :param inputs: everything else that the kernel was given.
         """
         index = _first(status[..., 0])
         if index is None:
