@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import Estimate, geometric
 from pkm_twin.identification.calibration_fit import derivatives
@@ -18,8 +18,7 @@ from pkm_twin.identification.measurements import KINDS, Kind, Partial, Readings,
 from pkm_twin.identification.partial import placed, unknowns
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
+from pkm_twin.robot.workspace import within_limits
 
 CANDIDATES: Final = 300
 DRAWN: Final = 20
@@ -220,9 +219,7 @@ def _candidates(
         )  # fmt: skip
     poses = rng.uniform(box[:, 0], box[:, 1], (DRAWN * CANDIDATES, len(box)))
     q, good = robot.try_inverse(poses)
-    if limits is not None:
-        with np.errstate(invalid="ignore"):
-            good = good & ((q >= limits[:, 0]) & (q <= limits[:, 1])).all(-1)
+    good &= within_limits(robot, q)
     if good.sum() < len(names):
         raise ParameterError("--within", dict(within) or None, "poses that the machine reaches")
     return np.asarray(q[good][:CANDIDATES], np.float64)

@@ -15,14 +15,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.joint_path import JointPath, place_at
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 NOTHING: Final = 1e-12
 """Part of the greatest rate below which a joint does not move."""
@@ -116,6 +115,7 @@ class Forces:
     ) -> Forces:
         """From the inverse dynamics at joint positions with derivatives by s, (p, n) each.
 
+        :param wrench: on the platform all the time, (6,); None: no wrench.
         :raises ParameterError: friction of a law that these five do not describe.
         """
         if robot.laws:
@@ -125,9 +125,8 @@ class Forces:
         zero = np.zeros_like(q)
         rates = (zero, zero, first, -first, 2.0 * first)
         changes = (zero, first, second, second, 4.0 * second)
-        load = None if wrench is None else np.tile(wrench, (5, 1))
         efforts = inverse_dynamics(
-            robot, np.tile(q, (5, 1)), np.concatenate(rates), np.concatenate(changes), load
+            robot, np.tile(q, (5, 1)), np.concatenate(rates), np.concatenate(changes), wrench
         )
         g, a, ahead, back, twice = efforts.reshape(5, *q.shape)
         b = 0.5 * (ahead + back) - g

@@ -7,20 +7,19 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.paths.constraints import Limits, Rows, check_rest, shares
+from pkm_twin.paths.constraints import Forces, Limits, Rows, check_rest, shares
 from pkm_twin.paths.geometry import Path, through
 from pkm_twin.paths.jerk import smooth_profile, smooth_run
 from pkm_twin.paths.joint_path import JointPath, Slowdown, joint_paths
 from pkm_twin.paths.laws import LAWS, Law, quintic, shortest
-from pkm_twin.paths.motion import Run, Timed, TimedPath, forces_at, needs_forces
+from pkm_twin.paths.motion import Run, Timed, TimedPath, needs_forces
 from pkm_twin.paths.profile import fastest_profile
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 POINTS: Final = 1000
 """Points of a path."""
@@ -146,7 +145,9 @@ def _run(
     robot: Robot, part: JointPath, limits: Limits, wrench: Array | None, begin: float
 ) -> Timed:
     """One stretch, its limits kept between the points too."""
-    forces = forces_at(robot, part, wrench) if needs_forces(robot, limits) else None
+    forces = None
+    if needs_forces(robot, limits):
+        forces = Forces.of(robot, part.q, part.first, part.second, wrench)
     rows = Rows.of(part, forces, limits.part(1.0 - KEPT))
     check_rest(robot, part, rows, limits, begin)
     if np.isfinite(limits.jerk).any():
@@ -196,22 +197,17 @@ def passed(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) -> Ar
     time = (begin[:, None] + span[:, None] * LOOKED).ravel()
     interval, at, v, u = run.at(time)
     part = run.part
-    q, first, second = part.between(interval, at)
-    qd = first * v[:, None]
-    qdd = first * u[:, None] + second * (v**2)[:, None]
+    q, qd, qdd = part.motion(interval, at, v, u)
     effort = None
     if needs_forces(robot, limits):
-        load = None if wrench is None else np.broadcast_to(wrench, (len(q), 6))
-        effort = inverse_dynamics(robot, q, qd, qdd, load)
-    left = part.left[interval]
-    travel = (1.0 - at) * part.felt[left] + at * part.felt[left + 1]
+        effort = inverse_dynamics(robot, q, qd, qdd, wrench)
     jerk = np.zeros_like(qd)
     if np.isfinite(limits.jerk).any():
         inner = np.arange(len(time)).reshape(count, -1)[:, 1:-1]
         jerk[inner] = np.gradient(qdd[inner.ravel()], time[inner.ravel()], axis=0).reshape(
             *inner.shape, robot.joints_count
         )
-    used = shares(limits, effort, qd, qdd, jerk, v * travel)
+    used = shares(limits, effort, qd, qdd, jerk, part.speed(part.felt, interval, at, v))
     return np.asarray(used.max(1).reshape(count, len(LOOKED)).max(1), np.float64)
 
 

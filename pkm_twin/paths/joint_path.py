@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.paths.pieces import Piece, Smooth
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 LEAST_POINTS: Final = 16
@@ -70,6 +70,16 @@ class JointPath:
         first = u + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5)))
         second = 2 * c2 + t * (6 * c3 + t * (12 * c4 + t * 20 * c5))
         return q, first / h, second / h**2
+
+    def motion(self, interval: Index, part: Array, v: Array, u: Array) -> tuple[Array, ...]:
+        """Positions, rates and accelerations there, (k, n) each, at v and u along the path."""
+        q, first, second = self.between(interval, part)
+        return q, first * v[:, None], first * u[:, None] + second * (v**2)[:, None]
+
+    def speed(self, slopes: Array, interval: Index, part: Array, v: Array) -> Array:
+        """There at v along the path, (k,), by ways per s as ``travel`` and ``felt``, (p,)."""
+        left = self.left[interval]
+        return v * ((1.0 - part) * slopes[left] + part * slopes[left + 1])
 
 
 def _joints(robot: Robot, places: Array, way: Array) -> Array:

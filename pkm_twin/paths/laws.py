@@ -11,13 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.constraints import Forces, Limits
 from pkm_twin.paths.joint_path import JointPath
 from pkm_twin.paths.motion import needs_forces
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Law = Callable[[Array], tuple[Array, Array, Array]]
 
@@ -111,12 +111,9 @@ def shortest(
     """A stretch by a law, the shortest within the limits."""
     run = LawRun(part, law, 1.0)
     interval, share, v, u = run.at(run.times)
-    q, first, second = part.between(interval, share)
-    qd = first * v[:, None]
-    qdd = first * u[:, None] + second * (v**2)[:, None]
+    _, qd, qdd = part.motion(interval, share, v, u)
     jerk = np.gradient(qdd, run.times, axis=0)
-    left = part.left[interval]
-    travel = v * ((1.0 - share) * part.felt[left] + share * part.felt[left + 1])
+    travel = part.speed(part.felt, interval, share, v)
     duration = max(
         float((np.abs(qd) / limits.velocity).max()),
         float((travel / limits.speed).max()),
@@ -124,8 +121,7 @@ def shortest(
         float((np.abs(jerk) / limits.jerk).max()) ** (1 / 3),
     )
     if needs_forces(robot, limits):
-        load = None if wrench is None else np.broadcast_to(wrench, (len(q), 6))
-        forces = Forces.of(robot, q, first, second, load)
+        forces = Forces.of(robot, *part.between(interval, share), wrench)
         square = forces.a * u[:, None] + forces.b * (v**2)[:, None]
         linear, fixed = forces.w * v[:, None], forces.g + forces.k
         for sign in (1.0, -1.0):

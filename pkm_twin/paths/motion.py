@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.paths.constraints import Forces, Limits, names_of, shares
+from pkm_twin.paths.constraints import Limits, names_of, shares
 from pkm_twin.paths.geometry import Path
 from pkm_twin.paths.joint_path import JointPath
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 BINDS: Final = 0.98
@@ -166,20 +166,15 @@ class TimedPath:
             if not len(mine):
                 continue
             interval, part, v, u = run.at(t[mine] - begin)
-            place, first, second = run.part.between(interval, part)
             # At its end the machine rests; at its beginning it has its friction already.
             passed = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
             v, u = np.where(passed, np.maximum(v, CREEP), 0.0), np.where(passed, u, 0.0)
-            q[mine] = place
-            qd[mine] = first * v[:, None]
-            qdd[mine] = first * u[:, None] + second * (v**2)[:, None]
-            left = run.part.left[interval]
+            q[mine], qd[mine], qdd[mine] = run.part.motion(interval, part, v, u)
             for speeds, slopes in ((travel, run.part.travel), (felt, run.part.felt)):
-                speeds[mine] = v * ((1.0 - part) * slopes[left] + part * slopes[left + 1])
+                speeds[mine] = run.part.speed(slopes, interval, part, v)
         effort = None
         if has_masses(self.robot):
-            load = None if self.wrench is None else np.broadcast_to(self.wrench, (len(t), 6))
-            effort = inverse_dynamics(self.robot, q, qd, qdd, load)
+            effort = inverse_dynamics(self.robot, q, qd, qdd, self.wrench)
         return Samples(t, q, qd, qdd, effort, self.robot.forward(q), travel, felt)
 
     def uniform(self, rate: float) -> Samples:
@@ -334,9 +329,3 @@ def needs_forces(robot: Robot, limits: Limits) -> bool:
         return False
     robot.massive()
     return True
-
-
-def forces_at(robot: Robot, part: JointPath, wrench: Array | None) -> Forces:
-    """Of a stretch's points."""
-    load = None if wrench is None else np.broadcast_to(wrench, (len(part.s), 6))
-    return Forces.of(robot, part.q, part.first, part.second, load)

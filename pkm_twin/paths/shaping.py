@@ -16,14 +16,13 @@ from typing import Any, Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.paths.joint_path import JointPath, check_positions
 from pkm_twin.paths.motion import Samples, TimedPath, has_masses
-
-Array = NDArray[np.float64]
 
 DELAYS: Final = {"zv": 1, "zvd": 2}
 """Half vibrations that each shaper takes."""
@@ -117,8 +116,7 @@ class ShapedPath(TimedPath):
         qdd = np.asarray(np.linalg.solve(jacobian, (change - rest)[..., None])[..., 0], np.float64)
         effort = None
         if has_masses(robot):
-            load = None if self.wrench is None else np.broadcast_to(self.wrench, (len(t), 6))
-            effort = inverse_dynamics(robot, q, qd, qdd, load)
+            effort = inverse_dynamics(robot, q, qd, qdd, self.wrench)
         moved = (robot.platform_jacobian(q)[:, :3] @ qd[..., None])[..., 0]
         speed = np.linalg.norm(moved, axis=1)
         return Samples(t, q, qd, qdd, effort, pose, speed, speed)

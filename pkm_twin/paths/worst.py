@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.directions import sphere_directions
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
+from pkm_twin.robot.workspace import within_limits
 
 RAYS: Final = 1000
 """Rays from home on which poses of the workspace are taken."""
@@ -76,17 +75,13 @@ def workspace_poses(robot: Robot, rays: int = RAYS, singularity: float = SINGULA
     return np.asarray(found[_inside(robot, found, singularity)], np.float64)
 
 
-def _inside(robot: Robot, poses: Array, singularity: float) -> NDArray[np.bool_]:
+def _inside(robot: Robot, poses: Array, singularity: float) -> Mask:
     """Which poses (k, m) are of the workspace."""
     q, good = robot.try_inverse(poses)
-    limits = robot.limits.position
-    if limits is not None:
-        with np.errstate(invalid="ignore"):
-            good = good & ((q >= limits[:, 0]) & (q <= limits[:, 1])).all(1)
-    result = good.copy()
+    good &= within_limits(robot, q)
     if good.any():
-        result[good] = robot.singularity(q[good]) >= singularity
-    return result
+        good[good] = robot.singularity(q[good]) >= singularity
+    return good
 
 
 def worst_over_workspace(
