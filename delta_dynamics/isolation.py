@@ -15,17 +15,14 @@ from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import BASE, Graph
+from pkm_twin.machine.graph import BASE, Graph, limbs
 from pkm_twin.robot.outline import body_points, robot_bars
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 TWISTS: Final = "twists of bodies"
 PLATFORM: Final = "platform"
@@ -84,12 +81,7 @@ def limbs_of(robot: Robot) -> dict[str, str]:
     A limb has the name of its actuated joint's limb, or of its first body where it has none.
     """
     graph = robot.graph
-    ends = {BASE, graph.platform}
-    limb = {name: name for name in (*graph.bodies, *graph.rods) if name not in ends}
-    for a, b in joined_bodies(graph):
-        if a in limb and b in limb:
-            one, other = limb[a], limb[b]
-            limb = {name: one if root == other else root for name, root in limb.items()}
+    limb = {name: names[0] for names in limbs(graph) for name in names}
     names: dict[str, str] = {}
     for joint_name, own in zip(graph.actuated, robot.limb_names, strict=True):
         joint = graph.joints[joint_name]
@@ -103,9 +95,7 @@ def limbs_of(robot: Robot) -> dict[str, str]:
 
 def joined_bodies(graph: Graph) -> list[tuple[str, str]]:
     """Bodies and rods that a joint joins, both ways."""
-    pairs = [(joint.inner, joint.outer) for joint in graph.joints.values()]
-    pairs += [(name, end) for name, rod in graph.rods.items() for end in (rod.inner, rod.outer)]
-    return [*pairs, *((b, a) for a, b in pairs)]
+    return [*graph.links, *((b, a) for a, b in graph.links)]
 
 
 def _twists(t: Traced) -> Program:
@@ -143,11 +133,11 @@ class Places:
         graph = robot.graph
         bodies = [*graph.bodies, BASE]
         at = robot.engine.tree.at
-        limbs = limbs_of(robot)
-        found = [(bar.part, bar.start, bar.end) for bar in robot_bars(robot) if bar.part in limbs]
+        limb_of = limbs_of(robot)
+        found = [(bar.part, bar.start, bar.end) for bar in robot_bars(robot) if bar.part in limb_of]
         drawn = {part for part, _, _ in found}
         for body, points in body_points(graph).items():
-            if body in limbs and body not in drawn:
+            if body in limb_of and body not in drawn:
                 only = (body, points[0] if points else graph.bodies[body].com)
                 found.append((body, only, only))
         blocks = _blocks(graph)
@@ -170,7 +160,7 @@ class Places:
         self._mix = np.zeros((len(ends), len(mix)))
         for i, (k, s) in enumerate(mix):
             self._mix[2 * k : 2 * k + 2, i] = 1.0 - s, s
-        self.limbs = [limbs[part] for part in self.parts]
+        self.limbs = [limb_of[part] for part in self.parts]
         size = np.maximum(lengths, 1e-3 * graph.size)
         self.thin = np.array([part not in blocks for part in self.parts]) & (np.array(lengths) > 0)
         self.names = tuple(dict.fromkeys(name for name in self.limbs if name != PLATFORM))
@@ -201,12 +191,8 @@ class Places:
     def at(self, q: Array) -> tuple[Array, Array, Array]:
         """Positions (P, 3), Jacobians (P, n, 3) and directions of the bars (P, 3), base axes."""
         n, count = self.robot.joints_count, len(self.robot.graph.bodies)
-        robot, none = self.robot, np.zeros(0)
-        flat = robot.call_one(TWISTS, lambda: _kernel(robot), none, q)
-        if flat is None:
-            (flat,), status = _kernel(robot)(none, q)
-            if status is not None:
-                robot.refuse_joints(status, q)
+        robot = self.robot
+        flat = robot.first_output(TWISTS, lambda: _kernel(robot), np.zeros(0), q)
         placed = np.concatenate([flat[: 12 * count], BASE_PLACED]).reshape(count + 1, 12)
         rates = np.zeros((n, count + 1, 6))
         rates[:, :count] = flat[12 * count :].reshape(n, count, 6)

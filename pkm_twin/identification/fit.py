@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.identification.estimation import Estimate
 from pkm_twin.identification.file_parameters import FileParameters, file_parameters
@@ -27,10 +27,10 @@ from pkm_twin.identification.judge import EXACT
 from pkm_twin.identification.samples import Filtering
 from pkm_twin.identification.verdict import Verdict
 from pkm_twin.machine.friction import LAWS, FrictionLaw
+from pkm_twin.machine.places import path_of
 from pkm_twin.machine.shared import KINDS, Key, Kind, Shared
 from pkm_twin.robot.robot import Robot
 
-Array = NDArray[np.float64]
 Status = Literal["fitted", "combination", "not excited"]
 
 LOADED: Final = frozenset(name for name, law in LAWS.items() if law.share is not FrictionLaw.share)
@@ -70,7 +70,7 @@ class Number:
     @property
     def name(self) -> str:
         """The key, with dots."""
-        return "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in self.key)[1:]
+        return path_of(self.key)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,23 +6,22 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from delta_dynamics.derivatives import numbers_slopes, torques_by_numbers
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.file_parameters import FileParameters
 from pkm_twin.identification.fit_rows import BLOCK
 from pkm_twin.identification.fit_signals import Signals
 from pkm_twin.identification.samples import by_blocks
 from pkm_twin.identification.verdict import Suspect
+from pkm_twin.machine.places import path_of
 from pkm_twin.machine.uncertainty import numbers_below
 from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
-
-Array = NDArray[np.float64]
 
 GEOMETRY: Final = "geometry"
 USUAL: Final = 5e-3
@@ -112,9 +111,9 @@ def _weighing(robot: Robot, parameters: FileParameters, values: Array, *, loaded
     for where, group in zip(parameters.slices, parameters.groups, strict=True):
         if group.kind == "inertia" or (loaded and group.kind == "payload"):
             new = group.keys(values[where])
-            numbers |= {_path(key): value for key, value in new.items()}
+            numbers |= {path_of(key): value for key, value in new.items()}
             numbers |= {
-                _path((*key[:-2], key[-1], key[-2])): value
+                path_of((*key[:-2], key[-1], key[-2])): value
                 for key, value in new.items()
                 if isinstance(key[-1], int) and isinstance(key[-2], int)
             }
@@ -128,10 +127,6 @@ def _given(robot: Robot, path: str) -> bool:
     except ParameterError:
         return False
     return True
-
-
-def _path(key: tuple[Any, ...]) -> str:
-    return "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in key)[1:]
 
 
 def _payload(robot: Robot) -> dict[str, float]:

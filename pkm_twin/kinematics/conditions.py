@@ -16,7 +16,8 @@ from typing import Final
 
 import numpy as np
 
-from pkm_twin.machine.graph import BASE, Array, Graph, Joint, Rod, array
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.machine.graph import BASE, Graph, Joint, Rod, array, groups
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.rotations import skew
 
@@ -125,11 +126,12 @@ class Conditions:
 
     def _parallel(self) -> None:
         """Axes of one direction, each group by the direction that most of them have."""
-        groups = _Groups(len(self._axes))
-        for (i, a), (j, b) in combinations(enumerate(self._axes), 2):
-            if a.bodies & b.bodies and _sine(a.vector, b.vector) < self.tolerance:
-                groups.join(i, j)
-        for members in groups.members():
+        alike = [
+            (i, j)
+            for (i, a), (j, b) in combinations(enumerate(self._axes), 2)
+            if a.bodies & b.bodies and _sine(a.vector, b.vector) < self.tolerance
+        ]
+        for members in groups(range(len(self._axes)), alike):
             axes = [self._axes[i] for i in members]
             lead = max(
                 axes,
@@ -207,11 +209,12 @@ class Conditions:
         balls: list[tuple[str, Slot, frozenset[str]]],
     ) -> None:  # fmt: skip
         """What goes through one point goes through the place where most of it meets exactly."""
-        groups = _Groups(len(events))
-        for (m, (a, x)), (n, (b, y)) in combinations(enumerate(events), 2):
-            if set(a) & set(b) and np.linalg.norm(x - y) < 3 * self._length / _APART:
-                groups.join(m, n)
-        for number, members in enumerate(groups.members()):
+        near = [
+            (m, n)
+            for (m, (a, x)), (n, (b, y)) in combinations(enumerate(events), 2)
+            if set(a) & set(b) and np.linalg.norm(x - y) < 3 * self._length / _APART
+        ]
+        for number, members in enumerate(groups(range(len(events)), near)):
             elements = list(dict.fromkeys(i for m in members for i in events[m][0]))
             gaps = {
                 m: [self._gap(events[m][1], i, lines, balls) for i in elements] for m in members
@@ -378,42 +381,10 @@ class Conditions:
         return _with_vectors(self.graph, {s: v * sizes.get(s, 1.0) for s, v in values.items()})
 
 
-class _Groups:
-    """Things that are joined in pairs, as the groups that hang together."""
-
-    def __init__(self, count: int) -> None:
-        self._parent = list(range(count))
-
-    def _lead(self, i: int) -> int:
-        while self._parent[i] != i:
-            self._parent[i] = self._parent[self._parent[i]]
-            i = self._parent[i]
-        return i
-
-    def join(self, i: int, j: int) -> None:
-        self._parent[self._lead(i)] = self._lead(j)
-
-    def members(self) -> list[list[int]]:
-        """The groups, each in order."""
-        found: dict[int, list[int]] = {}
-        for i in range(len(self._parent)):
-            found.setdefault(self._lead(i), []).append(i)
-        return list(found.values())
-
-
 def merged(graph: Graph) -> dict[str, str]:
     """By body, the ground too: the first of those that fixed joints make one with it."""
-    names = [BASE, *graph.bodies]
-    number = {name: i for i, name in enumerate(names)}
-    groups = _Groups(len(names))
-    for joint in graph.joints.values():
-        if joint.kind == "fixed":
-            groups.join(number[joint.inner], number[joint.outer])
-    lead: dict[str, str] = {}
-    for group in groups.members():
-        first = names[min(group)]
-        lead |= {names[i]: first for i in group}
-    return lead
+    fixed = ((j.inner, j.outer) for j in graph.joints.values() if j.kind == "fixed")
+    return {name: one[0] for one in groups([BASE, *graph.bodies], fixed) for name in one}
 
 
 def _vectors(graph: Graph) -> dict[Slot, Array]:

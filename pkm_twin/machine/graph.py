@@ -3,19 +3,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import cos, maximum, minimum, norm, plain, reference, sin
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joints import TYPES, Constraint, Freedom, JointType
 
-Array = NDArray[np.float64]
+T = TypeVar("T", bound=Hashable)
 
 BASE: Final = "base"
 """Name of the ground."""
@@ -210,6 +211,14 @@ class Graph:
         return points
 
     @property
+    def links(self) -> list[tuple[str, str]]:
+        """Bodies and rods that a joint joins, from the base's side outwards."""
+        pairs = [(joint.inner, joint.outer) for joint in self.joints.values()]
+        for rod in self.rods.values():
+            pairs += [(rod.inner, rod.name), (rod.name, rod.outer)]
+        return pairs
+
+    @property
     def topology(self) -> str:
         """Text of what bodies, joints and rods there are, and how they meet: no number."""
         joints = [
@@ -287,16 +296,9 @@ class Graph:
             )
 
     def _check_connection(self) -> None:
-        reached, todo = {BASE}, [BASE]
-        links = [(j.inner, j.outer) for j in self.joints.values()]
-        links += [(r.inner, r.outer) for r in self.rods.values()]
-        while todo:
-            body = todo.pop()
-            for a, b in links:
-                for here, there in ((a, b), (b, a)):
-                    if here == body and there not in reached:
-                        reached.add(there)
-                        todo.append(there)
+        pairs = [(joint.inner, joint.outer) for joint in self.joints.values()]
+        pairs += [(rod.inner, rod.outer) for rod in self.rods.values()]
+        reached = groups([BASE, *self.bodies], pairs)[0]
         for name in self.bodies:
             if name not in reached:
                 raise ParameterError(
@@ -310,23 +312,25 @@ def rotation_about_z(angle: Any) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def groups(things: Iterable[T], pairs: Iterable[tuple[T, T]]) -> list[list[T]]:
+    """What pairs connect, each group in the order of the things; of others pairs say nothing."""
+    own = {thing: [thing] for thing in things}
+    for a, b in pairs:
+        if a in own and b in own and own[a] is not own[b]:
+            own[a].extend(own[b])
+            own |= dict.fromkeys(own[b], own[a])
+    place = {thing: k for k, thing in enumerate(own)}
+    found = {id(group): group for group in own.values()}
+    return [sorted(group, key=place.__getitem__) for group in found.values()]
+
+
+def limbs(graph: Graph) -> list[list[str]]:
+    """Bodies and rods of each limb: what hangs together without base and platform."""
+    parts = [name for name in (*graph.bodies, *graph.rods) if name not in (BASE, graph.platform)]
+    return groups(parts, graph.links)
+
+
 def limb_numbers(graph: Graph) -> dict[str, int]:
-    """By body and rod the number of its limb: what hangs together without base and platform."""
-    outside = {BASE, graph.platform}
-    links = [(j.inner, j.outer) for j in graph.joints.values()]
-    links += [(r.inner, r.name) for r in graph.rods.values()]
-    links += [(r.name, r.outer) for r in graph.rods.values()]
-    number: dict[str, int] = {}
-    for name in [*graph.bodies, *graph.rods]:
-        if name in number or name in outside:
-            continue
-        found, todo = {name}, [name]
-        while todo:
-            here = todo.pop()
-            for a, b in links:
-                for x, y in ((a, b), (b, a)):
-                    if x == here and y not in found and y not in outside:
-                        found.add(y)
-                        todo.append(y)
-        number |= dict.fromkeys(found, max(number.values(), default=-1) + 1)
+    """By body and rod the number of its limb, of the platform -1."""
+    number = {name: k for k, limb in enumerate(limbs(graph)) for name in limb}
     return number | {graph.platform: -1}

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.friction import all_keys, check_laws
@@ -25,11 +25,10 @@ from pkm_twin.machine.graph import (
 )
 from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
-from pkm_twin.machine.places import number_in, placed
+from pkm_twin.machine.places import number_in, path_of, placed
 from pkm_twin.machine.sections import DriveSpec, check_angles, length, mass, rare
 from pkm_twin.machine.shared import Key
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 
@@ -317,11 +316,10 @@ def written_out(
                 for name, entry in entries.items():
                     full = f"{name}_{number}"
                     if full in result[kind]:
-                        other = sources[kind, full].path
-                        where = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in other)
+                        where = path_of(sources[kind, full].path)
                         raise ParameterError(
                             f"{path}{kind}.{name}", full,
-                            f"a name of its own for each copy: {full} stands for {where[1:]} "
+                            f"a name of its own for each copy: {full} stands for {where} "
                             f"already, so rename one of the two, for example {name}_b",
                         )  # fmt: skip
                     copy = entry[number - 1]

@@ -25,6 +25,12 @@ def keys_of(path: str) -> list[Key]:
     return [name or int(place) for name, place in _PART.findall(path)]
 
 
+def path_of(keys: Iterable[Key]) -> str:
+    """The dotted path of keys and places."""
+    parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
+    return "".join(parts).removeprefix(".")
+
+
 def full_keys(path: str) -> list[Key]:
     """The same, of an inertia's principal moment ``inertia[0]`` as of its matrix."""
     keys = keys_of(path)
@@ -130,31 +136,6 @@ def merged(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
         both = isinstance(value, Mapping) and isinstance(old, Mapping)
         result[key] = merged(dict(old or {}), value) if both else schema.plain(value)
     return result
-
-
-def put(data: Any, path: str, value: float) -> None:
-    """Change one number of plain data in place.
-
-    :raises ParameterError: a path that there is not.
-    """
-    number_at(data, path)
-    *way, last = keys_of(path)
-    for key in way:
-        data = data[key]
-    data[last] = value
-
-
-def number_at(data: Any, path: str) -> Any:
-    """The value of plain data at a dotted path.
-
-    :raises ParameterError: a path that there is not.
-    """
-    try:
-        for key in keys_of(path):
-            data = data[key]
-    except (KeyError, IndexError, TypeError):
-        raise ParameterError(path, None, "a number that the robot's file gives") from None
-    return data
 
 
 def number_in(data: Any, keys: Iterable[Key], path: str) -> float:

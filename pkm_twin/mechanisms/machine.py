@@ -16,8 +16,8 @@ from functools import cached_property
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import norm, plain
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.kinematics.masses import check_masses
@@ -63,7 +63,6 @@ from pkm_twin.machine.uncertainty import UncertaintyEntry
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
 
-Array = NDArray[np.float64]
 M = TypeVar("M", bound="Machine")
 
 MOST_JOINTS: Final = 6
@@ -342,11 +341,7 @@ class Machine(Robot):
     def _length_of(self, name: str) -> float:
         """A body's extent: greatest distance of its joints and rods from its centre, m."""
         graph, body = self.graph, self.graph.bodies[name]
-        points = [j.at for j in graph.joints.values() if name in (j.inner, j.outer)]
-        for rod in graph.rods.values():
-            points += [
-                e for e, b in zip(rod.ends, (rod.inner, rod.outer), strict=True) if b == name
-            ]
+        points = graph.joint_points(name)
         far = max((float(np.linalg.norm(p - body.com)) for p in points), default=0.0)
         return far if far > 1e-3 * graph.size else 0.1 * graph.size
 
