@@ -105,16 +105,10 @@ def reactions(
     The rank of the balance decides which components the mechanism's statics determines; the others
     are NaN, see ``Reactions.determinate`` and ``Reactions.indeterminate``.
 
-    :param q: joint positions, shape (..., n), rad or m.
-    :param qd: joint rates, shape (..., n).
-    :param qdd: joint accelerations, shape (..., n).
-    :param wrench: external force and moment on the platform at its reference point, base axes,
-        shape (..., 6), N and N m; None: no wrench.
-    :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
-    :raises SingularityError: the Jacobian of the closure has no inverse, or the joints cannot
-        hold the loads (a constraint singularity).
-    :raises ParameterError: a robot without masses.
-    :raises ValueError: a wrong last axis, or a value that is not finite.
+    Parameters and errors as of :func:`~delta_dynamics.inverse_dynamics`.
+
+    :raises SingularityError: also where the joints cannot hold the loads (a constraint
+        singularity).
     """
     return known_alone(least_norm_reactions(robot, q, qd, qdd, wrench))
 

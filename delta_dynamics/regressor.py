@@ -84,14 +84,8 @@ def regressor(
     other values. The last column is the effort due to the wrench (zero without one); the value of
     its parameter is 1.
 
-    :param q: joint positions, shape (..., n), rad or m.
-    :param qd: joint rates, shape (..., n).
-    :param qdd: joint accelerations, shape (..., n).
-    :param wrench: as in ``inverse_dynamics``, shape (..., 6); None: no wrench.
-    :returns: Y, shape (..., n, p), N m or N per unit of the parameter.
-    :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
-    :raises SingularityError: a singularity on the way from home.
-    :raises ValueError: a wrong last axis, or a value that is not finite.
+    :returns: Y, shape (..., n, p), N m or N per unit of the parameter; parameters and errors as of
+        :func:`~delta_dynamics.inverse_dynamics`.
     """
     load = np.zeros(6) if wrench is None else wrench
     kernel, gravity = robot.massive().kernel("regressor", _regressor), robot.gravity

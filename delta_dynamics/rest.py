@@ -13,7 +13,6 @@ import numpy as np
 
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.errors import ParameterError
 from pkm_twin.machine.friction import LoadDependent, friction_values, load_of, parts
 from pkm_twin.robot.robot import Robot
 
@@ -29,9 +28,7 @@ def friction_reach(robot: Robot) -> Array:
     At home, passive joints' friction included; zero for a robot without masses.
     """
     n = robot.joints_count
-    try:
-        robot.massive()
-    except ParameterError:
+    if not robot.has_masses:
         return np.zeros(n)
     q, still = robot.inverse(robot.home()), np.zeros(n)
     size = np.abs(inverse_dynamics(robot, q, still, still)).max()

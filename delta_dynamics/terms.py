@@ -70,14 +70,8 @@ def dynamics_terms(
     masses, the basic friction's coefficients and the wrench; other friction laws are the difference
     of all efforts with and without friction.
 
-    :param q: joint positions, shape (..., n), rad or m.
-    :param qd: joint rates, shape (..., n).
-    :param qdd: joint accelerations, shape (..., n).
-    :param wrench: as in ``inverse_dynamics``, shape (..., 6); None: no wrench.
-    :returns: the terms, each of the common batch shape.
-    :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
-    :raises SingularityError: the Jacobian of the closure has no inverse.
-    :raises ValueError: a wrong last axis, or a value that is not finite.
+    :returns: the terms, each of the common batch shape; parameters and errors as of
+        :func:`~delta_dynamics.inverse_dynamics`.
     """
     kernel = torques(robot)
     load = np.zeros(6) if wrench is None else vectors(wrench, 6, "the wrench")

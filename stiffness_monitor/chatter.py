@@ -16,14 +16,12 @@ from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.vibration import ToolModes, tool_modes
-
-Complex = NDArray[np.complex128]
 
 SHARE: Final = 0.01
 """Least peak of a mode in the cutting plane, of the greatest, to count."""

@@ -18,7 +18,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.elastic_verdict import elastic_verdict, put_right
 from pkm_twin.identification.estimation import Estimate, estimate
-from pkm_twin.identification.fit import SURE, Judged, Number, known
+from pkm_twin.identification.fit import SURE, Judged, Number, known, refuse_faults
 from pkm_twin.identification.fit_solved import HELD_OUT
 from pkm_twin.identification.verdict import Verdict
 from pkm_twin.machine.shared import above_zero
@@ -212,15 +212,6 @@ def fit_elements(
         int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < SURE**2)), verdict,
         tuple(faults),
     )  # fmt: skip
-
-
-def refuse_faults(faults: Sequence[str], accept: bool) -> None:
-    """Refuse recordings that a machine cannot have made.
-
-    :raises PkmTwinError: by the first fault, unless they are accepted.
-    """
-    if faults and not accept:
-        raise PkmTwinError(f"{faults[0]}; --accept fits it nevertheless")
 
 
 def _numbers(

@@ -17,6 +17,7 @@ from pkm_twin.identification.estimation import Estimate
 from pkm_twin.identification.judge import Evidence, judge
 from pkm_twin.identification.verdict import Suspect, Verdict
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.deflection import in_base_axes
 from stiffness_monitor.response import ElementResponse
 
 Model = tuple[ElementResponse, Array, Array]
@@ -174,17 +175,15 @@ def put_right(
 ) -> Iterator[tuple[str, Array, Array]]:
     """Faults of a recording, and its wrenches and deflections without them."""
     rotation = robot.rotation(robot.forward(q))
-
-    def turned(values: Array, matrix: Array) -> Array:
-        return np.concatenate(
-            [np.einsum("kij,kj->ki", matrix, values[:, s : s + 3]) for s in (0, 3)], 1
-        )
-
     back = np.swapaxes(rotation, -1, -2)
     base, platform = "the base's axes", "the platform's"
-    yield f"the wrench is in {platform} axes, not in {base}", turned(wrench, rotation), deflection
-    yield f"the wrench is in {base}, not in {platform}", turned(wrench, back), deflection
-    own = turned(deflection, rotation)
+    yield (
+        f"the wrench is in {platform} axes, not in {base}",
+        in_base_axes(wrench, rotation),
+        deflection,
+    )
+    yield f"the wrench is in {base}, not in {platform}", in_base_axes(wrench, back), deflection
+    own = in_base_axes(deflection, rotation)
     yield f"the deflection is in {platform} axes, not in {base}", wrench, own
     for first in (0, 3):
         for i, j in ((0, 1), (0, 2), (1, 2)):

@@ -163,8 +163,7 @@ def fit(
         fault = recording_fault(robot, everything, recording, made)
         if fault is not None:
             faults.append(f"{recording.name}: {fault}")
-    if faults and not accept:
-        raise PkmTwinError(f"{faults[0]}; --accept fits it nevertheless")
+    refuse_faults(faults, accept)
     rows = [made.only(chosen, everything.values) for made in whole]
     solved = solve(parameters, rows)
     result, delays = solved.estimate, solved.delays
@@ -198,6 +197,15 @@ def fit(
         sum(made.outliers for made in rows), sum(held_from(made) for made in rows), delays,
         verdict, tuple(faults),
     )  # fmt: skip
+
+
+def refuse_faults(faults: Sequence[str], accept: bool) -> None:
+    """Refuse recordings that a machine cannot have made.
+
+    :raises PkmTwinError: by the first fault, unless they are accepted.
+    """
+    if faults and not accept:
+        raise PkmTwinError(f"{faults[0]}; --accept fits it nevertheless")
 
 
 def _less_sure(result: Estimate, change: Array) -> Estimate:

@@ -120,11 +120,7 @@ def rows_of(
         raise PkmTwinError(
             f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row"
         )
-    none = np.zeros((len(r.time), 6))
-    held = np.ones(len(r.time)) if r.held is None else r.held
-    pieces, how = tracks(
-        r.time, r.q, r.effort, none if r.wrench is None else r.wrench, held, window
-    )
+    pieces, how = tracks(r.time, r.q, r.effort, r.wrench, r.held, window)
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
     slow = SIGMAS * rate_noise(how, pieces[0].period)
@@ -189,10 +185,9 @@ def _shaken(
     inside = (r.time > track.time[0] - edge) & (r.time < track.time[-1] + edge)
     some = np.flatnonzero(inside)[:SHAKEN]
     time, q = r.time[some], r.q[some]
-    none, held = np.zeros((len(time), 6)), np.ones(len(time))
     told = []
     for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
-        pieces, _ = tracks(time, q + shake, np.zeros_like(q), none, held, how.window)
+        pieces, _ = tracks(time, q + shake, np.zeros_like(q), window=how.window)
         parts = [_piece(robot, parameters, r.carried, t, np.zeros(len(noise))) for t in pieces]
         told.append(np.concatenate([part.rest + part.table @ values for part in parts]))
     return np.asarray(told[1] - told[0], np.float64)

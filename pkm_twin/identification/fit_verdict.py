@@ -115,9 +115,8 @@ def _simpler(verdict: Verdict, frozen: Verdict) -> Verdict:
 
 @dataclass(frozen=True, eq=False)
 class _Recording:
-    """A recording at its rows: (k, n, ...) each, and its efforts function."""
+    """A recording at its rows: (k, n, ...) each."""
 
-    recorded: Recorded
     rows: Rows
     delay: float
     columns: Array
@@ -138,7 +137,7 @@ class _Recording:
         calm = calm_table(robot, everything, recorded.carried, rows.signals)
         own = lengths.columns(robot, everything, recorded.carried, values, rows.signals)
         columns = np.concatenate([columns, own], -1)
-        return cls(recorded, rows, delay, columns, missed, calm)
+        return cls(rows, delay, columns, missed, calm)
 
 
 @dataclass(frozen=True, eq=False)

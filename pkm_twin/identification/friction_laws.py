@@ -243,9 +243,7 @@ class _Search:
             end = held_from(rows)
             left.append((rows.target - rows.table @ values + delay * rows.change)[:end])
             weight.append((rows.counts / np.maximum(rows.signals.noise, 1e-300))[:end])
-            size = len(recording.time)
-            none, held = np.zeros((size, 6)), np.ones(size)
-            own, _ = tracks(recording.time, recording.q, recording.effort, none, held, how.window)
+            own, _ = tracks(recording.time, recording.q, recording.effort, window=how.window)
             self._pieces.append((own, how, end))
         self._weight = np.concatenate(weight)
         self._left = np.concatenate(left) * self._weight

@@ -125,6 +125,12 @@ class _Plane(Kind):
         return dict(zip(self.own, found.tolist(), strict=True))
 
 
+def _along(ways: Array) -> Array:
+    """Derivatives of lengths of ways (m, 3) by the velocities of their ends, (m, 6)."""
+    unit = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
+    return np.hstack([unit, np.zeros((len(ways), 3))])
+
+
 class _Ball(Kind):
     """Distance from a fixed centre of unknown place: a ball bar's length."""
 
@@ -134,9 +140,7 @@ class _Ball(Kind):
 
     def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
         del r
-        away = p - list(own.values())
-        unit = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-        return np.hstack([unit, np.zeros((len(p), 3))])
+        return _along(p - list(own.values()))
 
     def by_own(self, p: Array, own: Mapping[str, float]) -> dict[str, Array]:
         unit = -self.slopes(p, p, own)
@@ -166,8 +170,7 @@ class _Distance(Kind):
 
     def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
         del r, own
-        unit = p / np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-12)
-        return np.hstack([unit, np.zeros((len(p), 3))])
+        return _along(p)
 
 
 class _Scale(_Distance):

@@ -131,12 +131,16 @@ def even_pieces(time: Array, columns: list[Array]) -> list[tuple[Array, list[Arr
 
 
 def tracks(
-    time: Array, q: Array, effort: Array, wrench: Array, held: Array, window: int | None = None
-) -> tuple[list[Track], Filtering]:
+    time: Array, q: Array, effort: Array, wrench: Array | None = None, held: Array | None = None,
+    window: int | None = None,
+) -> tuple[list[Track], Filtering]:  # fmt: skip
     """A recording as evenly sampled motion, the ends of each piece left out.
 
+    :param wrench: (k, 6), none by default; ``held``: (k,), throughout by default.
     :param window: of the polynomial, samples; None chooses it.
     """
+    wrench = np.zeros((len(time), 6)) if wrench is None else wrench
+    held = np.ones(len(time)) if held is None else held
     period = float(np.median(np.diff(time)))
     pieces = even_pieces(time, [q, effort, wrench, held])
     if not pieces:
@@ -151,18 +155,8 @@ def tracks(
             for k in range(3)
         )
         cut = slice(width // 2, len(t) - width // 2)
-        result.append(
-            Track(
-                t[cut],
-                smooth[cut],
-                rate[cut],
-                second[cut],
-                force[cut],
-                load[cut],
-                carried[cut],
-                period,
-            )
-        )
+        motion = (t[cut], smooth[cut], rate[cut], second[cut])
+        result.append(Track(*motion, force[cut], load[cut], carried[cut], period))
     speed = np.sqrt(np.mean(np.concatenate([p.qd for p in result]) ** 2, 0))
     change = np.sqrt(np.mean(np.concatenate([p.qdd for p in result]) ** 2, 0))
     moving = speed > 0.0

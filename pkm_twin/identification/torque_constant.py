@@ -85,10 +85,8 @@ def _constants(
     currents: list[list[Array]] = [[] for _ in robot.joint_names]
     used = []
     for i, r in enumerate(recordings):
-        size = len(r.time)
-        wrench = np.zeros((size, 6)) if r.wrench is None else r.wrench
         window = None if windows is None else windows[i]
-        pieces, how = tracks(r.time, r.q, r.effort, wrench, np.zeros(size), window)
+        pieces, how = tracks(r.time, r.q, r.effort, r.wrench, window=window)
         used.append(how.window)
         model = robot if r.carried is None else r.carried
         model = model.changed(friction=dict.fromkeys(all_keys(), 0.0))

@@ -155,19 +155,15 @@ def choose_coordinates(graph: Graph) -> tuple[str, ...]:
 
     :raises ParameterError: something is free to move while the actuated joints are held.
     """
-    scheme = Scheme(graph, ())
+    scheme = Scheme(graph, tuple(poses.COORDINATES.values()))
     motion, closed = scheme.at(scheme.tree.home, graph.home)
     ju, jq = (numbers(m) for m in matrices(scheme.tree, closed))
     kept = scheme.kept
     rates = np.vstack([-np.linalg.solve(ju[kept], jq[kept]), np.eye(scheme.joints)])
     chosen: list[str] = []
     table = np.zeros((0, scheme.joints))
-    for name, coordinate in poses.COORDINATES.items():
-        row = np.zeros(scheme.tree.unknown_rates + scheme.joints)
-        ((_, columns),) = poses.rows((coordinate,), motion, [0.0])
-        for (kind, k), value in columns.items():
-            row[k if kind == "u" else scheme.tree.unknown_rates + k] = float(value)
-        scale = 1.0 / scheme.tree.size if coordinate.axis is not None else 1.0
+    rows = numbers(scheme.pose_rows(motion, [0.0] * len(scheme.coordinates)))
+    for name, scale, row in zip(poses.COORDINATES, scheme._pose_scales, rows, strict=True):
         extended = np.vstack([table, scale * row @ rates])
         if np.linalg.matrix_rank(extended, 1e-6) == len(extended):
             chosen.append(name)

@@ -198,6 +198,12 @@ class Structure:
         return replace(self, sections=sections, compliances=compliances)
 
 
+def axial(across: Any, along: Any, axis: Array) -> Array:
+    """Inertia of what is round about a unit vector: across it and along it, shape (3, 3)."""
+    inertia: Array = across * np.eye(3) + (along - across) * np.outer(axis, axis)
+    return inertia
+
+
 def disc(mass: float, radius: float) -> Array:
     """Inertia of a thin disc about its centre, axis z, shape (3, 3), kg m2."""
     return mass * radius**2 / 4 * np.diag([1.0, 1.0, 2.0])

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, ItemsView, Mapping, Sequence
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -80,7 +80,6 @@ def many(
     *,
     above: float = -math.inf,
     at_most: float = math.inf,
-    unit: str = "",
     default: Any = dataclasses.MISSING,
 ) -> Any:
     """Field: one number or more, read-only array; also none, where that is the default."""
@@ -93,22 +92,14 @@ def many(
             [_number(f"{field}[{i}]", item, above, at_most=at_most) for i, item in enumerate(value)]
         )
 
-    return _field(check, default, "one number or more" + _bound(above, at_most=at_most), unit)
+    return _field(check, default, "one number or more" + _bound(above, at_most=at_most))
 
 
 def matrix(rows: int, columns: int, *, unit: str = "", default: Any = dataclasses.MISSING) -> Any:
     """Field: ``rows`` lists of ``columns`` numbers, read-only array."""
 
     def check(field: str, value: Any) -> Array:
-        return frozen(
-            [
-                [
-                    _number(f"{field}[{i}][{j}]", v)
-                    for j, v in enumerate(_sequence(f"{field}[{i}]", row, columns))
-                ]
-                for i, row in enumerate(_sequence(field, value, rows))
-            ]
-        )
+        return frozen(_table(field, _sequence(field, value, rows), columns))
 
     return _field(check, default, f"{rows} lists of {columns} numbers", unit)
 
@@ -128,9 +119,8 @@ def mapping(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
     """Field: names to sections with the schema of the dataclass ``kind``."""
 
     def check(field: str, value: Any) -> dict[str, Any]:
-        if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
-            raise ParameterError(field, value, "a mapping of names to entries")
-        return {name: build(kind, entry, _join(field, name)) for name, entry in value.items()}
+        pairs = _named(field, value, "entries")
+        return {name: build(kind, entry, _join(field, name)) for name, entry in pairs}
 
     return _field(check, default, "a mapping of names to entries", entries=kind)
 
@@ -139,21 +129,18 @@ def numbers(
     *,
     at_least: float = -math.inf,
     at_most: float = math.inf,
-    unit: str = "",
     default: Any = dataclasses.MISSING,
 ) -> Any:
     """Field: names to numbers within bounds."""
 
     def check(field: str, value: Any) -> dict[str, float]:
-        if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
-            raise ParameterError(field, value, "a mapping of names to numbers")
         return {
             name: _number(_join(field, name), entry, at_least=at_least, at_most=at_most)
-            for name, entry in value.items()
+            for name, entry in _named(field, value, "numbers")
         }
 
     bound = "a mapping of names to numbers" + _bound(at_least=at_least, at_most=at_most)
-    return _field(check, default, bound, unit)
+    return _field(check, default, bound)
 
 
 def flag(*, default: Any = dataclasses.MISSING) -> Any:
@@ -226,15 +213,7 @@ def inertia(*, positive: bool, default: Any = dataclasses.MISSING) -> Any:
         if all(isinstance(row, (int, float)) and not isinstance(row, bool) for row in rows):
             matrix = np.diag([_number(f"{field}[{i}]", v) for i, v in enumerate(rows)])
         else:
-            matrix = np.array(
-                [
-                    [
-                        _number(f"{field}[{i}][{j}]", v)
-                        for j, v in enumerate(_sequence(f"{field}[{i}]", row, 3))
-                    ]
-                    for i, row in enumerate(rows)
-                ]
-            )
+            matrix = np.array(_table(field, rows, 3))
         scale = float(np.abs(matrix).max())
         if scale > 1e12:
             raise ParameterError(field, value, "at most 1e12 kg m2")
@@ -281,7 +260,7 @@ def choice(*allowed: str, default: Any = dataclasses.MISSING) -> Any:
     return _field(check, default, " or ".join(allowed))
 
 
-def choices(size: int, *allowed: str, default: Any = dataclasses.MISSING) -> Any:
+def choices(size: int, *allowed: str) -> Any:
     """Field: ``size`` words, each one of the allowed."""
 
     def check(field: str, value: Any) -> tuple[str, ...]:
@@ -291,7 +270,7 @@ def choices(size: int, *allowed: str, default: Any = dataclasses.MISSING) -> Any
                 raise UnknownNameError(f"{field}[{i}]", item, allowed)
         return tuple(items)
 
-    return _field(check, default, f"{size} words, each {' or '.join(allowed)}")
+    return _field(check, dataclasses.MISSING, f"{size} words, each {' or '.join(allowed)}")
 
 
 def section(kind: type, *, default: Any = dataclasses.MISSING) -> Any:
@@ -455,6 +434,16 @@ def _number(
     return result
 
 
+def _table(field: str, rows: Sequence[Any], columns: int) -> list[list[float]]:
+    return [
+        [
+            _number(f"{field}[{i}][{j}]", v)
+            for j, v in enumerate(_sequence(f"{field}[{i}]", row, columns))
+        ]
+        for i, row in enumerate(rows)
+    ]
+
+
 def _sequence(field: str, value: Any, size: int) -> Sequence[Any]:
     if isinstance(value, np.ndarray):
         value = value.tolist()
@@ -463,6 +452,12 @@ def _sequence(field: str, value: Any, size: int) -> Sequence[Any]:
     if len(value) != size:
         raise ParameterError(field, value, f"a list of {size}, not {len(value)}")
     return value
+
+
+def _named(field: str, value: Any, what: str) -> ItemsView[str, Any]:
+    if not isinstance(value, Mapping) or not all(isinstance(k, str) and k for k in value):
+        raise ParameterError(field, value, f"a mapping of names to {what}")
+    return value.items()
 
 
 def _join(path: str, name: str) -> str:

@@ -48,7 +48,7 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, Rod, array
 from pkm_twin.machine.inertia import ten_numbers
 from pkm_twin.machine.joints import unit
-from pkm_twin.machine.members import Beam, Structure, disc
+from pkm_twin.machine.members import Beam, Structure, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import shared_middle
 from pkm_twin.machine.shared import Key, Shared, above_zero, bar, point_mass, shared_number
@@ -456,5 +456,4 @@ class Delta(Robot):
 
 def _thin(across: float, along: Array) -> Array:
     """Inertia of a thin bar, ``across`` about every axis across it."""
-    e = unit(along)
-    return array(across * (np.eye(3) - np.outer(e, e)))
+    return array(axial(across, 0.0, unit(along)))

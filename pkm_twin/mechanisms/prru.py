@@ -55,7 +55,7 @@ from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.inertia import transport
-from pkm_twin.machine.members import Beam, Structure, Tube, disc
+from pkm_twin.machine.members import Beam, Structure, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.machine.shared import (
@@ -325,8 +325,8 @@ class Prru(Robot):
             slider, low, high = (f"{b} {limb}" for b in ("slider", "lower link", "upper link"))
             com = array(foot + m.link_com * l * d)
             bodies[slider] = Body(slider, m.slider_mass, foot)
-            bodies[low] = Body(low, m.lower_link_mass, com, _axial(lower, d))
-            bodies[high] = Body(high, m.upper_link_mass, com, _axial(upper, d))
+            bodies[low] = Body(low, m.lower_link_mass, com, array(axial(lower[0], lower[1], d)))
+            bodies[high] = Body(high, m.upper_link_mass, com, array(axial(upper[0], upper[1], d)))
             fixed = _named(BASE, e=e, t=t, z=UP)
             along = _named(low, **{"d": d, "t": t, "t x d": np.cross(t, d)})
             name = self.joints[i]
@@ -391,16 +391,16 @@ class Prru(Robot):
         end = np.array([l, l, -1.0, 0.0, 0.0, 0.0]).reshape(1, 1, 6)
 
         def keys(new: Array) -> dict[Key, float]:
-            first, second, moment, about, *axial = (float(v) for v in new)
-            rest = max(about - moment**2 / (first + second), sum(axial) / 2)
+            first, second, moment, about, *own = (float(v) for v in new)
+            rest = max(about - moment**2 / (first + second), sum(own) / 2)
             return {
                 ("inertia", "lower_link_mass"): first,
                 ("inertia", "upper_link_mass"): second,
                 ("inertia", "link_com"): min(1.0, max(0.0, moment / ((first + second) * l))),
                 ("inertia", "lower_link_inertia", 0): share * rest,
-                ("inertia", "lower_link_inertia", 1): axial[0],
+                ("inertia", "lower_link_inertia", 1): own[0],
                 ("inertia", "upper_link_inertia", 0): (1.0 - share) * rest,
-                ("inertia", "upper_link_inertia", 1): axial[1],
+                ("inertia", "upper_link_inertia", 1): own[1],
             }
 
         names = ("lower.mass", "upper.mass", "moment", "inertia", "lower.axial", "upper.axial")
@@ -459,12 +459,6 @@ def _spin(along: Array) -> Array:
     return np.array(
         [0.0, 0, 0, 0, *np.diag(turned), turned[0, 1], turned[0, 2], turned[1, 2]], np.float64
     )
-
-
-def _axial(moments: Array, along: Array) -> Array:
-    """Inertia of [across, along] a unit vector."""
-    across, axial = moments
-    return array(across * np.eye(3) + (axial - across) * np.outer(along, along))
 
 
 def _named(body: str, **vectors: Array) -> tuple[Direction, ...]:

@@ -53,7 +53,7 @@ from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.inertia import ten_numbers
-from pkm_twin.machine.members import Beam, Section, Structure, disc
+from pkm_twin.machine.members import Beam, Section, Structure, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import shared_middle
 from pkm_twin.machine.shared import Shared, shared_body, shared_number
@@ -389,9 +389,8 @@ class UprRpu(Robot):
             return Body(name, 0.0, array(com))
         radius = self.members.diameter[i] / 2
         weight = self.inertia.density * math.pi * radius**2 * reach
-        across, axial = weight * (reach**2 / 12 + radius**2 / 4), weight * radius**2 / 2
-        inertia = across * np.eye(3) + (axial - across) * np.outer(d, d)
-        return Body(name, weight, array(com), array(inertia))
+        across, along = weight * (reach**2 / 12 + radius**2 / 4), weight * radius**2 / 2
+        return Body(name, weight, array(com), array(axial(across, along, d)))
 
     @cached_property
     def beams(self) -> tuple[Beam, ...]:

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError
 from pkm_twin.paths.constraints import Limits, names_of, shares
 from pkm_twin.paths.geometry import Path
 from pkm_twin.paths.joint_path import JointPath
@@ -173,7 +172,7 @@ class TimedPath:
             for speeds, slopes in ((travel, run.part.travel), (felt, run.part.felt)):
                 speeds[mine] = run.part.speed(slopes, interval, part, v)
         effort = None
-        if has_masses(self.robot):
+        if self.robot.has_masses:
             effort = inverse_dynamics(self.robot, q, qd, qdd, self.wrench)
         return Samples(t, q, qd, qdd, effort, self.robot.forward(q), travel, felt)
 
@@ -265,15 +264,6 @@ class Samples:
     pose: Array
     speed: Array
     felt: Array
-
-
-def has_masses(robot: Robot) -> bool:
-    """Whether a robot's file gives masses."""
-    try:
-        robot.massive()
-    except ParameterError:
-        return False
-    return True
 
 
 def binding(used: Array) -> list[int]:

@@ -22,7 +22,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.paths.joint_path import JointPath, check_positions
-from pkm_twin.paths.motion import Samples, TimedPath, has_masses
+from pkm_twin.paths.motion import Samples, TimedPath
 
 DELAYS: Final = {"zv": 1, "zvd": 2}
 """Half vibrations that each shaper takes."""
@@ -115,7 +115,7 @@ class ShapedPath(TimedPath):
         rest = robot.pose_acceleration(q, qd, np.zeros_like(qd))
         qdd = np.asarray(np.linalg.solve(jacobian, (change - rest)[..., None])[..., 0], np.float64)
         effort = None
-        if has_masses(robot):
+        if robot.has_masses:
             effort = inverse_dynamics(robot, q, qd, qdd, self.wrench)
         moved = (robot.platform_jacobian(q)[:, :3] @ qd[..., None])[..., 0]
         speed = np.linalg.norm(moved, axis=1)

@@ -92,21 +92,25 @@ def _joined(group: list[Finding]) -> Finding:
     )
 
 
+def _outside(
+    field: str, quantity: str, value: float, bounds: tuple[float, float], unit: str,
+    likely: tuple[str, str],
+) -> Iterator[Finding]:  # fmt: skip
+    """A quantity below or above two bounds; zero is none.
+
+    :param likely: what it means below and above them.
+    """
+    if value > bounds[1]:
+        yield Finding(field, quantity, value, bounds[1], unit, likely[1])
+    elif 0.0 < value < bounds[0]:
+        yield Finding(field, quantity, value, bounds[0], unit, likely[0])
+
+
 def _size(graph: Graph) -> Iterator[Finding]:
-    extent = _extent(graph)
-    if extent > LARGEST:
-        yield Finding(
-            "geometry", "extent of the machine", extent, LARGEST, "m", "lengths in millimetres?"
-        )
-    elif 0.0 < extent < SMALLEST:
-        yield Finding(
-            "geometry",
-            "extent of the machine",
-            extent,
-            SMALLEST,
-            "m",
-            "lengths in another unit than metres?",
-        )
+    yield from _outside(
+        "geometry", "extent of the machine", _extent(graph), (SMALLEST, LARGEST), "m",
+        ("lengths in another unit than metres?", "lengths in millimetres?"),
+    )  # fmt: skip
 
 
 def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
@@ -115,24 +119,11 @@ def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
         return
     # As dense as a box of the machine's extent would be: grams or tonnes change it a thousandfold.
     density = total / max(_extent(graph), 1e-9) ** 3 if _extent(graph) else 0.0
-    if density > DENSEST:
-        yield Finding(
-            "masses",
-            "all that moves over the cube of the extent",
-            density,
-            DENSEST,
-            "kg/m3",
-            f"{total:.4g} kg in all; masses in grams?",
-        )
-    elif 0.0 < density < LIGHTEST:
-        yield Finding(
-            "masses",
-            "all that moves over the cube of the extent",
-            density,
-            LIGHTEST,
-            "kg/m3",
-            f"{total:.4g} kg in all; masses in tonnes?",
-        )
+    whole = f"{total:.4g} kg in all; masses in"
+    yield from _outside(
+        "masses", "all that moves over the cube of the extent", density, (LIGHTEST, DENSEST),
+        "kg/m3", (f"{whole} tonnes?", f"{whole} grams?"),
+    )  # fmt: skip
     lead = merged(graph)
     with_platform = [b for b in graph.bodies if lead[b] == lead[graph.platform]]
     if not any(graph.bodies[b].mass for b in with_platform) and not robot.payload.mass:
@@ -243,12 +234,9 @@ def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
 
 def _gravity(robot: Robot) -> Iterator[Finding]:
     size = float(np.linalg.norm(robot.gravity))
-    if size > GRAVITY[1]:
-        times = f"{size / 9.81:.4g} times the Earth's; in mm/s2 or cm/s2?"
-        yield Finding("gravity", "gravity", size, GRAVITY[1], "m/s2", times)
-    elif 0.0 < size < GRAVITY[0]:
-        yield Finding("gravity", "gravity", size, GRAVITY[0], "m/s2", "in km/s2?")
-    elif size == 1.0:
+    times = f"{size / 9.81:.4g} times the Earth's; in mm/s2 or cm/s2?"
+    yield from _outside("gravity", "gravity", size, GRAVITY, "m/s2", ("in km/s2?", times))
+    if size == 1.0:
         yield Finding("gravity", "gravity", size, 1.62, "m/s2", "in units of the Earth's?")
 
 

@@ -18,7 +18,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.code import NOT_FINITE
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
-from pkm_twin.errors import SingularityError, UnreachableError
+from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.engine import Engine, engine_of
 from pkm_twin.kinematics.passive import (
     passive_names,
@@ -195,6 +195,15 @@ class Robot(Mechanism):
         :raises ParameterError: the robot's file gives none.
         """
         return self._massive
+
+    @property
+    def has_masses(self) -> bool:
+        """Whether the robot's file gives masses."""
+        try:
+            self.massive()
+        except ParameterError:
+            return False
+        return True
 
     def inverse(self, pose: ArrayLike) -> Array:
         """Joint positions q (..., n) of poses (..., m); ``forward(q)`` is the pose.
