@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final
 
 import numpy as np
@@ -107,9 +107,12 @@ class Elastic:
         if known is None:
             numbers = np.array(numbers_of(self.structure), np.float64)
             known = self._kernels[name] = self.robot.engine.kernel_with(
-                numbers, name, lambda t: write(Solved(t, self)), self._key, free=free
+                numbers, name, partial(self._written, write), self._key, free=free
             )
         return known
+
+    def _written(self, write: Callable[[Solved], Program], t: Traced) -> Program:
+        return write(Solved(t, self))
 
     @cached_property
     def compliance(self) -> Kernel:

@@ -69,6 +69,16 @@ def test_packages_import_only_what_they_stand_on(importing):
         assert found <= {"pkm_twin.errors", "pkm_twin.files"}
 
 
+def test_codegen_names_nothing_above_it():
+    above = {name.rpartition(".")[2] for name in MAY} - {"pkm_twin", "codegen", "errors", "files"}
+    # As part of a name, or alone in quotation marks (a machine is also an axis of a program).
+    quoted = "|".join(f"['\"]{name}['\"]" for name in above - {"machine"})
+    text = re.compile(rf"pkm_twin[./]({'|'.join(above)})\b|{quoted}|{'|'.join(TWINS)}")
+    for module, path in sources().items():
+        if within(module, "pkm_twin.codegen"):
+            assert not text.search(path.read_text(encoding="utf-8")), module
+
+
 def test_nobody_imports_in_a_circle():
     rooms = {here: there - {here} for here, there in MAY.items()}
     assert list(TopologicalSorter(rooms).static_order())

@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable, Sequence
 from functools import cache as remembered
 from functools import cached_property
-from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen import cache
 from pkm_twin.codegen.arrays import Array, doubles
+from pkm_twin.codegen.key import ProgramKey
 from pkm_twin.codegen.parts import in_parts
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
@@ -36,8 +36,6 @@ NOT_FINITE: Final = 2.0
 
 MOST: Final = 1_000_000
 """Upper limit of the numbers in an input, an output or the parameters."""
-_WRITERS: Final = ("codegen", "machine", "kinematics", "robot", "mechanisms", "streams")
-"""Folders beside this one whose sources write programs."""
 SMALL: Final = 4096
 """Samples of a batch that is copied into a room of its own."""
 KEPT_ROOMS: Final = 16
@@ -64,16 +62,6 @@ def compiled() -> bool:
     return _llvm() is not None
 
 
-@remembered
-def _sources() -> str:
-    """Digest of all sources that write programs: after a change they are compiled again."""
-    root = Path(__file__).resolve().parents[1]
-    folders = [root / name for name in _WRITERS]
-    folders += [root.parent / name for name in ("delta_dynamics", "stiffness_monitor")]
-    paths = sorted(path for place in folders for path in place.glob("*.py"))
-    return cache.digest(*(path.read_text(encoding="utf-8") for path in paths))
-
-
 def _axes(array: Array) -> int:
     return array.ndim
 
@@ -84,11 +72,11 @@ class Code:
     What hangs on parameters alone is prepared once a machine, see :meth:`prepare`.
 
     :param build: writes the program; called only where no compiled one is stored.
-    :param key: text that the program's content hangs on, beside the package's own sources.
+    :param key: the program's identity.
     """
 
-    def __init__(self, build: Callable[[], Program], key: str) -> None:
-        self._build, self._key = build, key
+    def __init__(self, build: Callable[[], Program], key: ProgramKey) -> None:
+        self.build, self.key = build, key
         self._lock = threading.Lock()
         self._spaces: dict[int, list[Space]] = {}
         """Rooms that nobody uses, by their number of samples."""
@@ -96,7 +84,7 @@ class Code:
     @cached_property
     def program(self) -> Program:
         """The program itself."""
-        return self._build()
+        return self.build()
 
     @cached_property
     def _loaded(self) -> tuple[dict[str, Any], Any, Any, Any]:
@@ -108,7 +96,7 @@ class Code:
                 return _header(self.program, 1), plain.prepare, plain, None
             from pkm_twin.codegen import native
 
-            name = cache.digest(self._key, _sources(), llvm.IDENTITY)
+            name = self.key.digest(llvm.IDENTITY)
             stored = cache.read(name)
             if stored and _sound(stored[0]) and cache.is_object(stored[1], native.SYMBOL):
                 header, code = stored

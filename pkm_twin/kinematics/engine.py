@@ -18,6 +18,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.key import EMPTY, ProgramKey
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.iterations import least_squares, newton
 from pkm_twin.kinematics.linkage import hold
@@ -170,11 +171,12 @@ class Engine(Scheme):
 
         :param extra: as of :meth:`kernel`, and ``free``.
         """
-        key, numbers = f"{name} {extra} {self.structure}", np.concatenate([self.geometry, more])
+        key = self.structure.also(f"{name} {extra}", write, Traced)
+        numbers = np.concatenate([self.geometry, more])
         made = Kernel(_code(key, self, write, more, free=free), numbers)
         if not made.holds:
             # It takes for constant what is none here: a program of these numbers' own.
-            exact = f"{key} {self.graph.key} {more.tolist()}"
+            exact = key.also(f"{self.graph.key} {more.tolist()}")
             made = Kernel(_code(exact, self, write, more), numbers)
         return made
 
@@ -210,10 +212,10 @@ def _reciprocal(matrix: Array) -> float:
     return float(s[-1] / s[0]) if s.size and s[0] > 0.0 else 0.0
 
 
-_engines: Final[WeakValueDictionary[str, Engine]] = WeakValueDictionary()
+_engines: Final[WeakValueDictionary[ProgramKey, Engine]] = WeakValueDictionary()
 """Engines that something still holds, by geometry: however many machines there are in between."""
-_codes: Final[WeakValueDictionary[str, Code]] = WeakValueDictionary()
-"""Programs that something still holds, by structure: machines of one structure share them."""
+_codes: Final[WeakValueDictionary[ProgramKey, Code]] = WeakValueDictionary()
+"""Programs that something still holds: machines of one structure share them."""
 
 
 def engine_of(
@@ -221,13 +223,13 @@ def engine_of(
     coordinates: Sequence[Coordinate],
     closed: Closed | None = None,
     branch: Branch | None = None,
-    mark: str = "",
+    mark: ProgramKey = EMPTY,
 ) -> Engine:
     """The engine of a geometry: machines that differ in inertia or limits alone share it.
 
-    :param mark: text that tells closed forms and branch rules from others.
+    :param mark: what tells closed forms and branch rules from others, and who writes them.
     """
-    key = f"{graph.key} {coordinates!r} {mark}"
+    key = mark.also(f"{graph.key} {coordinates!r}")
     engine = _engines.get(key)
     if engine is None:
         engine = _engines.setdefault(key, Engine(graph, coordinates, closed, branch, mark))
@@ -236,7 +238,12 @@ def engine_of(
 
 
 def _code(
-    key: str, engine: Engine, write: Callable[[Traced], Program], more: Array, *, free: bool = False
+    key: ProgramKey,
+    engine: Engine,
+    write: Callable[[Traced], Program],
+    more: Array,
+    *,
+    free: bool = False,
 ) -> Code:
     """The program of a key, written on an engine if nobody has it."""
     code = _codes.get(key)

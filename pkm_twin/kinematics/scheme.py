@@ -12,6 +12,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects
+from pkm_twin.codegen.key import EMPTY, ProgramKey
 from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics import pose as poses
@@ -48,7 +49,7 @@ class Scheme(Linkage):
         coordinates: Sequence[Coordinate],
         closed: Closed | None = None,
         branch: Branch | None = None,
-        mark: str = "",
+        mark: ProgramKey = EMPTY,
     ) -> None:
         super().__init__(graph)
         self.coordinates = tuple(coordinates)
@@ -60,12 +61,12 @@ class Scheme(Linkage):
         return np.concatenate([geometry_of(self.graph), self.closed.numbers])
 
     @cached_property
-    def structure(self) -> str:
-        """Text of all that programs hang on: machines of one structure share them."""
-        return repr((
-            self._mark, self.graph.topology, pattern_of(self.tree), self.coordinates,
+    def structure(self) -> ProgramKey:
+        """All that programs hang on: machines of one structure share them."""
+        return self._mark.also(repr((
+            self.graph.topology, pattern_of(self.tree), self.coordinates,
             self.closed.start is not None, self.branch is not None, self.kept, self.pivots,
-        ))  # fmt: skip
+        )))  # fmt: skip
 
     @cached_property
     def kept(self) -> list[int]:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.code import NOT_FINITE
 from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.key import EMPTY
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.engine import Engine, engine_of
@@ -127,7 +128,7 @@ class Robot(Mechanism):
         start = (lambda numbers, q: self.on(numbers).start(q)) if self.has_start else None
         closed = Closed(np.array(self.closed_numbers, np.float64), start)
         branch = self.branch if self.has_branch else None
-        mark = f"{self.mechanism} {self.closed_key}"
+        mark = EMPTY.also(f"{self.mechanism} {self.closed_key}", type(self))
         return engine_of(graph, self.coordinates, closed, branch, mark)
 
     @cached_property

@@ -23,6 +23,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.expressions import Objects, Tape, sqrt
 from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.key import EMPTY
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.stamps import SECOND
@@ -164,8 +165,8 @@ def _kernel(degree: int, joints: int, *, solved: bool) -> Kernel:
     and half of it, and where to look, ns. Out: the sums; or, ``solved``, the first and the second
     derivative by s there, and the pivots of V V'.
     """
-    name = f"polynomial fit {degree} {joints} {solved}"
-    return Kernel(Code(lambda: _program(degree, joints, solved), name))
+    key = EMPTY.also(f"polynomial fit {degree} {joints} {solved}", _program)
+    return Kernel(Code(lambda: _program(degree, joints, solved), key))
 
 
 def _program(degree: int, joints: int, solved: bool) -> Program:

@@ -19,6 +19,7 @@ from pkm_twin.codegen import expressions as ex
 from pkm_twin.codegen.cholesky import FLOOR, traces_over
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import Kernel
+from pkm_twin.codegen.key import ProgramKey
 from pkm_twin.codegen.lu import SparseLU, independent_rows, pivot_order
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, UnreachableError
@@ -39,7 +40,7 @@ def program(write, size):
 def both(write, x, key):
     """What compiled and plain code give for samples x, shape (count, size)."""
     made = program(write, x.shape[1])
-    (fast,), status = Kernel(Code(lambda: made, key))(NONE, x)
+    (fast,), status = Kernel(Code(lambda: made, ProgramKey(key)))(NONE, x)
     assert status is None
     (slow,), codes = PlainKernel(made).run([x])
     assert not codes[:, 0].any()
@@ -157,7 +158,7 @@ def test_large_batches_in_threads_have_the_same_bits(rng, monkeypatch):
 @compiled
 def test_a_call_keeps_its_arguments_while_other_threads_allocate(monkeypatch):
     """Compiled code reads where and how many its samples are after the interpreter's lock."""
-    code = Code(lambda: program(lambda x: [2.0 * x[0]], 1), "test arguments")
+    code = Code(lambda: program(lambda x: [2.0 * x[0]], 1), ProgramKey("test arguments"))
     header, prepare, batch, one = code._loaded
     taken = []
 
@@ -350,7 +351,8 @@ def test_a_stored_program_that_must_not_run_is_rebuilt(tmp_path, monkeypatch, ha
     made = [program(lambda x, k=k: [k * x[0]], 1) for k in (2.0, 3.0)]
 
     def outputs():
-        return [Kernel(Code(lambda m=m: m, f"times {id(m)}"))(NONE, [1.0])[0][0][0] for m in made]
+        codes = [Code(lambda m=m: m, ProgramKey(f"times {id(m)}")) for m in made]
+        return [Kernel(code)(NONE, [1.0])[0][0][0] for code in codes]
 
     assert outputs() == [2.0, 3.0]
     paths = sorted(tmp_path.iterdir())
