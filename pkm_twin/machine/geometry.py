@@ -48,18 +48,7 @@ def scales_of(graph: Graph) -> list[float]:
 
 def geometry_of(graph: Graph) -> Array:
     """All numbers of a graph's geometry, shape (k,), lengths that only scale equations last."""
-    return array([*_walk(graph), *graph.origin, *scales_of(graph)])
-
-
-def _walk(graph: Graph) -> Iterator[float]:
-    for joint in graph.joints.values():
-        yield from (*joint.at, *joint.axes.ravel(), joint.home)
-        if joint.type.threaded():
-            yield joint.pitch
-        for direction in joint.directions:
-            yield from direction.vector
-    for rod in graph.rods.values():
-        yield from (*rod.ends.ravel(), *(() if rod.pair is None else rod.pair))
+    return array([*graph.numbers, *scales_of(graph)])
 
 
 def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
@@ -97,7 +86,7 @@ def pattern_of(tree: Tree) -> str:
     Two graphs of one topology and one pattern have the same programs, on their own numbers.
     """
     graph = tree.graph
-    parts: list[Any] = [marks([*_walk(graph), *graph.origin])]
+    parts: list[Any] = [marks(graph.numbers)]
     for body, link in tree.links.items():
         # The signs and zeros of a frame in base axes tell which way its axes were chosen.
         parts += [link.parent, marks(link.arm), marks(link.axes)]

@@ -232,22 +232,23 @@ class Graph:
         return repr((list(self.bodies), joints, rods, self.platform, *self.laws))
 
     @property
+    def numbers(self) -> list[float]:
+        """All numbers of the geometry in a row, inertia and friction not."""
+        found: list[float] = []
+        for joint in self.joints.values():
+            found += (*joint.at, *joint.axes.ravel(), joint.home)
+            if joint.type.threaded():
+                found.append(joint.pitch)
+            for direction in joint.directions:
+                found += (*direction.vector,)
+        for rod in self.rods.values():
+            found += (*rod.ends.ravel(), *(() if rod.pair is None else rod.pair))
+        return [*found, *self.origin]
+
+    @property
     def key(self) -> str:
-        """Text of the geometry: all that compiled programs hang on, inertia and friction not."""
-        joints = [
-            (
-                j.name, j.kind, j.inner, j.outer, j.at.tolist(), j.axes.tolist(), j.actuated,
-                j.home, j.given, j.loaded, j.pitch,
-                [(d.body, d.vector.tolist()) for d in j.directions],
-            )
-            for j in self.joints.values()
-        ]  # fmt: skip
-        rods = [
-            (r.name, r.inner, r.outer, r.ends.tolist(), None if r.pair is None else r.pair.tolist())
-            for r in self.rods.values()
-        ]
-        place = self.origin.tolist()
-        return repr((list(self.bodies), joints, rods, self.platform, place, *self.laws))
+        """Text of the geometry: all that compiled programs hang on."""
+        return f"{self.topology} {array(self.numbers).tolist()}"
 
     def check(self) -> None:
         """Refuse what no machine can be, by the name of the field.
