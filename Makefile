@@ -107,7 +107,7 @@ pages: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.parameters docs/parameters.md
 	$(BIN)/python -m tools.pages.commands docs/commands.md
 	$(BIN)/python -m tools.pages.errors docs/errors.md
-	$(BIN)/python -m tools.pages.nodes docs/nodes.md
+	$(BIN)/python -m tools.pages.nodes docs/nodes.md docs/security/policy.xml
 	$(BIN)/python -m tools.pages.engine docs/engine.md
 	$(BIN)/python -m tools.pages.trend docs/trend.md
 	$(BIN)/python -m tools.pages.architecture docs/architecture.png

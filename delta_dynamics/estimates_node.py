@@ -73,8 +73,8 @@ class Estimates:
             read_only=True,
         ):
             return None
-        self._load = node.create_guarded_publisher(InertiaStamped, "~/payload")
-        self._load_deviation = node.create_guarded_publisher(InertiaStamped, "~/payload_deviation")
+        self._load = node.create_guarded_publisher("~/payload")
+        self._load_deviation = node.create_guarded_publisher("~/payload_deviation")
         node.create_service(Trigger, "~/reset_payload", self._reset_payload)
         return PayloadEstimator(robot)
 
@@ -105,11 +105,11 @@ class Estimates:
         )
         if not wanted:
             return None
-        self._wrench = node.create_guarded_publisher(WrenchStamped, "~/external_wrench")
+        self._wrench = node.create_guarded_publisher("~/external_wrench")
         self._effort = JointPublisher(node, robot, "~/external_effort")
-        self._event = node.create_guarded_publisher(Bool, "~/contact", latched=True)
-        self._body = node.create_guarded_publisher(String, "~/contact_body", latched=True)
-        self._point = node.create_guarded_publisher(PointStamped, "~/contact_point")
+        self._event = node.create_guarded_publisher("~/contact")
+        self._body = node.create_guarded_publisher("~/contact_body")
+        self._point = node.create_guarded_publisher("~/contact_point")
         return ContactMonitor(robot, bandwidth, sigmas)
 
     def warning(self) -> str:

@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 from rclpy.duration import Duration
-from sensor_msgs.msg import JointState
 
 from delta_dynamics.gate import Gate, GateSettings
 from delta_dynamics.parameters_node import changed, declare_changes
+from delta_dynamics.topics import GATE
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError
@@ -40,6 +40,8 @@ class CommandGate(TwinNode):
     A process of its own: it outlives the node whose torques it forwards.
     """
 
+    topics = GATE
+
     def __init__(self) -> None:
         super().__init__("command_gate")
         robot = self.declare_robot()
@@ -55,7 +57,6 @@ class CommandGate(TwinNode):
         self._decode_torques = JointStateDecoder(definition)
         self._decode_state = JointStateDecoder(definition)
         self.create_guarded_subscription(
-            JointState,
             TORQUES,
             self._on_torques,
             raw=True,
@@ -65,7 +66,7 @@ class CommandGate(TwinNode):
         )
         if settings.on_stop == "gravity":
             self.create_guarded_subscription(
-                JointState, "joint_states", self._on_joint_state, raw=True, awaited=True
+                "joint_states", self._on_joint_state, raw=True, awaited=True
             )
         follow_changes(
             self,

@@ -13,14 +13,13 @@ import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.duration import Duration
 from rclpy.time import Time
-from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics.estimates_node import Estimates
 from delta_dynamics.feedforward import Feedforward, Torques, warm_up
 from delta_dynamics.parameters_node import CHANGES, changed, declare_changes
 from delta_dynamics.reactions import reactions
 from delta_dynamics.settings import Settings
+from delta_dynamics.topics import TWIN
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.messages.intake import JointStateDecoder, RawTrajectory
@@ -44,6 +43,8 @@ LAST_WORD: Final = 0.5
 class DeltaDynamics(TwinNode):
     """Feedforward torques from the virtual-work model of any robot with masses."""
 
+    topics = TWIN
+
     def __init__(self) -> None:
         super().__init__("delta_dynamics")
         robot = self.declare_robot()
@@ -60,7 +61,7 @@ class DeltaDynamics(TwinNode):
                 None,
                 "nothing, zeros or gravity, explicitly set, because publish_commands is true",
             )
-        self._trajectory = self.create_guarded_publisher(JointTrajectory, "~/joint_trajectory_ff")
+        self._trajectory = self.create_guarded_publisher("~/joint_trajectory_ff")
         # A torque is worth nothing once the stream that it answers would be stale.
         stale_after = self._feedforward.settings.stale_after
         self._torques = JointPublisher(self, robot, "~/joint_torques", expiry=stale_after)
@@ -76,12 +77,8 @@ class DeltaDynamics(TwinNode):
         if self._estimates.warning():
             self.get_logger().warning(self._estimates.warning())
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
-        # Long messages must not lose their parts.
+        self.create_guarded_subscription("~/joint_trajectory", self._on_trajectory, raw=True)
         self.create_guarded_subscription(
-            JointTrajectory, "~/joint_trajectory", self._on_trajectory, raw=True, best_effort=False
-        )
-        self.create_guarded_subscription(
-            JointState,
             "joint_states",
             self._on_joint_state,
             raw=True,
@@ -268,7 +265,7 @@ class DeltaDynamics(TwinNode):
         mounts = declare_mounts(self)
         if not wanted:
             return None
-        self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench, awaited=True)
+        self.create_guarded_subscription("wrench", self._on_wrench, awaited=True)
         return WrenchWindow(
             WrenchReader(wrench, mounts),
             round(age * SECOND),
@@ -300,9 +297,7 @@ class DeltaDynamics(TwinNode):
             return {}
         rest = np.zeros((2, len(robot.joint_names)))
         return {
-            name: self.create_guarded_publisher(
-                WrenchStamped, f"~/reactions/{name.replace(' ', '_')}"
-            )
+            name: self.create_guarded_publisher("~/reactions/<joint>", joint=name.replace(" ", "_"))
             for name in reactions(robot, robot.inverse(robot.home()), *rest).names
         }
 

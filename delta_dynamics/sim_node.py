@@ -10,15 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
-from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics.feedforward import warm_up
 from delta_dynamics.gate import effort_limits
@@ -29,6 +26,7 @@ from delta_dynamics.simulation import (
     WrenchSignal,
     tuned,
 )
+from delta_dynamics.topics import SIMULATION
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.intake import DoublesTemplate, RawTrajectory
@@ -38,6 +36,7 @@ from pkm_twin.robot.variation import KINDS, MAX_SPREAD, Variation, varied
 from pkm_twin.ros import health
 from pkm_twin.ros.joints import FIELDS, JointPublisher
 from pkm_twin.ros.node import TwinNode
+from pkm_twin.ros.qos import latched_qos
 from pkm_twin.ros.run import run
 
 Array = NDArray[np.float64]
@@ -63,6 +62,8 @@ OWN_CLOCK: Final = "false, because machine_sim has its own clock"
 
 class MachineSim(TwinNode):
     """A robot's drives and sensors, its motion simulated."""
+
+    topics = SIMULATION
 
     def __init__(self) -> None:
         super().__init__("machine_sim")
@@ -264,7 +265,7 @@ class MachineSim(TwinNode):
 
     def _create_topics(self) -> None:
         self._states = JointPublisher(self, self._simulation.robot, "joint_states", FIELDS)
-        self._wrenches = self.create_guarded_publisher(WrenchStamped, "wrench")
+        self._wrenches = self.create_guarded_publisher("wrench")
         self._wrench = DoublesTemplate(
             WRENCH,
             message_definition(WRENCH),
@@ -274,16 +275,13 @@ class MachineSim(TwinNode):
             },
             stamped=True,
         )
-        kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._drawn = self.create_publisher(DiagnosticArray, "~/drawn", kept)
+        self._drawn = self.create_publisher(DiagnosticArray, "~/drawn", latched_qos())
         self._clock_topic = self.create_publisher(Clock, "/clock", 10) if self._simulated else None
         self._clock_due = 0
-        self.create_guarded_subscription(Float64MultiArray, "~/commands", self._on_commands)
+        self.create_guarded_subscription("~/commands", self._on_commands)
+        self.create_guarded_subscription("~/joint_trajectory", self._on_trajectory, raw=True)
         self.create_guarded_subscription(
-            JointTrajectory, "~/joint_trajectory", self._on_trajectory, raw=True, best_effort=False
-        )
-        self.create_guarded_subscription(
-            WrenchStamped, "~/applied_wrench", lambda m: self._simulation.push(m, self._base)
+            "~/applied_wrench", lambda m: self._simulation.push(m, self._base)
         )
 
     def _on_commands(self, message: Float64MultiArray) -> None:

@@ -65,12 +65,8 @@ class StiffnessAlarmTopics:
         if not wanted:
             return
         self._core = StiffnessWatch(robot, rules, frames, settings, age, period)
-        self._alarm = node.create_guarded_publisher(
-            DiagnosticArray, "~/stiffness_alarm", latched=True
-        )
-        node.create_guarded_subscription(
-            TransformStamped, "measured_deflection", self._on_deflection
-        )
+        self._alarm = node.create_guarded_publisher("~/stiffness_alarm")
+        node.create_guarded_subscription("measured_deflection", self._on_deflection)
         node.create_service(Trigger, "~/reset_stiffness", self._on_reset)
 
     def _declare_settings(self) -> AlarmSettings:

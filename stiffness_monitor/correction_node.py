@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import JointState
 
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.reading import JointReader
@@ -98,11 +97,11 @@ class SetpointCorrection:
         fields = ("position",)
         self._offsets = JointPublisher(node, robot, "~/setpoint_offset", fields)
         self._corrected = JointPublisher(node, robot, "~/corrected_setpoint", fields)
-        node.create_guarded_subscription(JointState, "setpoint", self._on_setpoint, raw=True)
+        node.create_guarded_subscription("setpoint", self._on_setpoint, raw=True)
         if paired:
             both = ("position", "effort")
             self._both = JointPublisher(node, robot, "~/setpoint_with_torques", both)
-            node.create_guarded_subscription(JointState, "torques", self._on_torques, raw=True)
+            node.create_guarded_subscription("torques", self._on_torques, raw=True)
 
     def reset(self) -> None:
         """Forget the last wrench, as when the clock jumps."""

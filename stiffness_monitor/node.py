@@ -36,6 +36,7 @@ from stiffness_monitor.compliance import kernels
 from stiffness_monitor.correction_node import SetpointCorrection
 from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings
+from stiffness_monitor.topics import STIFFNESS
 
 AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
 UPPER: Final = np.triu_indices(6)
@@ -45,6 +46,8 @@ ENTRIES: Final = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER, strict=Tru
 
 class StiffnessMonitor(TwinNode):
     """Live compliance and strain energy of any robot with elastic members."""
+
+    topics = STIFFNESS
 
     def __init__(self) -> None:
         super().__init__("stiffness_monitor")
@@ -77,14 +80,14 @@ class StiffnessMonitor(TwinNode):
         )  # fmt: skip
         # What has no stamp, or texts for numbers, has a sibling that plots can draw.
         self._outputs = [
-            (self.create_guarded_publisher(kind, topic), make)
-            for topic, kind, make in (
-                ("~/compliance", Float64MultiArray, _matrix),
-                ("~/compliance_stamped", JointState, self._entries),
-                ("~/strain_energy", DiagnosticArray, self._energies),
-                ("~/strain_energy_stamped", JointState, self._factors),
-                ("~/dominant_element", String, lambda answer: String(data=answer.energy.dominant)),
-                ("~/deflection", TransformStamped, self._transform),
+            (self.create_guarded_publisher(topic), make)
+            for topic, make in (
+                ("~/compliance", _matrix),
+                ("~/compliance_stamped", self._entries),
+                ("~/strain_energy", self._energies),
+                ("~/strain_energy_stamped", self._factors),
+                ("~/dominant_element", lambda answer: String(data=answer.energy.dominant)),
+                ("~/deflection", self._transform),
             )
         ]
         self._known = 0
@@ -96,17 +99,15 @@ class StiffnessMonitor(TwinNode):
         if rate > 0.0 and has_modes(robot):
             # What the first call loads and compiles is not waited for in a callback.
             natural_frequencies(robot, robot.home())
-            self._frequencies = self.create_guarded_publisher(
-                Float64MultiArray, "~/natural_frequencies"
-            )
+            self._frequencies = self.create_guarded_publisher("~/natural_frequencies")
             self._frequencies_stamped = self.create_guarded_publisher(
-                JointState, "~/natural_frequencies_stamped"
+                "~/natural_frequencies_stamped"
             )
             self.create_guarded_timer(1.0 / rate, self._publish_frequencies)
         self.create_guarded_subscription(
-            JointState, "joint_states", self._on_joint_state, raw=True, awaited=True
+            "joint_states", self._on_joint_state, raw=True, awaited=True
         )
-        self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
+        self.create_guarded_subscription("wrench", self._on_wrench)
         follow_changes(
             self,
             changeable(Settings),

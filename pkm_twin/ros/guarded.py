@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Callable
-from typing import Any, Final, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Final
 
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
@@ -21,8 +21,7 @@ from pkm_twin.ros.parameters import ParameterNode
 from pkm_twin.ros.qos import EXPIRY, OVERRIDES, input_qos, latched_qos, output_qos
 from pkm_twin.ros.turns import SeldomGroup
 from pkm_twin.streams.monitor import TopicStatistics
-
-M = TypeVar("M")
+from pkm_twin.streams.topics import Topic
 
 # The middleware's threads hold its locks while they report an event, and wait there for the lock
 # that the executor holds while it takes one or ends: a node could stand still for ever.
@@ -35,6 +34,9 @@ class GuardedNode(ParameterNode):
 
     A node that is not active takes no message.
     """
+
+    topics: ClassVar[Mapping[str, Topic]]
+    """The topics that it can have, and its own services."""
 
     def __init__(self, name: str) -> None:
         # rclpy subscribes to the clock while it makes the node.
@@ -111,43 +113,45 @@ class GuardedNode(ParameterNode):
 
     def create_guarded_subscription(
         self,
-        kind: type[M],
         topic: str,
         callback: Callable[[Any], None],
         *,
         raw: bool = False,
-        best_effort: bool = True,
         awaited: bool = False,
         expires: Callable[[], float] | None = None,
         expiry: float | None = None,
     ) -> None:
-        """Subscribe, with QoS overrides by parameter and a callback that cannot end the node.
+        """Subscribe to a topic of the node's table, with a callback that cannot end the node.
+
+        QoS overrides are parameters. By default messages may be lost for the newest, and publishers
+        of both kinds match. Of a topic that is ``whole`` none is lost, as long messages need it,
+        until a best-effort publisher comes: from there on as others.
 
         :param raw: the callback takes the message's bytes.
-        :param best_effort: messages may be lost for the newest, and publishers of both kinds
-            match. Otherwise none is lost, as long messages need it, until a best-effort publisher
-            comes: from there on as if true.
         :param awaited: the diagnostics warn until the first message.
         :param expires: how long a message may wait for the node, s; older ones count as lost.
         :param expiry: lifespan and deadline that publishers have to offer, s; None is any.
         """
         if awaited:
             self.health.awaited.append(topic)
+        row = self.topics[topic]
         GuardedSubscription(
-            self, kind, topic, callback,
-            raw=raw, best_effort=best_effort, expires=expires, expiry=expiry,
+            self, row.message, topic, callback,
+            raw=raw, best_effort=not row.whole, expires=expires, expiry=expiry,
         )  # fmt: skip
 
     def create_guarded_publisher(
-        self, kind: type[M], topic: str, expiry: float | None = None, *, latched: bool = False
+        self, topic: str, expiry: float | None = None, *, joint: str = ""
     ) -> Any:
-        """A publisher with QoS overrides by parameter.
+        """A publisher of a topic of the node's table, with QoS overrides by parameter.
 
-        :param expiry: lifespan and deadline that the topic offers, s; None is none. ``latched``:
-            late joiners get the last message.
+        :param expiry: lifespan and deadline that the topic offers, s; None is none. ``joint``:
+            stands for ``<joint>`` in the name.
         :raises ParameterError: an override that would make it never expire.
         """
-        qos = latched_qos() if latched else output_qos()
+        row = self.topics[topic]
+        topic = topic.replace("<joint>", joint)
+        qos = latched_qos() if row.latched else output_qos()
         overrides: tuple[Any, ...] = OVERRIDES
         if expiry is not None:
             qos.lifespan = qos.deadline = Duration(seconds=expiry)
@@ -163,7 +167,7 @@ class GuardedNode(ParameterNode):
                     raise ParameterError(override, given.value, "1 ns or more")
         self.health.watch(topic)
         return self.create_publisher(
-            kind, topic, qos, qos_overriding_options=QoSOverridingOptions(overrides)
+            row.message, topic, qos, qos_overriding_options=QoSOverridingOptions(overrides)
         )
 
     def create_guarded_timer(self, period: float, callback: Callable[[], None]) -> Any:

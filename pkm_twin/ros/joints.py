@@ -11,8 +11,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.machine.joint_map import ControllerNumbers
@@ -44,7 +42,7 @@ class JointPublisher:
         :param fields: some of :data:`FIELDS`, in their order.
         :param expiry: as of ``create_guarded_publisher``, s.
         """
-        self._publisher = node.create_guarded_publisher(JointState, topic, expiry=expiry)
+        self._publisher = node.create_guarded_publisher(topic, expiry)
         names = list(robot.controller.names)
         arrays = {what: [0.0] * len(names) if what in fields else [] for what in FIELDS}
         definition = message_definition(JOINT_STATE)
@@ -65,7 +63,7 @@ class CommandPublisher:
         self, node: TwinNode, robot: Robot, topic: str, expiry: float | None = None
     ) -> None:
         """Create the topic; ``expiry`` as of ``create_guarded_publisher``, s."""
-        self.publisher = node.create_guarded_publisher(Float64MultiArray, topic, expiry=expiry)
+        self.publisher = node.create_guarded_publisher(topic, expiry)
         message = {"data": [0.0] * robot.joints_count}
         self._template = DoublesTemplate(
             NUMBERS, message_definition(NUMBERS), message, stamped=False

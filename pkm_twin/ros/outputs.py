@@ -113,8 +113,8 @@ class Transforms:
         self._message = TFMessage
         self._base, self._frames, self._tool = base, frames, tool
         self.platform = platform
-        self._static = node.create_guarded_publisher(TFMessage, "/tf_static", latched=True)
-        self._moving = node.create_guarded_publisher(TFMessage, "/tf") if platform else None
+        self._static = node.create_guarded_publisher("/tf_static")
+        self._moving = node.create_guarded_publisher("/tf") if platform else None
 
     def send_tool(self, now: int) -> None:
         """Platform to tool, once and for all; ``now`` in ns."""

@@ -6,12 +6,10 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
+from geometry_msgs.msg import WrenchStamped
 from rclpy.duration import Duration
 from rclpy.time import Time
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from visualization_msgs.msg import MarkerArray
 
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
@@ -27,6 +25,7 @@ from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, triple
 from pkm_twin.state.scene import Load, Scales, Scene
 from pkm_twin.state.state import MachineState, State
+from pkm_twin.state.topics import STATE
 from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.settings import changeable, with_parameters
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
@@ -38,6 +37,8 @@ LIFETIME = 1.0
 
 class MachineStateNode(TwinNode):
     """What others need to see the machine: rviz2, Foxglove, robot_state_publisher, plots."""
+
+    topics = STATE
 
     def __init__(self) -> None:
         super().__init__("machine_state")
@@ -73,10 +74,10 @@ class MachineStateNode(TwinNode):
         self._elastic = _is_elastic(robot)
         _warm_up(robot)
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
-        self._joints = self.create_guarded_publisher(JointState, "~/joint_states")
-        self._pose = self.create_guarded_publisher(PoseStamped, "~/pose")
-        self._twist = self.create_guarded_publisher(TwistStamped, "~/twist")
-        self._description = self.create_guarded_publisher(String, "robot_description", latched=True)
+        self._joints = self.create_guarded_publisher("~/joint_states")
+        self._pose = self.create_guarded_publisher("~/pose")
+        self._twist = self.create_guarded_publisher("~/twist")
+        self._description = self.create_guarded_publisher("robot_description")
         # Hardware only where it is asked for: a controller_manager beside would load and move it.
         hardware = self.declare(
             "hardware_plugin", "", "hardware plugin in the ros2_control element of "
@@ -90,9 +91,9 @@ class MachineStateNode(TwinNode):
         """Stamp of the state that was drawn last."""
         self._create_markers()
         self.create_guarded_subscription(
-            JointState, "joint_states", self._on_joint_state, raw=True, awaited=True
+            "joint_states", self._on_joint_state, raw=True, awaited=True
         )
-        self.create_guarded_subscription(WrenchStamped, "wrench", self._on_wrench)
+        self.create_guarded_subscription("wrench", self._on_wrench)
         follow_changes(
             self,
             changeable(WrenchSettings),
@@ -181,7 +182,7 @@ class MachineStateNode(TwinNode):
             read_only=True,
         )  # fmt: skip
         if rate > 0.0:
-            self._markers = self.create_guarded_publisher(MarkerArray, "~/markers")
+            self._markers = self.create_guarded_publisher("~/markers")
             self.create_guarded_timer(1.0 / rate, self._publish_markers)
 
     def _on_joint_state(self, data: bytes) -> None:

@@ -113,7 +113,7 @@ class Topics:
     def declare(self, name, default, *_, **__):
         return default if name.startswith("observer") else True
 
-    def create_guarded_publisher(self, _, topic, **__):
+    def create_guarded_publisher(self, topic, *_, **__):
         self.published[topic] = []
         return type("Publisher", (), {"publish": staticmethod(self.published[topic].append)})
 

@@ -18,13 +18,17 @@ from delta_dynamics.feedforward import Feedforward
 from delta_dynamics.gate import Gate, GateSettings, effort_limits
 from delta_dynamics.settings import Settings
 from delta_dynamics.simulation import MachineSettings, Simulation, tuned
+from delta_dynamics.topics import GATE, SIMULATION, TWIN
 from pkm_twin.apps.view.live import Live
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import StampRules
 from pkm_twin.state.state import MachineState
+from pkm_twin.state.topics import STATE
+from pkm_twin.streams.topics import JOINTS, NUMBERS, TRAJECTORY
 from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor.monitor import Monitor
+from stiffness_monitor.topics import STIFFNESS
 from test.nodes.harness import REPOSITORY, SECOND, Maker, Plain
 from test.support.mapped import sides
 from test.support.robots import joint_units_of_size, random_joints
@@ -282,12 +286,14 @@ def test_what_a_wrench_does(name):
     close(answers[1].energy.deflection, answers[0].energy.deflection)
 
 
-LEAVES = ("JointState", "JointTrajectory", "Float64MultiArray")
+LEAVES = (JOINTS, TRAJECTORY, NUMBERS)
 """Messages that can carry joint numbers."""
 OTHERS = {
     ("delta_dynamics/node.py", "~/joint_trajectory_ff"): "bytes, filled with ControllerNumbers",
-    ("pkm_twin/ros/joints.py", ""): "the publishers themselves",
     ("pkm_twin/state/node.py", "~/joint_states"): "joints of the URDF, which are the model's",
+    ("stiffness_monitor/node.py", "~/compliance"): "no joints",
+    ("stiffness_monitor/node.py", "~/compliance_stamped"): "no joints",
+    ("stiffness_monitor/node.py", "~/strain_energy_stamped"): "no joints",
     ("stiffness_monitor/node.py", "~/natural_frequencies"): "no joints",
     ("stiffness_monitor/node.py", "~/natural_frequencies_stamped"): "no joints",
 }
@@ -295,19 +301,29 @@ OTHERS = {
 
 def test_joint_numbers_leave_through_the_publishers_that_ask_for_converted_ones():
     """Who publishes one of these messages in another way has to be on the list, with a reason."""
+    tables = {
+        "delta_dynamics": (TWIN, GATE, SIMULATION),
+        "stiffness_monitor": (STIFFNESS,),
+        "pkm_twin": (STATE,),
+    }
     found = set()
-    for package in ("delta_dynamics", "stiffness_monitor", "pkm_twin"):
-        for path in (REPOSITORY / package).rglob("*.py"):
-            for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute)):
-                    continue
-                if call.func.attr not in ("create_guarded_publisher", "create_publisher"):
-                    continue
-                if len(call.args) < 2:
-                    continue  # One that passes its arguments on.
-                kind, topic = call.args[:2]
-                if isinstance(kind, ast.Name) and kind.id in LEAVES:
-                    where = str(path.relative_to(REPOSITORY))
-                    found.add((where, topic.value if isinstance(topic, ast.Constant) else ""))
-    demo = {where for where in found if where[0].startswith("pkm_twin/apps/demo")}
-    assert found - demo == set(OTHERS)
+    for package, own in tables.items():
+        rows = [row for table in own for row in table.values()]
+        topics = {row.name for row in rows if row.way == "out" and row.kind in LEAVES}
+        for path in (REPOSITORY / package).rglob("*node.py"):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+            left = {
+                argument
+                for call in calls
+                if ast.unparse(call.func).endswith(
+                    ("JointPublisher", "CommandPublisher", "create_guarded_subscription", "defer")
+                )
+                for argument in call.args
+            }
+            found |= {
+                (str(path.relative_to(REPOSITORY)), node.value)
+                for node in ast.walk(tree)
+                if isinstance(node, ast.Constant) and node.value in topics and node not in left
+            }
+    assert found == set(OTHERS)

@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of docs/nodes.md of topics and parameters are those of the running nodes."""
+"""The tables of topics and parameters, and docs/nodes.md by them, are those of running nodes."""
 
 import re
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
 from pkm_twin.apps.nodes import MODULES
 from test.nodes.harness import REPOSITORY
+from tools.pages.nodes import GROUPS, class_of
 
 pytest.importorskip("rclpy", exc_type=ImportError)
 
 from rcl_interfaces.srv import ListParameters
 
 PAGE = (REPOSITORY / "docs" / "nodes.md").read_text(encoding="utf-8")
-OTHERS = re.compile(r"/(rosout|parameter_events|diagnostics|clock)|.*/transition_event")
+OPTIONAL = ("clock", "parameter_events")
+"""What a node may listen to, and does not always."""
 TF = find_spec("tf2_msgs") is not None
 MIDDLEWARE = re.compile(r"qos_overrides\..*|use_sim_time|start_type_description_service")
 
@@ -65,32 +69,40 @@ def node(request, peer, launch):
     return name
 
 
-def topics(node, found):
-    """Topics by name, reactions as one."""
-    names = {}
-    for topic, kinds in found:
-        if not OTHERS.fullmatch(topic):
-            short = topic.replace(f"/{node}/", "~/").removeprefix("/")
-            names[re.sub("reactions/.*", "reactions/<joint>", short)] = kinds[0].replace(
-                "/msg/", "/"
-            )
-    return names
+def names(node, found):
+    """Types of topics by short names, reactions as one."""
+    short = {}
+    for topic, (kind, *_) in found:
+        name = topic.replace(f"/{node}/", "~/").removeprefix("/")
+        name = re.sub("reactions/.*", "reactions/<joint>", name)
+        short[name] = re.sub("/(msg|srv)/", "/", kind)
+    return short
 
 
-def test_topics(node, peer):
-    written = {"in": {}, "out": {}}
-    for cells in rows(node):
+def test_topics_and_services(node, peer):
+    """Those of the node's own table, and those that the security policy allows every node."""
+    table = class_of(node).topics.values()
+    ask = peer.node
+    asked = {
+        "in": ask.get_subscriber_names_and_types_by_node,
+        "out": ask.get_publisher_names_and_types_by_node,
+        "service": ask.get_service_names_and_types_by_node,
+    }
+    common = ElementTree.parse(REPOSITORY / "docs" / "security" / "node.xml").getroot()
+
+    def agree(way):
+        what, how = GROUPS[way].split()
+        found = names(node, asked[way](node, "/"))
+        own = {row.name.removeprefix("/"): row.kind for row in table if row.way == way}
         # Transforms where tf2 is installed.
-        if cells[0] in written and (TF or not cells[1].startswith("`/tf")):
-            written[cells[0]][cells[1].strip("`/")] = cells[2]
+        own = {name: kind for name, kind in own.items() if TF or not name.startswith("tf")}
+        allowed = {
+            element.text.removeprefix("/") for element in common.iterfind(f"{what}[@{how}]/*")
+        }
+        listened = set(OPTIONAL) if way == "in" else set()
+        return found.items() >= own.items() and found.keys() | listened == own.keys() | allowed
 
-    def agree():
-        ask = peer.node
-        return written["in"] == topics(
-            node, ask.get_subscriber_names_and_types_by_node(node, "/")
-        ) and written["out"] == topics(node, ask.get_publisher_names_and_types_by_node(node, "/"))
-
-    peer.until(agree)
+    peer.until(lambda: all(map(agree, asked)))
 
 
 def test_parameters(node, peer):
@@ -101,49 +113,10 @@ def test_parameters(node, peer):
     assert {cell.strip("`") for cell in table} - {"parameter", "---"} == known
 
 
-def test_the_tables_are_those_that_nodes_declare(tmp_path):
-    page = tmp_path / "nodes.md"
-    page.write_text(PAGE)
+def test_page_and_policy_are_those_of_the_nodes(tmp_path):
+    pages = [REPOSITORY / "docs" / "nodes.md", REPOSITORY / "docs" / "security" / "policy.xml"]
+    copies = [shutil.copy(page, tmp_path) for page in pages]
     # In a process of its own: it makes every node for a moment.
-    subprocess.run([sys.executable, "-m", "tools.pages.nodes", page], check=True, cwd=REPOSITORY)
-    assert page.read_text() == PAGE
-
-
-def allowed(node, what, how):
-    """Full names that the security policy's profile of a node allows."""
-    folder = REPOSITORY / "docs" / "security"
-    policy = ElementTree.parse(folder / "policy.xml")
-    profiles = policy.findall(f".//profile[@node='{node}']")
-    assert len(profiles) == 1
-    common = ElementTree.parse(folder / "node.xml").getroot()
-    names = [
-        name.text
-        for profile in (profiles[0], common)
-        for group in profile.findall(f"{what}s[@{how}='ALLOW']")
-        for name in group.findall(what)
-    ]
-    assert len(set(names)) == len(names)
-    if not TF:
-        names = [name for name in names if name not in ("/tf", "/tf_static")]
-    full = {n.replace("~", f"/{node}") for n in names}
-    return {n if n.startswith("/") else f"/{n}" for n in full}
-
-
-def test_the_security_policy_is_that_of_the_node(node, peer):
-    """Not less, or the node would not work; and not more but for a clock that it may be given."""
-    ask = peer.node
-
-    def names(found):
-        return {re.sub("/reactions/.*", "/reactions/*", name) for name, _ in found}
-
-    def agree():
-        published = names(ask.get_publisher_names_and_types_by_node(node, "/"))
-        heard = names(ask.get_subscriber_names_and_types_by_node(node, "/"))
-        served = names(ask.get_service_names_and_types_by_node(node, "/"))
-        return (
-            published == allowed(node, "topic", "publish")
-            and heard | {"/clock", "/parameter_events"} == allowed(node, "topic", "subscribe")
-            and served == allowed(node, "service", "reply")
-        )
-
-    peer.until(agree)
+    subprocess.run([sys.executable, "-m", "tools.pages.nodes", *copies], check=True, cwd=REPOSITORY)
+    for page, copy in zip(pages, copies, strict=True):
+        assert Path(copy).read_text() == page.read_text()

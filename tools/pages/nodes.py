@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of parameters in docs/nodes.md: ``python -m tools.pages.nodes docs/nodes.md``.
+"""Tables of docs/nodes.md, and the topics of docs/security/policy.xml, by the nodes' own tables.
 
-They are those that the nodes declare.
+``python -m tools.pages.nodes docs/nodes.md docs/security/policy.xml``
 """
 
 from __future__ import annotations
@@ -10,25 +10,25 @@ import importlib
 import os
 import re
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
 from pkm_twin.apps.nodes import MODULES
 from pkm_twin.streams.settings import Setting
+from pkm_twin.streams.topics import Topic
 
 COMMON: Final = ("autostart", "executor", "queue_depth", "thread_priority")
 """Parameters of every node, in a table of their own."""
 GIVEN: Final = {"command_gate": ("on_stop:=gravity",)}
 """Without it the gate has no payload."""
 HEAD: Final = "| parameter | default | unit, values | changeable | |\n|---|---|---|---|---|\n"
+GROUPS: Final = {"in": "topics subscribe", "out": "topics publish", "service": "services reply"}
+TOPICS: Final = "| | topic | type | |\n|---|---|---|---|\n"
 
 
-def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
-    """What a node declares: the default, and what it means; in this process, for a moment."""
-    # Nobody else's node is meant.
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
-    import rclpy
-
+def class_of(node: str) -> Any:
+    """The class of a node."""
     from pkm_twin.ros.node import TwinNode
 
     module = importlib.import_module(MODULES[node])
@@ -38,10 +38,19 @@ def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
         if isinstance(value, type) and value.__module__ == module.__name__
         if issubclass(value, TwinNode)
     }
+    return kind
+
+
+def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
+    """What a node declares: the default, and what it means; in this process, for a moment."""
+    # Nobody else's node is meant.
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+    import rclpy
+
     options = [word for value in GIVEN.get(node, ()) for word in ("-p", value)]
     rclpy.init(args=["--ros-args", "--log-level", "error", *options])
     try:
-        made = kind()
+        made = class_of(node)()
         try:
             return dict(made.rows)
         finally:
@@ -57,6 +66,13 @@ def row(name: str, default: Any, setting: Setting) -> str:
         "" if setting.fixed else "yes", setting.text,
     ]  # fmt: skip
     return f"| {' | '.join(cells)} |\n"
+
+
+def topic_row(row: Topic) -> str:
+    """A topic's line of the table."""
+    when = f"only with {row.when}: " if row.when else ""
+    kept = "; transient local" if row.latched else ""
+    return f"| {row.way} | `{row.name}` | {row.kind} | {when}{row.text}{kept} |\n"
 
 
 def _value(value: Any) -> str:
@@ -86,22 +102,44 @@ def page(text: str) -> str:
     """The page with today's tables."""
     for node in MODULES:
         found = rows_of(node)
-        common = HEAD + "".join(row(name, *found.pop(name)) for name in COMMON)
-        own = HEAD + "".join(row(name, *entry) for name, entry in found.items())
-        text = _replaced(text, node, own)
-    return _replaced(text, "All nodes", common)
+        common = [row(name, *found.pop(name)) for name in COMMON]
+        text = _replaced(text, node, HEAD, [row(name, *entry) for name, entry in found.items()])
+        text = _replaced(text, node, TOPICS, map(topic_row, class_of(node).topics.values()))
+    return _replaced(text, "All nodes", HEAD, common)
 
 
-def _replaced(text: str, section: str, table: str) -> str:
+def _replaced(text: str, section: str, head: str, rows: Iterable[str]) -> str:
     begin = text.index(f"\n## {section}\n")
-    start = text.index("\n| parameter |", begin) + 1
-    return text[:start] + table + text[re.compile(r"\n(?!\|)").search(text, start).end() :]
+    start = text.index("\n" + head, begin) + 1
+    end = re.compile(r"\n(?!\|)").search(text, start).end()
+    return text[:start] + head + "".join(rows) + text[end:]
+
+
+def policy(text: str) -> str:
+    """The security policy with today's topics and services of the nodes."""
+    for node in MODULES:
+        found = class_of(node).topics.values()
+        allowed = "".join(
+            _group(head, [row.name for row in found if row.way == way])
+            for way, head in GROUPS.items()
+        )
+        start = text.index("/>\n", text.index(f'node="{node}"')) + len("/>\n")
+        text = text[:start] + allowed + text[text.index("        </profile>", start) :]
+    return text
+
+
+def _group(head: str, names: list[str]) -> str:
+    tag = head.partition("s ")[0]
+    lines = [f"  <{tag}>{name.replace('<joint>', '*')}</{tag}>\n" for name in names]
+    lines = [f'<{head}="ALLOW">\n', *lines, f"</{tag}s>\n"] if names else []
+    return "".join(f"          {line}" for line in lines)
 
 
 def main() -> None:
-    """Write the tables into the page."""
-    path = Path(sys.argv[1])
-    path.write_text(page(path.read_text(encoding="utf-8")), encoding="utf-8")
+    """Write the tables into the page, and the topics into the policy."""
+    for name, made in zip(sys.argv[1:], (page, policy), strict=True):
+        path = Path(name)
+        path.write_text(made(path.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

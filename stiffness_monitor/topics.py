@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Topics of the node ``stiffness_monitor``."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pkm_twin.streams.topics import JOINTS, NUMBERS, STATUSES, TEXT, TRIGGER, WRENCH, Topic, table
+
+_TRANSFORM: Final = "geometry_msgs/TransformStamped"
+_CORRECTED: Final = "`correct_setpoint`"
+
+STIFFNESS: Final = table(
+    Topic("in", "wrench", WRENCH,
+          "measured at the platform's reference point, or at the sensor position given by "
+          "`sensor.xyz` or `/tf`"),
+    Topic("in", "joint_states", JOINTS, "joint positions, which determine the pose"),
+    Topic("out", "~/compliance", NUMBERS,
+          "6x6 row-major, labels row, col; base axes, m and rad per N and N m"),
+    Topic("out", "~/compliance_stamped", JOINTS,
+          "its upper triangle, name `x_ry` and so on, position the entry"),
+    Topic("out", "~/strain_energy", STATUSES,
+          "message: the dominant element; values: each element's share (factor), `total_energy`, "
+          "the pose, `frame`"),
+    Topic("out", "~/strain_energy_stamped", JOINTS,
+          "name of an element, position its share, effort its energy in J"),
+    Topic("out", "~/dominant_element", TEXT, "its name, or `none` for a zero wrench"),
+    Topic("out", "~/deflection", _TRANSFORM,
+          "platform to deflected platform, in platform axes; frames `platform_frame` and the same "
+          "with `_deflected`"),
+    Topic("in", "setpoint", JOINTS, "commanded positions", _CORRECTED),
+    Topic("out", "~/setpoint_offset", JOINTS,
+          "offsets for the joints' set points that keep the tool point in place", _CORRECTED),
+    Topic("out", "~/corrected_setpoint", JOINTS, "`setpoint` with the last offset", _CORRECTED),
+    Topic("in", "torques", JOINTS, "efforts, as `~/joint_torques` of `delta_dynamics`",
+          "`pair_torques`"),
+    Topic("out", "~/setpoint_with_torques", JOINTS,
+          "corrected set point and efforts of the same stamp in one message", "`pair_torques`"),
+    Topic("in", "measured_deflection", _TRANSFORM,
+          "the platform's deflection, where it is measured, in `base_frame` or the frame of "
+          "`~/deflection`", "`watch_stiffness`"),
+    Topic("out", "~/stiffness_alarm", STATUSES,
+          "an element whose compliance differs from the file: WARN, message its name, or the names "
+          "that the loads do not distinguish; values `element`, `factor`, `deviation`, `bound`, "
+          "`or NAME`; once a second of stamps while active, then once OK and `none`",
+          "`watch_stiffness`", latched=True),
+    Topic("out", "~/natural_frequencies", NUMBERS,
+          "the first six at the latest joint state with locked actuators, Hz, where the robot's "
+          "file has the masses"),
+    Topic("out", "~/natural_frequencies_stamped", JOINTS,
+          "name `mode_1` and so on, position Hz"),
+    Topic("service", "~/reset_stiffness", TRIGGER,
+          "discards measured deflections, for example after a repair", "`watch_stiffness`"),
+)  # fmt: skip
