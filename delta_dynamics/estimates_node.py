@@ -139,13 +139,13 @@ class Estimates:
 
     def take(self, torques: Torques) -> None:
         """A sample whose torques were published; without measured efforts it tells nothing."""
-        if torques.residual is None:
+        effort = torques.measured
+        if effort is None:
             return
         # The stream may have begun anew at earlier stamps, as where a bag loops.
         if not 0 < torques.stamp - self._last <= GAP * SECOND:
             self.reset()
         self._last = torques.stamp
-        effort = torques.effort + torques.residual
         if self._contact is not None:
             self._take_contact(self._contact, torques, effort)
         if self._payload is not None and torques.stamp - self._due >= PAYLOAD_PERIOD:

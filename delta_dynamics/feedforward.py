@@ -39,7 +39,7 @@ SLICE: Final = 256
 
 
 class Torques(NamedTuple):
-    """Efforts for one joint state; ``residual`` is measured minus predicted, None if unmeasured.
+    """Efforts for one joint state; ``measured`` ones are those of the sensors, None without.
 
     ``wrench``: the one that they bear, base axes at the platform's reference point, shape (6,).
     ``doubt``: how far the rates may be off, shape (n,), where somebody asks for it.
@@ -49,10 +49,15 @@ class Torques(NamedTuple):
     motion: tuple[Array, Array, Array]
     """q, qd, qdd, shape (n,) each."""
     effort: Array
-    residual: Array | None
+    measured: Array | None
     saturated: bool
     wrench: Array | None = None
     doubt: Array | None = None
+
+    @property
+    def residual(self) -> Array | None:
+        """Measured minus predicted efforts, shape (n,)."""
+        return None if self.measured is None else self.measured - self.effort
 
 
 @dataclass
@@ -340,8 +345,7 @@ class Feedforward:
         if rates is None:
             return None
         self._last_good = sample.q
-        residual = None if measured is None else measured - effort
-        return Torques(sample.stamp, motion, effort, residual, saturated, external, doubt)
+        return Torques(sample.stamp, motion, effort, measured, saturated, external, doubt)
 
     def _doubt(self, sample: JointSample, rates: tuple[Array, Array] | None) -> Array | None:
         """How far the sample's rates may be off, where that makes a difference."""

@@ -359,8 +359,9 @@ class DeltaDynamics(TwinNode):
                 self._send_stop()
         effort = core.sent(torques.effort)
         self._torques.publish(torques.stamp, effort)
-        if torques.residual is not None:
-            self._residual.publish(torques.stamp, core.sent(torques.residual))
+        residual = torques.residual
+        if residual is not None:
+            self._residual.publish(torques.stamp, core.sent(residual))
         if self._commands is not None:
             self._commands.publish(effort)
         for tell in (self._estimates.take, self._tell_reactions):
