@@ -40,6 +40,7 @@ def setpoint_correction(
     *,
     tool: ArrayLike = (0.0, 0.0, 0.0),
     bound: ArrayLike = np.inf,
+    rotation: Array | None = None,
 ) -> Correction:
     """Joint offsets that move the tool point back to its position without load.
 
@@ -53,6 +54,7 @@ def setpoint_correction(
     :param tool: from the platform's reference point, platform axes, shape (..., 3), m.
     :param bound: largest offset of a joint, shape (n,) or one for all; a larger offset is scaled
         down, with its direction kept.
+    :param rotation: of the platform at q, shape (..., 3, 3), where it is known.
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     :raises ValueError: a wrong last axis, a value that is not finite, or a bound below zero.
     """
@@ -62,7 +64,8 @@ def setpoint_correction(
             f"bound is {limit.tolist()}; expected 0 or more, one number or one per joint"
         )
     moved = vectors(deflection, 6, "the deflection")
-    _, rotation = robot.platform(q)
+    if rotation is None:
+        _, rotation = robot.platform(q)
     lever = skew((rotation @ vectors(tool, 3, "the tool point")[..., None])[..., 0])
     twist = robot.platform_jacobian(q) / robot.joint_scales
     place, turn = twist[..., :3, :] - lever @ twist[..., 3:, :], twist[..., 3:, :]

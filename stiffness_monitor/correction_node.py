@@ -122,6 +122,7 @@ class SetpointCorrection:
             answer.energy.deflection,
             tool=self._tool,
             bound=self._bound,
+            rotation=answer.rotation,
         )
         self.bounded += bool(found.bounded)
         self._offset = answer.stamp, found.offset

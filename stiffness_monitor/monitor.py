@@ -95,8 +95,7 @@ class Monitor(PairingCore):
         return answer
 
     def _answer(self, sample: WrenchSample, mount: Mount, q: Array) -> Answer:
-        pose = self.robot.forward(q)
-        _, rotation = self.robot.platform(q)
+        pose, _, rotation = self.robot.placed(q)
         fixed = self._wrench_reader.at_reference(sample, mount, rotation)
         energy = platform_response(self.robot, q, fixed)
         return Answer(sample.stamp, q, pose, fixed, energy, rotation)

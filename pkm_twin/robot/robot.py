@@ -337,8 +337,12 @@ class Robot(Mechanism):
 
         Base axes; the rotation is relative to home. Errors as :meth:`forward`.
         """
-        _, position, rotation = self.evaluate(self.engine.forward, _NONE, q)
-        return position, rotation.reshape(*rotation.shape[:-1], 3, 3)
+        return self.placed(q)[1:]
+
+    def placed(self, q: ArrayLike) -> tuple[Array, Array, Array]:
+        """Pose as :meth:`forward`, then position and rotation as :meth:`platform`, solved once."""
+        pose, position, rotation = self.evaluate(self.engine.forward, _NONE, q)
+        return pose, position, rotation.reshape(*rotation.shape[:-1], 3, 3)
 
     def placements(self, q: ArrayLike) -> tuple[dict[str, Array], dict[str, Array]]:
         """Rotation from home (..., 3, 3) and position of the frame's origin (..., 3) of each body.
