@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Numbers, Objects, atan2, sqrt
+from pkm_twin.codegen.expressions import Expression, Numbers, Objects, atan2, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.motion import cross
@@ -101,6 +101,43 @@ def passive_names(engine: Engine) -> tuple[str, ...]:
 def passive_program(t: Traced) -> Program:
     """Q to all passive numbers."""
     t.solve()
+    return Program({"q": t.joints}, 0, {"passive": t.lift(_values(t))}, t.equations())
+
+
+def passive_rates_program(t: Traced) -> Program:
+    """Q and qd to the rates of all passive numbers."""
+    t.solve()
+    qd = t.tape.inputs("qd", t.joints)
+    rates = t.lift(_rates(t, qd, t.set_rates(qd)))
+    return Program({"q": t.joints, "qd": t.joints}, 0, {"rates": rates}, t.equations())
+
+
+def state_program(t: Traced) -> Program:
+    """Q to position (3) and rotation (9) of the platform, and all passive numbers."""
+    t.solve()
+    return Program({"q": t.joints}, 0, _state(t), t.equations())
+
+
+def moving_state_program(t: Traced) -> Program:
+    """The same of q and qd; then the rates of all passive numbers, and the platform's twist (6)."""
+    t.solve()
+    qd = t.tape.inputs("qd", t.joints)
+    u, motion, graph = t.set_rates(qd), t.motion, t.graph
+    twist = [*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]]
+    outputs = {**_state(t), "rates": t.lift(_rates(t, qd, u)), "twist": t.lift(twist)}
+    return Program({"q": t.joints, "qd": t.joints}, 0, outputs, t.equations())
+
+
+def _state(t: Traced) -> dict[str, list[Expression]]:
+    position, rotation = t.motion.platform()
+    return {
+        "position": t.lift(position),
+        "rotation": t.lift(np.ravel(rotation)),
+        "passive": t.lift(_values(t)),
+    }
+
+
+def _values(t: Traced) -> list[Any]:
     motion, tree = t.motion, t.tree
     values: list[Any] = []
     for link in t.tree.links.values():
@@ -121,14 +158,10 @@ def passive_program(t: Traced) -> Program:
         span = motion.turned(rod.inner).T @ _across_ends(t, rod)
         b, a, x = _rod_sides(rod, span)
         values += [atan2(a, x), atan2(b, sqrt(x * x + a * a))]
-    return Program({"q": t.joints}, 0, {"passive": t.lift(values)}, t.equations())
+    return values
 
 
-def passive_rates_program(t: Traced) -> Program:
-    """Q and qd to the rates of all passive numbers."""
-    t.solve()
-    qd = t.tape.inputs("qd", t.joints)
-    u = t.set_rates(qd)
+def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
     motion = t.motion
     rates: list[Any] = []
     for link in t.tree.links.values():
@@ -158,8 +191,7 @@ def passive_rates_program(t: Traced) -> Program:
         level = sqrt(square)
         change = (x * vx + a * va) / level
         rates += [(x * va - a * vx) / square, (level * vb - b * change) / (square + b * b)]
-    sizes = {"q": t.joints, "qd": t.joints}
-    return Program(sizes, 0, {"rates": t.lift(rates)}, t.equations())
+    return rates
 
 
 def _relative(t: Traced, link: Link) -> Objects:

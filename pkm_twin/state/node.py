@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import sys
 
-import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.duration import Duration
 from rclpy.time import Time
@@ -24,7 +23,7 @@ from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, triple
 from pkm_twin.state.scene import Load, Scales, Scene
-from pkm_twin.state.state import MachineState, State
+from pkm_twin.state.state import MachineState, State, moving_state_kernel, state_kernel
 from pkm_twin.state.topics import STATE
 from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.settings import changeable, with_parameters
@@ -257,12 +256,9 @@ def _is_elastic(robot: Robot) -> bool:
 
 def _warm_up(robot: Robot) -> None:
     """Compile, or load, what a sample needs before there is a topic to be found by."""
-    q = robot.inverse(robot.home())
-    robot.platform(q)
-    robot.passive(q)
-    robot.passive_rates(q, np.zeros_like(q))
-    robot.platform_jacobian(q)
-    robot.placements(q)
+    for kernel in (state_kernel(robot), moving_state_kernel(robot)):
+        kernel.warm_up()
+    robot.placements(robot.inverse(robot.home()))
 
 
 NODE = MachineStateNode

@@ -4,19 +4,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError
+from pkm_twin.kinematics.passive import moving_state_program, state_program
 from pkm_twin.messages.reading import JointSample, WrenchSample, as_message_error
 from pkm_twin.messages.stamps import SECOND
+from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.pairing import PairingCore
 from pkm_twin.streams.wrench import Mount, Recent, check_order
 
 Array = NDArray[np.float64]
+
+NONE: Final = np.zeros(0)
+"""The programs' parameters: a geometry is all that they take."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +42,16 @@ class State:
     rotation: Array
     rates: Array | None
     twist: Array | None
+
+
+def state_kernel(robot: Robot) -> Kernel:
+    """Program of a state without velocities."""
+    return robot.engine.kernel("state", state_program)
+
+
+def moving_state_kernel(robot: Robot) -> Kernel:
+    """Program of a state with velocities."""
+    return robot.engine.kernel("moving state", moving_state_program)
 
 
 @dataclass
@@ -94,13 +110,15 @@ class MachineState(PairingCore):
         return self._wrench_reader.at_reference(sample, mount, state.rotation)
 
     def _state(self, sample: JointSample) -> State:
-        robot, q = self.robot, sample.q
-        position, rotation = robot.platform(q)
-        joints = np.concatenate((q, robot.passive(q)))
+        robot, q, qd = self.robot, sample.q, sample.qd
         rates = twist = None
-        if sample.qd is not None:
-            rates = np.concatenate((sample.qd, robot.passive_rates(q, sample.qd)))
-            twist = robot.platform_jacobian(q) @ sample.qd
+        if qd is None:
+            position, flat, passive = robot.evaluate(state_kernel(robot), NONE, q)
+        else:
+            found = robot.evaluate(moving_state_kernel(robot), NONE, q, qd)
+            position, flat, passive, passive_rates, twist = found
+            rates = np.concatenate((qd, passive_rates))
+        rotation, joints = flat.reshape(3, 3), np.concatenate((q, passive))
         for values in (position, joints, rates, twist):
             if values is not None and not np.isfinite(values).all():
                 raise MessageError("non-finite result", "the model gave a value that is not finite")

@@ -61,8 +61,13 @@ class TestState:
         for q in poses(robot):
             state = told(robot, q)
             position, rotation = robot.platform(q)
-            assert (state.position == position).all() and (state.rotation == rotation).all()
-            assert (state.joints == [*q, *robot.passive(q)]).all()
+            joints = [*q, *robot.passive(q)]
+            for found, expected in zip(
+                (state.position, state.rotation, state.joints),
+                (position, rotation, joints),
+                strict=True,
+            ):
+                np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13)
             assert len(MachineState(robot).joint_names) == len(state.joints)
             assert state.twist is None and state.rates is None
 
