@@ -174,7 +174,7 @@ class ContactMonitor:
         still = np.abs(qd) <= doubt
         sure = moving_rates(qd, still, self._reach + self._share.share)
         effort, holds = self._share.taken_out(q, sure, effort)
-        parts = effort_parts(self.robot, q, sure, qdd, wrench)
+        parts = effort_parts(self.robot, q, sure, qdd, wrench, mass)
         self._last = time
         self._greatest = np.maximum(self._greatest, np.abs(parts.whole))
         was_idle = self.drives.idle

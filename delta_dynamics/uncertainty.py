@@ -42,15 +42,17 @@ class EffortParts(NamedTuple):
 
 
 def effort_parts(
-    robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | None = None
+    robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | None, mass: Array
 ) -> EffortParts:
-    """The efforts of one motion sample by what needs them; arguments as ``inverse_dynamics``'."""
+    """The efforts of one motion sample by what needs them; arguments as ``inverse_dynamics``'.
+
+    :param robot: without friction that grows with the load, so that efforts are linear in qdd.
+    :param mass: its mass matrix at q, shape (n, n).
+    """
     still = np.zeros_like(q)
-    return EffortParts(
-        inverse_dynamics(robot, q, still, still, wrench),
-        inverse_dynamics(robot, q, qd, still, wrench),
-        inverse_dynamics(robot, q, qd, qdd, wrench),
-    )
+    moving = inverse_dynamics(robot, q, qd, still, wrench)
+    rest = inverse_dynamics(robot, q, still, still, wrench)
+    return EffortParts(rest, moving, moving + mass @ qdd)
 
 
 def usual_effort(robot: Robot) -> Array:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from delta_dynamics import inverse_dynamics, torque_deviation
+from delta_dynamics import inverse_dynamics, mass_matrix, torque_deviation
 from delta_dynamics.derivatives import torque_effects
+from delta_dynamics.uncertainty import effort_parts
 from pkm_twin import Robot, variants
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
@@ -21,7 +22,7 @@ from pkm_twin.robot.derivatives import position_effects
 from pkm_twin.robot.entries import entries, with_entries
 from stiffness_monitor import compliance, compliance_deviation, strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
-from test.support.robots import joint_range, load
+from test.support.robots import joint_range, load, massive, random_joints
 
 Array = NDArray[np.float64]
 
@@ -161,3 +162,14 @@ def test_a_machine_keeps_what_its_file_says_beside_its_graph() -> None:
         inverse_dynamics(again, q, still, still)
     )
     np.testing.assert_allclose(share, 0.02, rtol=1e-6)
+
+
+@massive
+def test_efforts_by_what_needs_them_are_those_of_the_whole_motion(name, rng):
+    robot = load(name)
+    q = random_joints(robot, rng, 5)
+    qd, qdd, wrench = (rng.normal(size=(5, n)) for n in (*(2 * q.shape[1:]), 6))
+    for one in zip(q, qd, qdd, wrench, strict=True):
+        parts = effort_parts(robot, *one, mass_matrix(robot, one[0]))
+        whole = inverse_dynamics(robot, *one)
+        np.testing.assert_allclose(parts.whole, whole, rtol=1e-12, atol=1e-12 * np.abs(whole).max())
