@@ -117,7 +117,7 @@ class Maximal(Moving):
     def point(self, body: str, at: Array) -> Jet:
         """A point fixed in a body, by its place at home (m)."""
         if body == BASE:
-            return self._still(at)
+            return self.still(at)
         k = self.names.index(body)
         state = self._state
         arm = state.rotation[k] @ (at - self._coms[k])
@@ -131,7 +131,7 @@ class Maximal(Moving):
     def direction(self, body: str, axis: Array) -> Jet:
         """A direction fixed in a body, by its components at home."""
         if body == BASE:
-            return self._still(axis)
+            return self.still(axis)
         k = self.names.index(body)
         value = self._state.rotation[k] @ axis
         columns = np.zeros((3, self.size))
@@ -144,13 +144,10 @@ class Maximal(Moving):
         """A body's angular velocity; as a vector it is nothing, its value is zero."""
         columns = np.zeros((3, self.size))
         if body == BASE:
-            return self._still(np.zeros(3))
+            return self.still(np.zeros(3))
         k = self.names.index(body)
         columns[:, 6 * k + 3 : 6 * k + 6] = np.eye(3)
         return Jet(np.zeros(3), columns, self._state.velocity[k, 3:], np.zeros(3))
-
-    def _still(self, value: Array) -> Jet:
-        return Jet(value, np.zeros((3, self.size)), np.zeros(3), np.zeros(3))
 
     def _analyse(self) -> Home:
         closures = self.closures()
@@ -209,7 +206,7 @@ class Maximal(Moving):
         machine = self.machine
         if len(machine.pose) != len(machine.actuated):
             return 1.0
-        twist = self._twist_columns() @ tangent
+        twist = self.twist_columns() @ tangent
         _, rotation = self._place()
         _, pitch, yaw = angles(rotation)
         c, s = math.cos(yaw), math.sin(yaw)
@@ -236,13 +233,9 @@ class Maximal(Moving):
         for _ in range(12):
             self._state = state
             closures, drives = self.closures(), self.drives()
-            missing = drives.value - way
-            for k, joint in enumerate(self.machine.actuated):
-                if joint.kind == "revolute":
-                    missing[k] = math.remainder(missing[k], 2 * math.pi)
             step, _, rank, sizes = np.linalg.lstsq(
                 np.vstack([closures.columns, drives.columns]),
-                -np.concatenate([closures.value, missing]),
+                np.concatenate([-closures.value, self.missing(way)]),
                 rcond=SINGULAR,
             )
             length = float(np.abs(step).max())
@@ -291,12 +284,7 @@ class Maximal(Moving):
     def jacobian(self, q: Array) -> Array:
         """The platform's twist at its reference point per joint rate, shape (6, n)."""
         self.assemble(q)
-        return self._twist_columns() @ self._tangent()
-
-    def _twist_columns(self) -> Array:
-        machine = self.machine
-        point = self.point(machine.platform, machine.origin)
-        return np.vstack([point.columns, self.spin(machine.platform).columns])
+        return self.twist_columns() @ self._tangent()
 
     def _tangent(self) -> Array:
         n = len(self.machine.actuated)
@@ -317,7 +305,7 @@ class Maximal(Moving):
         tangent = self._tangent()
         force = self._mass() @ change.ravel() + self._bias()
         if wrench is not None:
-            force -= self._twist_columns().T @ np.asarray(wrench, dtype=float)
+            force -= self.twist_columns().T @ np.asarray(wrench, dtype=float)
         for joint in self.machine.joints:
             if joint.actuated:
                 continue
@@ -337,11 +325,7 @@ class Maximal(Moving):
         """Inertia felt at the actuated joints, shape (n, n), kg m2, kg or kg m."""
         self.assemble(q)
         tangent = self._tangent()
-        result: Array = tangent.T @ self._mass() @ tangent
-        for joint in self.machine.joints:
-            if joint.rotor_inertia:
-                rates = self.rates(joint).columns @ tangent
-                result += joint.rotor_inertia * rates.T @ rates
+        result: Array = tangent.T @ self._mass() @ tangent + self.rotors(tangent)
         return result
 
     def energy(self, q: Array, qd: Array) -> tuple[float, float]:

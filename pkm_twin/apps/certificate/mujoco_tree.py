@@ -152,12 +152,12 @@ class MujocoTree(Moving):
 
     def point(self, body: str, at: Array) -> Jet:
         """A point fixed in a body, by its place at home (m)."""
-        return self._still(at) if body == BASE else self._moved(self._bodies[body], at)
+        return self.still(at) if body == BASE else self._moved(self._bodies[body], at)
 
     def spin(self, body: str) -> Jet:
         """A body's angular velocity; as a vector it is nothing, its value is zero."""
         if body == BASE:
-            return self._still(np.zeros(3))
+            return self.still(np.zeros(3))
         model, data, number = self._model, self._data, self._bodies[body]
         columns, change = np.zeros((3, self.size)), np.zeros((3, self.size))
         mujoco.mj_jac(model, data, None, columns, data.xpos[number], number)
@@ -167,15 +167,12 @@ class MujocoTree(Moving):
     def direction(self, body: str, axis: Array) -> Jet:
         """A direction fixed in a body, by its components at home."""
         if body == BASE:
-            return self._still(axis)
+            return self.still(axis)
         value = self._data.xmat[self._bodies[body]].reshape(3, 3) @ axis
         spin = self.spin(body)
         columns = np.array([cross(column, value) for column in spin.columns.T]).T
         rate = cross(spin.rate, value)
         return Jet(value, columns, rate, cross(spin.bias, value) + cross(spin.rate, rate))
-
-    def _still(self, value: Array) -> Jet:
-        return Jet(value, np.zeros((3, self.size)), np.zeros(3), np.zeros(3))
 
     def loops(self) -> list[Joint]:
         """The joints that the tree leaves out."""
@@ -224,11 +221,7 @@ class MujocoTree(Moving):
         last = math.inf
         for _ in range(12):
             self._place(full)
-            missing = way - self.drives().value
-            for k, joint in enumerate(self.machine.actuated):
-                if joint.kind == "revolute":
-                    missing[k] = math.remainder(missing[k], 2 * math.pi)
-            step = self._solve(-self.closures().value, missing)
+            step = self._solve(-self.closures().value, self.missing(way))
             length = float(np.abs(step).max())
             if length > min(last / 2, 0.3):
                 break
@@ -260,12 +253,7 @@ class MujocoTree(Moving):
     def jacobian(self, q: Array) -> Array:
         """The platform's twist at its reference point per joint rate, shape (6, n)."""
         self._place(self.assemble(q))
-        return self._twist_columns() @ self._tangent()
-
-    def _twist_columns(self) -> Array:
-        machine = self.machine
-        point = self.point(machine.platform, machine.origin)
-        return np.vstack([point.columns, self.spin(machine.platform).columns])
+        return self.twist_columns() @ self._tangent()
 
     def inverse_dynamics(
         self, q: Array, qd: Array, qdd: Array, wrench: Array | None = None
@@ -279,7 +267,7 @@ class MujocoTree(Moving):
         change = self._solve(-self.closures().bias, qdd - self.drives().bias)
         force = np.zeros(self.size)
         if wrench is not None:
-            force -= self._twist_columns().T @ np.asarray(wrench, dtype=float)
+            force -= self.twist_columns().T @ np.asarray(wrench, dtype=float)
         for joint in self.machine.joints:
             if joint.viscous or joint.coulomb or joint.offset or joint.rotor_inertia:
                 row = self.rates(joint)
@@ -303,11 +291,7 @@ class MujocoTree(Moving):
             self._data.qacc[:] = acceleration
             mujoco.mj_inverse(self._model, self._data)
             rows.append(self._data.qfrc_inverse.copy())
-        result: Array = (np.array(rows[1:]) - rows[0]) @ tangent
-        for joint in self.machine.joints:
-            if joint.rotor_inertia:
-                rates = self.rates(joint).columns @ tangent
-                result += joint.rotor_inertia * rates.T @ rates
+        result: Array = (np.array(rows[1:]) - rows[0]) @ tangent + self.rotors(tangent)
         return result
 
 

@@ -15,14 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkm_twin.apps.certificate.description import (
-    Array,
-    Joint,
-    Machine,
-    Rod,
-    UnfitError,
-    across,
-)
+from pkm_twin.apps.certificate.description import Array, Joint, Machine, Rod, UnfitError, across
 
 
 class Jet(NamedTuple):
@@ -68,6 +61,10 @@ class Moving(ABC):
     @abstractmethod
     def spin(self, body: str) -> Jet:
         """A body's angular velocity; as a vector it is nothing, its value is zero."""
+
+    def still(self, value: Array) -> Jet:
+        """What stands."""
+        return Jet(value, np.zeros((3, self.size)), np.zeros(3), np.zeros(3))
 
     def _joint_rows(self, joint: Joint) -> list[Rows]:
         inner, outer = joint.inner, joint.outer
@@ -146,6 +143,29 @@ class Moving(ABC):
     def drives(self) -> Rows:
         """The actuated joints' rows; the value is the way from home, rad or m."""
         return stacked([self.rates(joint) for joint in self.machine.actuated], self.size)
+
+    def missing(self, way: Array) -> Array:
+        """How far the actuated joints are from their way from home, shape (n,), rad or m."""
+        result: Array = way - self.drives().value
+        for k, joint in enumerate(self.machine.actuated):
+            if joint.kind == "revolute":
+                result[k] = math.remainder(result[k], 2 * math.pi)
+        return result
+
+    def twist_columns(self) -> Array:
+        """The platform's twist at its reference point per coordinate rate, shape (6, size)."""
+        machine = self.machine
+        point = self.point(machine.platform, machine.origin)
+        return np.vstack([point.columns, self.spin(machine.platform).columns])
+
+    def rotors(self, tangent: Array) -> Array:
+        """The rotors' part of the mass matrix, shape (n, n); the coordinates' rates by joint."""
+        result = np.zeros((tangent.shape[1], tangent.shape[1]))
+        for joint in self.machine.joints:
+            if joint.rotor_inertia:
+                rates = self.rates(joint).columns @ tangent
+                result += joint.rotor_inertia * rates.T @ rates
+        return result
 
 
 def dot(a: Jet, b: Jet) -> Rows:
