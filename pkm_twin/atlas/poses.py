@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.atlas.grids import FULL, workspace_box
-from pkm_twin.atlas.sweep import Chunk, Sweep, Variable
+from pkm_twin.atlas.sweep import Chunk, Sweep, Variable, about, axis
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.clearance import has_clearance
 from pkm_twin.robot.robot import Robot
@@ -65,7 +65,7 @@ class PoseSweep(Sweep):
         if self.slices:
             return self._sliced_coordinates()
         ticks = {
-            name: Variable((name,), ticks, {"units": unit, "long_name": f"pose coordinate {name}"})
+            name: axis(name, ticks, f"pose coordinate {name}", unit)
             for name, unit, ticks in zip(robot.pose_names, robot.pose_units, self.axes, strict=True)
         }
         return ticks | self._home()
@@ -87,17 +87,14 @@ class PoseSweep(Sweep):
                 ticks = [self.home]
             result[f"{dim}_name"] = texts("slice", [names[k] for k in picked])
             result[f"{dim}_unit"] = texts("slice", [units[k] for k in picked])
-            result[f"{dim}_value"] = Variable(
-                ("slice", dim), np.array(ticks), {"long_name": f"coordinate along the {dim}s"}
-            )
+            along = about(f"coordinate along the {dim}s")
+            result[f"{dim}_value"] = Variable(("slice", dim), np.array(ticks), along)
         return result
 
     def _home(self) -> dict[str, Variable]:
         return {
             "coordinate": texts("coordinate", self.robot.pose_names),
-            "home": Variable(
-                ("coordinate",), self.home, {"long_name": "pose that sections go through"}
-            ),
+            "home": Variable(("coordinate",), self.home, about("pose that sections go through")),
         }
 
     @property

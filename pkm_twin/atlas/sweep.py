@@ -8,6 +8,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
@@ -23,10 +24,16 @@ if TYPE_CHECKING:
 POSITIVE: Final = {"valid_min": 0.0}
 SHARE: Final = {"units": "1", "valid_min": 0.0, "valid_max": 1.0}
 FLAG: Final = {"valid_min": 0, "valid_max": 1}
+NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 """Attributes by what a variable can be (CF conventions, 2.5.1): checked when a file is opened."""
 
 Array = NDArray[np.float64]
 Values = dict[str, NDArray[Any]]
+
+
+def about(what: str, units: str = "", bounds: Mapping[str, Any] = NONE) -> dict[str, Any]:
+    """Attributes of a variable: what it can be, its unit where it has one, and what it is."""
+    return {**bounds, **({"units": units} if units else {}), "long_name": what}
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +43,16 @@ class Variable:
     dims: tuple[str, ...]
     values: NDArray[Any]
     attrs: Mapping[str, Any]
+
+
+def axis(name: str, values: Any, what: str, units: str = "") -> Variable:
+    """The coordinate of a dimension of its name."""
+    return Variable((name,), np.asarray(values), about(what, units))
+
+
+def number(value: Any, what: str, units: str = "", bounds: Mapping[str, Any] = NONE) -> Variable:
+    """A single number."""
+    return Variable((), np.array(value), about(what, units, bounds))
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,7 @@ from pkm_twin.atlas.isotropy import figures, page
 from pkm_twin.atlas.sweep import Kind
 
 KIND: Final = Kind(
-    "isotropy",
-    figures=figures.FIGURES,
-    page=page.page,
-    title=page.title,
+    "isotropy", figures.FIGURES, page.page, page.title,
     help="A sphere is all directions of the pose rates at one pose; it looks the same from behind. "
     "A few values beyond the ends of the colours have the end's colour.",
-)
+)  # fmt: skip

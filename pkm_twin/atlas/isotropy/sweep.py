@@ -24,7 +24,18 @@ from delta_dynamics.isotropy import (
     max_driving_force,
 )
 from pkm_twin.atlas.grids import circles, ladder, turns, workspace_box
-from pkm_twin.atlas.sweep import FLAG, POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
+from pkm_twin.atlas.sweep import (
+    FLAG,
+    POSITIVE,
+    SHARE,
+    Chunk,
+    Field,
+    Sweep,
+    Values,
+    Variable,
+    about,
+    axis,
+)
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import distance_unit, reachable, singularity_at, try_inverse
@@ -35,6 +46,8 @@ POINTS: Final = 48_000
 TILT: Final = math.radians(45.0)
 """Largest tilt of the paper's atlas, rad."""
 CHUNK: Final = 16384
+SINGULARITY: Final = "singularity index: 0 in a singularity, 1 at best"
+WITHIN: Final = "1 where the pose keeps all limits of the machine"
 
 _SPHERE: Final = ("polar", "turn")
 
@@ -70,21 +83,12 @@ class IsotropySweep(Sweep):
         sphere = (*self.axes, *_SPHERE)
         share = "eta_KE, the platform's part of the kinetic energy"
         return {
-            "eta": Field(sphere, {**SHARE, "long_name": share}),
-            "force": Field(
-                sphere, {**POSITIVE, "units": unit, "long_name": "F_max, largest driving force"}
-            ),
-            "eta_least": Field(self.axes, {**SHARE, "long_name": f"least {share}, exact"}),
-            "eta_greatest": Field(self.axes, {**SHARE, "long_name": f"greatest {share}, exact"}),
-            "singularity": Field(
-                self.axes,
-                {**SHARE, "long_name": "singularity index: 0 in a singularity, 1 at best"},
-            ),
-            "within_limits": Field(
-                self.axes,
-                {**FLAG, "long_name": "1 where the pose keeps all limits of the machine"},
-                "i1",
-            ),
+            "eta": Field(sphere, about(share, bounds=SHARE)),
+            "force": Field(sphere, about("F_max, largest driving force", unit, POSITIVE)),
+            "eta_least": Field(self.axes, about(f"least {share}, exact", bounds=SHARE)),
+            "eta_greatest": Field(self.axes, about(f"greatest {share}, exact", bounds=SHARE)),
+            "singularity": Field(self.axes, about(SINGULARITY, bounds=SHARE)),
+            "within_limits": Field(self.axes, about(WITHIN, bounds=FLAG), "i1"),
         }
 
     @property
@@ -97,25 +101,16 @@ class IsotropySweep(Sweep):
             "tilt": "lean of the platform's axis, no torsion",
         }
         result = {
-            name: Variable(
-                (name,),
-                values,
-                {
-                    "units": units.get(name, "rad"),
-                    "long_name": what.get(name, f"pose coordinate {name}"),
-                },
+            name: axis(
+                name, values, what.get(name, f"pose coordinate {name}"), units.get(name, "rad")
             )
             for name, values in zip(self.axes, (self.first, self.second), strict=True)
         }
-        result["polar"] = Variable(
-            ("polar",), self.polar, {"units": "rad", "long_name": f"angle from {rates[2]}"}
-        )
-        result["turn"] = Variable(
-            ("turn",),
-            self.turn,
-            {"units": "rad", "long_name": f"about {rates[2]}, from {rates[0]} to {rates[1]}"},
-        )
-        return result
+        turn = f"about {rates[2]}, from {rates[0]} to {rates[1]}"
+        return result | {
+            "polar": axis("polar", self.polar, f"angle from {rates[2]}", "rad"),
+            "turn": axis("turn", self.turn, turn, "rad"),
+        }
 
     @property
     def directions(self) -> Array:

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +67,6 @@ class Quantity:
     population: int = 256
     rounds: int = 200
     screen: Quantity | None = None
-    attrs: Mapping[str, Any] = field(default_factory=lambda: {"valid_min": 0.0})
 
 
 def no_wrench(name: str) -> Case:

@@ -23,7 +23,7 @@ from pkm_twin.atlas.maps.frequency import FREQUENCY
 from pkm_twin.atlas.maps.milling import Process
 from pkm_twin.atlas.maps.quantity import Array, Case, Found, Quantity
 from pkm_twin.atlas.poses import PoseSweep, pose_axes, texts
-from pkm_twin.atlas.sweep import SHARE, Chunk, Field, Values, Variable
+from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Values, Variable, about, number
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import keeps_limits
@@ -68,21 +68,17 @@ class MapSweep(PoseSweep):
     def fields(self) -> Mapping[str, Field]:  # type: ignore[override]
         """Value, direction and element of each case; NaN and -1 where a pose does not count."""
         by_case = (*self.dims, "case")
-        what, about = self.quantity, self.quantity.attrs
+        what, turn = self.quantity, {"valid_min": -1.0, "valid_max": 1.0}
         least = {"valid_min": -1, "valid_max": len(self.elements) - 1}
-        turn = {"valid_min": -1.0, "valid_max": 1.0}
+        direction = about("direction of the value, base axes", "", turn)
         fields = {
-            "value": Field(by_case, {**about, "long_name": what.what}),
-            "direction": Field(
-                (*by_case, "axis"), {**turn, "long_name": "direction of the value, base axes"}
-            ),
-            "dominant": Field(
-                by_case, {**least, "long_name": f"index of the {what.element}"}, "i2"
-            ),
+            "value": Field(by_case, about(what.what, "", POSITIVE)),
+            "direction": Field((*by_case, "axis"), direction),
+            "dominant": Field(by_case, about(f"index of the {what.element}", "", least), "i2"),
         }
         if what.has_shares:
-            about = {**SHARE, "long_name": "part of each element"}
-            fields["factor"] = Field((*by_case, "element"), about)
+            share = about("part of each element", "", SHARE)
+            fields["factor"] = Field((*by_case, "element"), share)
         return fields
 
     @property
@@ -154,9 +150,8 @@ class MapSweep(PoseSweep):
         for k, case in enumerate(self.cases):
             starts = np.concatenate([starts[k] for starts, _ in parts])
             worst.append(worst_of(self, case, starts[np.isfinite(starts[:, 0])]))
-        about = {**SHARE, "long_name": "part of the grid that counts"}
         return {
-            "valid": Variable((), np.array(counted / every), about),
+            "valid": number(counted / every, "part of the grid that counts", "", SHARE),
             **worst_variables(self, worst),
         }
 
@@ -178,8 +173,7 @@ def worst_variables(sweep: MapSweep, worst: Sequence[Worst]) -> dict[str, Variab
     result: dict[str, Variable] = {}
 
     def stored(name: str, dims: tuple[str, ...], values: Any, what: str, **more: int) -> None:
-        about = {"long_name": what, **more}
-        result[f"worst_{name}"] = Variable(("case", *dims), np.array(values), about)
+        result[f"worst_{name}"] = Variable(("case", *dims), np.array(values), about(what, "", more))
 
     stored("value", (), [f.value[0] for f in each], "worst value of the whole workspace")
     stored("pose", ("coordinate",), [w.pose for w in worst], "pose of the worst value, m and rad")

@@ -7,11 +7,8 @@ from pkm_twin.atlas.modes import figures, page
 from pkm_twin.atlas.sweep import Kind
 
 KIND: Final = Kind(
-    "modes",
-    figures=figures.FIGURES,
-    page=page.page,
-    title=page.title,
+    "modes", figures.FIGURES, page.page, page.title,
     help="Left: the frame at rest (grey) and in the chosen mode, enlarged; squares stand on the "
     "ground. The button swings it, the slider stops it. Right: the mode's frequency at places of "
     "the workspace; modes are numbered at each place, lowest first.",
-)
+)  # fmt: skip

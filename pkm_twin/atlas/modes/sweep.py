@@ -18,15 +18,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.atlas.grids import (
-    circles,
-    cylinder,
-    height_range,
-    ladder,
-    largest_cylinder,
-    turns,
-)
-from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
+from pkm_twin.atlas.grids import circles, cylinder, height_range, ladder, largest_cylinder, turns
+from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable, about, axis
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import BASE
 from pkm_twin.robot.robot import Robot
@@ -62,8 +55,7 @@ class ModesSweep(Sweep):
     kind: ClassVar[str] = "modes"
     fields: ClassVar[Mapping[str, Field]] = {
         "frequency": Field(
-            (*_GRID, "mode"),
-            {**POSITIVE, "units": "Hz", "long_name": "natural frequency, actuators locked"},
+            (*_GRID, "mode"), about("natural frequency, actuators locked", "Hz", POSITIVE)
         )
     }
 
@@ -71,27 +63,18 @@ class ModesSweep(Sweep):
     def coordinates(self) -> dict[str, Variable]:
         """Height, distance from the axis, azimuth, number of the mode; names for the shapes."""
         what = "tilt" if distance_unit(self.robot) == "rad" else "distance from the axis"
+        ends = {"valid_min": 0, "valid_max": len(self.nodes) - 1}
         return {
-            "z": Variable(("z",), self.heights, {"units": "m", "long_name": "height"}),
-            "distance": Variable(
-                ("distance",),
-                self.distances,
-                {"units": distance_unit(self.robot), "long_name": what},
-            ),
+            "z": axis("z", self.heights, "height", "m"),
+            "distance": axis("distance", self.distances, what, distance_unit(self.robot)),
             "azimuth": Variable(("azimuth",), turns(self.azimuths), {"units": "rad"}),
-            "mode": Variable(("mode",), np.arange(1, COUNT + 1), {"long_name": "lowest first"}),
-            "node": _names("node", self.nodes, "the platform's origin, then points of the members"),
-            "axis": _names("axis", ("x", "y", "z"), "fixed axes"),
-            "element": _names("element", self.elements, "bodies, and joints with elasticity"),
-            "parameter": _names("parameter", self.robot.pose_names, "parameters of a pose"),
+            "mode": axis("mode", np.arange(1, COUNT + 1), "lowest first"),
+            "node": axis("node", self.nodes, "the platform's origin, then points of the members"),
+            "axis": axis("axis", ("x", "y", "z"), "fixed axes"),
+            "element": axis("element", self.elements, "bodies, and joints with elasticity"),
+            "parameter": axis("parameter", self.robot.pose_names, "parameters of a pose"),
             "line": Variable(
-                ("edge", "end"),
-                self.edges,
-                {
-                    "long_name": "indices of the nodes that it joins",
-                    "valid_min": 0,
-                    "valid_max": len(self.nodes) - 1,
-                },
+                ("edge", "end"), self.edges, about("indices of the nodes that it joins", "", ends)
             ),
         }
 
@@ -131,32 +114,18 @@ class ModesSweep(Sweep):
         what = "of the nodes in a mode of unit generalised mass"
         return {
             **super().summaries(partial),
-            "shape_pose": Variable(
-                ("parameter",), self.middle, {"units": units, "long_name": "pose of the shapes"}
-            ),
+            "shape_pose": Variable(("parameter",), self.middle, about("pose of the shapes", units)),
             "shape_frequency": Variable(
-                ("mode",),
-                found.frequencies,
-                {**POSITIVE, "units": "Hz", "long_name": "frequency of the shape"},
+                ("mode",), found.frequencies, about("frequency of the shape", "Hz", POSITIVE)
             ),
-            "position": Variable(
-                ("node", "axis"), found.positions, {"units": "m", "long_name": "node at rest"}
-            ),
-            "displacement": Variable(
-                node, moved, {"units": "1/sqrt(kg)", "long_name": f"displacements {what}"}
-            ),
-            "rotation": Variable(
-                node, turned, {"units": "rad/(m sqrt(kg))", "long_name": f"rotations {what}"}
-            ),
+            "position": Variable(("node", "axis"), found.positions, about("node at rest", "m")),
+            "displacement": Variable(node, moved, about(f"displacements {what}", "1/sqrt(kg)")),
+            "rotation": Variable(node, turned, about(f"rotations {what}", "rad/(m sqrt(kg))")),
             "strain_share": Variable(
-                part,
-                found.energies.strain,
-                {**SHARE, "long_name": "part of the mode's strain energy"},
+                part, found.energies.strain, about("part of the mode's strain energy", "", SHARE)
             ),
             "kinetic_share": Variable(
-                part,
-                found.energies.kinetic,
-                {**SHARE, "long_name": "part of the mode's kinetic energy"},
+                part, found.energies.kinetic, about("part of the mode's kinetic energy", "", SHARE)
             ),
         }
 
@@ -198,10 +167,6 @@ def structure_edges(model: StructuralModel, nodes: tuple[str, ...]) -> NDArray[n
     if len(around) > 2:
         lines += pairwise([*around, around[0]])
     return np.array(lines, np.int64)
-
-
-def _names(dim: str, names: Iterable[str], what: str) -> Variable:
-    return Variable((dim,), np.array(list(names)), {"long_name": what})
 
 
 def modes_sweep(robot: Robot, points: int | None = None) -> ModesSweep:

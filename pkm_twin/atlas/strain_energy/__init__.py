@@ -7,10 +7,7 @@ from pkm_twin.atlas.strain_energy import figures, page
 from pkm_twin.atlas.sweep import Kind
 
 KIND: Final = Kind(
-    "strain-energy",
-    figures=figures.FIGURES,
-    page=page.page,
-    title=page.title,
+    "strain-energy", figures.FIGURES, page.page, page.title,
     help="Each slice is one height; the slider shows one alone. The menu chooses the total "
     "energy or one element's part of it.",
-)
+)  # fmt: skip

@@ -26,7 +26,7 @@ from pkm_twin.atlas.maps.sweep import (
     worst_of,
     worst_variables,
 )
-from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable
+from pkm_twin.atlas.sweep import POSITIVE, SHARE, Chunk, Field, Sweep, Values, Variable, about, axis
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import strain_energy
@@ -59,6 +59,7 @@ AZIMUTHS: Final = 72
 FINEST: Final = 8
 """Most layers that one coarse step of height is divided into."""
 
+DOMINANT: Final = "index of the element with the largest factor, -1 outside"
 _GRID: Final = ("z", "tilt", "azimuth")
 
 
@@ -79,18 +80,9 @@ class StrainEnergySweep(Sweep):
 
     kind: ClassVar[str] = "strain-energy"
     fields: ClassVar[Mapping[str, Field]] = {
-        "energy": Field(_GRID, {**POSITIVE, "units": "J", "long_name": "total strain energy"}),
-        "factor": Field(
-            (*_GRID, "element"), {**SHARE, "long_name": "strain-energy factor, U_e / U"}
-        ),
-        "dominant": Field(
-            _GRID,
-            {
-                "long_name": "index of the element with the largest factor, -1 outside",
-                "valid_min": -1,
-            },
-            "i1",
-        ),
+        "energy": Field(_GRID, about("total strain energy", "J", POSITIVE)),
+        "factor": Field((*_GRID, "element"), about("strain-energy factor, U_e / U", "", SHARE)),
+        "dominant": Field(_GRID, about(DOMINANT, "", {"valid_min": -1}), "i1"),
     }
 
     @property
@@ -102,17 +94,11 @@ class StrainEnergySweep(Sweep):
     def coordinates(self) -> dict[str, Variable]:
         """Height, tilt, azimuth, element, and each height's circle."""
         return {
-            "z": Variable(("z",), self.heights, {"units": "m", "long_name": "height of o"}),
-            "tilt": Variable(
-                ("tilt",), self.tilts, {"units": "rad", "long_name": "root of beta^2 + gamma^2"}
-            ),
-            "azimuth": Variable(
-                ("azimuth",), self.turn, {"units": "rad", "long_name": "from beta to gamma"}
-            ),
+            "z": axis("z", self.heights, "height of o", "m"),
+            "tilt": axis("tilt", self.tilts, "root of beta^2 + gamma^2", "rad"),
+            "azimuth": axis("azimuth", self.turn, "from beta to gamma", "rad"),
             "element": Variable(("element",), np.array(ELEMENTS, "U"), {}),
-            "radius": Variable(
-                ("z",), self.radii, {"units": "rad", "long_name": "largest circle of tilts"}
-            ),
+            "radius": Variable(("z",), self.radii, about("largest circle of tilts", "rad")),
             **worst_coordinates(self.whole),
         }
 
@@ -178,7 +164,7 @@ class StrainEnergySweep(Sweep):
             ("volume_factor", volume, weight, "mean over the volume of z, beta and gamma"),
         ):
             values = np.array([math.fsum(row) for row in sums]) / count
-            attrs = {**SHARE, "long_name": f"global strain-energy factor, {what}"}
+            attrs = about(f"global strain-energy factor, {what}", "", SHARE)
             result[name] = Variable(("element",), values, attrs)
         whole = self.whole
         # Three coordinates and a smooth quantity: a small part of the usual search is enough.

@@ -7,10 +7,7 @@ from pkm_twin.atlas.sweep import Kind
 from pkm_twin.atlas.workspace import figures, page
 
 KIND: Final = Kind(
-    "workspace",
-    figures=figures.FIGURES,
-    page=page.page,
-    title=page.title,
+    "workspace", figures.FIGURES, page.page, page.title,
     help="Reachable poses, coloured by the singularity index: 0 in a singularity, 1 at best. The "
     "menu chooses what is shown, the slider one layer alone.",
-)
+)  # fmt: skip

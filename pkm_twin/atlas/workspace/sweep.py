@@ -20,7 +20,18 @@ from numpy.typing import NDArray
 
 from pkm_twin.atlas.grids import circles, largest_cylinder
 from pkm_twin.atlas.poses import PoseSweep, pose_axes
-from pkm_twin.atlas.sweep import FLAG, POSITIVE, SHARE, Chunk, Field, Values, Variable
+from pkm_twin.atlas.sweep import (
+    FLAG,
+    POSITIVE,
+    SHARE,
+    Chunk,
+    Field,
+    Values,
+    Variable,
+    about,
+    axis,
+    number,
+)
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.robot import Robot
@@ -35,6 +46,11 @@ from pkm_twin.robot.workspace import (
 Array = NDArray[np.float64]
 
 POINTS: Final = 200_000
+SINGULARITY: Final = "singularity index of reachable poses: 0 singular, 1 at best"
+CLEARANCE: Final = (
+    "least distance of different limbs' members, negative where they "
+    "meet; poses that are reachable but for it"
+)
 LAYERS: Final = 101
 """Heights of the regular workspace."""
 
@@ -54,36 +70,15 @@ class WorkspaceSweep(PoseSweep):
     def fields(self) -> Mapping[str, Field]:  # type: ignore[override]
         """Reach, singularity measure, passive angle and clearance where the machine tells them."""
         fields = {
-            "reachable": Field(
-                self.dims, {**FLAG, "long_name": "1 where all limits are kept"}, "i1"
-            ),
-            "singularity": Field(
-                self.dims,
-                {
-                    **SHARE,
-                    "long_name": "singularity index of reachable poses: 0 singular, 1 at best",
-                },
-            ),
+            "reachable": Field(self.dims, about("1 where all limits are kept", "", FLAG), "i1"),
+            "singularity": Field(self.dims, about(SINGULARITY, "", SHARE)),
         }
         if has_joint_angles(self.robot):
-            fields["joint_angle"] = Field(
-                self.dims,
-                {
-                    **POSITIVE,
-                    "units": "rad",
-                    "long_name": "largest passive joint angle; reachable poses",
-                },
-            )
+            what = "largest passive joint angle; reachable poses"
+            fields["joint_angle"] = Field(self.dims, about(what, "rad", POSITIVE))
         if has_clearance(self.robot):
             # Also where limbs meet, so that the file shows what interference takes away.
-            fields["clearance"] = Field(
-                self.dims,
-                {
-                    "units": "m",
-                    "long_name": "least distance of different limbs' members, negative where they "
-                    "meet; poses that are reachable but for it",
-                },
-            )
+            fields["clearance"] = Field(self.dims, about(CLEARANCE, "m"))
         return fields
 
     @property
@@ -91,8 +86,7 @@ class WorkspaceSweep(PoseSweep):
         """The pose coordinates, and of a cylinder the heights of the circles."""
         result = super().coordinates
         if self.upright:
-            about = {"units": "m", "long_name": "height of the circles"}
-            result["height"] = Variable(("height",), self.heights, about)
+            result["height"] = axis("height", self.heights, "height of the circles", "m")
         return result
 
     @property
@@ -132,18 +126,12 @@ class WorkspaceSweep(PoseSweep):
         if not self.slices:
             steps = [ticks[1] - ticks[0] for ticks in self.axes]
             units = _product(self.robot.pose_units)
-            result["volume"] = Variable(
-                (),
-                np.array(count * math.prod(steps)),
-                {**POSITIVE, "units": units, "long_name": "volume of the reachable poses"},
-            )
+            what = "volume of the reachable poses"
+            result["volume"] = number(count * math.prod(steps), what, units, POSITIVE)
         if has_clearance(self.robot):
             share = (otherwise - count) / otherwise if otherwise else math.nan
-            result["interference"] = Variable(
-                (),
-                np.array(share),
-                {**SHARE, "long_name": "share of otherwise reachable poses where limbs meet"},
-            )
+            what = "share of otherwise reachable poses where limbs meet"
+            result["interference"] = number(share, what, "", SHARE)
         if self.upright:
             result |= self._regular()
         return result
@@ -155,21 +143,13 @@ class WorkspaceSweep(PoseSweep):
         )
         best = largest_cylinder(reach)
         unit = distance_unit(self.robot)
-        result = {
-            "circle": Variable(
-                ("height",),
-                reach.radius,
-                {**POSITIVE, "units": unit, "long_name": "largest circle, radius"},
-            )
+        circle = about("largest circle, radius", unit, POSITIVE)
+        return {
+            "circle": Variable(("height",), reach.radius, circle),
+            "cylinder_low": number(best.low, "largest cylinder, low", "m"),
+            "cylinder_high": number(best.high, "largest cylinder, high", "m"),
+            "cylinder_radius": number(best.radius, "largest cylinder, radius", unit),
         }
-        for name, value, u in (
-            ("low", best.low, "m"),
-            ("high", best.high, "m"),
-            ("radius", best.radius, unit),
-        ):
-            about = {"units": u, "long_name": f"largest cylinder, {name}"}
-            result[f"cylinder_{name}"] = Variable((), np.array(value), about)
-        return result
 
 
 def _product(units: Iterable[str]) -> str:
