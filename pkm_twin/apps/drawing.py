@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.apps.view.scene import GROUND, PLATFORM, Scene
 from pkm_twin.apps.view.stage import LOOK
-from pkm_twin.atlas.plots import rendered
+from pkm_twin.atlas.plots import pyplot, rendered
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.files import replace_file
 from pkm_twin.robot.robot import Robot
@@ -140,10 +140,7 @@ def draw(robot: Robot) -> Any:
     Colours are those of ``pkm-twin view``: drives blue, rods light blue, the platform orange. The
     names of the drives are next to them, the base frame and a scale in the corners.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import patheffects, pyplot
+    from matplotlib import patheffects
 
     scene, q = Scene(robot), robot.inverse(robot.home())
     shapes = scene.shapes(q)
@@ -161,7 +158,7 @@ def draw(robot: Robot) -> Any:
         camera.plate(scene.platform + shapes.platform_at, PLATFORM)
     if len(scene.base):
         camera.plate(scene.base, GROUND, opacity=0.35)
-    figure = pyplot.figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
+    figure = pyplot().figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     extent = (camera.low[0], camera.high[0], camera.low[1], camera.high[1])
     ax.imshow(camera.pixels(), origin="lower", extent=extent, interpolation="nearest")

@@ -142,18 +142,13 @@ def draw_limits(motion: TimedPath, path: Path) -> None:
         if colour is not None:
             for ax in (top, low):
                 ax.axvspan(bound.begin, bound.end, color=colour, alpha=0.15, lw=0)
-    top.set_title(
-        f"{motion.robot.name}: which limit binds when ({motion.law}, {motion.duration:.4g} s)"
-    )
-    top.set_ylabel("part of the limit (%)")
+    title = f"{motion.robot.name}: which limit binds when ({motion.law}, {motion.duration:.4g} s)"
+    plots.label(top, "time (s)", "part of the limit (%)", title)
     top.set_ylim(0, 105)
     if shown:
         top.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     low.plot(time, motion.fine.speed, color="black", lw=1.2)
-    low.set_title("speed of the tool point; colours are those of the limit that binds")
-    low.set_ylabel("speed (m/s)")
+    title = "speed of the tool point; colours are those of the limit that binds"
+    plots.label(low, "time (s)", "speed (m/s)", title)
     low.set_ylim(bottom=0)
-    for ax in (top, low):
-        ax.set_xlabel("time (s)")
-        ax.grid(alpha=0.3)
     plots.save(figure, path)

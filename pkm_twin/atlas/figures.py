@@ -28,25 +28,15 @@ LINES: Final = tuple(colour for colour in plots.COLOURS if colour != "#F0E442")
 PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 
 
-def pyplot() -> Any:
-    """Matplotlib's pyplot, drawing into files only."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    return pyplot
-
-
 def subplots(*shape: int, **options: Any) -> tuple[Figure, Any]:
     """A new figure and its axes, as ``pyplot.subplots`` has them."""
-    figure, axes = pyplot().subplots(*shape, **options)
+    figure, axes = plots.pyplot().subplots(*shape, **options)
     return figure, axes
 
 
 def new_figure(**options: Any) -> Figure:
     """A new figure without axes."""
-    figure: Figure = pyplot().figure(**options)
+    figure: Figure = plots.pyplot().figure(**options)
     return figure
 
 

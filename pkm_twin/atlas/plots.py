@@ -17,17 +17,31 @@ from pkm_twin.files import replace_file
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
 
 
-def columns(count: int, rows: int) -> tuple[Any, list[Any]]:
-    """A figure of ``count`` columns with ``rows`` axes each."""
+def pyplot() -> Any:
+    """Matplotlib's pyplot, drawing into files only."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(
+    return pyplot
+
+
+def columns(count: int, rows: int) -> tuple[Any, list[Any]]:
+    """A figure of ``count`` columns with ``rows`` axes each."""
+    figure, axes = pyplot().subplots(
         rows, count, figsize=(8 * count, 3 * rows), squeeze=False, layout="constrained"
     )
     return figure, list(axes.T)
+
+
+def label(ax: Any, x: str, y: str, title: str = "", size: float | None = None) -> None:
+    """Name the axes, and draw a grid; ``size``: of the title's letters."""
+    ax.set_xlabel(x)
+    ax.set_ylabel(y)
+    if title:
+        ax.set_title(title, **({} if size is None else {"fontsize": size}))
+    ax.grid(alpha=0.3)
 
 
 def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
@@ -35,8 +49,6 @@ def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
 
     Names of files and joints may have a dollar in them: no text that is set here is a formula.
     """
-    from matplotlib import pyplot
-
     texts = [] if figure._suptitle is None else [figure._suptitle]
     for ax in figure.axes:
         legend = ax.get_legend()
@@ -46,7 +58,7 @@ def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
         text.set_parse_math(False)
     data = io.BytesIO()
     figure.savefig(data, dpi=dpi, format=form)
-    pyplot.close(figure)
+    pyplot().close(figure)
     return data.getvalue()
 
 
@@ -73,8 +85,8 @@ def torques(motion: Any, table: Mapping[str, Any]) -> Any:
         if f"{joint}.effort_deviation" in table:
             band = 2.0 * table[f"{joint}.effort_deviation"]
             low, high = (table[f"{joint}.effort"] + sign * band for sign in (-1.0, 1.0))
-            label = "two deviations"
-            ax.fill_between(table["time"], low, high, color="0.3", alpha=0.25, lw=0, label=label)
+            style: dict[str, Any] = {"color": "0.3", "alpha": 0.25, "lw": 0}
+            ax.fill_between(table["time"], low, high, label="two deviations", **style)
         for colour, term in zip(COLOURS, terms, strict=False):
             values = table[f"{joint}.effort_{term}"]
             if np.any(values != 0.0):
@@ -89,9 +101,6 @@ def torques(motion: Any, table: Mapping[str, Any]) -> Any:
                 zorder=0,
                 label="beyond limits",
             )
-        ax.set_title(f"{robot.name}: effort of {joint}")
-        ax.set_xlabel("time (s)")
-        ax.set_ylabel(f"effort ({unit})")
+        label(ax, "time (s)", f"effort ({unit})", f"{robot.name}: effort of {joint}")
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-        ax.grid(alpha=0.3)
     return figure

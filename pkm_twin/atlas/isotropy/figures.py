@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.atlas import figures
+from pkm_twin.atlas import figures, plots
 from pkm_twin.atlas.isotropy.stored import at_height, rates_of
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def spheres(atlas: Dataset, index: str = "eta", ax: Axes | None = None) -> Axes:
     within = atlas.within_limits.isel(picked).values > 0
     low, high = np.nanpercentile(values, (TAIL, 100 - TAIL))
     norm = colors.LogNorm(low, high) if index == "force" else colors.Normalize(low, high)
-    steps = figures.pyplot().get_cmap(
+    steps = plots.pyplot().get_cmap(
         figures.MAP if index == "eta" else figures.OTHER_MAP, figures.LEVELS
     )
     ring = scale * float(second[seconds[1]] - second[0])
@@ -96,7 +96,7 @@ def spheres(atlas: Dataset, index: str = "eta", ax: Axes | None = None) -> Axes:
                 x, y = float(first[i]), float(second[j])
             size = radius if not polar_grid else min(radius, _room(first, scale, second, j, ring))
             ring_of = {"ec": "0.3", "lw": 0.6} if within[a, b] else BEYOND
-            rim = figures.pyplot().Circle((x, y), size, fill=False, zorder=2.1, **ring_of)
+            rim = plots.pyplot().Circle((x, y), size, fill=False, zorder=2.1, **ring_of)
             ax.add_patch(rim)
             beyond |= not within[a, b]
             if not known:
@@ -114,7 +114,7 @@ def spheres(atlas: Dataset, index: str = "eta", ax: Axes | None = None) -> Axes:
             image.set_clip_path(rim)
     if beyond:
         label = "beyond the machine's limits"
-        handle = figures.pyplot().Line2D([], [], ls="--", lw=1.6, color=BEYOND["ec"], label=label)
+        handle = plots.pyplot().Line2D([], [], ls="--", lw=1.6, color=BEYOND["ec"], label=label)
         ax.legend(handles=[handle], loc="upper right", fontsize=8)
     if polar_grid:
         reach = _rings(ax, first[list(firsts)], second[list(seconds)], scale, ring)
@@ -231,10 +231,8 @@ def spread_over_poses(atlas: Dataset, index: str = "eta", ax: Axes | None = None
                     lw=max(1.2, 5.0 - 0.65 * drawn),
                     label=f"{azimuth:.0f}°",
                 )
-        ax.set_xlabel("tilt (deg)")
-        ax.set_ylabel(f"{what} ({unit})")
+        plots.label(ax, "tilt (deg)", f"{what} ({unit})")
         ax.legend(title="azimuth", fontsize=8)
-        ax.grid(alpha=0.3)
         return ax
     first, second = (atlas[name].values for name in names)
     from matplotlib import colors

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from pkm_twin.atlas import figures
+from pkm_twin.atlas import figures, plots
 from pkm_twin.atlas.modes.stored import (
     ENLARGED,
     across,
@@ -58,11 +58,9 @@ def frequency_range(atlas: Dataset, ax: Axes | None = None) -> Axes:
         ax.fill_between(atlas.z.values, low, high, color=style["color"], alpha=0.2, lw=0)
         ax.plot(atlas.z.values, low, **style, label=f"mode {mode}")
         ax.plot(atlas.z.values, high, **style)
-    ax.set_xlabel("z (m)")
-    ax.set_ylabel("frequency, least to greatest (Hz)")
+    plots.label(ax, "z (m)", "frequency, least to greatest (Hz)")
     ax.set_ylim(bottom=0.0)
     ax.margins(x=0)
-    ax.grid(alpha=0.3)
     # In the order of the lines: the highest mode on top.
     handles, labels = ax.get_legend_handles_labels()
     ax.legend(handles[::-1], labels[::-1], loc="center left", bbox_to_anchor=(1.0, 0.5))

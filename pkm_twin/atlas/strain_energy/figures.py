@@ -89,9 +89,7 @@ def stack(atlas: Dataset, ax: Any = None, layers: int = 6) -> Any:
     """Total energy on slices of the workspace, stacked by height, on 3-D axes."""
     if ax is None:
         ax = (
-            figures.pyplot()
-            .figure(figsize=(8, 7), layout="constrained")
-            .add_subplot(projection="3d")
+            plots.pyplot().figure(figsize=(8, 7), layout="constrained").add_subplot(projection="3d")
         )
     from matplotlib import cm, colors
 

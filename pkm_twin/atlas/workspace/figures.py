@@ -70,9 +70,7 @@ def section(
         )
         marks = [*ax.get_legend_handles_labels()[0], *marks]
     else:
-        ax.add_patch(
-            figures.pyplot().Circle((0, 0), radius, fill=False, ls="--", lw=1.2, ec="black")
-        )
+        ax.add_patch(plots.pyplot().Circle((0, 0), radius, fill=False, ls="--", lw=1.2, ec="black"))
         ax.set_aspect("equal")
     _legend_above(ax, marks)
     figures.bar(ax, mesh, "singularity index (dimensionless)")
@@ -129,9 +127,7 @@ def _hatch(atlas: Dataset, ax: Axes, first: str, second: str, gap: Array, what: 
     ax.contourf(x, y, near, [0.5, 1.5], colors=["0.85"], hatches=["////"])
     ax.contour(x, y, near, [0.5], colors="0.2", linewidths=0.8)
     label = f"{what} {_near(atlas)}"
-    return [
-        figures.pyplot().Rectangle((0, 0), 1, 1, fc="0.85", ec="0.2", hatch="////", label=label)
-    ]
+    return [plots.pyplot().Rectangle((0, 0), 1, 1, fc="0.85", ec="0.2", hatch="////", label=label)]
 
 
 def _clearance(atlas: Dataset, ufunc: Any, kept: list[str]) -> Array:
