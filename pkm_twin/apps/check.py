@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -16,7 +15,7 @@ from delta_dynamics.rest import beyond_friction, friction_reach, moving_rates
 from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.limits import ranges
 from pkm_twin.apps.loads import Load, by_load
-from pkm_twin.apps.recorded import Recording, read_recording
+from pkm_twin.apps.recorded import Recording
 from pkm_twin.apps.topics import Topics
 from pkm_twin.apps.verdict import Item, Verdict
 from pkm_twin.errors import MessageError, SingularityError, UnreachableError
@@ -116,26 +115,8 @@ class CheckReport:
         }
 
 
-def check_bag(
-    path: str | Path,
-    robot: str | None = None,
-    bounds: Bounds | None = None,
-    progress: Callable[[int], None] | None = None,
-    *,
-    topics: Sequence[str] = (),
-    carried: Load | None = None,
-) -> CheckReport:
-    """Compare a bag with the model.
-
-    :param topics: joint-state and wrench topic, where names and joints do not tell.
-    :param carried: the payload, by default the one that the bag tells of.
-    :raises BagError: the file is damaged or cannot be judged at all.
-    """
-    return judged(read_recording(path, robot, progress, topics=topics, carried=carried), bounds)
-
-
 def judged(recording: Recording, bounds: Bounds | None = None) -> CheckReport:
-    """Judge a recording against the twin."""
+    """Compare a recording with the model."""
     bounds = bounds or Bounds()
     path = recording.source
     items = [*_file(recording, bounds), *_timing(recording, bounds), *_limits(recording)]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import struct
@@ -19,6 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
+from pkm_twin.bags.definitions import message_class
 from pkm_twin.bags.reader import BagMessage, BagWriter
 from pkm_twin.errors import PkmTwinError
 
@@ -190,12 +190,6 @@ def child_environment() -> dict[str, str]:
     environment = dict(os.environ)
     environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
     return environment
-
-
-def message_class(kind: str) -> Any:
-    """The class of a type's name."""
-    package, _, name = kind.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 def wait_for(

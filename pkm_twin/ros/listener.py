@@ -6,12 +6,12 @@ ROS is imported inside the functions, so that a command line can show its help w
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from pkm_twin.bags.definitions import message_class
 from pkm_twin.ros.context import own_node
 
 
@@ -48,7 +48,5 @@ def subscribe_best_effort(node: Any, kind: str, topic: str, take: Callable[[Any]
     """
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-    package, _, name = kind.partition("/msg/")
-    message = getattr(importlib.import_module(f"{package}.msg"), name)
     qos = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-    node.create_subscription(message, topic, take, qos)
+    node.create_subscription(message_class(kind), topic, take, qos)

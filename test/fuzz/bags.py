@@ -13,7 +13,8 @@ from typing import Any
 import zstandard
 from hypothesis import strategies as st
 
-from pkm_twin.apps.check import check_bag
+from pkm_twin.apps.check import judged
+from pkm_twin.apps.recorded import read_recording
 from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.qos import parse_qos, require_topic
 from pkm_twin.bags.reader import BagWriter, inspect, read_messages
@@ -230,5 +231,5 @@ class NonsenseBags(Kind):
         if self.turn % 2:
             refusal(lambda: recover(path, self.folder / "saved.mcap", overwrite=True))
         elif self.turn % 10 == 0:
-            refusal(lambda: check_bag(path, "prru"))
+            refusal(lambda: judged(read_recording(path, "prru")))
         return next((part for part in [refusal(decode), *parts] if part != "good"), "good")
