@@ -85,19 +85,22 @@ def table_console() -> Console:
     return console if console.is_terminal else Console(width=140)
 
 
+def finite(value: float | None) -> float | None:
+    """A number for JSON, which has no infinity; None where it is not known."""
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
 def print_json(data: Any) -> None:
     """JSON proper: a number that is not finite is a mistake here."""
     typer.echo(json.dumps(data, indent=2, allow_nan=False))
 
 
-def file_name(option: typer.CallbackParam, path: Path | None) -> Path | None:
-    """Callback of an option that names a file to write: neither a folder nor nothing.
-
-    :raises PkmTwinError: by the option's name.
-    """
-    if path is not None and path.name in ("", ".."):
-        raise PkmTwinError(f"{option.opts[-1]}: {str(path)!r} is a folder; expected a file name")
-    return path
+def answer(data: Any, text: str, as_json: bool, *, piped: bool = False) -> None:
+    """Print a result as data or as text; where a table is ``piped`` to stdout, text to stderr."""
+    if as_json:
+        print_json(data)
+    else:
+        typer.echo(text, err=piped)
 
 
 def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:
@@ -120,6 +123,18 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
         require_replaceable(path)
     except OSError as error:
         raise PkmTwinError(f"{path} cannot be written: {error.strerror}") from None
+
+
+@contextmanager
+def writing(path: Path | None) -> Iterator[None]:
+    """What the system refuses as one line with the file's name, ``path`` where it names none.
+
+    :raises PkmTwinError: in place of any ``OSError``.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise PkmTwinError(f"cannot write {error.filename or path}: {error.strerror}") from None
 
 
 def tell(text: str) -> None:

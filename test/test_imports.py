@@ -23,6 +23,7 @@ MAY = {
     "pkm_twin.files": set(),
     "pkm_twin.threads": set(),
     "pkm_twin.console": set(),
+    "pkm_twin.options": set(),
     "pkm_twin.codegen": set(),
     "pkm_twin.bags": set(),
     "pkm_twin.machine": {"pkm_twin.codegen"},
@@ -42,11 +43,11 @@ MAY = {
     "delta_dynamics.node": NODE | {"delta_dynamics"},
     "stiffness_monitor.node": NODE | {"stiffness_monitor"},
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
-    "pkm_twin.atlas": NODE | TWINS | {"pkm_twin.console"},
+    "pkm_twin.atlas": NODE | TWINS | {"pkm_twin.console", "pkm_twin.options"},
     "pkm_twin.apps": NODE
     | TWINS
     | {"pkm_twin.console", "pkm_twin.atlas", "pkm_twin.export", "pkm_twin.identification"}
-    | {"pkm_twin.paths", "pkm_twin.design"},
+    | {"pkm_twin.paths", "pkm_twin.design", "pkm_twin.options"},
 }
 """Rooms that each may import, beside itself and :data:`OWN`; so nobody imports apps or a node."""
 ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces")

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 from textwrap import fill
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -30,7 +30,7 @@ from pkm_twin.apps.partial_report import (
     scale_text,
 )
 from pkm_twin.apps.pose_table import LENGTHS, parse_columns, read_partial, read_poses
-from pkm_twin.console import file_name, print_json, progress, refuse_existing, table_console
+from pkm_twin.console import print_json, progress, refuse_existing, table_console
 from pkm_twin.errors import ParameterError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.identification.calibration import (
@@ -48,6 +48,7 @@ from pkm_twin.identification.partial import PartialCalibration, calibrate_partia
 from pkm_twin.identification.plan import MOST
 from pkm_twin.identification.plan import plan as plan_poses
 from pkm_twin.identification.transmission import Transmission, written
+from pkm_twin.options import OptionalFloat, OptionalInt, OptionalPath, OptionalText, file_name
 from pkm_twin.robot.edited import Fitted, edited_yaml, write_edited
 
 Array = NDArray[np.float64]
@@ -60,11 +61,10 @@ MOST_SHOWN = 10
 def calibrate_command(
     robot: RobotName,
     poses: Annotated[
-        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        OptionalPath,
         typer.Argument(
             help="CSV: JOINT.position columns, x y z (m), perhaps roll pitch yaw (rad) or "
-            "qx qy qz qw; or what --measure names",
-            show_default=False,
+            "qx qy qz qw; or what --measure names"
         ),
     ] = None,
     out: Annotated[
@@ -121,23 +121,20 @@ def calibrate_command(
         typer.Option(help="KIND=VALUE: known standard deviation of a measurement, m or rad"),
     ] = [],  # noqa: B006  typer copies it
     plan: Annotated[
-        Optional[Path],  # noqa: UP045
+        OptionalPath,
         typer.Option(
             help="write the poses to measure next, a CSV, and predict how well the machine will "
             "be known; calibrate nothing",
             callback=file_name,
         ),
     ] = None,
-    count: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option(min=1, max=MOST, help="poses of a plan"),
-    ] = None,
+    count: Annotated[OptionalInt, typer.Option(min=1, max=MOST, help="poses of a plan")] = None,
     accuracy: Annotated[
-        Optional[float],  # noqa: UP045
+        OptionalFloat,
         typer.Option(min=1e-9, help="position's standard deviation that a plan is to reach, m"),
     ] = None,
     within: Annotated[
-        Optional[str],  # noqa: UP045
+        OptionalText,
         typer.Option(help="where a plan measures: x=-0.1:0.1,z=0 (m, rad); default: everywhere"),
     ] = None,
     beyond_limits: BeyondLimits = False,

@@ -21,6 +21,7 @@ from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.apps.certificate.description import UnfitError
 from pkm_twin.apps.certificate.maximal import Maximal
 from pkm_twin.apps.certificate.states import States, random_states
+from pkm_twin.console import finite
 from pkm_twin.errors import ParameterError, PkmTwinError, install
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
@@ -127,8 +128,8 @@ class Certificate:
                 {
                     "engine": item.engine,
                     "what": item.what,
-                    "worst": item.worst if math.isfinite(item.worst) else None,
-                    "median": item.median if math.isfinite(item.median) else None,
+                    "worst": finite(item.worst),
+                    "median": finite(item.median),
                     "bound": item.bound,
                     "good": item.good,
                 }

@@ -8,13 +8,14 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from pkm_twin.apps.options import BagTopics, Json, LoadTimes, OptionalRobot, Payload, load_of
 from pkm_twin.console import print_json, progress, table_console, tell
 from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.options import OptionalPath, OptionalText
 from pkm_twin.threads import one_blas_thread_for_children
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def is_collection(path: Path) -> bool:
 
 
 def check_one(path: Path, request: Request, update: Any = None) -> CheckReport:
-    """Judge a recording, and append it to the history; errors as ``check_bag``."""
+    """Judge a recording, and append it to the history; errors as ``read_recording``."""
     from pkm_twin.apps.check import Bounds, judged
     from pkm_twin.apps.recorded import read_recording
 
@@ -119,10 +120,7 @@ def _check_folder(folder: Path, request: Request, jobs: int, as_json: bool) -> b
 def check(
     bag: Annotated[
         Path,
-        typer.Argument(
-            help="a bag: an MCAP file or a rosbag2 folder; a CSV; or a folder of bags",
-            show_default=False,
-        ),
+        typer.Argument(help="a bag: an MCAP file or a rosbag2 folder; a CSV; or a folder of bags"),
     ],
     robot: OptionalRobot = None,
     residual: Annotated[
@@ -137,16 +135,14 @@ def check(
     payload: Payload = None,
     load_times: LoadTimes = None,
     history: Annotated[
-        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        OptionalPath,
         typer.Option(
             help="also append residual, friction, payload and stiffness to this file, for "
-            "`pkm-twin trend`",
-            show_default=False,
+            "`pkm-twin trend`"
         ),
     ] = None,
     machine: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="name in the history; default: the robot's", show_default=False),
+        OptionalText, typer.Option(help="name in the history; default: the robot's")
     ] = None,
     jobs: Annotated[int, typer.Option(help="processes for a folder of bags", min=1)] = 1,
     as_json: Json = False,

@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, Optional
+from typing import Annotated, Any, NoReturn
 
 import numpy as np
 import typer
@@ -47,7 +47,6 @@ from pkm_twin.apps.vibration import frf, lobes
 from pkm_twin.apps.view.command import view
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
-    file_name,
     flush_output,
     print_json,
     progress,
@@ -56,9 +55,11 @@ from pkm_twin.console import (
     system_error,
     table_console,
     tell,
+    writing,
 )
 from pkm_twin.errors import ParameterError, PkmTwinError, plain_warnings
 from pkm_twin.files import STANDARD, open_standard_streams
+from pkm_twin.options import OptionalFloat, OptionalPath, file_name
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
 app = typer.Typer(
@@ -107,7 +108,7 @@ def play(
     rate: Annotated[float, typer.Option(help="speed factor; 1 is the recorded speed")] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="restart at the end")] = False,
     clock: Annotated[
-        Optional[float],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        OptionalFloat,
         typer.Option(help="publish /clock at this many Hz, for nodes with use_sim_time"),
     ] = None,
     wait: Annotated[
@@ -161,7 +162,7 @@ def info(
     platform: Platform = None,
     as_json: Json = False,
     picture: Annotated[
-        Optional[Path],  # noqa: UP045  typer reads it
+        OptionalPath,
         typer.Option(
             help="draw the robot at home into this file, .png or .svg", callback=file_name
         ),
@@ -250,9 +251,7 @@ def convert(robot: RobotName, platform: Platform = None) -> None:
 @tables
 def torques(
     robot: RobotName,
-    motion: Annotated[
-        Path, typer.Argument(help="a bag, or a CSV with a header row", show_default=False)
-    ],
+    motion: Annotated[Path, typer.Argument(help="a bag, or a CSV with a header row")],
     out: Annotated[
         Path,
         typer.Option(
@@ -284,7 +283,7 @@ def torques(
     """
     from pkm_twin.apps.limits import beyond_limits as find_beyond
     from pkm_twin.apps.limits import refuse_beyond
-    from pkm_twin.apps.torques import check_target, motion_of_bag, motion_of_csv, table, write_table
+    from pkm_twin.apps.torques import check_target, motion_of, table, write_table
     from pkm_twin.atlas import plots
     from pkm_twin.bags.storage import is_bag
 
@@ -294,24 +293,19 @@ def torques(
     for target in (out, drawing) if picture else (out,):
         refuse_existing(target, overwrite, motion)
     carried = load_of(payload, load_times)
-    if is_bag(motion):
-        data = motion_of_bag(motion, robot, topic, carried)
-    elif topic:
+    if topic and not is_bag(motion):
         raise typer.BadParameter(f"--topic is for bags; {motion} is read as CSV")
-    else:
-        data = motion_of_csv(motion, robot, carried)
+    data = motion_of(motion, robot, topic, carried)
     _, found = find_beyond(data.robot, data.q, data.qd)
     if not beyond_limits:
         refuse_beyond(found)
     with progress("torques", len(data.time)) as update:
         columns = table(data, update)
-    try:
+    with writing(out):
         write_table(columns, out)
         typer.echo(f"{out}: {len(data.time)} rows, {len(columns)} columns", err=piped)
         if picture:
             typer.echo(f"{plots.save(plots.torques(data, columns), drawing)}")
-    except OSError as error:
-        raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
     for note in (*data.notes, *(f"beyond limits: {item}" for item in found)):
         typer.echo(note, err=piped)
 

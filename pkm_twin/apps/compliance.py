@@ -9,15 +9,8 @@ import numpy as np
 import typer
 
 from pkm_twin.apps import export, maps  # noqa: F401  maps adds its commands to atlas
-from pkm_twin.apps.options import (
-    BeyondLimits,
-    Json,
-    RobotName,
-)
-from pkm_twin.console import (
-    numbers,
-    print_json,
-)
+from pkm_twin.apps.options import BeyondLimits, Json, RobotName
+from pkm_twin.console import numbers, print_json
 from pkm_twin.errors import PkmTwinError
 
 
@@ -25,10 +18,7 @@ def compliance(
     robot: RobotName,
     pose: Annotated[
         list[float],
-        typer.Argument(
-            help="the pose's coordinates, for upr_rpu z (m), beta, gamma (rad)",
-            show_default=False,
-        ),
+        typer.Argument(help="the pose's coordinates, for upr_rpu z (m), beta, gamma (rad)"),
     ],
     wrench: Annotated[
         str,

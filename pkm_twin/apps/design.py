@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Final, Optional
+from typing import Annotated, Final
 
 import typer
 
-from pkm_twin.apps.options import Json, Payload, Platform, RobotName, load_of
-from pkm_twin.console import file_name, numbers, print_json, progress, refuse_existing
+from pkm_twin.apps.options import Json, Payload, Platform, RobotName, loaded
+from pkm_twin.console import answer, numbers, progress, refuse_existing
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.options import OptionalPath, OptionalText, file_name
 
 SWEEPS: Final = ("grid", "sobol")
 
@@ -29,11 +29,8 @@ def design_command(
         ),
     ] = [],  # noqa: B006  typer copies it
     path: Annotated[
-        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-        typer.Option(
-            help="motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording",
-            show_default=False,
-        ),
+        OptionalPath,
+        typer.Option(help="motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording"),
     ] = None,
     minimise: Annotated[
         list[str],
@@ -54,7 +51,7 @@ def design_command(
         ),
     ] = [],  # noqa: B006
     sweep: Annotated[
-        Optional[str],  # noqa: UP045
+        OptionalText,
         typer.Option(help="grid or sobol: compute machines within the bounds into --out FILE.nc"),
     ] = None,
     samples: Annotated[
@@ -62,16 +59,12 @@ def design_command(
         typer.Option(help="machines of a sweep: per axis of a grid, or in total with sobol", min=1),
     ] = 20,
     scheduler: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(
-            help="of a sweep: address of a Dask scheduler: tcp://HOST:8786", show_default=False
-        ),
+        OptionalText, typer.Option(help="of a sweep: address of a Dask scheduler: tcp://HOST:8786")
     ] = None,
     wrench: Annotated[
-        Optional[str],  # noqa: UP045
+        OptionalText,
         typer.Option(
-            help="fx,fy,fz,mx,my,mz on the platform, N and N m, base axes; added to the path's",
-            show_default=False,
+            help="fx,fy,fz,mx,my,mz on the platform, N and N m, base axes; added to the path's"
         ),
     ] = None,
     payload: Payload = None,
@@ -82,20 +75,15 @@ def design_command(
     points: Annotated[int, typer.Option(help="points of a Pareto front", min=3)] = 9,
     seed: Annotated[int, typer.Option(help="seed of starts and samples", min=0)] = 0,
     out: Annotated[
-        Optional[Path],  # noqa: UP045
+        OptionalPath,
         typer.Option(
             help="FILE.yaml: the robot's file with the new values; for a sweep FILE.nc",
             callback=file_name,
-            show_default=False,
         ),
     ] = None,
     picture: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(
-            help="PNG: efforts before and after, or the Pareto front",
-            callback=file_name,
-            show_default=False,
-        ),
+        OptionalPath,
+        typer.Option(help="PNG: efforts before and after, or the Pareto front", callback=file_name),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the files")] = False,
     as_json: Json = False,
@@ -114,7 +102,6 @@ def design_command(
     the standard deviations of the platform's position and rotation, with the share of each value,
     on the path or, without --path, over the workspace.
     """
-    from pkm_twin import load
     from pkm_twin.apps import design_report as report
     from pkm_twin.atlas.run import on_cluster
     from pkm_twin.design import design as find
@@ -126,15 +113,12 @@ def design_command(
     for target in (out, picture):
         if target is not None:
             refuse_existing(target, overwrite, path)
-    machine = load(robot, platform=platform) if platform else load(robot)
-    carried = load_of(payload, None)
-    if carried is not None:
-        machine = carried.on(machine)
+    machine, _ = loaded(robot, platform, payload)
     load_on = None if wrench is None else numbers(wrench, 6, "fx,fy,fz,mx,my,mz")
     if tolerance:
         if vary or minimise or sweep or subject_to or out or picture:
             raise typer.BadParameter("--tolerance goes with --path and --json only")
-        _print(report.budget(machine, _sigmas(tolerance), path), as_json)
+        answer(*report.budget(machine, _sigmas(tolerance), path), as_json)
         return
     if path is None:
         raise typer.BadParameter("give the motion with --path, see `pkm-twin path`")
@@ -155,7 +139,7 @@ def design_command(
                 "grid" if sweep == "grid" else "sobol", seed=seed, progress=update,
                 compute=compute,
             )  # fmt: skip
-        _print(report.write_sweep(machine, table, sweep, path, out), as_json)
+        answer(*report.write_sweep(machine, table, sweep, path, out), as_json)
         return
     if scheduler is not None:
         raise typer.BadParameter("--scheduler goes with --sweep only")
@@ -172,15 +156,7 @@ def design_command(
         report.write_robot(machine, robot, result, path, out)
     if picture is not None:
         report.draw(machine, result, way, picture)
-    _print(report.told(machine, box, result, way, out, picture), as_json)
-
-
-def _print(both: tuple[object, str], as_json: bool) -> None:
-    data, text = both
-    if as_json:
-        print_json(data)
-    else:
-        typer.echo(text)
+    answer(*report.told(machine, box, result, way, out, picture), as_json)
 
 
 def _sigmas(texts: list[str]) -> dict[str, float]:

@@ -11,11 +11,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.torques import motion_of_bag, motion_of_csv
+from pkm_twin.apps.torques import motion_of
 from pkm_twin.atlas import plots
 from pkm_twin.atlas.extras import require
 from pkm_twin.atlas.store import writing
-from pkm_twin.bags.storage import is_bag
+from pkm_twin.console import finite
 from pkm_twin.design import QUANTITIES, Design, DesignPoint, PosePath, Sweep, pose_errors
 from pkm_twin.design.pose_path import Followed
 from pkm_twin.design.tolerance import workspace_states
@@ -39,7 +39,7 @@ def read_path(path: Path, robot: Robot, wrench: Sequence[float] | None) -> tuple
     :raises ParameterError: a table that is no motion, or a payload that is held part of the time.
     :raises BagError: a bag without a motion.
     """
-    motion = motion_of_bag(path, robot) if is_bag(path) else motion_of_csv(path, robot)
+    motion = motion_of(path, robot)
     if motion.load is not None:
         if motion.load.times:
             raise ParameterError(
@@ -89,7 +89,7 @@ def told(
         "numbers": dict(best.numbers),
         "quantities": {
             name: {
-                "before": _finite(before.quantities.get(name)), "after": value,
+                "before": finite(before.quantities.get(name)), "after": value,
                 "unit": QUANTITIES[name].unit(robot),
             }
             for name, value in best.quantities.items()
@@ -141,10 +141,6 @@ def _at_bound(value: float, bound: tuple[float, float]) -> str:
     return " (at its lower bound)" if low else " (at its upper bound)" if high else ""
 
 
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
 def _point(point: DesignPoint) -> dict[str, Any]:
     return {"variables": dict(point.variables), "quantities": dict(point.quantities)}
 
@@ -188,11 +184,9 @@ def draw(robot: Robot, result: Design, path: PosePath, picture: Path) -> None:
         ax.plot(best[first], best[second], "D", color=plots.COLOURS[2], label="chosen")
         if result.before.feasible:
             ax.plot(old[first], old[second], "s", color=plots.COLOURS[1], label="before")
-        ax.set_xlabel(f"{first} ({QUANTITIES[first].unit(robot)})")
-        ax.set_ylabel(f"{second} ({QUANTITIES[second].unit(robot)})")
-        ax.set_title(f"{robot.name}: {first} against {second}")
+        x, y = (f"{aim} ({QUANTITIES[aim].unit(robot)})" for aim in result.minimise)
+        plots.label(ax, x, y, f"{robot.name}: {first} against {second}")
         ax.legend()
-        ax.grid(alpha=0.3)
     else:
         numbers = result.best.numbers
         both = [{n: [robot.number(n)] for n in numbers}, {n: [v] for n, v in numbers.items()}]
@@ -202,10 +196,9 @@ def draw(robot: Robot, result: Design, path: PosePath, picture: Path) -> None:
             for k, joint in enumerate(robot.joint_names):
                 colour = plots.COLOURS[k % len(plots.COLOURS)]
                 ax.plot(path.time, table[:, k], color=colour, lw=1.2, label=joint)
-            ax.set_title(f"{robot.name} {title}: efforts on the path")
-            ax.set_xlabel("time (s)")
-            ax.set_ylabel(f"effort ({' or '.join(sorted(set(robot.effort_units)))})")
-            ax.grid(alpha=0.3)
+            unit = " or ".join(sorted(set(robot.effort_units)))
+            head = f"{robot.name} {title}: efforts on the path"
+            plots.label(ax, "time (s)", f"effort ({unit})", head)
         most = np.nanmax(np.abs(efforts)) * 1.05
         for ax in axes[0]:
             ax.set_ylim(-most, most)

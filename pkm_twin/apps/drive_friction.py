@@ -22,8 +22,7 @@ def drive_friction_command(
         Path,
         typer.Argument(
             help="CSV with one row per weight: mass_kg or torque_nm, iq_up_A, iq_down_A; "
-            "optional: speed",
-            show_default=False,
+            "optional: speed"
         ),
     ],
     lever: Annotated[

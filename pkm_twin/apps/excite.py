@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
 from pkm_twin.apps.options import Json, OverwriteBoth, RobotName
-from pkm_twin.console import file_name, print_json, progress, refuse_existing
-from pkm_twin.errors import BagError, ParameterError, PkmTwinError
+from pkm_twin.console import print_json, progress, refuse_existing, writing
+from pkm_twin.errors import BagError, ParameterError
+from pkm_twin.options import OptionalFloat, OptionalPath, file_name
 
 if TYPE_CHECKING:
     from pkm_twin.identification.excitation import Bounds, Judge
@@ -30,8 +31,7 @@ def excite(
         typer.Option(help="MCAP to write; the CSV has the same name with .csv", callback=file_name),
     ] = Path("excite.mcap"),
     beside: Annotated[
-        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-        typer.Option(help="also report the condition number of this bag", show_default=False),
+        OptionalPath, typer.Option(help="also report the condition number of this bag")
     ] = None,
     friction: Annotated[
         bool,
@@ -46,11 +46,8 @@ def excite(
         float, typer.Option(help="fraction of all limits to use", min=0.05, max=1.0)
     ] = 0.9,
     acceleration: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(
-            help="acceleration limit of every joint, rad/s2 or m/s2; default: none",
-            show_default=False,
-        ),
+        OptionalFloat,
+        typer.Option(help="acceleration limit of every joint, rad/s2 or m/s2; default: none"),
     ] = None,
     singularity: Annotated[
         float, typer.Option(help="least singularity index, 0 to 1", min=0.001, max=0.9)
@@ -159,10 +156,8 @@ def write_motion(
     for i, joint in enumerate(machine.joint_names):
         for word, values in zip(("position", "velocity", "acceleration"), motion, strict=True):
             columns[f"{joint}.{word}"] = values[:, i]
-    try:
+    with writing(table):
         write_table(columns, table)
-    except OSError as error:
-        raise PkmTwinError(f"cannot write {error.filename or table}: {error.strerror}") from None
     return best, len(time)
 
 

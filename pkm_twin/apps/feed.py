@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -23,9 +23,10 @@ from pkm_twin.apps.options import (
     loaded,
 )
 from pkm_twin.apps.path import ENDINGS, read_waypoints
-from pkm_twin.console import print_json
-from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.console import answer, writing
+from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD
+from pkm_twin.options import OptionalFloat
 
 if TYPE_CHECKING:
     from pkm_twin.paths import TimedPath
@@ -50,10 +51,7 @@ def bend_per_feed(robot: Robot, force: float, q: Array, way: Array) -> Array:
 def feed(
     robot: RobotName,
     waypoints: Annotated[
-        Path,
-        typer.Argument(
-            help="CSV of waypoints, in the format of `pkm-twin path`", show_default=False
-        ),
+        Path, typer.Argument(help="CSV of waypoints, in the format of `pkm-twin path`")
     ],
     force: Annotated[
         float,
@@ -62,12 +60,11 @@ def feed(
     tolerance: Annotated[float, typer.Option(help="largest deflection of the platform, m")],
     speed: Annotated[float, typer.Option(help="programmed feed, m/s")],
     blend: Annotated[
-        Optional[float],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        OptionalFloat,
         typer.Option(
             help="distance from a corner at which rounding begins, m; 0 stops at every waypoint; "
             "default: a smooth curve through the waypoints",
             min=0.0,
-            show_default=False,
         ),
     ] = None,
     share: LimitShare = 1.0,
@@ -102,16 +99,11 @@ def feed(
 
     way = read_waypoints(waypoints, machine, blend)
     motion = fastest(machine, way, speed=speed, share=share, slowdown=slowdown)
-    try:
+    with writing(out):
         if out is not None:
             write(motion, motion.uniform(rate), carried, out, overwrite)
         data, text = _report(motion, force, speed, tolerance, out, drawing)
-    except OSError as error:
-        raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
-    if as_json:
-        print_json(data)
-    else:
-        typer.echo(text, err=str(out) == STANDARD)
+    answer(data, text, as_json, piped=str(out) == STANDARD)
 
 
 def _report(
@@ -147,10 +139,8 @@ def _report(
         for ax, (values, label, limit), scale in zip(axes[0], curves, (1e3, 1e6), strict=True):
             ax.plot(s.time, values, color=plots.COLOURS[0], lw=1.2)
             ax.axhline(scale * limit, color=plots.COLOURS[1], lw=1.0)
-            ax.set_ylabel(label)
-            ax.set_xlabel("time (s)")
+            plots.label(ax, "time (s)", label)
             ax.set_ylim(bottom=0.0)
-            ax.grid(alpha=0.3)
         figure.suptitle(title.replace(", deflection", ",\ndeflection"), fontsize=10)
         plots.save(figure, drawing)
     return data, "\n".join([title, *(str(name) for name in (out, drawing) if name is not None)])

@@ -6,21 +6,24 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.table import Table
 
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
 from pkm_twin.apps.options import Accept, BagTopics, BeyondLimits, Json, LoadTimes, Payload, load_of
-from pkm_twin.console import file_name, print_json, progress, refuse_existing, table_console
+from pkm_twin.console import print_json, progress, refuse_existing, writing
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.machine.strict_yaml import parse_yaml
+from pkm_twin.options import OptionalText, file_name
 from pkm_twin.robot.catalogue import robot_of_data
+
+if TYPE_CHECKING:
+    from pkm_twin.apps.fit_report import Report
 
 Array = NDArray[np.float64]
 
@@ -36,9 +39,7 @@ COMPLIANCE: Final = "compliance"
 
 def fit(
     robot: RobotFile,
-    recordings: Annotated[
-        list[Path], typer.Argument(help="bags, or CSV files with a header row", show_default=False)
-    ],
+    recordings: Annotated[list[Path], typer.Argument(help="bags, or CSV files with a header row")],
     what: Annotated[
         str,
         typer.Option(
@@ -64,11 +65,10 @@ def fit(
         ),
     ] = "auto",
     torque_constant: Annotated[
-        Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        OptionalText,
         typer.Option(
             help="efforts are motor currents, A: N m or N per ampere at the joint, one number or "
-            "one per joint with commas; `fit` takes it from the masses of the file",
-            show_default=False,
+            "one per joint with commas; `fit` takes it from the masses of the file"
         ),
     ] = None,
     topic: BagTopics = [],  # noqa: B006  typer copies it
@@ -111,14 +111,12 @@ def fit(
     the columns JOINT.position, fx fy fz mx my mz, and those of dx dy dz (m) rx ry rz (rad) that
     were measured, all at the platform's reference point in base axes.
     """
-    from pkm_twin.apps.fit_files import fitted_yaml, robot_text, yaml_head
-    from pkm_twin.robot.edited import write_edited
-
-    page = out.with_suffix(".html")
+    page = out.with_suffix(".html") if report else None
     if out.suffix not in (".yaml", ".yml"):
         raise ParameterError("out", str(out), "a name that ends in .yaml or .yml")
-    for target in (out, page) if report else (out,):
-        refuse_existing(target, overwrite)
+    for target in (out, page):
+        if target is not None:
+            refuse_existing(target, overwrite)
     _check_topics(topic, recordings)
     if COMPLIANCE in [word.strip() for word in what.split(",")]:
         if per_copy or payload is not None or load_times is not None:
@@ -126,10 +124,11 @@ def fit(
                 "what", what, "no --per-copy, --payload or --load-times, which are for efforts"
             )
         _fit_compliance(
-            robot, recordings, what, topic, out, page if report else None, json_output,
-            beyond_limits, accept,
-        )  # fmt: skip
+            robot, recordings, what, topic, out, page, json_output, beyond_limits, accept
+        )
         return
+    from pkm_twin.apps.fit_files import robot_text
+    from pkm_twin.apps.fit_report import effort_report
     from pkm_twin.identification.friction_laws import laws_of
 
     kinds, laws = kinds_of(what), laws_of(friction)
@@ -145,26 +144,40 @@ def fit(
         *(f"accepted by --accept: {line}" for line in result.accepted),
         *beyond,
     ]
-    names = [one_line(path.name, 100) for path in recordings]
-    fitted = fitted_yaml(text, result, names)
-    _check_loads(fitted, out)
-    try:
-        write_edited(out, [*marks, *yaml_head(result, names)], fitted)
-        if report:
-            from pkm_twin.apps.fit_report import fit_page
+    told = [dataclasses.asdict(choice) for choice in choices]
+    more = {"beyond_limits": beyond, "friction_laws": told}
+    _finish(effort_report(result, _named(recordings)), text, marks, out, page, json_output, more)
 
-            replace_file(page, fit_page(result, names, marks).encode())
-    except OSError as error:
-        raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
-    if json_output:
-        files = {"out": str(out), "report": str(page) if report else None}
-        told = [dataclasses.asdict(choice) for choice in choices]
-        print_json(as_json(result) | files | {"beyond_limits": beyond, "friction_laws": told})
+
+def _named(recordings: Sequence[Path]) -> list[str]:
+    return [one_line(path.name, 100) for path in recordings]
+
+
+def _finish(
+    report: Report, text: str, marks: Sequence[str], out: Path, page: Path | None, as_json: bool,
+    more: dict[str, Any],
+) -> None:  # fmt: skip
+    """Write the robot's file and the page, and print what was found.
+
+    :param text: of the robot's file before. ``marks``: lines that come first.
+    """
+    from pkm_twin.apps.fit_files import fitted_yaml
+    from pkm_twin.robot.edited import write_edited
+
+    fitted = fitted_yaml(text, report.result, report.recordings)
+    _check_loads(fitted, out)
+    with writing(out):
+        write_edited(out, [*marks, *report.head()], fitted)
+        if page is not None:
+            replace_file(page, report.page(marks).encode())
+    if as_json:
+        files = {"out": str(out), "report": None if page is None else str(page)}
+        print_json(report.as_json() | files | more)
         return
-    _print(result)
+    report.echo()
     for line in marks:
         typer.echo(line)
-    typer.echo(f"{out}" + (f", {page}" if report else ""))
+    typer.echo(f"{out}" + (f", {page}" if page is not None else ""))
 
 
 def _check_topics(topics: Sequence[str], recordings: Sequence[Path]) -> None:
@@ -208,11 +221,10 @@ def _fit_compliance(
     page: Path | None, json_output: bool, beyond_limits: bool, accept: bool,
 ) -> None:  # fmt: skip
     """The fit of elastic elements, its files and what it says."""
-    from pkm_twin.apps import elastic_report
     from pkm_twin.apps.elastic_recordings import read_deflected
-    from pkm_twin.apps.fit_files import fitted_yaml, robot_text
+    from pkm_twin.apps.elastic_report import elastic_report
+    from pkm_twin.apps.fit_files import robot_text
     from pkm_twin.identification.elastic_fit import fit_elements
-    from pkm_twin.robot.edited import write_edited
 
     if what.strip() != COMPLIANCE:
         raise ParameterError("what", what, "compliance alone: it is fitted to other recordings")
@@ -226,26 +238,8 @@ def _fit_compliance(
         beyond = _beyond(machine, [(r.name, r.q) for r in read], not beyond_limits)
         result = fit_elements(machine, read, lambda k: update(len(recordings) + k), accept=accept)
     marks = [*(f"accepted by --accept: {line}" for line in result.accepted), *beyond]
-    names = [one_line(path.name, 100) for path in recordings]
-    fitted = fitted_yaml(text, result, names)
-    _check_loads(fitted, out)
-    try:
-        write_edited(out, [*marks, *elastic_report.yaml_head(result, names)], fitted)
-        if page is not None:
-            replace_file(page, elastic_report.elastic_page(result, names, marks).encode())
-    except OSError as error:
-        raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
-    if json_output:
-        print_json(
-            elastic_report.as_json(result)
-            | {"out": str(out), "report": None if page is None else str(page)}
-            | {"beyond_limits": beyond}
-        )
-        return
-    elastic_report.print_fit(result)
-    for line in marks:
-        typer.echo(line)
-    typer.echo(f"{out}" + (f", {page}" if page is not None else ""))
+    report = elastic_report(result, _named(recordings))
+    _finish(report, text, marks, out, page, json_output, {"beyond_limits": beyond})
 
 
 def fit_recordings(
@@ -385,95 +379,3 @@ def _of_csv(path: Path, machine: Any, drive: str = "effort") -> Any:
     if any(axis in columns for axis in WRENCH_AXES):
         wrench = np.stack([columns.get(a, np.zeros(len(time))) for a in WRENCH_AXES], -1)
     return Recorded(one_line(path.name, 100), time, q, effort, wrench)
-
-
-def as_json(result: Any) -> dict[str, Any]:
-    """Plain data, units beside the numbers."""
-    e = result.estimate
-    units = result.robot.effort_units
-    return {
-        "robot": result.robot.name,
-        "verdict": result.verdict.as_json(units, result.parameters.names),
-        "accepted": list(result.accepted),
-        "condition": e.condition if np.isfinite(e.condition) else None,
-        "combinations_determined": e.directions,
-        "held_by_a_physical_bound": e.bound,
-        "samples_fitted": result.samples,
-        "outliers_replaced": result.outliers,
-        "efforts_late_s": list(result.delays),
-        "parameters": [
-            {
-                "key": number.name, "unit": number.unit, "before": number.before,
-                "value": number.after,
-                "standard_deviation": number.deviation if np.isfinite(number.deviation) else None,
-                "status": number.status,
-            }
-            for number in result.numbers
-        ],
-        "not_excited": [number.name for number in result.of("not excited")],
-        "effort_noise": dict(zip(result.robot.joint_names, e.noise.tolist(), strict=True)),
-        "effort_units": dict(zip(result.robot.joint_names, units, strict=True)),
-        "held_out": [
-            {
-                "recording": judged.name,
-                "from_s": float(judged.time[0]), "to_s": float(judged.time[-1]),
-                "residual_rms_before": judged.rms(judged.before).tolist(),
-                "residual_rms_after": judged.rms(judged.after).tolist(),
-                "effort_deviation_rms_after": np.sqrt(np.mean(judged.deviation**2, 0)).tolist(),
-                "peak_effort": np.abs(judged.measured).max(0).tolist(),
-            }
-            for judged in result.judged
-        ],
-        "filtering": [
-            {
-                "window_samples": how.window, "cutoff_Hz": how.cutoff,
-                "kept_every": how.keep_every, "position_noise": list(how.position_noise),
-            }
-            for how in result.filtering
-        ],
-    }  # fmt: skip
-
-
-def verdict_lines(result: Any) -> list[str]:
-    """Whether the model explains the recordings, in sentences."""
-    names, units = result.parameters.names, result.parameters.units
-    verdict = result.verdict
-    told: list[str] = verdict.lines(result.robot.effort_units)
-    told += verdict.blind_lines(names, units)
-    return told
-
-
-def _print(result: Any) -> None:
-    table = Table(box=None)
-    for name, side in (("", "left"), ("before", "right"), ("now", "right"), ("+-", "right")):
-        table.add_column(name, justify=side)  # type: ignore[arg-type]
-    table.add_column("unit")
-    table.add_column("")
-    for n in result.numbers:
-        if n.status == "not excited":
-            continue
-        note = "known only in combination with others" if n.status == "combination" else ""
-        table.add_row(n.name, f"{n.before:.6g}", f"{n.after:.6g}", n.spread, n.unit, note)
-    console = table_console()
-    console.print(table)
-    idle = result.of("not excited")
-    if idle:
-        typer.echo(
-            "not excited by the motion, the file's value stays: " + ", ".join(n.name for n in idle)
-        )
-    e = result.estimate
-    typer.echo(f"condition number {e.condition:.3g} over {e.directions} combinations")
-    if e.bound:
-        typer.echo(
-            "at a physical bound: the data alone would give negative friction or an impossible body"
-        )
-    for line in verdict_lines(result):
-        typer.echo(line)
-    for judged, delay in zip(result.judged, result.delays, strict=True):
-        typer.echo(f"{judged.name}: efforts late by {1e3 * delay:.3g} ms")
-        before, after = judged.rms(judged.before), judged.rms(judged.after)
-        for k, joint in enumerate(result.robot.joint_names):
-            typer.echo(
-                f"{judged.name}, held out, {joint}: residual {before[k]:.4g} before, "
-                f"{after[k]:.4g} {result.robot.effort_units[k]} now"
-            )

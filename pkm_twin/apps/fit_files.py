@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from pkm_twin import Robot, load
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.fit import Fit, Number
+from pkm_twin.identification.fit import Number
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.shared import Key
 from pkm_twin.machine.yaml_edit import edit_yaml
@@ -53,23 +53,6 @@ def _elastic(robot: Robot) -> bool:
     except ParameterError:
         return False
     return True
-
-
-def yaml_head(result: Fit, recordings: Sequence[str]) -> list[str]:
-    """Lines for the head of the file: from what, how well."""
-    e = result.estimate
-    lines = [
-        f"Fitted from {', '.join(recordings)}: {e.directions} combinations, condition number "
-        f"{e.condition:.3g}."
-    ]
-    lines += [f"Verdict: {line}." for line in result.verdict.lines(result.robot.effort_units)]
-    for judged in result.judged:
-        before, after = (
-            ", ".join(f"{v:.3g}" for v in judged.rms(which))
-            for which in (judged.before, judged.after)
-        )
-        lines.append(f"Residual rms held out of {judged.name}: {before} before, {after} now.")
-    return lines
 
 
 def fitted_yaml(text: str, result: Fitted, recordings: Sequence[str]) -> str:

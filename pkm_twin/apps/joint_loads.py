@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 import typer
@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from delta_dynamics.elastic_reactions import elastic_reactions
 from pkm_twin.apps.loads import by_load
 from pkm_twin.apps.options import BagTopics, Json, LoadTimes, Payload, Platform, RobotName, load_of
-from pkm_twin.apps.torques import Motion
-from pkm_twin.console import file_name, print_json, refuse_existing
-from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.apps.torques import Motion, motion_of
+from pkm_twin.console import answer, finite, refuse_existing, writing
+from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD, replace_file
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE
+from pkm_twin.options import OptionalPath, file_name
 from pkm_twin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -224,7 +225,7 @@ def report(
                 life = life_of(robot, load, bearings[load.name], motion.time)
                 entry["life"] = {
                     "equivalent_load_N": life.load, "turns": life.turns,
-                    "L10_turns": _finite(life.life_turns), "L10_hours": _finite(life.life_hours),
+                    "L10_turns": finite(life.life_turns), "L10_hours": finite(life.life_hours),
                 }  # fmt: skip
                 text += f"; bearing: P {life.load:.4g} N, L10 {life.life_hours:.4g} h"
         data["joints"][load.name] = entry
@@ -234,10 +235,6 @@ def report(
             "undetermined: rigid bodies leave it open, and no elastic member or joint decides"
         )
     return data, "\n".join(lines)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def table(motion: Motion, loads: list[JointLoad]) -> str:
@@ -284,12 +281,9 @@ def draw(motion: Motion, loads: list[JointLoad], path: Path) -> None:
         label = f"{name}, {AXES[axis]}"
         reached = np.cumsum(cycles.counts[down])
         axes[1].step(reached, cycles.ranges[down], color=colour, where="pre", label=label)
-    axes[0].set_xlabel("time (s)")
-    axes[0].set_ylabel("force (N)")
-    axes[1].set_xlabel("cycles of at least this range")
-    axes[1].set_ylabel("range (N)")
+    plots.label(axes[0], "time (s)", "force (N)")
+    plots.label(axes[1], "cycles of at least this range", "range (N)")
     for ax in axes:
-        ax.grid(alpha=0.3)
         if order:
             # Below: beside curves that fill their axes there is no room.
             ax.legend(fontsize=9, ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
@@ -298,20 +292,13 @@ def draw(motion: Motion, loads: list[JointLoad], path: Path) -> None:
     plots.save(figure, path)
 
 
-_File = Optional[Path]  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-
-
 def loads(
     robot: RobotName,
     motion: Annotated[
-        Path,
-        typer.Argument(
-            help="a recording or a path: MCAP, rosbag2 folder or CSV", show_default=False
-        ),
+        Path, typer.Argument(help="a recording or a path: MCAP, rosbag2 folder or CSV")
     ],
     bearings: Annotated[
-        _File,
-        typer.Option(help="YAML of bearings by joint: C (N), p, and X, Y", show_default=False),
+        OptionalPath, typer.Option(help="YAML of bearings by joint: C (N), p, and X, Y")
     ] = None,
     exponent: Annotated[
         float, typer.Option(help="Woehler exponent of the equivalent range", min=1.0, max=50.0)
@@ -321,16 +308,13 @@ def loads(
     platform: Platform = None,
     topic: BagTopics = [],  # noqa: B006  typer copies it
     out: Annotated[
-        _File,
-        typer.Option(help="CSV of the loads over time", callback=file_name, show_default=False),
+        OptionalPath, typer.Option(help="CSV of the loads over time", callback=file_name)
     ] = None,
     spectrum: Annotated[
-        _File,
-        typer.Option(help="CSV of the rainflow counts", callback=file_name, show_default=False),
+        OptionalPath, typer.Option(help="CSV of the rainflow counts", callback=file_name)
     ] = None,
     picture: Annotated[
-        _File,
-        typer.Option(help="PNG of forces and spectra", callback=file_name, show_default=False),
+        OptionalPath, typer.Option(help="PNG of forces and spectra", callback=file_name)
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the files")] = False,
     as_json: Json = False,
@@ -344,12 +328,12 @@ def loads(
     What rigid bodies leave open in an overconstrained machine follows from the elasticity of its
     members and joints; without these it is named as undetermined.
     """
-    from pkm_twin.apps.sizes import loaded, motion_of
+    from pkm_twin import load
 
     for target in (out, spectrum, picture):
         if target is not None:
             refuse_existing(target, overwrite, motion)
-    machine = loaded(robot, platform)
+    machine = load(robot, platform=platform)
     taken = motion_of(motion, machine, topic, load_of(payload, load_times))
     if len(taken.time) < 2:
         raise ParameterError(str(motion), f"{len(taken.time)} samples", "2 or more")
@@ -357,16 +341,11 @@ def loads(
     names = tuple(load.name for load in found)
     fitted = {} if bearings is None else read_bearings(bearings, names)
     data, text = report(taken, found, fitted, exponent)
-    try:
+    with writing(out):
         if out is not None:
             replace_file(out, table(taken, found).encode())
         if spectrum is not None:
             replace_file(spectrum, spectra(found).encode())
         if picture is not None:
             draw(taken, found, picture)
-    except OSError as error:
-        raise PkmTwinError(f"cannot write {error.filename}: {error.strerror}") from None
-    if as_json:
-        print_json(data)
-    else:
-        typer.echo(text, err=STANDARD in (str(out), str(spectrum)))
+    answer(data, text, as_json, piped=STANDARD in (str(out), str(spectrum)))

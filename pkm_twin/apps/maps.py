@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -26,6 +26,7 @@ from pkm_twin.apps.vibration import (
 from pkm_twin.atlas.commands import Alone, kind
 from pkm_twin.console import numbers, print_json, refuse_existing
 from pkm_twin.errors import ParameterError
+from pkm_twin.options import OptionalPath, OptionalText, options_of, take_options
 
 if TYPE_CHECKING:
     from pkm_twin.atlas.maps.milling import Process
@@ -39,11 +40,10 @@ _SINGULARITY = 0.05
 _NAMES = "P1, P2, P3 or six numbers separated by commas, N and N m; or NAME=six numbers"
 
 Along = Annotated[
-    Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+    OptionalPath,
     typer.Option(
         help="instead of the workspace: a CSV of `pkm-twin path`, or any motion that `pkm-twin "
-        "torques` reads; --out FILE.csv writes the values",
-        show_default=False,
+        "torques` reads; --out FILE.csv writes the values"
     ),
 ]
 Wrench = Annotated[
@@ -54,11 +54,8 @@ Wrench = Annotated[
     ),
 ]
 LoadOf = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option(
-        help="MASS[,x,y,z] on the platform instead of the file's payload, kg and m",
-        show_default=False,
-    ),
+    OptionalText,
+    typer.Option(help="MASS[,x,y,z] on the platform instead of the file's payload, kg and m"),
 ]
 Singularity = Annotated[
     float, typer.Option(help="singularity index (0 to 1) below which a pose does not count")
@@ -187,12 +184,10 @@ class PathMap:
                 own = one.element == element
                 colour = plots.COLOURS[n % len(plots.COLOURS)]
                 ax.plot(self.time[own], values[own], ".", ms=4, color=colour, label=names[element])
-            ax.set_xlabel("time (s)")
-            ax.set_ylabel(f"{self.quantity.name.replace('-', ' ')} ({unit})")
-            ax.set_title(case.name, fontsize=9)
+            what = f"{self.quantity.name.replace('-', ' ')} ({unit})"
+            plots.label(ax, "time (s)", what, case.name, 9)
             title = self.quantity.element
             ax.legend(title=title, loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-            ax.grid(alpha=0.3)
         figure.suptitle(f"{self.robot.name}: {self.quantity.question}")
         return plots.save(figure, path)
 
@@ -201,7 +196,8 @@ def _made(
     name: str | Process,
     machine: Robot,
     points: int | None,
-    wrench: Sequence[str],
+    wrench: Sequence[str] = (),
+    *,
     payload: str | None,
     along: Path | None,
     least_singularity: float,
@@ -224,55 +220,65 @@ def _made(
             machine, name, points, cases=cases, least_singularity=least_singularity,
             least_clearance=least_clearance,
         )  # fmt: skip
-    from pkm_twin.apps.sizes import motion_of
+    from pkm_twin.apps.torques import motion_of
 
     quantity = QUANTITIES[name] if isinstance(name, str) else name.quantity
     check(machine, quantity, cases)
-    motion = motion_of(along, machine, (), None)
+    motion = motion_of(along, machine)
     return PathMap(
         machine, quantity, tuple(cases) or (quantity.default,), along, motion.time, motion.q,
         least_singularity, least_clearance,
     )  # fmt: skip
 
 
-def _offer(name: str, doc: str, *, loads: bool = True) -> None:
-    """Make a map a command; with load cases, or without."""
+def _loads(wrench: Wrench = []) -> None:  # noqa: B006  typer copies it
+    """The option of maps with load cases."""
 
-    def loaded(
-        machine: Robot,
-        points: int | None,
-        wrench: Wrench = [],  # noqa: B006  typer copies it
-        payload: LoadOf = None,
-        along: Along = None,
-        least_singularity: Singularity = _SINGULARITY,
-        least_clearance: Clearance = 0.0,
-    ) -> Sweep | Alone:
-        bounds = least_singularity, least_clearance
-        return _made(name, machine, points, wrench, payload, along, *bounds)
 
-    def unloaded(
-        machine: Robot,
-        points: int | None,
-        payload: LoadOf = None,
-        along: Along = None,
-        least_singularity: Singularity = _SINGULARITY,
-        least_clearance: Clearance = 0.0,
-    ) -> Sweep | Alone:
-        return _made(name, machine, points, (), payload, along, least_singularity, least_clearance)
+def _poses(
+    payload: LoadOf = None,
+    along: Along = None,
+    least_singularity: Singularity = _SINGULARITY,
+    least_clearance: Clearance = 0.0,
+) -> None:
+    """The options of all maps."""
 
-    made: Callable[..., Sweep | Alone] = loaded if loads else unloaded
+
+def _milling(
+    teeth: Teeth,
+    tangential: Tangential,
+    radial: Radial,
+    immersion: Immersion = 1.0,
+    up: Up = False,
+    feed: Feed = 0.0,
+    tool: Tool = "0,0,0",
+    damping: Damping = None,
+) -> None:
+    """The options of a milling process."""
+
+
+def _offer(name: str, doc: str, own: Callable[..., None] | None = _loads) -> None:
+    """Make a map a command with the options of a function and those of all maps."""
+    process = options_of(_milling) if own is _milling else {}
+
+    def made(machine: Robot, points: int | None, **given: Any) -> Sweep | Alone:
+        cut = {key: given.pop(key) for key in process}
+        return _made(process_of(**cut) if cut else name, machine, points, **given)
+
     made.__name__, made.__doc__ = name, doc
+    options = [] if own is None else options_of(own).values()
+    take_options(made, [*options, *options_of(_poses).values()])
     kind(made)
 
 
 _offer("compliance", "The softest pose: compliance and its direction, or deflections under loads.")
 _offer("payload", "The largest mass that the drives hold at rest.")
 _offer("acceleration", "The acceleration from rest that the drives reach in every direction.")
-_offer("frequency", "The first natural frequency, actuators locked.", loads=False)
+_offer("frequency", "The first natural frequency, actuators locked.", None)
 _offer(
     "pose-error",
     "The standard deviation of the position, from the file's `uncertainty`.",
-    loads=False,
+    None,
 )
 _offer(
     "strain-energy",
@@ -282,26 +288,8 @@ _offer(
     circle of each height, and the command compares the result with table 2 of the 2UPR-RPU paper.
     """,
 )
-
-
-@kind
-def cutting_depth(
-    machine: Robot,
-    points: int | None,
-    teeth: Teeth,
-    tangential: Tangential,
-    radial: Radial,
-    immersion: Immersion = 1.0,
-    up: Up = False,
-    feed: Feed = 0.0,
-    tool: Tool = "0,0,0",
-    damping: Damping = None,
-    payload: LoadOf = None,
-    along: Along = None,
-    least_singularity: Singularity = _SINGULARITY,
-    least_clearance: Clearance = 0.0,
-) -> Sweep | Alone:
-    """The axial depth of cut that mills without chatter at every spindle speed (zero-order)."""
-    process = process_of(teeth, tangential, radial, immersion, up, feed, tool, damping)
-    bounds = least_singularity, least_clearance
-    return _made(process, machine, points, (), payload, along, *bounds)
+_offer(
+    "cutting-depth",
+    "The axial depth of cut that mills without chatter at every spindle speed (zero-order).",
+    _milling,
+)

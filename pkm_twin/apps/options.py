@@ -5,25 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
-from pkm_twin.console import file_name, refuse_existing
+from pkm_twin.console import refuse_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD
+from pkm_twin.options import OptionalPath, OptionalText, file_name
 
 RobotName = Annotated[
     str, typer.Argument(help="a robot's name (see `pkm-twin robots`), a YAML file or a URDF")
 ]
 Json = Annotated[bool, typer.Option("--json", help="machine-readable output")]
 OptionalRobot = Annotated[
-    Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+    OptionalText,
     typer.Option("--robot", help="a robot's name or file; default: the robot that the bag names"),
 ]
-BagPath = Annotated[
-    Path, typer.Argument(help="a bag: an MCAP file or a rosbag2 folder", show_default=False)
-]
+BagPath = Annotated[Path, typer.Argument(help="a bag: an MCAP file or a rosbag2 folder")]
 BagTopics = Annotated[
     list[str],
     typer.Option(
@@ -32,14 +31,14 @@ BagTopics = Annotated[
     ),
 ]
 Payload = Annotated[
-    Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+    OptionalText,
     typer.Option(
         help="payload on the platform: MASS[,x,y,z], kg, m from the platform's reference point; "
         "default: that of the bag or the robot file"
     ),
 ]
 LoadTimes = Annotated[
-    Optional[str],  # noqa: UP045
+    OptionalText,
     typer.Option(
         help="intervals in which --payload is held: FROM,TO[,FROM,TO...], s from the start; "
         "default: always"
@@ -58,22 +57,18 @@ Accept = Annotated[
         help="also use data that this machine cannot have produced, and mark the results",
     ),
 ]
-Platform = Annotated[
-    Optional[str],  # noqa: UP045  typer reads it
-    typer.Option(help="for a URDF: the link that carries the tool", show_default=False),
-]
+Platform = Annotated[OptionalText, typer.Option(help="for a URDF: the link that carries the tool")]
 OverwriteBoth = Annotated[bool, typer.Option("--overwrite", help="replace both files")]
 LimitShare = Annotated[
     float, typer.Option(help="fraction of the file's effort and velocity limits to use")
 ]
 SampleRate = Annotated[float, typer.Option(help="samples per second in the file", min=1.0, max=1e5)]
 MotionOut = Annotated[
-    Optional[Path],  # noqa: UP045
+    OptionalPath,
     typer.Option(
         help="file to write: FILE.mcap (a JointTrajectory with efforts), or a table, FILE.csv, "
         ".parquet or .mat",
         callback=file_name,
-        show_default=False,
     ),
 ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Final, Optional
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
@@ -23,9 +23,10 @@ from pkm_twin.apps.options import (
     drawing_of,
     loaded,
 )
-from pkm_twin.console import numbers, parse_numbers, print_json
-from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
+from pkm_twin.console import answer, numbers, parse_numbers, writing
+from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import STANDARD
+from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText
 from pkm_twin.paths.geometry import Path as Way
 from pkm_twin.paths.geometry import Space
 from pkm_twin.paths.motion import TimedPath
@@ -117,46 +118,34 @@ def _chosen(
     )
 
 
-_PerJoint = Optional[str]  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-
-
 def path_command(
     robot: RobotName,
     waypoints: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Argument(
-            help="CSV of waypoints, unless --cycle or --circle is given", show_default=False
-        ),
+        OptionalPath, typer.Argument(help="CSV of waypoints, unless --cycle or --circle is given")
     ] = None,
     cycle: Annotated[
-        _PerJoint,
+        OptionalText,
         typer.Option(
-            help="pick-and-place cycle there and back: HEIGHT,WIDTH[,LIFT] in mm, as in 25,305,25",
-            show_default=False,
+            help="pick-and-place cycle there and back: HEIGHT,WIDTH[,LIFT] in mm, as in 25,305,25"
         ),
     ] = None,
-    circle: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(help="follow a circle of this radius, m", show_default=False),
-    ] = None,
+    circle: Annotated[OptionalFloat, typer.Option(help="follow a circle of this radius, m")] = None,
     at: Annotated[
-        _PerJoint,
+        OptionalText,
         typer.Option(
             help="centre of --cycle (between pick and place) or --circle: the pose's coordinates, "
-            "separated by commas; default: home",
-            show_default=False,
+            "separated by commas; default: home"
         ),
     ] = None,
     direction: Annotated[
         float, typer.Option(help="direction of the cycle in the xy plane, degrees from x towards y")
     ] = 0.0,
     blend: Annotated[
-        Optional[float],  # noqa: UP045
+        OptionalFloat,
         typer.Option(
             help="distance from a corner at which rounding begins, m; 0 stops at every waypoint; "
             "default: a smooth curve through the waypoints; in a cycle 0.8 of its rise",
             min=0.0,
-            show_default=False,
         ),
     ] = None,
     dwell: Annotated[float, typer.Option(help="dwell at pick and at place, s", min=0.0)] = 0.0,
@@ -168,49 +157,43 @@ def path_command(
         typer.Option(help="motion law without --fastest: quintic or s-curve, from stop to stop"),
     ] = "quintic",
     duration: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(help="duration of the motion, s; default: the shortest", show_default=False),
+        OptionalFloat, typer.Option(help="duration of the motion, s; default: the shortest")
     ] = None,
     effort: Annotated[
-        _PerJoint,
+        OptionalText,
         typer.Option(
             help="effort limit, one for all joints or one per joint, N m or N; default: the file's"
         ),
     ] = None,
     velocity: Annotated[
-        _PerJoint,
+        OptionalText,
         typer.Option(help="velocity limit of the joints, rad/s or m/s; default: the file's"),
     ] = None,
     acceleration: Annotated[
-        _PerJoint,
+        OptionalText,
         typer.Option(help="acceleration limit of the joints, rad/s2 or m/s2; default: none"),
     ] = None,
     jerk: Annotated[
-        _PerJoint, typer.Option(help="jerk limit of the joints, rad/s3 or m/s3; default: none")
+        OptionalText, typer.Option(help="jerk limit of the joints, rad/s3 or m/s3; default: none")
     ] = None,
     speed: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(help="speed limit of the tool point, m/s; default: none", show_default=False),
+        OptionalFloat, typer.Option(help="speed limit of the tool point, m/s; default: none")
     ] = None,
     share: LimitShare = 1.0,
     singularity: Annotated[
         float, typer.Option(help="least singularity index on the path, 0 to 1", min=0.0, max=1.0)
     ] = 0.01,
     shaper: Annotated[
-        _PerJoint,
+        OptionalText,
         typer.Option(
             help="input shaper for the first natural frequency, which depends on the pose: zv, or "
             "zvd, which tolerates more error of the frequency; costs half or one vibration at each "
-            "stop",
-            show_default=False,
+            "stop"
         ),
     ] = None,
     damping: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(
-            help="damping ratio of that mode; default: `modal_damping` of the robot file",
-            show_default=False,
-        ),
+        OptionalFloat,
+        typer.Option(help="damping ratio of that mode; default: `modal_damping` of the robot file"),
     ] = None,
     payload: Payload = None,
     platform: Platform = None,
@@ -258,18 +241,13 @@ def path_command(
         motion = _shaped(motion, shaper, damping, singularity)
     elif damping is not None:
         raise typer.BadParameter("--damping is for --shaper")
-    try:
+    with writing(out):
         if out is not None:
             write(motion, motion.uniform(rate), carried, out, overwrite)
         if drawing is not None:
             draw_limits(motion, drawing)
-    except OSError as error:
-        raise PkmTwinError(f"cannot write {error.filename or out}: {error.strerror}") from None
     data, text = report(motion, carried, out, drawing)
-    if as_json:
-        print_json(data)
-    else:
-        typer.echo(text, err=str(out) == STANDARD)
+    answer(data, text, as_json, piped=str(out) == STANDARD)
 
 
 def _shaped(motion: TimedPath, shaper: str, damping: float | None, singularity: float) -> TimedPath:

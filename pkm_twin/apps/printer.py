@@ -10,9 +10,10 @@ import typer
 
 from pkm_twin.apps.options import RobotName
 from pkm_twin.apps.printer_files import Firmware, printer_of, read_printer, written
-from pkm_twin.console import file_name, refuse_existing
+from pkm_twin.console import refuse_existing
 from pkm_twin.errors import FileError, one_line
 from pkm_twin.files import open_regular, replace_file
+from pkm_twin.options import OptionalFloat, OptionalPath, file_name
 
 MAX_BYTES = 64 * 1024**2
 
@@ -33,8 +34,7 @@ def printer_command(
         typer.Option(help="of the files; default: by what they contain"),
     ] = None,
     probe_radius: Annotated[
-        Optional[float],  # noqa: UP045
-        typer.Option(min=1.0, help="of G33's points, mm; default: B of M665"),
+        OptionalFloat, typer.Option(min=1.0, help="of G33's points, mm; default: B of M665")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the files")] = False,
 ) -> None:
@@ -72,8 +72,7 @@ def export_printer(
     robot: RobotName,
     firmware: Annotated[Firmware, typer.Option(help="klipper, marlin or reprapfirmware")],
     out: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="a file; default: print", callback=file_name),
+        OptionalPath, typer.Option(help="a file; default: print", callback=file_name)
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file")] = False,
 ) -> None:

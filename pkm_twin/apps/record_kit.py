@@ -8,27 +8,25 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Final, Optional
+from typing import Annotated, Any, Final
 
 import typer
 
 from pkm_twin.apps.excite import write_motion
 from pkm_twin.apps.options import Json
 from pkm_twin.apps.recorded import BASE_FRAME, PLATFORM_FRAME
-from pkm_twin.apps.topics import DEFINITIONS, JOINT_STATE, WRENCH, is_output
-from pkm_twin.apps.trajectories import DEFINITION, SECOND
-from pkm_twin.apps.trajectories import TYPE as TRAJECTORY
+from pkm_twin.apps.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, WRENCH, is_output
+from pkm_twin.apps.trajectories import SECOND
 from pkm_twin.bags.reader import Bag, BagWriter, open_bag
-from pkm_twin.console import print_json, refuse_existing
-from pkm_twin.errors import BagError, ParameterError, PkmTwinError
+from pkm_twin.console import print_json, refuse_existing, writing
+from pkm_twin.errors import BagError, ParameterError
+from pkm_twin.options import OptionalPath, OptionalText
 from pkm_twin.robot.robot import Robot
 
 KEPT: Final = {
-    JOINT_STATE: ("/joint_states", DEFINITIONS[JOINT_STATE]),
-    WRENCH: ("/wrench", DEFINITIONS[WRENCH]),
-    TRAJECTORY: ("/joint_trajectory", DEFINITION),
-}
-"""Types of topics that stay in an anonymised bag, their neutral topics and their definitions."""
+    JOINT_STATE: "/joint_states", WRENCH: "/wrench", TRAJECTORY: "/joint_trajectory",
+}  # fmt: skip
+"""Types of topics that stay in an anonymised bag, and their neutral topics."""
 NAMES: Final = {JOINT_STATE: "name", TRAJECTORY: "joint_names"}
 """Where their joints' names are."""
 ONE_CLOCK: Final = 60 * SECOND
@@ -41,19 +39,17 @@ FRAMES: Final = ("", BASE_FRAME, PLATFORM_FRAME)
 
 def record_kit(
     robot: Annotated[
-        Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
+        OptionalText,
         typer.Argument(
             help="a robot's name, a YAML file or a URDF; with --anonymise optional: only its "
-            "joints are kept",
-            show_default=False,
+            "joints are kept"
         ),
     ] = None,
     out: Annotated[
         Path, typer.Option(help="folder to write; with --anonymise the file, FILE.mcap")
     ] = Path("record_kit"),
     anonymise: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="write this bag again without names and dates", show_default=False),
+        OptionalPath, typer.Option(help="write this bag again without names and dates")
     ] = None,
     keep_names: Annotated[
         bool,
@@ -100,10 +96,8 @@ def record_kit(
     motions = {"excitation": (False, duration), "friction": (True, friction_duration)}
     texts = {"README.md": readme(machine, robot), "NOTES.md": notes(machine)}
     names = [*texts, *(f"{name}.{ending}" for name in motions for ending in ("mcap", "csv"))]
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise PkmTwinError(f"cannot write {out}: {error.strerror}") from None
     for name in names:
         refuse_existing(out / name, overwrite)
     for name, (sweeps, seconds) in motions.items():
@@ -114,10 +108,8 @@ def record_kit(
         if not json_output:
             typer.echo(f"{out / name}.mcap, .csv: {best.duration:.4g} s")
     for name, text in texts.items():
-        try:
+        with writing(out / name):
             (out / name).write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise PkmTwinError(f"cannot write {out / name}: {error.strerror}") from None
     if json_output:
         print_json({"robot": machine.name, "out": str(out), "files": names})
         return
@@ -206,7 +198,7 @@ def anonymised(
         elif not info.count:
             dropped[name] = "no messages"
         else:
-            neutral = KEPT[info.type][0]
+            neutral = KEPT[info.type]
             used[neutral] = used.get(neutral, 0) + 1
             number = used[neutral]
             topics[name] = name if keep_names else neutral + (f"_{number}" if number > 1 else "")
@@ -220,7 +212,7 @@ def anonymised(
     ) as writer:
         for name, neutral in topics.items():
             kind = bag.report.topics[name].type
-            writer.add_topic(neutral, kind, definition=KEPT[kind][1])
+            writer.add_topic(neutral, kind, definition=DEFINITIONS[kind])
         for message in bag.messages(list(topics)):
             content = message.message
             header = {

@@ -3,63 +3,56 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 from pkm_twin.apps.options import BagTopics, Json, LoadTimes, Payload, Platform, RobotName, load_of
-from pkm_twin.console import file_name, numbers, print_json, refuse_existing
-from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.console import answer, numbers, refuse_existing, writing
+from pkm_twin.errors import ParameterError
+from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText, file_name
 
 
 def size(
     robot: RobotName,
     motion: Annotated[
-        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-        typer.Argument(
-            help="a recording or a path: MCAP, rosbag2 folder or CSV", show_default=False
-        ),
+        OptionalPath, typer.Argument(help="a recording or a path: MCAP, rosbag2 folder or CSV")
     ] = None,
     drives: Annotated[
-        Optional[Path],  # noqa: UP045
+        OptionalPath,
         typer.Option(
-            help="YAML of motors to compare, or `shipped` for the motors in config/drives",
-            show_default=False,
+            help="YAML of motors to compare, or `shipped` for the motors in config/drives"
         ),
     ] = None,
     motor: Annotated[
         list[str], typer.Option(help="compare only this motor of the drives file; may be repeated")
     ] = [],  # noqa: B006  typer copies it
     ratio: Annotated[
-        Optional[float],  # noqa: UP045
+        OptionalFloat,
         typer.Option(
             help="gear of the joints that turn, where the file has no drive: turns of the motor "
             "per turn of the joint",
             min=1e-6,
             max=1e6,
-            show_default=False,
         ),
     ] = None,
     lead: Annotated[
-        Optional[float],  # noqa: UP045
+        OptionalFloat,
         typer.Option(
             help="screw or belt of the joints that slide, where the file has no drive: m per turn "
             "of the motor",
             min=1e-6,
             max=1e6,
-            show_default=False,
         ),
     ] = None,
     efficiency: Annotated[
         float, typer.Option(help="efficiency of --ratio and --lead", min=1e-3, max=1.0)
     ] = 1.0,
     over_workspace: Annotated[
-        Optional[str],  # noqa: UP045
+        OptionalText,
         typer.Option(
             help="in place of a motion: SPEED,ACCELERATION of the tool point (m/s, m/s2), in the "
-            "worst direction at the worst pose",
-            show_default=False,
+            "worst direction at the worst pose"
         ),
     ] = None,
     singularity: Annotated[
@@ -74,12 +67,8 @@ def size(
     platform: Platform = None,
     topic: BagTopics = [],  # noqa: B006
     picture: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(
-            help="write a PNG of torque against speed for each drive",
-            callback=file_name,
-            show_default=False,
-        ),
+        OptionalPath,
+        typer.Option(help="write a PNG of torque against speed for each drive", callback=file_name),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the picture")] = False,
     as_json: Json = False,
@@ -97,6 +86,7 @@ def size(
     The motion is a CSV of `pkm-twin path` or `pkm-twin torques`, a bag of joint states, or a bag
     with a JointTrajectory.
     """
+    from pkm_twin import load
     from pkm_twin.apps import sizes
     from pkm_twin.paths.sizing import Gear
 
@@ -107,7 +97,7 @@ def size(
     if (motion is None) == (over_workspace is None):
         raise typer.BadParameter("give a recording or path, or --over-workspace")
     carried = load_of(payload, load_times)
-    machine = sizes.loaded(robot, platform)
+    machine = load(robot, platform=platform)
     motors = [] if drives is None else sizes.read_motors(drives, motor)
     geared = ratio is not None or lead is not None
     if over_workspace is not None and (geared or motors):
@@ -126,13 +116,7 @@ def size(
         result = sizes.duties(taken, motors, gear)
         data, text = sizes.report(taken, result)
         if picture is not None:
-            try:
+            with writing(picture):
                 sizes.draw(taken, result, picture)
-            except OSError as error:
-                what = f"cannot write {error.filename or picture}: {error.strerror}"
-                raise PkmTwinError(what) from None
             text += f"\n{picture}"
-    if as_json:
-        print_json(data)
-    else:
-        typer.echo(text)
+    answer(data, text, as_json)

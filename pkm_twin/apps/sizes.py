@@ -15,10 +15,8 @@ import yaml
 from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin import load
 from pkm_twin.apps.loads import Load, by_load
-from pkm_twin.apps.torques import Motion, motion_of_bag, motion_of_csv
-from pkm_twin.bags.storage import is_bag
+from pkm_twin.apps.torques import Motion, motion_of
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.paths.sizing import DriveDuty, Fit, Gear, Motor, size_drives
@@ -51,18 +49,6 @@ class Taken:
         """RMS difference between efforts and model over the model's RMS, shape (n,)."""
         squares = ((self.effort - self.model) ** 2).mean(0)
         return np.asarray(np.sqrt(squares / np.maximum((self.model**2).mean(0), 1e-24)))
-
-
-def loaded(name: str, platform: str | None) -> Robot:
-    """The robot of a command line."""
-    return load(name, platform=platform) if platform else load(name)
-
-
-def motion_of(path: Path, robot: Robot, topics: Sequence[str], carried: Load | None) -> Motion:
-    """A recording or a path; errors as :func:`read_motion`."""
-    if is_bag(path):
-        return motion_of_bag(path, robot, topics, carried)
-    return motion_of_csv(path, robot, carried)
 
 
 def read_motion(
@@ -278,9 +264,7 @@ def draw(taken: Taken, result: Sequence[DriveDuty], path: Path) -> None:
         if d.fits:
             fastest = 1.3 * float(np.abs(speeds).max())
             ax.set(xlim=(-fastest, fastest), ylim=(-1.1 * most, 1.1 * most))
-        ax.set_title(f"{m.robot.name}: is the drive of {d.joint} strong enough? ({side})")
-        ax.set_xlabel(labels[0])
-        ax.set_ylabel(labels[1])
+        title = f"{m.robot.name}: is the drive of {d.joint} strong enough? ({side})"
+        plots.label(ax, *labels, title)
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
-        ax.grid(alpha=0.3)
     plots.save(figure, path)

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import csv
 import functools
-import inspect
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final, Optional, get_type_hints
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.options import OptionalText, options_of, take_options
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -132,29 +132,26 @@ def _dialect(
     return Dialect(mark, decimal, names, sizes)
 
 
-_Text = Optional[str]  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-
-
 def _options(
     separator: Annotated[
-        _Text, typer.Option(help="of a table's columns: , ; or tab; default: found")
+        OptionalText, typer.Option(help="of a table's columns: , ; or tab; default: found")
     ] = None,
-    decimal: Annotated[_Text, typer.Option(help="of a table's numbers: . or ,")] = None,
+    decimal: Annotated[OptionalText, typer.Option(help="of a table's numbers: . or ,")] = None,
     columns: Annotated[
-        _Text,
+        OptionalText,
         typer.Option(help="names of a table's columns, OURS=THEIRS,...: time=t,arm_1.position=q1"),
     ] = None,
     units: Annotated[
-        _Text, typer.Option(help="of a table: of rad, deg, m, mm, s, ms, us; default SI")
+        OptionalText, typer.Option(help="of a table: of rad, deg, m, mm, s, ms, us; default SI")
     ] = None,
-    time: Annotated[_Text, typer.Option(help="name of a table's column of times")] = None,
+    time: Annotated[OptionalText, typer.Option(help="name of a table's column of times")] = None,
 ) -> None:
     del separator, decimal, columns, units, time
 
 
 def tables(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command that reads tables the options of their dialect."""
-    names = inspect.signature(_options).parameters
+    names = options_of(_options)
 
     @functools.wraps(command)
     def wrapped(**given: Any) -> None:
@@ -164,16 +161,5 @@ def tables(command: Callable[..., None]) -> Callable[..., None]:
         finally:
             CHOSEN.reset(token)
 
-    hints = get_type_hints(_options, include_extras=True)
-    more = [
-        p.replace(annotation=hints[n], kind=inspect.Parameter.KEYWORD_ONLY)
-        for n, p in names.items()
-    ]
-    own = get_type_hints(command, include_extras=True)
-    kept = [
-        p.replace(annotation=own[n], kind=inspect.Parameter.KEYWORD_ONLY)
-        for n, p in inspect.signature(command).parameters.items()
-    ]
-    vars(wrapped)["__signature__"] = inspect.Signature([*kept, *more])
-    wrapped.__annotations__ = {p.name: p.annotation for p in [*kept, *more]}
+    take_options(wrapped, [*options_of(command).values(), *options_of(_options).values()])
     return wrapped

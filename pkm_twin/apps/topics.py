@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from pkm_twin.bags.definitions import parse_definition
+from pkm_twin.bags.definitions import SEPARATOR, parse_definition
 from pkm_twin.bags.reader import Bag
 from pkm_twin.errors import BagError, one_line
 from pkm_twin.robot.robot import Robot
@@ -16,6 +16,7 @@ from pkm_twin.robot.robot import Robot
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
+TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
 TWIN_OUTPUTS: Final = (
     "joint_torques",
     "torque_residual",
@@ -28,51 +29,42 @@ TWIN_OUTPUTS: Final = (
 )
 """Last names of the twin's own topics of these two types, or a name before the last."""
 
-_STAMPED = "std_msgs/Header header\n"
-_HEADER = """
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-"""
-_VECTOR3 = """================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
+_FIELDS: Final = {
+    "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
+    "builtin_interfaces/Duration": ("int32 sec", "uint32 nanosec"),
+    "geometry_msgs/Vector3": ("float64 x", "float64 y", "float64 z"),
+    "geometry_msgs/Quaternion": ("float64 x", "float64 y", "float64 z", "float64 w"),
+    "geometry_msgs/Transform": ("Vector3 translation", "Quaternion rotation"),
+    "geometry_msgs/Wrench": ("Vector3 force", "Vector3 torque"),
+    "trajectory_msgs/JointTrajectoryPoint": (
+        "float64[] positions", "float64[] velocities", "float64[] accelerations",
+        "float64[] effort", "builtin_interfaces/Duration time_from_start",
+    ),
+}  # fmt: skip
+
+
+def _definition(fields: Sequence[str], *held: str) -> str:
+    """The ros2msg text of a type with a header, these fields, and the types that they hold."""
+    parts = ["\n".join(["std_msgs/Header header", *fields])]
+    parts += ["\n".join([f"MSG: {name}", *_FIELDS[name]]) for name in ("std_msgs/Header", *held)]
+    return f"\n{SEPARATOR}\n".join(parts) + "\n"
+
+
 DEFINITIONS: Final = {
-    JOINT_STATE: _STAMPED
-    + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
-    + _HEADER,
-    WRENCH: _STAMPED
-    + "Wrench wrench"
-    + _HEADER
-    + """
-================================================================================
-MSG: geometry_msgs/Wrench
-Vector3 force
-Vector3 torque
-"""
-    + _VECTOR3,
-    TRANSFORM: _STAMPED
-    + "string child_frame_id\nTransform transform"
-    + _HEADER
-    + """
-================================================================================
-MSG: geometry_msgs/Transform
-Vector3 translation
-Quaternion rotation
-"""
-    + _VECTOR3
-    + """================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-""",
-}
+    JOINT_STATE: _definition(
+        ["string[] name", "float64[] position", "float64[] velocity", "float64[] effort"]
+    ),
+    WRENCH: _definition(["Wrench wrench"], "geometry_msgs/Wrench", "geometry_msgs/Vector3"),
+    TRANSFORM: _definition(
+        ["string child_frame_id", "Transform transform"],
+        "geometry_msgs/Transform", "geometry_msgs/Vector3", "geometry_msgs/Quaternion",
+    ),
+    TRAJECTORY: _definition(
+        ["string[] joint_names", "JointTrajectoryPoint[] points"],
+        "trajectory_msgs/JointTrajectoryPoint", "builtin_interfaces/Duration",
+    ),
+}  # fmt: skip
+"""Of the types that are read and written."""
 # How many messages of a topic are looked at for the robot's joints.
 _LOOK = 50
 

@@ -24,6 +24,7 @@ from pkm_twin.apps.recorded import WRENCH_AXES, read_recording, robot_of
 from pkm_twin.apps.topics import JOINT_STATE
 from pkm_twin.apps.trajectories import read_trajectory
 from pkm_twin.bags.reader import open_bag
+from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import (
     BagError,
     ParameterError,
@@ -68,6 +69,15 @@ class Motion:
     still: NDArray[np.bool_] | None = None
     planned: Array | None = None
     """Efforts of a planned motion, shape (samples, n)."""
+
+
+def motion_of(
+    path: Path, robot: str | Robot, topics: Sequence[str] = (), carried: Load | None = None
+) -> Motion:
+    """The motion of a bag or a table; errors as of the two functions below."""
+    if is_bag(path):
+        return motion_of_bag(path, robot, topics, carried)
+    return motion_of_csv(path, robot, carried)
 
 
 def motion_of_bag(

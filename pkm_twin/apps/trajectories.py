@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.apps.topics import DEFINITIONS, TRAJECTORY
 from pkm_twin.bags.reader import Bag, BagWriter
 from pkm_twin.errors import BagError
 from pkm_twin.robot.robot import Robot
@@ -17,27 +18,6 @@ from pkm_twin.robot.robot import Robot
 Array = NDArray[np.float64]
 
 TOPIC: Final = "/delta_dynamics/joint_trajectory"
-TYPE: Final = "trajectory_msgs/msg/JointTrajectory"
-DEFINITION: Final = """\
-std_msgs/Header header
-string[] joint_names
-JointTrajectoryPoint[] points
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: trajectory_msgs/JointTrajectoryPoint
-float64[] positions
-float64[] velocities
-float64[] accelerations
-float64[] effort
-builtin_interfaces/Duration time_from_start
-================================================================================
-MSG: builtin_interfaces/Duration
-int32 sec
-uint32 nanosec
-"""
 SECOND: Final = 1_000_000_000
 
 
@@ -81,7 +61,7 @@ def write_trajectory(
     }
     metadata = {"pkm_twin": {key: str(value) for key, value in facts.items()}}
     with BagWriter(path, overwrite=overwrite, metadata=metadata, flush_period=None) as bag:
-        bag.add_topic(TOPIC, TYPE, definition=DEFINITION)
+        bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])
         bag.write(TOPIC, message, 0)
 
 
@@ -95,7 +75,7 @@ def read_trajectory(
 
     :raises BagError: joints of another robot, or several trajectories.
     """
-    names = [name for name, topic in bag.report.topics.items() if topic.type == TYPE]
+    names = [name for name, topic in bag.report.topics.items() if topic.type == TRAJECTORY]
     messages = list(bag.messages(names)) if names else []
     if not messages:
         return None

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Final, Optional
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from pkm_twin.apps.history import Series, read_history
 from pkm_twin.apps.options import Json
-from pkm_twin.console import file_name, print_json, refuse_existing
-from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.console import finite, print_json, refuse_existing, writing
+from pkm_twin.errors import ParameterError
+from pkm_twin.options import OptionalPath, OptionalText, file_name
 
 Array = NDArray[np.float64]
 
@@ -61,11 +62,11 @@ class Judged:
         when = None if self.change is None else _day(s.time[self.change])
         return {
             "machine": s.machine, "quantity": s.quantity, "part": s.part, "unit": s.unit,
-            "recordings": len(s.value), "last": float(s.value[-1]), "centre": _number(self.centre),
-            "low": _number(self.low), "high": _number(self.high),
+            "recordings": len(s.value), "last": float(s.value[-1]), "centre": finite(self.centre),
+            "low": finite(self.low), "high": finite(self.high),
             "beyond": int(self.beyond.sum()), "last_beyond": bool(self.beyond[-1]),
-            "changed": when, "chance": _number(self.chance), "before": _number(self.before),
-            "after": _number(self.after), "drifts": self.drifts,
+            "changed": when, "chance": finite(self.chance), "before": finite(self.before),
+            "after": finite(self.after), "drifts": self.drifts,
         }  # fmt: skip
 
 
@@ -112,11 +113,11 @@ def judged(series: Series, baseline: int, alarm: float) -> Judged:
 def trend(
     history: Annotated[
         Path,
-        typer.Argument(help="a file that `pkm-twin check --history` wrote", show_default=False),
+        typer.Argument(help="a file that `pkm-twin check --history` wrote")
     ],
     machine: Annotated[
-        Optional[str],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-        typer.Option(help="report this machine only", show_default=False),
+        OptionalText,
+        typer.Option(help="report this machine only")
     ] = None,
     baseline: Annotated[
         int, typer.Option(help="number of first recordings that set the control limits", min=3)
@@ -128,11 +129,10 @@ def trend(
         ),
     ] = 0.01,
     picture: Annotated[
-        Optional[Path],  # noqa: UP045
+        OptionalPath,
         typer.Option(
-            help="PNG of the series with their control limits", callback=file_name,
-            show_default=False,
-        ),
+            help="PNG of the series with their control limits", callback=file_name
+        )
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the picture")] = False,
     as_json: Json = False,
@@ -153,10 +153,8 @@ def trend(
     results = [judged(series, baseline, false_alarm / len(found)) for series in found]
     drifting = [one for one in results if one.drifts]
     if picture is not None:
-        try:
+        with writing(picture):
             draw(results, picture)
-        except OSError as error:
-            raise PkmTwinError(f"cannot write {picture}: {error.strerror}") from None
     few = sum(len(one.series.value) < FEWEST for one in results)
     if as_json:
         print_json(
@@ -236,7 +234,3 @@ def draw(results: Sequence[Judged], path: Path) -> None:
 
 def _day(time: float) -> str:
     return datetime.fromtimestamp(time, UTC).isoformat(timespec="minutes")
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -21,9 +21,10 @@ from pkm_twin.apps.options import (
     drawing_of,
     loaded,
 )
-from pkm_twin.console import file_name, numbers, parse_numbers, print_json
+from pkm_twin.console import answer, numbers, parse_numbers
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD
+from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText, file_name
 
 if TYPE_CHECKING:
     from pkm_twin.atlas.maps.milling import Process
@@ -32,41 +33,30 @@ if TYPE_CHECKING:
     from stiffness_monitor.vibration import ToolModes
 
 Array = NDArray[np.float64]
-
-_Text = Optional[str]  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
 At = Annotated[
-    _Text,
-    typer.Option(
-        help="the pose's coordinates, separated by commas; default: home", show_default=False
-    ),
+    OptionalText, typer.Option(help="the pose's coordinates, separated by commas; default: home")
 ]
 Tool = Annotated[
     str, typer.Option(help="tool point from the platform's reference point, platform axes, m")
 ]
 Damping = Annotated[
-    _Text,
+    OptionalText,
     typer.Option(
         help="damping ratio of all modes, or of each from the lowest on, the last one also of all "
-        "others; default: `modal_damping` of the robot file",
-        show_default=False,
+        "others; default: `modal_damping` of the robot file"
     ),
 ]
 Out = Annotated[
-    Optional[Path],  # noqa: UP045
+    OptionalPath,
     typer.Option(
         help="table to write, .csv, .parquet or .mat; the picture has the same name with .png",
         callback=file_name,
-        show_default=False,
     ),
 ]
 Picture = Annotated[bool, typer.Option(help="plot the result as a PNG next to the table")]
-Teeth = Annotated[int, typer.Option(help="teeth of the tool", show_default=False)]
-Tangential = Annotated[
-    float, typer.Option(help="tangential cutting coefficient Kt, N/m2", show_default=False)
-]
-Radial = Annotated[
-    float, typer.Option(help="ratio of radial to tangential cutting force, Kr", show_default=False)
-]
+Teeth = Annotated[int, typer.Option(help="teeth of the tool")]
+Tangential = Annotated[float, typer.Option(help="tangential cutting coefficient Kt, N/m2")]
+Radial = Annotated[float, typer.Option(help="ratio of radial to tangential cutting force, Kr")]
 Immersion = Annotated[
     float, typer.Option(help="radial depth of cut over tool diameter, 1 is a slot")
 ]
@@ -148,7 +138,7 @@ def frf(
     tool: Tool = "0,0,0",
     damping: Damping = None,
     frequencies: Annotated[
-        _Text,
+        OptionalText,
         typer.Option(help="LOW,HIGH of the table, Hz; default: 0 to above the sixth mode"),
     ] = None,
     points: Annotated[int, typer.Option(help="rows of the table", min=2, max=10**6)] = 2001,
@@ -226,11 +216,8 @@ def frf(
 
 
 def _print(data: dict[str, Any], text: list[str], as_json: bool, out: Path | None) -> None:
-    if as_json:
-        print_json(data)
-        return
     files = [data[name] for name in ("out", "picture") if data[name] is not None]
-    typer.echo("\n".join([*text, *files]), err=str(out) == STANDARD)
+    answer(data, "\n".join([*text, *files]), as_json, piped=str(out) == STANDARD)
 
 
 def _draw_response(grid: Array, response: Any, modes: ToolModes, title: str, path: Path) -> None:
@@ -245,12 +232,9 @@ def _draw_response(grid: Array, response: Any, modes: ToolModes, title: str, pat
     for frequency in modes.frequencies[modes.frequencies <= grid[-1]]:
         size.axvline(frequency, color="0.8", lw=0.8, zorder=0)
     figure.suptitle(title.replace("): ", "):\n"), fontsize=11)
-    size.set_ylabel("displacement per force (µm/N)")
+    plots.label(size, "frequency (Hz)", "displacement per force (µm/N)")
     size.legend(fontsize=8)
-    phase.set_ylabel("phase (deg)")
-    for ax in (size, phase):
-        ax.set_xlabel("frequency (Hz)")
-        ax.grid(alpha=0.3)
+    plots.label(phase, "frequency (Hz)", "phase (deg)")
     plots.save(figure, path)
 
 
@@ -259,7 +243,7 @@ def lobes(
     teeth: Teeth,
     tangential: Tangential,
     radial: Radial,
-    speeds: Annotated[str, typer.Option(help="spindle speeds LOW,HIGH, rpm", show_default=False)],
+    speeds: Annotated[str, typer.Option(help="spindle speeds LOW,HIGH, rpm")],
     immersion: Immersion = 1.0,
     up: Up = False,
     feed: Feed = 0.0,
@@ -268,11 +252,10 @@ def lobes(
     damping: Damping = None,
     points: Annotated[int, typer.Option(help="spindle speeds to compute", min=2, max=10**5)] = 181,
     deepest: Annotated[
-        Optional[float],  # noqa: UP045
+        OptionalFloat,
         typer.Option(
             help="largest depth to look at, m; default: 25 times the depth that is stable at every "
-            "speed",
-            show_default=False,
+            "speed"
         ),
     ] = None,
     payload: Payload = None,
@@ -349,10 +332,8 @@ def _draw_lobes(found: Lobes, milling: Milling, title: str, path: Path) -> None:
     ax.fill_between(found.speeds, depth, 1.05 * depth.max(), color=plots.COLOURS[1], alpha=0.3)
     ax.plot(found.speeds[found.best], depth[found.best], "*", color="red", mec="white", ms=13)
     way = "slot" if milling.immersion == 1.0 else "up-milling" if milling.up else "down-milling"
-    ax.set_title(f"{title}\n{milling.teeth} teeth, {way}; chatter above the line", fontsize=10)
-    ax.set_xlabel("spindle speed (rpm)")
-    ax.set_ylabel("axial depth of cut (mm)")
+    head = f"{title}\n{milling.teeth} teeth, {way}; chatter above the line"
+    plots.label(ax, "spindle speed (rpm)", "axial depth of cut (mm)", head, 10)
     ax.set_ylim(0.0, 1.05 * depth.max())
     ax.margins(x=0.0)
-    ax.grid(alpha=0.3)
     plots.save(figure, path)

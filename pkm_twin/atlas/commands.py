@@ -4,18 +4,26 @@
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Optional, Protocol, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from typer.core import TyperGroup
 
-from pkm_twin.console import file_name, print_json, progress
+from pkm_twin.console import print_json, progress
 from pkm_twin.errors import UnknownNameError
+from pkm_twin.options import (
+    OptionalFloat,
+    OptionalInt,
+    OptionalPath,
+    OptionalText,
+    file_name,
+    options_of,
+    take_options,
+)
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
 from pkm_twin.threads import one_blas_thread
 
@@ -27,12 +35,6 @@ if TYPE_CHECKING:
 
 MOST: Final = 10**11
 """Samples beyond which a number is a slip."""
-
-# typer of Ubuntu 24.04 reads no unions.
-_Number = Optional[int]  # noqa: UP045
-_Real = Optional[float]  # noqa: UP045
-_Text = Optional[str]  # noqa: UP045
-_File = Optional[Path]  # noqa: UP045
 
 Html = Annotated[bool, typer.Option("--html", help="also an offline interactive HTML page")]
 Json = Annotated[bool, typer.Option("--json", help="machine-readable output")]
@@ -81,12 +83,8 @@ def atlas(
 def show(
     file: Annotated[Path, typer.Argument(help="a file that `pkm-twin atlas` wrote")],
     out: Annotated[
-        _File,
-        typer.Option(
-            help="stem of the PNGs; default: that of the file",
-            show_default=False,
-            callback=file_name,
-        ),
+        OptionalPath,
+        typer.Option(help="stem of the PNGs; default: that of the file", callback=file_name),
     ] = None,
     html: Html = False,
     as_json: Json = False,
@@ -113,27 +111,14 @@ def kind(sweep: Callable[..., Sweep | Alone]) -> Callable[..., Sweep | Alone]:
         shared = {key: options.pop(key) for key in common}
         _compute(name, functools.partial(sweep, **options), **shared)
 
-    common = _parameters(_compute, "kind", "sweep")
-    own = _parameters(sweep, "machine", "points")
+    # What only the checker imports is no option's type.
+    common = options_of(_compute, "kind", "sweep", Sweep=Any, Robot=Any)
+    own = options_of(sweep, "machine", "points", Sweep=Any, Alone=Alone, Robot=Any)
     first, *rest = common.values()
-    parameters = [first, *own.values(), *rest]
-    vars(command)["__signature__"] = inspect.Signature(parameters)
-    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    take_options(command, [first, *own.values(), *rest])
     command.__doc__ = sweep.__doc__
     app.command(name)(command)
     return sweep
-
-
-def _parameters(function: Callable[..., Any], *without: str) -> dict[str, inspect.Parameter]:
-    """Parameters of a function as keywords, their annotations evaluated."""
-    # What only the checker imports is no option's type.
-    names = {**globals(), **vars(inspect.getmodule(function)), "Sweep": Any, "Robot": Any}
-    hints = get_type_hints(function, names, include_extras=True)
-    return {
-        key: parameter.replace(annotation=hints[key], kind=inspect.Parameter.KEYWORD_ONLY)
-        for key, parameter in inspect.signature(function).parameters.items()
-        if key not in without
-    }
 
 
 def _compute(
@@ -142,19 +127,16 @@ def _compute(
     *,
     context: typer.Context,
     points: Annotated[
-        _Number, typer.Option(max=MOST, help="approximate number of samples; default: by kind")
+        OptionalInt, typer.Option(max=MOST, help="approximate number of samples; default: by kind")
     ] = None,
     out: Annotated[
-        _File,
-        typer.Option(
-            help="file to write; default: ROBOT_KIND.nc", show_default=False, callback=file_name
-        ),
+        OptionalPath, typer.Option(help="file to write; default: ROBOT_KIND.nc", callback=file_name)
     ] = None,
     workers: Annotated[
-        _Number, typer.Option(help="processes on this computer; default: one per core")
+        OptionalInt, typer.Option(help="processes on this computer; default: one per core")
     ] = None,
     scheduler: Annotated[
-        _Text, typer.Option(help="address of a Dask scheduler: tcp://HOST:8786")
+        OptionalText, typer.Option(help="address of a Dask scheduler: tcp://HOST:8786")
     ] = None,
     picture: Annotated[bool, typer.Option(help="also PNGs next to the file")] = True,
     html: Html = False,
@@ -220,7 +202,7 @@ def isotropy(
     machine: Robot,
     points: int | None,
     height: Annotated[
-        _Real, typer.Option(help="z of the poses (m); default: that of the home pose")
+        OptionalFloat, typer.Option(help="z of the poses (m); default: that of the home pose")
     ] = None,
     energy: Annotated[
         float, typer.Option(help="the platform's kinetic energy for F_max (J)")

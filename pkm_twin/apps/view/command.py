@@ -7,21 +7,19 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 
 from pkm_twin.apps.options import BagTopics, LoadTimes, Payload, Platform, RobotName, load_of
 from pkm_twin.console import progress
+from pkm_twin.options import OptionalPath
 
 
 def view(
     robot: RobotName,
     platform: Platform = None,
-    bag: Annotated[
-        Optional[Path],  # noqa: UP045  typer of Ubuntu 24.04 reads no unions
-        typer.Option(help="replay this recording on a timeline", show_default=False),
-    ] = None,
+    bag: Annotated[OptionalPath, typer.Option(help="replay this recording on a timeline")] = None,
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
     load_times: LoadTimes = None,

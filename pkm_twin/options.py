@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Types and signatures of options, for typer."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Optional, get_type_hints
+
+import typer
+
+from pkm_twin.errors import PkmTwinError
+
+# typer of Ubuntu 24.04 reads no unions.
+OptionalInt = Optional[int]  # noqa: UP045
+OptionalFloat = Optional[float]  # noqa: UP045
+OptionalText = Optional[str]  # noqa: UP045
+OptionalPath = Optional[Path]  # noqa: UP045
+
+
+def options_of(
+    function: Callable[..., Any], *without: str, **types: Any
+) -> dict[str, inspect.Parameter]:
+    """Parameters of a function as keywords by name, their annotations evaluated.
+
+    :param without: names that are left out. ``types``: of names that only the checker imports.
+    """
+    hints = get_type_hints(function, localns=types, include_extras=True)
+    return {
+        name: parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(function).parameters.items()
+        if name not in without
+    }
+
+
+def take_options(command: Callable[..., Any], options: Iterable[inspect.Parameter]) -> None:
+    """Give a function of keywords a signature, for typer."""
+    parameters = list(options)
+    vars(command)["__signature__"] = inspect.Signature(parameters)
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+
+
+def file_name(option: typer.CallbackParam, path: Path | None) -> Path | None:
+    """Callback of an option that names a file to write: neither a folder nor nothing.
+
+    :raises PkmTwinError: by the option's name.
+    """
+    if path is not None and path.name in ("", ".."):
+        raise PkmTwinError(f"{option.opts[-1]}: {str(path)!r} is a folder; expected a file name")
+    return path
