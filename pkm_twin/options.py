@@ -6,11 +6,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Optional, get_type_hints
+from typing import Any, Optional, TypeVar, get_type_hints
 
 import typer
 
 from pkm_twin.errors import PkmTwinError
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 # typer of Ubuntu 24.04 reads no unions.
 OptionalInt = Optional[int]  # noqa: UP045
@@ -39,6 +41,31 @@ def take_options(command: Callable[..., Any], options: Iterable[inspect.Paramete
     parameters = list(options)
     vars(command)["__signature__"] = inspect.Signature(parameters)
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+
+
+class Commands(typer.Typer):
+    """Commands as typer of Ubuntu 24.04 needs them: it evaluates no annotations and shows None."""
+
+    def command(self, *names: Any, **settings: Any) -> Callable[[Command], Command]:
+        """As typer's."""
+        return _evaluated(super().command(*names, **settings))
+
+    def callback(self, **settings: Any) -> Callable[[Command], Command]:
+        """As typer's."""
+        return _evaluated(super().callback(**settings))
+
+
+def _evaluated(register: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    def taken(command: Command) -> Command:
+        options = options_of(command).values()
+        take_options(command, options)
+        for option in options:
+            if option.default in (None, inspect.Parameter.empty):
+                for declared in getattr(option.annotation, "__metadata__", ()):
+                    declared.show_default = False
+        return register(command)
+
+    return taken
 
 
 def file_name(option: typer.CallbackParam, path: Path | None) -> Path | None:

@@ -59,10 +59,10 @@ from pkm_twin.console import (
 )
 from pkm_twin.errors import ParameterError, PkmTwinError, plain_warnings
 from pkm_twin.files import STANDARD, open_standard_streams
-from pkm_twin.options import OptionalFloat, OptionalPath, file_name
+from pkm_twin.options import Commands, OptionalFloat, OptionalPath, file_name
 from pkm_twin.ros.signals import INTERRUPTED, first_signal, ignore_signals
 
-app = typer.Typer(
+app = Commands(
     cls=Tasks,
     invoke_without_command=True,
     pretty_exceptions_enable=False,

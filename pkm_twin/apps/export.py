@@ -14,9 +14,10 @@ from pkm_twin.apps.options import RobotName
 from pkm_twin.console import refuse_existing
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import replace_file
+from pkm_twin.options import Commands
 from pkm_twin.robot.robot import Robot
 
-app = typer.Typer(help="Export a robot to other software.", no_args_is_help=True)
+app = Commands(help="Export a robot to other software.", no_args_is_help=True)
 
 SHARE = 0.5
 """Fraction of the effort left at home after gravity that a planner may use to accelerate."""

@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 from pkm_twin.console import print_json, progress
 from pkm_twin.errors import UnknownNameError
 from pkm_twin.options import (
+    Commands,
     OptionalFloat,
     OptionalInt,
     OptionalPath,
@@ -53,7 +54,7 @@ class _Kinds(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
-app = typer.Typer(
+app = Commands(
     cls=_Kinds,
     no_args_is_help=True,
     add_completion=False,

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``pkm-twin`` alone and ``--help``: every command once, by task, its purpose whole."""
 
+import inspect
 import re
 
 from typer.main import get_command
@@ -40,3 +41,20 @@ def test_an_older_name_runs_the_same_command(twin):
     names = ("monitor-torques", "guard-check")
     new, old = (twin(name, "--help").out.partition("Arguments:")[2] for name in names)
     assert new == old != ""
+
+
+def test_options_are_read_by_the_oldest_typer():
+    """It evaluates no annotations, and would show None as a default."""
+
+    def functions(group):
+        yield group.registered_callback
+        yield from group.registered_commands
+        for inner in group.registered_groups:
+            yield from functions(inner.typer_instance)
+
+    for one in functions(app):
+        for option in inspect.signature(one.callback).parameters.values() if one else ():
+            assert not isinstance(option.annotation, str), (one.callback, option)
+            if option.default in (None, option.empty):
+                declared = getattr(option.annotation, "__metadata__", ())
+                assert not any(item.show_default for item in declared), (one.callback, option)
