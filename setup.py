@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 from glob import glob
+from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import setup
 
 NAME = "pkm_twin"
+# ROS tools read it there, so it is the only place.
+VERSION = ElementTree.parse(Path(__file__).with_name("package.xml")).findtext("version")
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=VERSION,
     description="Digital twin of parallel kinematic machines",
     license="Apache-2.0",
     author="pkm_twin maintainers",

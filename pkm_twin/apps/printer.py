@@ -70,7 +70,7 @@ def printer_command(
 
 def export_printer(
     robot: RobotName,
-    firmware: Annotated[Firmware, typer.Option(help="klipper, marlin or reprapfirmware")],
+    firmware: Annotated[Firmware, typer.Option(help="klipper, marlin or reprapfirmware; smoothieware cannot be written")],
     out: Annotated[
         OptionalPath, typer.Option(help="a file; default: print", callback=file_name)
     ] = None,

@@ -235,7 +235,7 @@ def _present(file: Path, picture: bool, html: bool, as_json: bool, out: Path | N
 
     with open_atlas(file) as data:
         with reading(file):
-            about = f"{file}: {data.attrs['title']}, {dict(data.sizes)}"
+            about = f"{file}: {data.attrs['title']}; {_extent(data)}"
             worst = answers(data) if "worst_value" in data else []
             table = _factors(data) if "global_factor" in data else None
         target = out or file
@@ -253,6 +253,16 @@ def _present(file: Path, picture: bool, html: bool, as_json: bool, out: Path | N
             Console().print(table)
         for line in [*map(sentence, worst), *map(str, drawn)]:
             typer.echo(line)
+
+
+def _extent(data: Dataset) -> str:
+    """How many samples a map has of what it is over, in words."""
+    if data.sizes.keys() >= {"slice", "row", "column"}:
+        return f"{data.sizes['slice']} planes of {data.sizes['row']} x {data.sizes['column']} poses"
+    # Cases, nodes and the like are no samples; heights are those of the inscribed circles.
+    over = [n for n in data.sizes if n != "height" and "units" in data.get(n, data).attrs]
+    counts = " x ".join(str(data.sizes[n]) for n in over)
+    return f"{counts} samples over {', '.join(map(str, over))}"
 
 
 def _factors(data: Dataset) -> Table:

@@ -70,9 +70,7 @@ def write_page(atlas: Dataset, path: Path) -> Path:
     """
     kind = kind_of(atlas)
     with reading(source(atlas)):
-        drawn = kind.page(atlas)
-    scenes = list(drawn.select_scenes())
-    fits = len(scenes) == 1 and scenes[0].camera.projection.type != "orthographic"
+        drawn = kind.page(atlas).update_layout(title=pages.TITLE)
     plot = drawn.to_html(
         include_plotlyjs=True,
         full_html=False,
@@ -80,13 +78,15 @@ def write_page(atlas: Dataset, path: Path) -> Path:
         default_width="100%",
         default_height="100%",
         auto_play=False,
-        post_script=pages.NARROW if fits else None,
+        post_script=pages.FIT,
     )
     text = pages.SHELL.format(
         title=html.escape(kind.title(atlas)),
         plot=plot,
         help=html.escape(kind.help),
-        width=pages.FITTED if fits else pages.LEAST[len(scenes) > 1],
+        width=pages.LEAST,
+        below=drawn.layout.meta["below"] - 1,
+        tall=pages.TALL if len(list(drawn.select_scenes())) > 1 else 0,
     )
     with writing(path):
         replace_file(path, text.encode())

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,31 +26,58 @@ FLAT: Final = {"eye": {"x": 0.0, "y": -0.6, "z": 1.5}, "projection": {"type": "o
 CONFIG: Final = {"displaylogo": False, "responsive": True, "showSendToCloud": False}
 """No buttons that lead into the network."""
 MENU: Final = {"x": 0.0, "y": 1.0, "xanchor": "left", "yanchor": "bottom", "pad": {"b": 8}}
-LEAST: Final = (760, 1000)
-"""Widths below which titles and labels would overlap, pixels: of one scene and of two. Narrower
-windows scroll sideways."""
-FITTED: Final = 400
-"""The same for a scene that fits itself into a narrow window."""
-NARROW: Final = """
+LEAST: Final = 400
+"""Width below which titles and labels would overlap, pixels: narrower windows scroll sideways."""
+NARROW: Final = 760
+"""Width below which a page is laid out for a narrow window, pixels; of two scenes WIDE."""
+WIDE: Final = 1200
+TITLE: Final = {"y": 1.0, "yanchor": "top", "pad": {"t": 36}}
+"""Below the buttons of the plot, above the menu."""
+TALL: Final = 900
+"""Height of two scenes one above the other, pixels: lower windows scroll."""
+FIT: Final = r"""
 const plot = document.getElementById('{plot_id}');
-const eye = plot.layout.scene.camera.eye;
-let last = false;
+const {below, narrow, farther} = plot.layout.meta;
+const get = path =>
+  path.match(/[^.[\]]+/g).reduce((part, key) => part == null ? part : part[key], plot.layout);
+const now = path => get(path) ?? null;
+const wide = Object.fromEntries(Object.keys(narrow).map(path => [path, now(path)]));
+const eye = now('scene.camera.eye');
+let last = false, title = '', shown = '', tried = '';
+function wrapped() {
+  const text = now('title.text');
+  if (text !== shown) title = text;
+  if (/[<&]/.test(title)) return title;
+  const letters = plot.clientWidth / (0.56 * now('title.font.size')), lines = [''];
+  for (const word of title.split(' '))
+    if ((lines.at(-1) + word).length < letters || !lines.at(-1)) lines.push(lines.pop() + word + ' ');
+    else lines.push(word + ' ');
+  return shown = lines.map(line => line.trim()).join('<br>');
+}
 function fit() {
-  const narrow = plot.clientWidth < 760;
-  if (narrow === last) return;
-  last = narrow;
-  const far = narrow ? 1.5 : 1;
-  Plotly.relayout(plot, {
-    'title.font.size': narrow ? 13 : 17,
-    'coloraxis.colorbar.thickness': narrow ? 10 : 30,
-    'coloraxis.colorbar.title.side': narrow ? 'right' : 'top',
-    'scene.camera.eye': {x: far * eye.x, y: far * eye.y, z: far * eye.z},
-  });
+  const small = plot.clientWidth < below;
+  const wanted = {...(small ? narrow : wide), 'title.font.size': small ? 13 : 17};
+  if (now('title.font.size') === wanted['title.font.size']) wanted['title.text'] = wrapped();
+  const change = {};
+  for (const path in wanted)
+    if (JSON.stringify(now(path)) !== JSON.stringify(wanted[path])) change[path] = wanted[path];
+  if (small !== last && farther) {
+    const far = small ? farther : 1;
+    change['scene.camera.eye'] = {x: far * eye.x, y: far * eye.y, z: far * eye.z};
+  }
+  last = small;
+  const text = JSON.stringify(change);
+  if (text === '{}') tried = '';
+  else if (text !== tried) { tried = text; Plotly.relayout(plot, change); }
 }
 addEventListener('resize', fit);
+plot.on('plotly_afterplot', fit);
 fit();
 """
-"""Of a scene in perspective: narrow windows have a narrow bar of colours, its title along it."""
+"""Lays a page out by its width, also after a menu has put back what it changes. Of the layout's
+``meta``: the width, what narrow windows have instead, and how much farther away their camera is."""
+THIN_BAR: Final = {"thickness": 10, "title.side": "right"}
+"""A bar of colours in a narrow window: its title is along it."""
 MARGIN: Final = {"l": 20, "r": 20, "t": 110, "b": 20}
 # The text below the plot comes first: the plot takes the room that is left when it is drawn.
 SHELL: Final = """<!DOCTYPE html>
@@ -62,8 +89,9 @@ SHELL: Final = """<!DOCTYPE html>
 html, body {{ margin: 0; height: 100%; }}
 body {{ display: grid; grid-template-rows: 1fr auto; font: 14px sans-serif; color: #2a3f5f; }}
 p {{ grid-row: 2; margin: 4px 20px 10px; }}
-main {{ grid-row: 1; position: relative; min-height: 0; overflow-x: auto; }}
+main {{ grid-row: 1; position: relative; min-height: 0; overflow: auto; }}
 main > div {{ position: absolute; inset: 0; min-width: {width}px; }}
+@media (max-width: {below}px) {{ main > div {{ min-height: {tall}px; }} }}
 </style>
 </head>
 <body>
@@ -72,6 +100,25 @@ main > div {{ position: absolute; inset: 0; min-width: {width}px; }}
 </body>
 </html>
 """
+
+
+def narrow(
+    below: int = NARROW,
+    bars: Mapping[str, Mapping[str, Any]] | None = None,
+    *,
+    farther: float = 0.0,
+    **others: Any,
+) -> dict[str, Any]:
+    """What :data:`FIT` reads: how a page is laid out in windows of less than a width, pixels.
+
+    :param bars: of the colour axes, by name; default the only one with a thin bar.
+    :param farther: factor of the camera's distance, of one scene in perspective.
+    :param others: further entries of the layout, ``__`` for the dots of their names.
+    """
+    found = {name.replace("__", "."): value for name, value in others.items()}
+    for axis, bar in ({"coloraxis": {}} if bars is None else bars).items():
+        found |= {f"{axis}.colorbar.{key}": v for key, v in (THIN_BAR | dict(bar)).items()}
+    return {"below": below, "narrow": found, "farther": farther}
 
 
 def button(
@@ -252,6 +299,7 @@ def layers(
             "camera": CAMERA,
         },
         margin=MARGIN,
+        meta=narrow(farther=1.8),
         updatemenus=[{"buttons": buttons, **MENU}],
         sliders=[slider(steps, f"{names[2]}: ")],
     )

@@ -212,6 +212,7 @@ def _page_of_planes(title: str, atlas: Dataset, labels: Mapping[str, Label]) -> 
     figure.update_layout(
         coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8}},
         margin={**pages.MARGIN, "l": 70, "b": 60},
+        meta=pages.narrow(),
         updatemenus=[{"buttons": buttons, **pages.MENU}],
     )
     figure.update_layout(buttons[0]["args"][1])

@@ -76,7 +76,7 @@ def load(robot: str | Path, *, platform: str | None = None) -> Robot:
         for note in reading.notes:
             warn(path, note)
         robot_read = robot_of_data(reading.description, path.stem)
-        return _told(path, replace(robot_read, home_choice=reading.home))
+        return _told(path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals))
     if platform is not None:
         raise ParameterError("platform", platform, "none, because the file names its platform")
     return _told(path, robot_of_data(read_yaml(path), path.stem))

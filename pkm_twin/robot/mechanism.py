@@ -43,6 +43,7 @@ from pkm_twin.machine.uncertainty import (
     UncertaintyEntry,
     causes_of,
 )
+from pkm_twin.machine.urdf_visuals import Visual
 
 R = TypeVar("R", bound="Mechanism")
 
@@ -73,6 +74,8 @@ class Mechanism:
     """The name that the robot was loaded by."""
     home_choice: str = ""
     """How the home was chosen, of a file that leaves it open."""
+    visuals: tuple[Visual, ...] = ()
+    """Meshes of a URDF's links."""
     payload: Payload = schema.section(Payload, default={})
     friction: Coefficients = schema.section(friction_of(3), default={})
     gravity: Array = schema.vector(3, unit="m/s2", default=[0, 0, -9.81])

@@ -16,6 +16,7 @@ from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.urdf_file import Joint, Link, Urdf
 from pkm_twin.machine.urdf_loops import Closure
+from pkm_twin.machine.urdf_visuals import Visual, visuals
 from pkm_twin.machine.urdf_xml import Pose
 from pkm_twin.robot.urdf_home import Home, HomeSearch
 
@@ -43,11 +44,13 @@ class UrdfReading:
     """A file as a ``mechanism: machine`` description, and how it came to be.
 
     ``home``: how the home was chosen, in words. ``notes``: what was done to the file's machine.
+    ``visuals``: the meshes of a URDF's links.
     """
 
     description: dict[str, Any]
     home: str
     notes: tuple[str, ...]
+    visuals: tuple[Visual, ...] = ()
 
 
 def read_urdf(
@@ -102,7 +105,10 @@ def read_tree(
             )
         if home.held:
             notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
-    return UrdfReading(data, home.text, tuple(notes))
+    view = assembly.links[ground].inverse()
+    places = {name: view @ pose for name, pose in assembly.links.items()}
+    shown = () if top.tag == "mujoco" else visuals(path, top, places, bodies)
+    return UrdfReading(data, home.text, tuple(notes), tuple(shown))
 
 
 def _description(

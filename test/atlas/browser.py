@@ -147,6 +147,12 @@ class Browser:
         self.call("Page.enable")
         self.call("Page.addScriptToEvaluateOnNewDocument", source=script)
 
+    def resize(self, width: int, height: int) -> None:
+        """Let the page have this many pixels."""
+        sizes = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **sizes)
+        self.until(f"innerWidth === {width}")
+
     def open(self, path: Path) -> None:
         """Go to a file of this machine."""
         self.visit(path.resolve().as_uri())

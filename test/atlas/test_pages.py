@@ -211,3 +211,54 @@ def test_modes(browser, points, robot, small_atlases, tmp_path):
                 # Between the file's azimuths the page is on straight lines.
                 stored = np.interp(turn, ticks, frequency)
                 assert number(lines[3])[1] == pytest.approx(stored, rel=2e-3)
+
+
+FITTED = """(() => {
+  const seen = [...gd.querySelectorAll('.gtitle, .annotation-text, .cbtitle, .updatemenu-header, '
+    + '.updatemenu-button, .xtitle, .ytitle, .legendtext')].map(e => [e, e.getBoundingClientRect()]);
+  const boxes = seen.filter(([, box]) => box.width).map(([e, box]) => ({
+    name: e.getAttribute('class') + ' ' + e.textContent, left: box.left, right: box.right,
+    top: box.top, bottom: box.bottom}));
+  return {boxes, wide: [document.documentElement, document.querySelector('main')].map(
+    e => e.scrollWidth - e.clientWidth), width: innerWidth};
+})()"""
+SETTLED = """new Promise(found => {
+  let last = null, same = 0;
+  const look = () => {
+    const now = JSON.stringify(gd.layout) + gd.clientWidth;
+    same = now === last ? same + 1 : 0; last = now;
+    if (same > 5) found(true); else setTimeout(look, 100);
+  };
+  look();
+})"""
+
+
+@pytest.mark.parametrize(
+    "atlas",
+    [
+        "modes prru", "isotropy delta_cu", LONG("isotropy prru"), LONG("workspace delta_cu"),
+        LONG("workspace stewart"), LONG("workspace five_bar"), LONG("coarse-energy upr_rpu"),
+    ],
+)  # fmt: skip
+def test_a_page_fits_into_its_window(browser, atlas, small_atlases, tmp_path):
+    """No sideways scrolling, no text beyond the edges, and none over another."""
+    with open_atlas(small_atlases[atlas]) as data:
+        browser.resize(1400, 900)
+        show(browser, data, tmp_path)
+    entries = browser.run("gd.layout.updatemenus[0].buttons.length")
+    for width in (1400, 1000, 500):
+        browser.resize(width, 900)
+        for entry in (0, entries - 1):
+            choose(browser, entry)
+            assert browser.run(SETTLED)
+            found = browser.run(FITTED)
+            assert max(found["wide"]) <= 0, (width, found)
+            boxes = found["boxes"]
+            assert len(boxes) >= 2
+            for box in boxes:
+                assert box["left"] >= -1 and box["right"] <= width + 1, (width, box)
+            for k, one in enumerate(boxes):
+                for other in boxes[:k]:
+                    across = min(one["right"], other["right"]) - max(one["left"], other["left"])
+                    along = min(one["bottom"], other["bottom"]) - max(one["top"], other["top"])
+                    assert min(across, along) <= 2, (width, one, other)

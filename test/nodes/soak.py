@@ -270,18 +270,18 @@ def write(folder, summary, watched, ages):
         axes[0, 0].plot(minutes, np.array(w.memory) / 2**20, style, label=name)
         axes[0, 1].plot(minutes, w.descriptors, style, label=name)
         axes[1, 0].plot(minutes, w.threads, style, label=name)
-    for ax, what in zip(axes.flat, ("memory (MiB)", "descriptors", "threads"), strict=False):
-        ax.set_xlabel("time (min)")
-        ax.set_ylabel(what)
-        ax.set_ylim(0, 1.2 * ax.get_ylim()[1])
+    titles = ("resident memory of each node", "open file descriptors", "threads")
+    for ax, title, what in zip(axes.flat, titles, ("memory (MiB)", "number", "number"), strict=False):
+        ax.set(title=title, xlabel="time (min)", ylabel=what, ylim=(0, 1.2 * ax.get_ylim()[1]))
         ax.legend(ncols=2)
     last = axes[1, 1]
     for what, values in ages.all.items():
         last.hist(
             np.array(values) * 1e3, bins=np.geomspace(0.05, 1e3, 80), histtype="step", label=what
         )
-    last.axvline(1e3 * STALE, color="grey", linewidth=0.8)
+    last.axvline(1e3 * STALE, color="grey", linewidth=0.8, label="stale_after")
     last.set(xscale="log", yscale="log", xlabel="age at publication (ms)", ylabel="messages")
+    last.set_title("age of the published messages")
     last.legend()
     figure.savefig(folder / "soak.png", dpi=110)
     pyplot.close(figure)

@@ -229,3 +229,36 @@ def test_every_kind_of_machine_is_shown(browser, arguments, tmp_path):
             assert read(browser, "bag_time") == "0"
         assert addresses(browser) == {"127.0.0.1"}
         assert colours(browser.picture()) > 200
+
+
+ROOM = """(() => {
+  const wide = document.documentElement, scene = document.querySelector('canvas[data-engine]');
+  const inputs = [...document.querySelectorAll('input')].map(e => e.getBoundingClientRect());
+  const seen = inputs.filter(box => box.width), box = scene.getBoundingClientRect();
+  const shared = (a, b) => Math.min(a.right, b.right) > Math.max(a.left, b.left) + 1
+    && Math.min(a.bottom, b.bottom) > Math.max(a.top, b.top) + 1;
+  return {wide: wide.scrollWidth - wide.clientWidth, width: box.width, height: box.height,
+          right: Math.max(...seen.map(box => box.right)),
+          covered: seen.filter(b => b.top < innerHeight && shared(box, b)).length};
+})()"""
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    "arguments",
+    [("five_bar",), pytest.param(("delta_cu", "--bag", DELTA), marks=pytest.mark.long)],
+    ids=str,
+)
+def test_the_page_fits_into_its_window(browser, arguments):
+    """No sideways scrolling, and a scene of some size that no slider covers."""
+    with serving(*arguments) as (_, address):
+        for width in (1400, 1000, 500):
+            browser.resize(width, 900)
+            browser.visit(address)
+            assert float(browser.until(TEXT % "singularity")) > 0.0
+            fits = f"{ROOM}.width > 300 && {ROOM}.height > 300 && {ROOM}.covered === 0"
+            browser.until(f"document.querySelector('canvas[data-engine]') && {fits}")
+            room = browser.run(ROOM)
+            assert room["wide"] <= 0
+            assert room["right"] <= width
+    browser.call("Emulation.clearDeviceMetricsOverride")

@@ -48,10 +48,10 @@ def test_the_time_line_has_what_check_judges(recording):
 
 def test_curves_are_finite_and_few(recording):
     line = Timeline.of(recording)
-    time, twin, residual = line.curves()
-    assert len(time) == len(twin) == len(residual) <= POINTS
+    time, twin, measured = line.curves()
+    assert len(time) == len(twin) == len(measured) <= POINTS
     assert np.isfinite(twin).all()
-    assert np.isfinite(residual).all()
+    assert np.isfinite(measured).all()
     assert (np.diff(time) > 0).all()
 
 

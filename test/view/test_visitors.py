@@ -2,7 +2,9 @@
 """What one browser sends cannot end or change the page for the others, over real websockets."""
 
 import asyncio
+import contextlib
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from pkm_twin.apps.view.door import Door, listen
 from pkm_twin.apps.view.model import Model
 from pkm_twin.apps.view.page import Page, serving
 from pkm_twin.apps.view.panels import BagPanel
-from pkm_twin.apps.view.stage import framing
+from pkm_twin.apps.view.stage import farther
 from pkm_twin.apps.view.timeline import Timeline
 from test.support.robots import load
 
@@ -227,11 +229,37 @@ def test_a_change_that_fails_is_logged_once_and_the_page_goes_on(page, caplog, m
 
 
 def test_the_machine_fits_into_narrow_windows():
-    """As wide as in a square window, and in the upper part of a tall one."""
-    assert framing(1400, 757) == (1.0, 0.0)
+    """As wide as in a square window."""
+    assert farther(1400, 757) == 1.0
     sizes = np.linspace(0.3, 2.0, 200)
-    farther, up = np.array([framing(aspect, 1.0) for aspect in sizes]).T
-    assert (farther * sizes >= 1.0 - 1e-12).all()
-    assert (np.diff(up) <= 0.0).all()
-    # Its middle, and half of its height there, are inside the window.
-    assert (0.5 - up - 0.36 / farther > 0.0).all()
+    assert all(farther(aspect, 1.0) * aspect >= 1.0 - 1e-12 for aspect in sizes)
+
+
+def placed(page, states):
+    """Distances of the camera, in those of the beginning, after a browser reported states.
+
+    :param states: width, height, and the camera's distance at which the browser is.
+    """
+    start = page.server.initial_camera
+    middle, begin = np.array(start.look_at), np.array(start.position) - np.array(start.look_at)
+    calls = []
+    camera = SimpleNamespace(on_update=calls.append)
+    client = SimpleNamespace(camera=camera, atomic=contextlib.nullcontext)
+    asyncio.run(page.stage._frame(client))
+    for width, height, distance in states:
+        camera.image_width, camera.image_height = width, height
+        camera.position, camera.look_at = middle + distance * begin, middle
+        asyncio.run(calls[0](camera))
+        yield float(np.linalg.norm(camera.position - middle) / np.linalg.norm(begin))
+
+
+@pytest.mark.parametrize("late", [0.0, 1.0])
+def test_reports_that_come_late_do_not_move_the_camera_away(page, late):
+    """A page that is laid out slowly: thin first, then wide, while the browser lags behind."""
+    thin, wide = farther(150, 600), farther(1200, 700)
+    assert (thin, wide) == (4.0, 1.0)
+    behind = thin + late * (wide - thin)
+    states = [(3, 700, 1.0), (150, 600, 1.0), (1200, 700, behind), (1200, 700, thin)]
+    assert list(placed(page, states))[-1] == pytest.approx(wide)
+    # A camera that a visitor has moved stays.
+    assert list(placed(page, [(150, 600, 0.7)])) == pytest.approx([0.7])

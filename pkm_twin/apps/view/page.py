@@ -23,7 +23,7 @@ from pkm_twin.apps.view import texts
 from pkm_twin.apps.view.door import Door, behind
 from pkm_twin.apps.view.model import Model, Range, State
 from pkm_twin.apps.view.scene import DRIVE, Scene
-from pkm_twin.apps.view.stage import Stage
+from pkm_twin.apps.view.stage import SHEET, Stage
 from pkm_twin.apps.view.visitors import guard
 from pkm_twin.errors import one_line
 
@@ -139,6 +139,7 @@ class Page:
 
     def _build_panel(self) -> None:
         gui, model = self.server.gui, self.model
+        gui.add_html(SHEET)
         self._status = gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Move"):
@@ -149,6 +150,9 @@ class Page:
             self.ask(gui.add_button("Home").on_click, "home", self._go_home)
             named = gui.add_checkbox("names of drives", True)
             self.ask(named.on_update, "names", lambda: self.stage.name_drives(named.value))
+            if self.stage.has_meshes:
+                meshes = gui.add_checkbox("meshes of the URDF", True)
+                self.ask(meshes.on_update, "meshes", lambda: self.stage.show_meshes(meshes.value))
         with tabs.add_tab("Load"):
             with gui.add_folder("Wrench on the platform, base axes"):
                 self._wrench = self._sliders(model.wrench_ranges, "wrench", self._load)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -39,13 +40,22 @@ class BagPanel:
             self._play = gui.add_button("Play")
             self._speed = gui.add_dropdown("speed factor", SPEEDS, initial_value="1")
             self._instant = gui.add_html("")
-            at, twin, residual = timeline.curves()
-            named = (("effort of the model", twin), ("residual: measured minus model", residual))
-            self._charts = [
-                (_chart(page, title, at, values, mark=True), at, values)
-                for title, values in named
-                if values is not None and len(at) > 1
-            ]
+            names = page.model.robot.joint_names
+            self._times, self._twin, self._measured = timeline.curves()
+            self._charts: list[tuple[Any, Array]] = []
+            if len(self._times) > 1:
+                self._joint = gui.add_dropdown("joint", names, initial_value=names[0])
+                page.ask(self._joint.on_update, "joint", self._draw_joint)
+                efforts = {"measured": "#999999", "model": COLOURS[1]}
+                if self._measured is None:
+                    del efforts["measured"]
+                self._add_chart("effort of the joint", self._efforts(), efforts)
+                if self._measured is not None:
+                    self._add_chart(
+                        "residual: measured minus model",
+                        self._measured - self._twin,
+                        _coloured(names),
+                    )
         page.ask(self._time.on_update, "time", self._go)
         page.ask(self._play.on_click, "play", self._play_or_pause)
         page.ask(self._speed.on_update, "speed", self._restart)
@@ -53,6 +63,25 @@ class BagPanel:
         panel.set_width(WIDTH)
         page.moving.append(self)
         self._go()
+
+    def _add_chart(self, title: str, values: Array, colours: dict[str, str]) -> None:
+        chart = _chart(self._page, title, self._times, values, colours, mark=True)
+        self._charts.append((chart, values))
+
+    def _efforts(self) -> Array:
+        """Curves of the chosen joint: measured where the bag has it, and of the model, (j, k)."""
+        k = self._page.model.robot.joint_names.index(self._joint.value)
+        both = (self._measured, self._twin)
+        return np.column_stack([values[:, k] for values in both if values is not None])
+
+    def _draw_joint(self) -> None:
+        chart, _ = self._charts[0]
+        values = self._efforts()
+        self._charts[0] = chart, values
+        chart.data = (self._times, *map(np.ascontiguousarray, values.T), self._mark(values))
+
+    def _mark(self, values: Array) -> Array:
+        return _mark(self._times, values, self._time.value)
 
     @property
     def busy(self) -> bool:
@@ -75,8 +104,8 @@ class BagPanel:
         page.become(state)
         if not self.busy or time.monotonic() - self._marked > MARKED:
             self._marked = time.monotonic()
-            for chart, times, values in self._charts:
-                chart.data = (*chart.data[:-1], _mark(times, values, at.time))
+            for chart, values in self._charts:
+                chart.data = (*chart.data[:-1], self._mark(values))
 
     def _play_or_pause(self) -> None:
         if self.busy:
@@ -117,9 +146,12 @@ class LivePanel:
         panel = gui.add_panel()
         with panel.add_tab("Live"):
             self._heard = gui.add_html("")
-            nothing = np.zeros((2, page.model.robot.joints_count))
+            joints = _coloured(page.model.robot.joint_names)
+            nothing = np.zeros((2, len(joints)))
             self._charts = {
-                name: _chart(page, f"{name}, the last {SPAN:g} s", np.array([-SPAN, 0.0]), nothing)
+                name: _chart(
+                    page, f"{name}, the last {SPAN:g} s", np.array([-SPAN, 0.0]), nothing, joints
+                )
                 for name in TRACES
             }
         panel.dock_left()
@@ -148,16 +180,27 @@ class LivePanel:
             page.draw_deflected(moved, heard.shares, heard.dominant)
 
 
-def _chart(page: Page, title: str, times: Array, values: Array, *, mark: bool = False) -> Any:
-    """Curves of all joints, values (k, n), and where asked for a mark of the present."""
+def _coloured(names: Sequence[str]) -> dict[str, str]:
+    return {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(names)}
+
+
+def _chart(
+    page: Page,
+    title: str,
+    times: Array,
+    values: Array,
+    colours: Mapping[str, str],
+    *,
+    mark: bool = False,
+) -> Any:
+    """Curves with names and colours, values (k, n), and where asked for a mark of the present."""
     from viser import uplot
 
-    robot = page.model.robot
     points = uplot.Series_Points(show=False)
     series = [uplot.Series(label="t, s")]
     series += [
-        uplot.Series(label=name, stroke=COLOURS[k % len(COLOURS)], width=1.5, points=points)
-        for k, name in enumerate(robot.joint_names)
+        uplot.Series(label=name, stroke=colour, width=1.5, points=points)
+        for name, colour in colours.items()
     ]
     curves = list(map(np.ascontiguousarray, values.T))
     if mark:
@@ -166,7 +209,7 @@ def _chart(page: Page, title: str, times: Array, values: Array, *, mark: bool = 
     return page.server.gui.add_uplot(
         (times, *curves),
         tuple(series),
-        title=f"{title}, {robot.effort_unit}",
+        title=f"{title}, {page.model.robot.effort_unit}",
         scales={"x": uplot.Scale(time=False)},
         height=185,
     )

@@ -188,6 +188,22 @@ class Scene:
             places,
         )
 
+    def frames(self, q: Array, deflection: Array) -> dict[str, tuple[Array, Array]]:
+        """Where points of each body that are given at home, base axes, now stand.
+
+        Position (3,), m, and quaternion (4,), w first; the platform's with a deflection (6,), m
+        and rad, already enlarged.
+        """
+        posture, graph = Posture(self.robot, q), self.robot.graph
+        result = {}
+        for body, rotation in posture.rotations.items():
+            at, turn = posture.place(body, np.zeros(3)), Rotation.from_matrix(rotation)
+            if body == graph.platform:
+                origin, more = posture.place(body, graph.origin), Rotation.from_rotvec(deflection[3:])
+                at, turn = origin + deflection[:3] + more.apply(at - origin), more * turn
+            result[body] = at, _quaternions(turn)
+        return result
+
     def _colour(self, bar: Bar, colours: Mapping[str, Colour]) -> Colour:
         if bar.element in colours:
             return colours[bar.element]

@@ -5,13 +5,16 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.apps.view.scene import GROUND, PLATFORM, Scene, plate, round_mesh
+from pkm_twin.apps.view.meshes import body_meshes
+from pkm_twin.apps.view.scene import BODY, GROUND, PLATFORM, Scene, plate, round_mesh
+from pkm_twin.machine.graph import BASE
 
 Array = NDArray[np.float64]
 
@@ -21,23 +24,24 @@ ARROW: Final = 0.4
 """Length of the greatest wrench's arrow, per size of the machine."""
 LOOK: Final = np.array([0.62, -0.95, 0.42])
 """From where the machine is looked at, in its greatest extents from its middle."""
-LIFT: Final = 0.28
-"""How far up the machine is in a tall window, where a sheet of sliders covers the lower part, in
-parts of the window's height."""
+SMALLEST: Final = 100
+"""Width and height of a scene below which it is being laid out, and nothing is fitted, pixels."""
+SHEET: Final = """<style>
+@media (max-width: 36em) {
+  div:has(> div canvas[data-engine]):has(+ .mantine-Paper-root) { height: 45% !important; }
+  .mantine-Paper-root:has([role=tab]) { width: 100% !important; max-height: 55% !important; }
+  .mantine-Paper-root:has([role=tab]) > *,
+  .mantine-Paper-root:has([role=tab]) .mantine-ScrollArea-content > * { width: 100% !important; }
+}
+</style>"""
+"""In a narrow window the browser shows the sliders as a sheet at the bottom: it is as wide as the
+window, and the scene ends above it."""
 
-TALLEST: Final = 3.5
-"""Height per width of a window for which the camera moves away; a phone's is 2.2."""
 
-
-def framing(width: float, height: float) -> tuple[float, float]:
-    """How much farther away the camera is in a narrow window, and how far up the machine is.
-
-    :returns: factor of the distance, and part of the window's height.
-    """
-    # While a page is laid out its scene may be a few pixels wide.
-    aspect = 1.0 / min(height / width, TALLEST)
-    farther = max(1.0, 1.0 / aspect, min(1.3 / aspect, 2.0))
-    return farther, LIFT * min(max((1.0 - aspect) / 0.3, 0.0), 1.0)
+def farther(width: float, height: float) -> float:
+    """How much farther away the camera is in a window that is narrower than high, as a factor."""
+    aspect = height / width
+    return max(1.0, aspect, min(1.3 * aspect, 2.0))
 
 
 class Stage:
@@ -49,6 +53,7 @@ class Stage:
         self._ground(lowest)
         self._plates()
         self._machine(q)
+        self._meshes = self._bodies()
         size, draw = scene.size, server.scene
         self._names = {
             name: draw.add_label(f"/names/{k}", name, anchor="bottom-center", position=place)
@@ -91,26 +96,31 @@ class Stage:
         draw.add_frame("/base", **_axes(0.12 * size, size))
 
     async def _frame(self, client: Any) -> None:
-        """Let the machine be seen whole in this window, and after its size has changed."""
-        begin = np.array(self._server.initial_camera.position)
-        last, drop = (1.0, 0.0), 0.0
+        """Let the machine be seen whole in this window, and after its size has changed.
+
+        A camera that the visitor has turned or moved stays where it is.
+        """
+        start = self._server.initial_camera
+        middle = np.array(start.look_at)
+        begin = np.array(start.position) - middle
+        placed: deque[float] = deque(maxlen=16)
 
         async def fit(camera: Any) -> None:
-            nonlocal last, drop
             # A browser may send any numbers: those of no window change nothing.
             with contextlib.suppress(ArithmeticError, TypeError, ValueError):
-                if np.allclose(camera.position, begin, rtol=1e-4):
-                    # The page was opened, or its view reset.
-                    last, drop = (1.0, 0.0), 0.0
-                now = framing(camera.image_width, camera.image_height)
-                if now == last:
+                width, height = camera.image_width, camera.image_height
+                if not min(width, height) >= SMALLEST:
                     return
-                way = (camera.position - camera.look_at) * now[0] / last[0]
-                below = now[1] * 2.0 * float(np.linalg.norm(way)) * math.tan(camera.fov / 2.0)
-                middle = camera.look_at + np.array([0.0, 0.0, drop - below])
-                last, drop = now, below
-                with client.atomic():
-                    camera.position, camera.look_at = middle + way, middle
+                way, factor = camera.position - camera.look_at, farther(width, height)
+                part = float(way @ begin / (begin @ begin))
+                ours = any(math.isclose(part, known, rel_tol=1e-3) for known in (1.0, *placed))
+                near = 1e-3 * float(np.linalg.norm(begin))
+                still = np.allclose(way, part * begin, atol=near)
+                still = still and np.allclose(camera.look_at, middle, atol=near)
+                if ours and still and not math.isclose(part, factor, rel_tol=1e-3):
+                    placed.append(factor)
+                    with client.atomic():
+                        camera.position, camera.look_at = middle + factor * begin, middle
 
         client.camera.on_update(fit)
 
@@ -143,6 +153,26 @@ class Stage:
             lod="off",
         )  # fmt: skip
 
+    def _bodies(self) -> dict[str, Any]:
+        """Frames of the bodies that have meshes in the robot's file; bars are seen through them."""
+        draw, platform = self._server.scene, self._scene.robot.graph.platform
+        frames = {}
+        for k, (body, (corners, faces)) in enumerate(body_meshes(self._scene.robot).items()):
+            frames[body] = draw.add_frame(f"/meshes/{k}", show_axes=False)
+            colour = {BASE: GROUND, platform: PLATFORM}.get(body, BODY)
+            draw.add_mesh_simple(f"/meshes/{k}/mesh", corners, faces, color=colour, opacity=0.6)
+        return frames
+
+    @property
+    def has_meshes(self) -> bool:
+        """Whether any body has a mesh."""
+        return bool(self._meshes)
+
+    def show_meshes(self, shown: bool) -> None:
+        """Whether the meshes of the robot's file are drawn."""
+        for frame in self._meshes.values():
+            frame.visible = shown
+
     def draw(self, q: Array, deflection: Array, shares: Mapping[str, float], dominant: str) -> None:
         """The machine at q (n,), its platform moved by an enlarged deflection (6,), m and rad.
 
@@ -159,6 +189,10 @@ class Stage:
         balls.batched_scales = shapes.ball_sizes
         balls.batched_colors = _linear(shapes.ball_colours)
         self._platform.position, self._platform.wxyz = shapes.platform_at, shapes.platform_turn
+        if self._meshes:
+            for body, (at, turn) in self._scene.frames(q, deflection).items():
+                if body in self._meshes:
+                    self._meshes[body].position, self._meshes[body].wxyz = at, turn
         for name, place in self._scene.drive_places(q).items():
             self._names[name].position = place
         self._rest.visible = moved

@@ -91,7 +91,7 @@ class Timeline:
         )
 
     def curves(self) -> tuple[Array, Array, Array | None]:
-        """Times (j,), the twin's efforts and the residual (j, n) where the twin has any.
+        """Times (j,), the twin's and the measured efforts (j, n) where the twin has any.
 
         No more than POINTS of them, evenly taken.
         """
@@ -99,5 +99,4 @@ class Timeline:
             return np.zeros(0), np.zeros((0, self.q.shape[1])), None
         known = np.flatnonzero(~np.isnan(self.twin).any(1))
         rows = known[:: max(1, -(-len(known) // POINTS))]
-        residual = None if self.measured is None else self.measured[rows] - self.twin[rows]
-        return self.time[rows], self.twin[rows], residual
+        return self.time[rows], self.twin[rows], None if self.measured is None else self.measured[rows]

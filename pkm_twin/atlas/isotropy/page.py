@@ -65,9 +65,10 @@ def page(atlas: Dataset) -> Any:
     hidden = {"visible": False}
     thick = [-0.5 * balls.step, 0.5 * balls.step]
     sides = [[middle - balls.half, middle + balls.half] for middle in balls.middle]
+    longest = 2.2 if balls.polar else 1.7
     scene: dict[str, Any] = {
         "aspectmode": "manual",
-        "aspectratio": pages.aspect([*sides, thick], 2.2 if balls.polar else 1.7),
+        "aspectratio": pages.aspect([*sides, thick], longest),
         "camera": pages.FLAT,
         "zaxis": hidden,
     }
@@ -76,7 +77,7 @@ def page(atlas: Dataset) -> Any:
         scene[axis] = hidden if balls.polar else shown
     around = ""
     if balls.polar:
-        around = "around: azimuth, outwards: tilt; "
+        around = "around: azimuth, outwards: tilt<br>"
         tilts = np.degrees(part.tilt.values)
         figure.add_scatter3d(**_polar_names(part.azimuth.values, tilts, balls.step))
     figure.update_layout(
@@ -84,8 +85,11 @@ def page(atlas: Dataset) -> Any:
         f"{around}axes of a sphere: {ends}</span>",
         coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8}},
         scene=scene,
-        # Room for a title of two lines.
+        # Room for a title of three lines.
         margin=pages.MARGIN | {"t": 140},
+        legend={"x": 1.0, "xanchor": "right", "y": 1.0, "yanchor": "bottom"},
+        # A parallel projection is as high as its window.
+        meta=pages.narrow(scene__aspectratio=pages.aspect([*sides, thick], longest / 2.3)),
         updatemenus=[{"buttons": buttons, **pages.MENU}],
     )
     figure.update_layout(buttons[0]["args"][1])

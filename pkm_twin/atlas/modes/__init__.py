@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Modes atlas: the lowest natural frequencies over the regular workspace, actuators locked."""
+"""Modes atlas: the lowest natural frequencies over the largest cylinder of the workspace, actuators locked."""
 
 from typing import Final
 
@@ -8,7 +8,7 @@ from pkm_twin.atlas.sweep import Kind
 
 KIND: Final = Kind(
     "modes", figures.FIGURES, page.page, page.title,
-    help="Left: the frame at rest (grey) and in the chosen mode, enlarged; squares stand on the "
-    "ground. The button swings it, the slider stops it. Right: the mode's frequency at places of "
-    "the workspace; modes are numbered at each place, lowest first.",
+    help="First plot: the frame at rest (grey) and in the chosen mode, magnified; squares are on the "
+    "ground. The button animates it, the slider stops it. Second plot: the frequency of the mode "
+    "over the workspace; at each pose the modes are numbered from the lowest frequency.",
 )  # fmt: skip

@@ -155,6 +155,7 @@ def page(atlas: Dataset) -> Any:
             "zaxis_title": "z (m)",
         },
         margin={**pages.MARGIN, "t": 140},
+        meta=_narrow(),
         # The cameras stay where they were turned to.
         uirevision="modes",
         updatemenus=[
@@ -174,6 +175,22 @@ def page(atlas: Dataset) -> Any:
     )
     figure.update_layout(pages.colours("frequency (Hz)", fields[modes[0]], axis="coloraxis2"))
     return figure
+
+
+def _narrow() -> dict[str, Any]:
+    """One plot above the other in windows that are too narrow for both."""
+    middle, bar = 0.42, {"x": 0.86, "len": 0.4}
+    entries: dict[str, Any] = {"annotations[1].y": 0.47, "updatemenus[1].x": 0.5}
+    entries["sliders[0].len"] = 0.9
+    for k in range(2):
+        entries |= {f"annotations[{k}].x": middle, f"annotations[{k}].font.size": 11}
+    return pages.narrow(
+        pages.WIDE,
+        {"coloraxis": bar | {"y": 0.75}, "coloraxis2": bar | {"y": 0.22}},
+        scene__domain={"x": [0.0, 0.84], "y": [0.52, 0.93]},
+        scene2__domain={"x": [0.0, 0.84], "y": [0.0, 0.43]},
+        **entries,
+    )
 
 
 def _discs(atlas: Dataset) -> tuple[dict[str, Any], tuple[str, str]]:

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Meshes of a robot's URDF, read and placed: what its links look like on the page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.errors import one_line, warn
+from pkm_twin.machine.urdf_visuals import Visual
+from pkm_twin.robot.robot import Robot
+
+Array = NDArray[np.float64]
+
+LARGEST: Final = 64 * 1024 * 1024
+"""Largest file of a mesh that is read, bytes."""
+
+
+def body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]:
+    """Corners (k, 3) at home, m, base axes, and triangles (j, 3) of each body that has meshes.
+
+    A mesh that cannot be read is left out with a warning.
+    """
+    found: dict[str, list[tuple[Array, NDArray[np.int64]]]] = {}
+    for visual in robot.visuals:
+        try:
+            found.setdefault(visual.body, []).append(_read(visual))
+        except Exception as error:
+            # Readers of meshes raise anything.
+            why = one_line(str(error)) or type(error).__name__
+            warn(visual.urdf, f"mesh {visual.mesh!r}: {why}; it is not shown")
+    result = {}
+    for body, parts in found.items():
+        shifts = np.cumsum([0, *(len(corners) for corners, _ in parts[:-1])])
+        corners = np.concatenate([corners for corners, _ in parts])
+        faces = np.concatenate([f + shift for (_, f), shift in zip(parts, shifts, strict=True)])
+        result[body] = corners, faces
+    return result
+
+
+def mesh_path(visual: Visual) -> Path:
+    """The file of a mesh: a path from the URDF's folder, ``file://`` or ``package://``.
+
+    A package is a folder of that name above the URDF or beside one of those, else an installed
+    ROS package.
+
+    :raises FileNotFoundError: there is no such file.
+    """
+    kind, separator, rest = visual.mesh.partition("://")
+    folder = visual.urdf.resolve().parent
+    tried: Iterator[Path] = iter((folder / visual.mesh,))
+    if separator and kind == "file":
+        tried = iter((Path(unquote(rest)),))
+    elif separator and kind == "package":
+        tried = _in_package(*rest.partition("/")[::2], folder)
+    path = next((path for path in tried if path.is_file()), None)
+    if path is None:
+        raise FileNotFoundError("no such file")
+    return path
+
+
+def _in_package(package: str, rest: str, folder: Path) -> Iterator[Path]:
+    for above in (folder, *folder.parents):
+        if above.name == package:
+            yield above / rest
+        yield above / package / rest
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        yield Path(get_package_share_directory(package)) / rest
+    except (ImportError, LookupError, ValueError):
+        return
+
+
+def _read(visual: Visual) -> tuple[Array, NDArray[np.int64]]:
+    import trimesh  # type: ignore[import-untyped]  # viser needs it as well
+
+    path = mesh_path(visual)
+    if path.stat().st_size > LARGEST:
+        raise ValueError(f"more than {LARGEST} bytes")
+    mesh: Any = trimesh.load(path, force="mesh")
+    corners = np.asarray(mesh.vertices, np.float64) * visual.scale
+    faces = np.asarray(mesh.faces, np.int64)
+    if not len(faces) or not np.isfinite(corners).all():
+        raise ValueError("no triangles, or a corner that is not finite")
+    return corners @ visual.pose.rotation.T + visual.pose.position, faces
