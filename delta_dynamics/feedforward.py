@@ -384,7 +384,7 @@ def _of_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:
     except MessageError as error:
         if first == 0:
             raise
-        raise MessageError(error.reason, f"counted from point {first}: {error}") from error
+        raise MessageError(error.reason, f"in the points from point {first} on: {error}") from error
 
 
 def _gate(robot: Robot, policy: LimitPolicy, effort: Array) -> tuple[Array, bool]:

@@ -57,7 +57,7 @@ def decimal(text: str) -> float:
     :raises ValueError: no number.
     """
     if "_" in text or not text.isascii():
-        raise ValueError(f"could not convert string to float: {text!r}")
+        raise ValueError(f"{text!r} is not a number")
     return float(text)
 
 

@@ -117,7 +117,7 @@ def design_command(
     load_on = None if wrench is None else numbers(wrench, 6, "fx,fy,fz,mx,my,mz")
     if tolerance:
         if vary or minimise or sweep or subject_to or out or picture:
-            raise typer.BadParameter("--tolerance goes with --path and --json only")
+            raise typer.BadParameter("--tolerance can only be combined with --path and --json")
         answer(*report.budget(machine, _sigmas(tolerance), path), as_json)
         return
     if path is None:
@@ -128,7 +128,7 @@ def design_command(
         if sweep not in SWEEPS:
             raise UnknownNameError("sweep", sweep, SWEEPS)
         if minimise or subject_to or picture:
-            raise typer.BadParameter("--sweep computes all quantities; no --minimise, --subject-to")
+            raise typer.BadParameter("--sweep computes all quantities; leave out --minimise and --subject-to")
         if out is None or out.suffix != ".nc":
             raise ParameterError("out", str(out), "a name that ends in .nc, for --sweep")
         count = samples ** len(box) if sweep == "grid" else samples
@@ -142,7 +142,7 @@ def design_command(
         answer(*report.write_sweep(machine, table, sweep, path, out), as_json)
         return
     if scheduler is not None:
-        raise typer.BadParameter("--scheduler goes with --sweep only")
+        raise typer.BadParameter("--scheduler needs --sweep")
     if not minimise:
         raise typer.BadParameter("give --minimise, --sweep or --tolerance")
     if out is not None and out.suffix not in (".yaml", ".yml"):

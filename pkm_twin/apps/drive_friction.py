@@ -46,7 +46,7 @@ def drive_friction_command(
         torque = columns["torque_nm"]
     elif "mass_kg" in columns:
         if not lever > 0.0:
-            raise ParameterError("lever", lever, "metres a radian, above 0, for a column mass_kg")
+            raise ParameterError("lever", lever, "metres per radian, above 0, for a column mass_kg")
         torque = GRAVITY * lever * columns["mass_kg"]
     else:
         raise ParameterError(str(table), ", ".join(columns), "a column 'mass_kg' or 'torque_nm'")

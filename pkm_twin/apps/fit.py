@@ -198,7 +198,7 @@ def _check_loads(text: str, out: Path) -> None:
         robot_of_data(parse_yaml(text, str(out)), out.stem)
     except ValueError as error:
         raise PkmTwinError(
-            f"the recordings make no robot, and {out} is not written: {error}"
+            f"the fitted values are not a valid robot, so {out} is not written: {error}"
         ) from None
 
 
@@ -227,7 +227,7 @@ def _fit_compliance(
     from pkm_twin.identification.elastic_fit import fit_elements
 
     if what.strip() != COMPLIANCE:
-        raise ParameterError("what", what, "compliance alone: it is fitted to other recordings")
+        raise ParameterError("what", what, "only compliance, because it is fitted to other recordings")
     text, machine = robot_text(robot)
     _ = machine.elastic
     with progress("fit", 2 * len(recordings)) as update:
@@ -345,7 +345,7 @@ def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tu
     r = read_recording(path, robot=machine, topics=topics, carried=carried, limited=False)
     if r.effort is None:
         raise BagError(
-            f"no efforts on {r.topics.joint_states}: a fit needs what the drives gave",
+            f"no efforts on {r.topics.joint_states}: a fit needs the efforts of the drives",
             path=path, reason="no efforts",
         )  # fmt: skip
     return Recorded(one_line(path.name, 100), r.time, r.q, r.effort, r.wrench), r.load
@@ -363,7 +363,7 @@ def _of_csv(path: Path, machine: Any, drive: str = "effort") -> Any:
         missing = [j for j in machine.joint_names if f"{j}.{what}" not in columns]
         if missing and what == drive and len(missing) == len(machine.joint_names):
             raise ParameterError(
-                str(path), "no efforts", f"columns {missing[0]}.effort ...: what the drives gave; "
+                str(path), "no efforts", f"efforts of the drives in columns {missing[0]}.effort ..., "
                 f"or {missing[0]}.current ... with --torque-constant"
             )  # fmt: skip
         if missing:

@@ -76,9 +76,9 @@ def record_kit(
     (excitation.mcap, friction.mcap, and a CSV of each), NOTES.md with what to note, and README.md
     with the commands that record and judge.
 
-    With --anonymise BAG writes a bag of joint states, wrenches and trajectories alone: joints are
-    joint_1, joint_2, ..., topics and frames have neutral names, time begins at zero, and metadata,
-    definitions and QoS are the program's own. Topics that are left out are listed.
+    With --anonymise BAG it writes a bag with only joint states, wrenches and trajectories: joints
+    are joint_1, joint_2, ..., topics and frames have neutral names, time begins at zero, and
+    metadata, definitions and QoS are written by pkm-twin. Topics that are left out are listed.
     """
     if anonymise is not None:
         _anonymise(anonymise, out, robot, keep_names, overwrite, json_output)

@@ -42,8 +42,8 @@ Tool = Annotated[
 Damping = Annotated[
     OptionalText,
     typer.Option(
-        help="damping ratio of all modes, or of each from the lowest on, the last one also of all "
-        "others; default: `modal_damping` of the robot file"
+        help="damping ratio of all modes, or one per mode from the lowest on; the last one also "
+        "holds for all higher modes; default: `modal_damping` of the robot file"
     ),
 ]
 Out = Annotated[

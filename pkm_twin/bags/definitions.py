@@ -167,7 +167,7 @@ def _field_text(field: Field) -> str:
 def parse_definition(type_name: str, text: str) -> Definition:
     """Parse a concatenated ``ros2msg`` definition; the first entry is the message itself.
 
-    :raises BagError: a line is not a field, a held type has no definition or holds itself, or there
+    :raises BagError: a line is not a field, a held type has no definition or contains itself, or there
         is more than MAX_DEFINITION_CHARACTERS, MAX_FIELDS, MAX_NESTING or MAX_BOUND of it.
     """
     if len(text) > MAX_DEFINITION_CHARACTERS:
@@ -201,11 +201,11 @@ def _resolve(
 ) -> None:
     """Add ``name`` and the types it holds to ``definition``; ``holders`` are those above it."""
     if name in holders:
-        raise BagError(f"message type {name} holds itself", reason="schema")
+        raise BagError(f"message type {name} contains itself", reason="schema")
     if name in definition:
         return
     if name not in texts:
-        raise BagError(f"no definition of {name}, which {holders[-1]} holds", reason="schema")
+        raise BagError(f"no definition of {name}, which {holders[-1]} contains", reason="schema")
     if len(holders) >= MAX_NESTING:
         raise BagError(
             f"{holders[0]} holds types {len(holders)} deep; at most {MAX_NESTING - 1}",

@@ -461,7 +461,7 @@ def read_magic(reader: RecordReader) -> None:
     reader.seek(len(MAGIC))
     reader.crc = zlib.crc32(MAGIC)
     if reader.size == len(MAGIC):
-        raise FormatError("the file holds the MCAP mark and nothing else", 0, "truncated")
+        raise FormatError("the file contains only the MCAP mark", 0, "truncated")
 
 
 def read_attachment(reader: RecordReader, at: int, length: int) -> tuple[bytes, tuple[object, ...]]:

@@ -183,7 +183,7 @@ def fit(
         if gained > GOOD:
             damping = 0.1 * damping if damping > LIGHT else 0.0
     raise UnsettledError(
-        "poses", problem, "poses to which a fit settles: measure more, or fit less (--only)"
+        "poses", problem, "poses for which the fit converges: measure more, or fit less (--only)"
     )
 
 

@@ -343,7 +343,7 @@ def _copies(entry: Any, count: int, path: str) -> list[Any]:
             continue
         if len(value) != count:
             raise ParameterError(
-                f"{path}.{'.'.join(keys)}", value, f"one number, or {count}, one a copy"
+                f"{path}.{'.'.join(keys)}", value, f"one number, or {count}, one per copy"
             )
         for k in range(count):
             inner = {keys[-1]: value[k]}

@@ -39,7 +39,7 @@ class _StrictLoader(yaml.SafeLoader):
             for key, _ in node.value:
                 name = self.construct_object(key, deep=True)
                 if name in seen:
-                    raise yaml.YAMLError(f"key {name!r} stands twice")
+                    raise yaml.YAMLError(f"key {name!r} occurs twice")
                 seen.add(name)
         return mapping
 

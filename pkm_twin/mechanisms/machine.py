@@ -229,10 +229,9 @@ class Machine(Robot):
     def description(self) -> str:
         """How many of what."""
         g = self.graph
-        return (
-            f"machine of {len(g.bodies)} bodies, {len(g.joints)} joints and {len(g.rods)} rods, "
-            f"{len(g.actuated)} joints actuated"
-        )
+        counts = {"bodies": len(g.bodies), "joints": len(g.joints), "rods": len(g.rods)}
+        parts = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        return f"machine with {len(g.actuated)} actuated joints: {parts}"
 
     @property
     def mobility(self) -> str:
@@ -418,7 +417,7 @@ class Machine(Robot):
             if member is not None and body != self.graph.platform:
                 return np.asarray(member.end - member.start, np.float64)
         raise ParameterError(
-            f"joints.{name}.limits.axis", None, "the direction that it swivels from, base axes"
+            f"joints.{name}.limits.axis", None, "the direction in the middle of its range, base axes"
         )
 
     def passive_entries(self) -> dict[str, dict[str, dict[str, Any]]]:

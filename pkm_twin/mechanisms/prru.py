@@ -146,7 +146,7 @@ class Prru(Robot):
     joints: tuple[str, ...] = schema.names(3, default=["slider_1", "slider_2", "slider_3"])
     members: Members | None = schema.section(Members, default=None)
 
-    description: ClassVar[str] = "3-PRRU head, three vertical sliders and two links a limb"
+    description: ClassVar[str] = "3-PRRU head, three vertical sliders and two links per limb"
     mobility: ClassVar[str] = "3: translation z, rotations alpha, beta (x, y, gamma follow)"
     coordinates: ClassVar[tuple[Coordinate, ...]] = (
         COORDINATES["z"], about_x("alpha"), about_y("beta"),

@@ -232,7 +232,7 @@ def kept(
     while passed(robot, run.slower(high), limits, wrench).max() > 1.0:
         low, high = high, 1.0 + 2.0 * (high - 1.0)
         if high > 1e3:
-            raise ParameterError("path", "any speed", "limits that a slow motion keeps")
+            raise ParameterError("path", "any speed", "limits that a slow motion meets")
     while high - low > KEPT:
         middle = 0.5 * (low + high)
         good = passed(robot, run.slower(middle), limits, wrench).max() <= 1.0

@@ -193,7 +193,7 @@ class _Lines:
             if self.arcs[k + 1]:
                 if self.arcs[k + 2]:
                     raise ParameterError(
-                        f"waypoint {k + 2}: arc", 1, "an arc's end: one point in its middle only"
+                        f"waypoint {k + 2}: arc", 1, "only one point between the ends of an arc"
                     )
                 result.append((self._arc(k), k + 2))
                 k += 2

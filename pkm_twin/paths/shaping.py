@@ -193,7 +193,7 @@ def shaped(
             check_positions(motion.robot, part, 0.0, singularity)
             return result
         plain = replace(plain, runs=tuple(run.slower(over) for run in plain.runs))
-    raise ParameterError("shaper", shaper, "limits that the shaped motion keeps")
+    raise ParameterError("shaper", shaper, "limits that the shaped motion meets")
 
 
 def _rates(

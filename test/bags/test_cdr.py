@@ -233,8 +233,8 @@ def test_definitions_as_rosbag2_records_them() -> None:
     [
         ("what?", "is not a field"),
         ("other/Type x", "no definition of other/Type, which a/T holds"),
-        ("P p\n===\nMSG: a/P\nP p", "a/P holds itself"),
-        ("T t", "a/T holds itself"),
+        ("P p\n===\nMSG: a/P\nP p", "a/P contains itself"),
+        ("T t", "a/T contains itself"),
         ("wstring w", "wstring"),
         ("int8 a\n===\nint8 b", "not 'MSG:'"),
         ("int8 a\nint8 a", "cannot be attributes"),

@@ -599,7 +599,7 @@ class TestSlices:
         message = make.trajectory(NAMES, [i * STEP for i in range(count)], rows, zero, zero)
         reason, text = reject(core(limitless).trajectory, message, NOW)
         assert reason == "unreachable"
-        assert f"counted from point {SLICE}: " in text and "sample 4" in text
+        assert f"in the points from point {SLICE} on: " in text and "sample 4" in text
 
 
 class TestClocks:

@@ -131,7 +131,7 @@ def vector(value: Any) -> Array:
     """Three numbers as an array, shape (3,)."""
     result = np.asarray(value, dtype=float)
     if result.shape != (3,):
-        raise UnfitError(f"three numbers wanted, got {value!r}")
+        raise UnfitError(f"expected three numbers, found {value!r}")
     return result
 
 
@@ -166,7 +166,7 @@ def expand(description: Description) -> dict[str, Any]:
                 for name, entry in _section(section, kind):
                     full = f"{name}_{number}"
                     if full in result[kind]:
-                        raise UnfitError(f"{kind}.{full} stands twice")
+                        raise UnfitError(f"{kind}.{full} occurs twice")
                     result[kind][full] = _turned(dict(entry or {}), turn, own, number)
     return result
 
