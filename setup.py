@@ -7,7 +7,7 @@ from setuptools import setup
 
 NAME = "pkm_twin"
 # ROS tools read it there, so it is the only place.
-VERSION = ElementTree.parse(Path(__file__).with_name("package.xml")).findtext("version")
+VERSION = ElementTree.parse(Path(__file__).with_name("package.xml")).findtext("version")  # noqa: S314  its own file
 
 setup(
     name=NAME,

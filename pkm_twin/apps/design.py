@@ -128,7 +128,9 @@ def design_command(
         if sweep not in SWEEPS:
             raise UnknownNameError("sweep", sweep, SWEEPS)
         if minimise or subject_to or picture:
-            raise typer.BadParameter("--sweep computes all quantities; leave out --minimise and --subject-to")
+            raise typer.BadParameter(
+                "--sweep computes all quantities; leave out --minimise and --subject-to"
+            )
         if out is None or out.suffix != ".nc":
             raise ParameterError("out", str(out), "a name that ends in .nc, for --sweep")
         count = samples ** len(box) if sweep == "grid" else samples

@@ -108,7 +108,9 @@ def _of_bag(path: Path, robot: Robot, topics: Sequence[str]) -> Deflected:
     r = read_recording(path, robot=robot, topics=others, limited=False)
     if r.topics.wrench is None:
         raise BagError(
-            "no wrench in the bag; a fit of compliance needs the applied wrench", path=path, reason="no wrench"
+            "no wrench in the bag; a fit of compliance needs the applied wrench",
+            path=path,
+            reason="no wrench",
         )
     wrenches, deflections = _messages(bag, r.topics.wrench, chosen)
     for what, found in ((r.topics.wrench, wrenches), (chosen, deflections)):

@@ -227,7 +227,9 @@ def _fit_compliance(
     from pkm_twin.identification.elastic_fit import fit_elements
 
     if what.strip() != COMPLIANCE:
-        raise ParameterError("what", what, "only compliance, because it is fitted to other recordings")
+        raise ParameterError(
+            "what", what, "only compliance, because it is fitted to other recordings"
+        )
     text, machine = robot_text(robot)
     _ = machine.elastic
     with progress("fit", 2 * len(recordings)) as update:
@@ -363,8 +365,8 @@ def _of_csv(path: Path, machine: Any, drive: str = "effort") -> Any:
         missing = [j for j in machine.joint_names if f"{j}.{what}" not in columns]
         if missing and what == drive and len(missing) == len(machine.joint_names):
             raise ParameterError(
-                str(path), "no efforts", f"efforts of the drives in columns {missing[0]}.effort ..., "
-                f"or {missing[0]}.current ... with --torque-constant"
+                str(path), "no efforts", f"columns {missing[0]}.effort ... of the drives, or "
+                f"{missing[0]}.current ... with --torque-constant"
             )  # fmt: skip
         if missing:
             raise ParameterError(str(path), ", ".join(columns), f"a column {missing[0]}.{what}")

@@ -70,7 +70,10 @@ def printer_command(
 
 def export_printer(
     robot: RobotName,
-    firmware: Annotated[Firmware, typer.Option(help="klipper, marlin or reprapfirmware; smoothieware cannot be written")],
+    firmware: Annotated[
+        Firmware,
+        typer.Option(help="klipper, marlin or reprapfirmware; smoothieware cannot be written"),
+    ],
     out: Annotated[
         OptionalPath, typer.Option(help="a file; default: print", callback=file_name)
     ] = None,

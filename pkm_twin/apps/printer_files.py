@@ -101,7 +101,9 @@ def printer_of(robot: Robot) -> Printer:
     g: Any = vars(robot)["geometry"]
     own = robot.controller
     if g.leans is not None and np.any(g.leans):
-        raise ParameterError("geometry.leans", g.leans.tolist(), "0, because no firmware supports them")
+        raise ParameterError(
+            "geometry.leans", g.leans.tolist(), "0, because no firmware supports them"
+        )
     if not (own.factors == 1.0).all():
         raise ParameterError("joint_map", own.factors.tolist(), "ratios and signs of 1")
     angles = np.degrees(g.angles)

@@ -101,7 +101,9 @@ def size(
     motors = [] if drives is None else sizes.read_motors(drives, motor)
     geared = ratio is not None or lead is not None
     if over_workspace is not None and (geared or motors):
-        raise typer.BadParameter("--over-workspace reports joints; leave out --drives, --ratio and --lead")
+        raise typer.BadParameter(
+            "--over-workspace reports joints; leave out --drives, --ratio and --lead"
+        )
     gear = Gear(ratio, lead, efficiency) if geared else None
     if over_workspace is not None:
         speed, change = numbers(over_workspace, 2, "SPEED,ACCELERATION")

@@ -50,7 +50,8 @@ function wrapped() {
   if (/[<&]/.test(title)) return title;
   const letters = plot.clientWidth / (0.56 * now('title.font.size')), lines = [''];
   for (const word of title.split(' '))
-    if ((lines.at(-1) + word).length < letters || !lines.at(-1)) lines.push(lines.pop() + word + ' ');
+    if ((lines.at(-1) + word).length < letters || !lines.at(-1))
+      lines.push(lines.pop() + word + ' ');
     else lines.push(word + ' ');
   return shown = lines.map(line => line.trim()).join('<br>');
 }

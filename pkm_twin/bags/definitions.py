@@ -167,8 +167,8 @@ def _field_text(field: Field) -> str:
 def parse_definition(type_name: str, text: str) -> Definition:
     """Parse a concatenated ``ros2msg`` definition; the first entry is the message itself.
 
-    :raises BagError: a line is not a field, a held type has no definition or contains itself, or there
-        is more than MAX_DEFINITION_CHARACTERS, MAX_FIELDS, MAX_NESTING or MAX_BOUND of it.
+    :raises BagError: a line is not a field, a held type has no definition or contains itself, or
+        there is more than MAX_DEFINITION_CHARACTERS, MAX_FIELDS, MAX_NESTING or MAX_BOUND of it.
     """
     if len(text) > MAX_DEFINITION_CHARACTERS:
         raise BagError(

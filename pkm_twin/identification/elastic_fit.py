@@ -387,8 +387,8 @@ def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
         if moved.max() < CONVERGED:
             return found, table
     raise PkmTwinError(
-        f"the compliances do not converge in {STEPS} steps: no compliance of this robot explains the "
-        "deflections, or loads in more directions are needed"
+        f"the compliances do not converge in {STEPS} steps: no compliance of this robot explains "
+        "the deflections, or loads in more directions are needed"
     )
 
 

@@ -222,8 +222,8 @@ def _nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones)
         cvxpy: Any = importlib.import_module("cvxpy")
     except ImportError:
         raise PkmTwinError(
-            "the data require a mass or an inertia that no body can have, and the nearest possible one "
-            f"needs cvxpy: {install('fit')}"
+            "the data require a mass or an inertia that no body can have, and the nearest possible "
+            f"one needs cvxpy: {install('fit')}"
         ) from None
     # In deviations from the solution: each counts alike, however much the data know of it.
     moved = scales[:, None] * factor

@@ -53,5 +53,7 @@ def numbers_below(
     if not below:
         raise ParameterError(field, None, "the path of numbers that the file gives")
     if entry.deviation is not None and len(below) > 1:
-        raise ParameterError(field, entry.deviation, "relative, because the path names several numbers")
+        raise ParameterError(
+            field, entry.deviation, "relative, because the path names several numbers"
+        )
     return below

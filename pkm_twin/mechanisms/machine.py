@@ -417,7 +417,9 @@ class Machine(Robot):
             if member is not None and body != self.graph.platform:
                 return np.asarray(member.end - member.start, np.float64)
         raise ParameterError(
-            f"joints.{name}.limits.axis", None, "the direction in the middle of its range, base axes"
+            f"joints.{name}.limits.axis",
+            None,
+            "the direction in the middle of its range, base axes",
         )
 
     def passive_entries(self) -> dict[str, dict[str, dict[str, Any]]]:

@@ -120,7 +120,9 @@ class Forces:
         """
         if robot.laws:
             raise ParameterError(
-                "friction", robot.laws[0], "only viscous, coulomb and offset friction for a fastest motion"
+                "friction",
+                robot.laws[0],
+                "only viscous, coulomb and offset friction for a fastest motion",
             )
         zero = np.zeros_like(q)
         rates = (zero, zero, first, -first, 2.0 * first)

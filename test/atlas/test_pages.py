@@ -214,8 +214,9 @@ def test_modes(browser, points, robot, small_atlases, tmp_path):
 
 
 FITTED = """(() => {
-  const seen = [...gd.querySelectorAll('.gtitle, .annotation-text, .cbtitle, .updatemenu-header, '
-    + '.updatemenu-button, .xtitle, .ytitle, .legendtext')].map(e => [e, e.getBoundingClientRect()]);
+  const texts = '.gtitle, .annotation-text, .cbtitle, .updatemenu-header, .updatemenu-button, '
+    + '.xtitle, .ytitle, .legendtext';
+  const seen = [...gd.querySelectorAll(texts)].map(e => [e, e.getBoundingClientRect()]);
   const boxes = seen.filter(([, box]) => box.width).map(([e, box]) => ({
     name: e.getAttribute('class') + ' ' + e.textContent, left: box.left, right: box.right,
     top: box.top, bottom: box.bottom}));

@@ -271,7 +271,9 @@ def write(folder, summary, watched, ages):
         axes[0, 1].plot(minutes, w.descriptors, style, label=name)
         axes[1, 0].plot(minutes, w.threads, style, label=name)
     titles = ("resident memory of each node", "open file descriptors", "threads")
-    for ax, title, what in zip(axes.flat, titles, ("memory (MiB)", "number", "number"), strict=False):
+    for ax, title, what in zip(
+        axes.flat, titles, ("memory (MiB)", "number", "number"), strict=False
+    ):
         ax.set(title=title, xlabel="time (min)", ylabel=what, ylim=(0, 1.2 * ax.get_ylim()[1]))
         ax.legend(ncols=2)
     last = axes[1, 1]

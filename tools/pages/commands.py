@@ -50,7 +50,9 @@ def whole(section: str, command: Any) -> str:
     for name, inner in getattr(command, "commands", {}).items():
         # The writer cuts them at 45 characters.
         line = f"* `{name}`: {inner.get_short_help_str(WIDE)}"
-        section = re.sub(rf"^\* `{name}`: .*$", lambda _, line=line: line, section, count=1, flags=re.M)
+        section = re.sub(
+            rf"^\* `{name}`: .*$", lambda _, line=line: line, section, count=1, flags=re.M
+        )
     return section
 
 

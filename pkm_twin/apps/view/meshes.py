@@ -29,11 +29,13 @@ def body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]:
     found: dict[str, list[tuple[Array, NDArray[np.int64]]]] = {}
     for visual in robot.visuals:
         try:
-            found.setdefault(visual.body, []).append(_read(visual))
+            part = _read(visual)
         except Exception as error:
             # Readers of meshes raise anything.
             why = one_line(str(error)) or type(error).__name__
             warn(visual.urdf, f"mesh {visual.mesh!r}: {why}; it is not shown")
+        else:
+            found.setdefault(visual.body, []).append(part)
     result = {}
     for body, parts in found.items():
         shifts = np.cumsum([0, *(len(corners) for corners, _ in parts[:-1])])
@@ -78,7 +80,7 @@ def _in_package(package: str, rest: str, folder: Path) -> Iterator[Path]:
 
 
 def _read(visual: Visual) -> tuple[Array, NDArray[np.int64]]:
-    import trimesh  # type: ignore[import-untyped]  # viser needs it as well
+    import trimesh  # viser needs it as well
 
     path = mesh_path(visual)
     if path.stat().st_size > LARGEST:

@@ -199,7 +199,10 @@ class Scene:
         for body, rotation in posture.rotations.items():
             at, turn = posture.place(body, np.zeros(3)), Rotation.from_matrix(rotation)
             if body == graph.platform:
-                origin, more = posture.place(body, graph.origin), Rotation.from_rotvec(deflection[3:])
+                origin, more = (
+                    posture.place(body, graph.origin),
+                    Rotation.from_rotvec(deflection[3:]),
+                )
                 at, turn = origin + deflection[:3] + more.apply(at - origin), more * turn
             result[body] = at, _quaternions(turn)
         return result

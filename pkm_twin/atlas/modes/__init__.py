@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Modes atlas: the lowest natural frequencies over the largest cylinder of the workspace, actuators locked."""
+"""Modes atlas: the lowest natural frequencies over the largest cylinder, actuators locked."""
 
 from typing import Final
 

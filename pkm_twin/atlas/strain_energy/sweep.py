@@ -226,7 +226,9 @@ def checked_wrench(wrench: ArrayLike | str) -> tuple[float, ...]:
         raise ParameterError("wrench", values.tolist(), "six finite numbers, N and N m")
     if not values.any():
         raise ParameterError(
-            "wrench", values.tolist(), "a wrench that is not zero, because a zero wrench stores no energy"
+            "wrench",
+            values.tolist(),
+            "a wrench that is not zero, because a zero wrench stores no energy",
         )
     return tuple(values.tolist())
 
