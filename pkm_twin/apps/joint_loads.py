@@ -281,8 +281,9 @@ def draw(motion: Motion, loads: list[JointLoad], path: Path) -> None:
         label = f"{name}, {AXES[axis]}"
         reached = np.cumsum(cycles.counts[down])
         axes[1].step(reached, cycles.ranges[down], color=colour, where="pre", label=label)
-    plots.label(axes[0], "time (s)", "force (N)")
-    plots.label(axes[1], "cycles of at least this range", "range (N)")
+    plots.label(axes[0], "time (s)", "force (N)", "force in the joints")
+    x = "cycles of at least this range"
+    plots.label(axes[1], x, "range (N)", "load cycles of one component")
     for ax in axes:
         if order:
             # Below: beside curves that fill their axes there is no room.

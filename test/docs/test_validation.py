@@ -101,7 +101,7 @@ class TestFrequenciesOfTheDeltaCu:
         # "in 1 and 2 that rod's elbow end moves the most"
         assert ends == ["forearm III 0/8"] * 2
         forearms = [k for k, name in enumerate(names) if name.startswith("forearm")]
-        pattern = r"4 to 6 are the forearms' bending \((\d+) % of it or more\)"
+        pattern = r"4 to 6 the forearms bend \(at least (\d+) % of the kinetic energy\)"
         assert_printed(PAGE, pattern, 100 * kinetic[3:][:, forearms].sum(1).min())
 
 

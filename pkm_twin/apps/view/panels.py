@@ -22,6 +22,8 @@ COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E
 SPEEDS: Final = ("0.25", "0.5", "1", "2", "4")
 WIDTH: Final = 330
 """Of the panel, pixels."""
+_MEASURED: Final = "measured"
+"""A wide curve, on which the model's is seen."""
 MARKED: Final = 0.25
 """How often the curves' mark of the present moves while a bag plays, s."""
 
@@ -46,9 +48,9 @@ class BagPanel:
             if len(self._times) > 1:
                 self._joint = gui.add_dropdown("joint", names, initial_value=names[0])
                 page.ask(self._joint.on_update, "joint", self._draw_joint)
-                efforts = {"measured": "#999999", "model": COLOURS[1]}
+                efforts = {_MEASURED: "#999999", "model": COLOURS[1]}
                 if self._measured is None:
-                    del efforts["measured"]
+                    del efforts[_MEASURED]
                 self._add_chart("effort of the joint", self._efforts(), efforts)
                 if self._measured is not None:
                     self._add_chart(
@@ -199,7 +201,9 @@ def _chart(
     points = uplot.Series_Points(show=False)
     series = [uplot.Series(label="t, s")]
     series += [
-        uplot.Series(label=name, stroke=colour, width=1.5, points=points)
+        uplot.Series(
+            label=name, stroke=colour, width=4.0 if name == _MEASURED else 1.5, points=points
+        )
         for name, colour in colours.items()
     ]
     curves = list(map(np.ascontiguousarray, values.T))
