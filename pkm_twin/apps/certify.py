@@ -166,6 +166,9 @@ def certify(
     judges: dict[str, Judge] = {}
     missing: dict[str, str] = {}
     for name in engines:
+        if name == first.name:
+            judges[name] = first
+            continue
         module, kind = ENGINES[name][0].split(":")
         try:
             maker: Callable[[Mapping[str, Any]], Judge] = getattr(

@@ -39,6 +39,8 @@ FIRST_STEP: Final = 1.0 / 16.0
 LEAST_STEP: Final = 1e-5
 FAR: Final = 0.02
 """Longest first correction of a good step, relative to the motion's own size."""
+KEPT: Final = 64
+"""Assemblies that are kept: the way from home takes far longer than what is asked for there."""
 SINGULAR: Final = 1e-9
 """Least singular value over the greatest: below it the rows do not determine the motion."""
 
@@ -167,8 +169,9 @@ class Maximal(Moving):
         """
         q = np.asarray(q, dtype=float)
         if q.tobytes() not in self._assembled:
-            # One is enough: torques, place and masses are asked for one state after another.
-            self._assembled = {q.tobytes(): self._follow(q - self.machine.home)}
+            if len(self._assembled) == KEPT:
+                self._assembled.clear()
+            self._assembled[q.tobytes()] = self._follow(q - self.machine.home)
         self._state = self._assembled[q.tobytes()]
         return self._state
 
