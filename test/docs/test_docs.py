@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
+import io
 import json
-import os
 import re
 import runpy
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -30,27 +29,22 @@ def blocks(page):
         yield language, block, named and named[1]
 
 
-def run(language, block, folder, twin):
-    """What a block prints."""
+def run(language, block, twin):
+    """What a block prints, in the folder that it is to work in."""
     if language == "bash":
         results = [typed_line(twin, line) for line in block.splitlines()]
         assert all(result.code == 0 for result in results), [result.err for result in results]
         return "".join(result.out for result in results)
-    done = subprocess.run(
-        [sys.executable, "-c", block],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONPATH": f"{DOCS.parent}{os.pathsep}."},
-    )
-    assert done.returncode == 0, f"{block}\n{done.stderr}"
-    return done.stdout
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(compile(block, "page", "exec"), {"__name__": "__main__"})
+    return printed.getvalue()
 
 
 @pytest.mark.timeout(900)
 def test_a_new_machine_from_an_empty_file_to_torques(tmp_path, twin, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    # For what the page has the reader write and import.
+    monkeypatch.syspath_prepend(tmp_path)
     printed, ran = "", 0
     for language, block, name in blocks("new_machine.md"):
         if name:
@@ -58,7 +52,7 @@ def test_a_new_machine_from_an_empty_file_to_torques(tmp_path, twin, monkeypatch
         elif language == "text":
             assert printed.strip() == block.strip()
         else:
-            printed = run(language, block, tmp_path, twin)
+            printed = run(language, block, twin)
             ran += 1
     assert ran >= 7
     lines = (tmp_path / "my_delta.yaml").read_text().splitlines()
@@ -74,7 +68,7 @@ def test_a_printer_from_its_configuration_to_the_next(tmp_path, twin, monkeypatc
     page = (DOCS / "partial_measurements.md").read_text(encoding="utf-8")
     (tmp_path / "examples").symlink_to(DOCS.parent / "examples")
     ((language, block, _),) = blocks("partial_measurements.md")
-    printed = run(language, block, tmp_path, twin)
+    printed = run(language, block, twin)
     for kind, before, after in zip(("height", "distance"), (1.02, 1.06), (2, 3), strict=True):
         (row,) = re.findall(rf"^\W+{kind}\W+\d+\W+([\d.]+)\W+([\d.]+)", printed, re.M)
         assert [float(x) for x in row] == pytest.approx([before, after / 1e3], abs=5e-3 * before)
@@ -89,7 +83,7 @@ def test_a_printer_from_its_configuration_to_the_next(tmp_path, twin, monkeypatc
 @pytest.mark.parametrize("page", ["export_fmu.md", "simulators.md"])
 def test_the_blocks_of_a_page_run(page, tmp_path, twin, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    printed = [run(language, block, tmp_path, twin) for language, block, _ in blocks(page)]
+    printed = [run(language, block, twin) for language, block, _ in blocks(page)]
     assert len(printed) == 2 and all(printed)
 
 
@@ -108,7 +102,7 @@ def test_commands_of_the_design_page(tmp_path, twin, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for language, block, _ in blocks("design.md"):
         if language == "bash":
-            run(language, block, tmp_path, twin)
+            run(language, block, twin)
     assert {path.name for path in tmp_path.iterdir()} >= {"better.yaml", "better.png", "box.nc"}
 
 

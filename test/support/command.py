@@ -11,7 +11,9 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,8 @@ from pkm_twin.apps import cli
 REPOSITORY = Path(__file__).parents[2]
 SHELL = (">", ">>", "<", "|", "&&", ";", "2>")
 """Words of a line that are the shell's."""
+LIBRARIES = ("matplotlib.pyplot", "scipy.optimize", "xarray")
+"""What commands import when they need it: once here, and not in each fork."""
 _FORK = multiprocessing.get_context("fork")
 
 # The tree of all commands takes longer to build than most commands to run.
@@ -55,11 +59,15 @@ def command(capture: Any, *arguments: Any) -> Result:
 
 
 def typed_line(twin: Callable[..., Result], line: str) -> Result:
-    """What a line gives as it is typed; one that redirects or pipes, in processes of its own.
+    """What a line gives as it is typed; one that pipes, in processes of its own.
 
     :param twin: the fixture that runs a command in this process.
     """
-    words = shlex.split(line)[1:]
+    program, *words = shlex.split(line)
+    if program == "pkm-twin" and words[-2:-1] == [">"] and not set(words[:-2]) & set(SHELL):
+        result = twin(*words[:-2])
+        Path(words[-1]).write_text(result.out, encoding="utf-8")
+        return replace(result, out="")
     if not set(words) & set(SHELL):
         return twin(*words)
     program = f"{shlex.quote(sys.executable)} -m pkm_twin.apps.cli"
@@ -78,6 +86,9 @@ def forked(
     :param limit: bytes at which its files end.
     :param out: a device that takes what it prints.
     """
+    for name in LIBRARIES:
+        with suppress(ImportError):
+            import_module(name)
     outputs = [folder / "stdout.txt", folder / "stderr.txt"]
     outputs[0].touch()
     opened = [Path(out) if out else outputs[0], outputs[1]]

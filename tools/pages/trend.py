@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Final
 
 from examples.nights import record
+from pkm_twin.apps import cli
 
 SHOWN: Final = 5
 """Lines of the output on the page, besides the last."""
@@ -18,12 +20,14 @@ SHOWN: Final = 5
 
 def printed(history, picture):
     """Lines that the command prints for a history; it draws the picture."""
-    command = [sys.executable, "-m", "pkm_twin.apps.cli", "trend", str(history)]
-    command += ["--picture", str(picture), "--overwrite"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    # 1: something drifts.
-    assert done.returncode == 1, done.stderr
-    return [line for line in done.stdout.splitlines() if line != str(picture)]
+    out = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(out):
+            cli.main(["trend", str(history), "--picture", str(picture), "--overwrite"])
+    except SystemExit as end:
+        # Something drifts.
+        assert end.code == 1, out.getvalue()
+    return [line for line in out.getvalue().splitlines() if line != str(picture)]
 
 
 def rewritten(text, picture):
