@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from pkm_twin.apps import drawing, fit_report
+from pkm_twin.atlas import plots
 from pkm_twin.bags.reader import BagWriter, open_bag
 from test.support.command import Result
 
@@ -34,7 +36,22 @@ def process():
     return run
 
 
-def rewrite(source, target, change=None, begin=0.0, seconds=2.0, metadata=None, topics=None):
+@pytest.fixture(scope="module", autouse=True)
+def coarse_pictures():
+    """Pictures of few pixels, with their parts where matplotlib puts them at first."""
+    drawn = plots.rendered
+
+    def coarse(figure, dpi, form="png"):
+        figure.set_layout_engine("none")
+        return drawn(figure, 30, form)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (plots, drawing, fit_report):
+            patch.setattr(module, "rendered", coarse)
+        yield
+
+
+def rewrite(source, target, change=None, begin=0.0, seconds=1.2, metadata=None, topics=None):
     """Copy a part of a bag, each decoded message through ``change``: None leaves it out.
 
     ``change(topic, message, time)`` gets the time since the bag's first message, s.
@@ -61,8 +78,8 @@ def rewrite(source, target, change=None, begin=0.0, seconds=2.0, metadata=None, 
 
 @pytest.fixture(scope="session")
 def sample(tmp_path_factory):
-    """Two seconds of the Delta's recording, before the payload; not to be changed."""
-    return rewrite(DELTA, tmp_path_factory.mktemp("sample") / "sample.mcap")
+    """A part of the Delta's recording, before the payload; not to be changed."""
+    return rewrite(DELTA, tmp_path_factory.mktemp("sample") / "sample.mcap", seconds=1.5)
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,7 @@ from pkm_twin.apps.topics import JOINT_STATE, WRENCH
 from pkm_twin.bags.reader import BagWriter, inspect, open_bag, read_messages
 from test.bags.folders import make_folder
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
+from test.support.command import forked
 from test.support.mapped import sides
 from test.support.robots import massless, often, partly_long
 
@@ -178,7 +179,9 @@ def test_the_allowed_residual_is_an_option(twin, tmp_path, sample):
     assert twin("check", sample, "--residual", "0.001").code == 1
     scaled = rewrite(DELTA, tmp_path / "scaled.mcap", scaled_efforts)
     assert twin("check", scaled, "--residual", "0.5").code == 0
+    # A part, not percent.
     assert twin("check", sample, "--residual", "-1").code == 2
+    assert twin("check", sample, "--residual", "5").code == 2
 
 
 class TestRobot:
@@ -318,19 +321,19 @@ class TestDamage:
 
 
 class TestRecover:
-    def test_then_check(self, process, twin, sample, tmp_path):
+    def test_then_check(self, twin, sample, tmp_path):
         whole = sample.read_bytes()
         cut, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
         cut.write_bytes(whole[: len(whole) * 3 // 4])
-        refused = process("check", cut)
+        refused = forked(tmp_path, "check", cut)
         assert refused.code == 3
         promised = int(re.search(r"(\d+) intact messages", refused.one_line_error())[1])
-        done = process("recover", cut, saved, "--json")
+        done = forked(tmp_path, "recover", cut, saved, "--json")
         assert (done.code, done.err) == (3, "")
         facts = json.loads(done.out)
         assert not facts["lossless"]
         assert facts["messages"] == promised == inspect(saved).message_count
-        assert promised > 1000
+        assert promised > 800
         assert cut.read_bytes() == whole[: len(whole) * 3 // 4]
         assert twin("check", saved).code == 0
 
@@ -542,8 +545,8 @@ class TestPayload:
         assert twin("check", silent, "--payload", "0.15").code == 1
         assert twin("check", silent, "--payload", "0.6", "--load-times", "1.275,9").code == 1
 
-    def test_the_option_goes_before_the_bag(self, twin):
-        text = twin("check", DELTA, "--payload", "0").out
+    def test_the_option_goes_before_the_bag(self, twin, sample):
+        text = twin("check", sample, "--payload", "0").out
         assert "payload: 0 kg, all the time, as asked for" in text
 
     @pytest.mark.parametrize(
@@ -612,8 +615,3 @@ def test_only_regular_files(twin, tmp_path):
     for path, kind in ((tmp_path / "x.mcap", "FIFO"), ("/dev/zero", "device")):
         assert kind in twin("check", path).one_line_error()
         assert kind in twin("recover", path, tmp_path / "new.mcap").one_line_error()
-
-
-def test_the_allowed_residual_is_a_part_not_percent(twin, sample):
-    result = twin("check", sample, "--residual", "5")
-    assert (result.code, result.out) == (2, "")

@@ -159,11 +159,6 @@ class TestCompliance:
         assert plain.code == 0
         assert plain.out == dashed.out
 
-    def test_no_load_has_no_dominant_element(self, twin):
-        assert parse(twin("compliance", "upr_rpu", *POSE, "--json", "--wrench", "0,0,0,0,0,0").out)[
-            "dominant"
-        ] == ("none")
-
     def test_a_tie_is_told_as_one(self, twin):
         text = twin("compliance", "upr_rpu", *POSE, "--wrench", "0,0,1,0,0,0")
         data = parse(twin("compliance", "upr_rpu", *POSE, "--json").out)

@@ -12,7 +12,6 @@ import pytest
 from pkm_twin.apps.history import Measured, Series, append, measure, read_history
 from pkm_twin.apps.recorded import read_recording
 from pkm_twin.apps.trend import judged
-from test.commands.conftest import DELTA
 from test.support.command import command
 from test.support.nights import night
 from test.support.robots import load, often
@@ -63,7 +62,7 @@ def _write(arguments):
 
 def test_many_write_at_once_and_none_is_lost(tmp_path):
     path = tmp_path / "nights.db"
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
+    with multiprocessing.get_context("fork").Pool(2) as pool:
         pool.map(_write, [(path, k) for k in range(24)], chunksize=1)
     # The same once more takes the place of the first.
     _write((path, 7))
@@ -116,11 +115,11 @@ def test_nights_of_a_folder_to_a_verdict(tmp_path, capsys, monkeypatch, rng):
     assert (tmp_path / "trend.png").stat().st_size
 
 
-def test_a_folder_is_judged_bag_by_bag(tmp_path, capsys):
+def test_a_folder_is_judged_bag_by_bag(tmp_path, capsys, sample):
     folder = tmp_path / "night"
     folder.mkdir()
-    (folder / "good.mcap").write_bytes(DELTA.read_bytes())
-    (folder / "bad.mcap").write_bytes(DELTA.read_bytes()[:5000])
+    (folder / "good.mcap").write_bytes(sample.read_bytes())
+    (folder / "bad.mcap").write_bytes(sample.read_bytes()[:5000])
     done = command(
         capsys, "check", folder, "--jobs", 2, "--history", tmp_path / "h.db", "--json"
     )  # fmt: skip
