@@ -11,8 +11,11 @@ import h5py
 
 from pkm_twin.atlas.soundness import SEALED, seal
 from pkm_twin.atlas.store import AtlasError, open_atlas
+from test.support.robots import partly_long
 
-NAMES = ["modes prru", "workspace delta_cu", "isotropy delta_cu"]
+NAMES = partly_long(
+    ["modes prru", "workspace delta_cu", "isotropy delta_cu"], "modes prru", "workspace delta_cu"
+)
 SEAL = 56
 """Bytes of the checksum and of the mark before it."""
 

@@ -87,7 +87,7 @@ def test_circles_end_where_the_first_ray_does(name):
     """Each height alone, its rays one test at a time: whole inside, not whole a hair beyond."""
     robot = load(name)
     low, high = height_range(robot)
-    found = circles(robot, np.linspace(low, high, 41))
+    found = circles(robot, np.linspace(low, high, 31))
     assert (found.radius > 0.0).sum() > 4
     turn = np.arange(RAYS) * (2 * np.pi / RAYS)
     step = largest_distance(robot) / 340

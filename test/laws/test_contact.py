@@ -138,13 +138,19 @@ class TestDepartures:
         assert not touching[len(touching) // 2 :].any()
 
 
-@pytest.mark.parametrize("rest", [0.0, 0.5])
-@pytest.mark.parametrize("what", ["as the model", "both, 3 % each"])
+@pytest.mark.parametrize(
+    "case",
+    partly_long(
+        [(what, rest) for what in ("as the model", "both, 3 % each") for rest in (0.0, 0.5)],
+        ("as the model", 0.5), ("both, 3 % each", 0.0),
+    ),
+)  # fmt: skip
 @massive
 def test_free_motion_touches_nothing_from_the_first_sample_on(
-    name: str, what: str, rest: float
+    name: str, case: tuple[str, float]
 ) -> None:
     """Also where the friction is large beside the efforts so far: the fastest moves come later."""
+    what, rest = case
     robot, rng = load(name), np.random.default_rng([30, *name.encode()])
     stream = measured(robot, rng, moves(robot, rng, 40, 0.7, rest), **OFF[what])
     first = Stream(*(part[: round((rest + 2.0) * RATE)] for part in vars(stream).values()))

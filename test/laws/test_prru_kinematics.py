@@ -188,11 +188,6 @@ def test_closure(robot: Prru, tilt: float) -> None:
     np.testing.assert_allclose(found[:, 10], payload, atol=1e-13)
 
 
-def test_forward_undoes_inverse(robot: Prru) -> None:
-    pose = poses(5000, reach(robot))
-    np.testing.assert_allclose(robot.forward(robot.inverse(pose)), pose, atol=1e-12)
-
-
 @pytest.mark.parametrize("branch", ["below", "above"])
 @pytest.mark.parametrize("seed", partly_long(range(3), 0))
 def test_forward_undoes_inverse_for_any_size(branch: str, seed: int) -> None:

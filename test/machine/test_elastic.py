@@ -17,6 +17,7 @@ from stiffness_monitor.structure import structural_model
 from test.machine.random_machines import plain
 from test.support.robots import load, rigid
 
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
 POSES = [[0.02, 0.03, -0.33], [-0.05, 0.0, -0.36]]
 
 

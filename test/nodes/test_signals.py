@@ -6,14 +6,18 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import product
 from pathlib import Path
 
 import pytest
 
 from test.nodes.harness import DEADLINE, end_with_parent
+from test.support.robots import partly_long
 from test.support.waiting import wait_until
 
 pytest.importorskip("rclpy", exc_type=ImportError)
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 LINES = """
 import os, signal, sys
@@ -116,9 +120,15 @@ def hearing():
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("loaded", ["_multiarray_umath", "_rclpy_pybind11"])
-def test_a_signal_in_an_import_ends_a_node_quietly(domain, loaded, number):
+@pytest.mark.parametrize(
+    "case",
+    partly_long(
+        product(("_multiarray_umath", "_rclpy_pybind11"), SIGNALS),
+        ("_multiarray_umath", SIGNALS[0]), *(("_rclpy_pybind11", each) for each in SIGNALS[1:]),
+    ),
+)  # fmt: skip
+def test_a_signal_in_an_import_ends_a_node_quietly(domain, case):
+    loaded, number = case
     code = "from pkm_twin.apps.nodes import command_gate; command_gate()"
     process = subprocess.Popen(
         [sys.executable, "-c", code],
