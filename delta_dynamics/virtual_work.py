@@ -78,8 +78,10 @@ def torques(robot: Robot) -> Kernel:
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Generalised mass matrix on the actuated joints, payload included, shape (..., n, n)."""
     # A simulation asks for one sample, several thousand times a second.
-    flat = robot.first_output("mass matrix", lambda: masses_kernel(robot), robot.inertial, q)
-    return _square(robot, flat)
+    one = robot.call_one("mass matrix", lambda: masses_kernel(robot), robot.inertial, q)
+    if one is not None:
+        return one.reshape(robot.joints_count, -1)
+    return _square(robot, robot.evaluate(masses_kernel(robot), robot.inertial, q)[0])
 
 
 def masses_kernel(robot: Robot) -> Kernel:

@@ -154,13 +154,6 @@ class Robot(Mechanism):
             return None
         return result
 
-    def first_output(
-        self, name: str, kernel: Callable[[], Kernel], p: Array, q: ArrayLike, *inputs: ArrayLike
-    ) -> Array:
-        """First output of a program; one sample as fast as can be. Errors as :meth:`evaluate`."""
-        one = self.call_one(name, kernel, p, q, *inputs)
-        return self.evaluate(kernel(), p, q, *inputs)[0] if one is None else one
-
     def evaluate(self, kernel: Kernel, p: Array, q: ArrayLike, *inputs: ArrayLike) -> list[Array]:
         """Outputs of a program of joint positions and other inputs.
 
@@ -321,7 +314,8 @@ class Robot(Mechanism):
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a singularity on the way from home.
         """
-        return self.first_output("forward", self._forward_kernel, _NONE, q)
+        pose = self.call_one("forward", self._forward_kernel, _NONE, q)
+        return self.evaluate(self.engine.forward, _NONE, q)[0] if pose is None else pose
 
     def _forward_kernel(self) -> Kernel:
         return self.engine.forward
@@ -400,7 +394,10 @@ class Robot(Mechanism):
         edge of the workspace); see ``kinematics.singularity``. It is dimensionless and independent
         of the machine's scale. Errors as :meth:`forward`.
         """
-        measure = self.first_output("singularity", self.singularity_kernel, _NONE, q)
+        one = self.call_one("singularity", self.singularity_kernel, _NONE, q)
+        if one is not None:
+            return np.asarray(one[0])
+        (measure,) = self.evaluate(self.singularity_kernel(), _NONE, q)
         return np.asarray(measure[..., 0], np.float64)
 
     def singularity_kernel(self) -> Kernel:
