@@ -18,8 +18,9 @@ from delta_dynamics.reactions import Balance, Reactions, balance, known_alone
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import reaction_directions
-from pkm_twin.machine.graph import BASE, Joint
+from pkm_twin.machine.graph import Joint
 from pkm_twin.machine.members import Beam, Section
+from pkm_twin.robot.outline import Posture
 from pkm_twin.robot.robot import Robot
 
 SOFT: Final = 1e-9
@@ -73,26 +74,13 @@ def _energy(robot: Robot, q: Array, found: Balance) -> Array:
 
 def _matrices(robot: Robot, q: Array, found: Balance) -> dict[str, Array]:
     """Twice the energy by element, a quadratic form (..., unknowns, unknowns)."""
-    structure = robot.elastic
-    rotations, origins = robot.placements(q)
-    batch = found.value.shape[:-1]
-    at = robot.engine.tree.at
-
-    def turned(body: str, vector: Array) -> Array:
-        if body == BASE:
-            return np.broadcast_to(vector, (*batch, 3))
-        return np.broadcast_to(rotations[body] @ vector, (*batch, 3))
-
-    def placed(body: str, point: Array) -> Array:
-        if body == BASE:
-            return np.broadcast_to(point, (*batch, 3))
-        return origins[body] + turned(body, point - at[body])
-
+    structure, batch = robot.elastic, found.value.shape[:-1]
+    posture = Posture(robot, np.broadcast_to(q, (*batch, robot.joints_count)))
     result: dict[str, Array] = {}
     for beam in structure.beams:
         if beam.parts[0] in robot.graph.rods or beam.parts[0] == robot.graph.platform:
             continue
-        ends = [np.asarray(placed(*place), np.float64) for place in (beam.inner, beam.outer)]
+        ends = [posture.place(*place) for place in (beam.inner, beam.outer)]
         matrix = _of_beam(robot, beam, structure.sections[beam.name], ends, found)
         result[beam.element] = result.get(beam.element, 0.0) + matrix
     for k, joint in enumerate(found.joints):
@@ -101,7 +89,7 @@ def _matrices(robot: Robot, q: Array, found: Balance) -> dict[str, Array]:
         if values is None or not known:
             continue
         weights, axes = _along(known[0], [float(v) for v in values])
-        world = np.stack([turned(*one) for one in axes], -1)
+        world = np.stack([posture.turn(*one) for one in axes], -1)
         if len(axes) == 2:
             normal = np.cross(world[..., 0], world[..., 1])
             normal /= np.linalg.norm(normal, axis=-1, keepdims=True)

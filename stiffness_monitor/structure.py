@@ -179,15 +179,11 @@ def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
     :raises UnreachableError: no assembly of the robot; a singularity as ``forward``.
     """
     structure, posture = robot.elastic, Posture(robot, q)
-
-    def turn(body: str, vector: Array) -> Array:
-        return np.asarray(posture.rotations[body] @ vector, np.float64)
-
     model = posed(
-        plan_of(robot.graph, structure), posture.place, turn, structure.sections.__getitem__,
-        lambda joint, k: float(structure.compliances[joint][k]),
+        plan_of(robot.graph, structure), posture.place, posture.turn,
+        structure.sections.__getitem__, lambda joint, k: float(structure.compliances[joint][k]),
     )  # fmt: skip
-    return replace(model, bodies=tuple(_masses(robot, posture.place, turn)))
+    return replace(model, bodies=tuple(_masses(robot, posture.place, posture.turn)))
 
 
 def posed(

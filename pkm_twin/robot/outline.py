@@ -38,19 +38,26 @@ class Bar:
 
 
 class Posture:
-    """Where points of bodies stand in one joint state, shape (n,); errors as ``forward``."""
+    """Where points and directions of bodies are at joint positions, shape (..., n).
+
+    ``rotations``: of bodies since home, shape (..., 3, 3). Errors as :meth:`Robot.forward`.
+    """
 
     def __init__(self, robot: Robot, q: ArrayLike) -> None:
         rotations, origins = robot.placements(q)
-        at = robot.engine.tree.at
-        self.rotations = {BASE: np.eye(3)} | rotations
-        self._shifts = {BASE: np.zeros(3)} | {
+        at, batch = robot.engine.tree.at, np.shape(q)[:-1]
+        self.rotations = {BASE: np.broadcast_to(np.eye(3), (*batch, 3, 3))} | rotations
+        self._shifts = {BASE: np.zeros((*batch, 3))} | {
             name: origins[name] - rotations[name] @ at[name] for name in rotations
         }
 
     def place(self, body: str, point: Array) -> Array:
-        """A point of a body, given at home, (3,) m: where it is now."""
+        """A point of a body, given at home, (3,) m: where it is now, (..., 3)."""
         return np.asarray(self.rotations[body] @ point + self._shifts[body], np.float64)
+
+    def turn(self, body: str, vector: Array) -> Array:
+        """A direction of a body, given at home, (3,): where it points now, (..., 3)."""
+        return np.asarray(self.rotations[body] @ vector, np.float64)
 
 
 def telescope(joint: Joint) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.machine.graph import BASE
+from pkm_twin.robot.outline import Posture
 from pkm_twin.robot.robot import Robot
 
 
@@ -16,20 +16,8 @@ def passive_values(robot: Robot, q: ArrayLike) -> Array:
 
     :param q: joint positions, shape (..., n); errors as ``robot.forward``.
     """
-    rotations, origins = robot.placements(q)
-    at = robot.engine.tree.at
-    batch = np.shape(q)[:-1]
-    ground = np.broadcast_to(np.eye(3), (*batch, 3, 3))
-
-    def turned(body: str, vector: Array) -> Array:
-        return np.asarray((ground if body == BASE else rotations[body]) @ vector, np.float64)
-
-    def placed(body: str, point: Array) -> Array:
-        if body == BASE:
-            return np.broadcast_to(point, (*batch, 3))
-        return np.asarray(origins[body] + turned(body, point - at[body]), np.float64)
-
-    values = []
+    posture, values = Posture(robot, q), []
+    turned, placed = posture.turn, posture.place
     for limit in robot.passive_limits:
         axis = turned(limit.inner, limit.axis)
         if limit.kind == "slide":
