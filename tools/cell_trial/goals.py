@@ -170,6 +170,26 @@ class Cell:
             lambda: self.states and any(self.states[-1].reference.velocities), "motion"
         )
 
+    def least_share(self, since: float) -> float:
+        """The least share of the weight that an effort has had since then, moving or not."""
+        stamps, share = self._shares()
+        return float(share[stamps > since].min())
+
+    def _shares(self) -> tuple[Any, Any]:
+        """Stamps, s, and the effort of the joint that bears most, over the weight there."""
+        joint = int(np.abs(self.weight).argmax())
+        efforts = np.array([m.output.effort[joint] for m in self.states])
+        stamps = np.array([_seconds(m.header.stamp) for m in self.states])
+        return stamps, efforts / self.weight[joint]
+
+    def pass_by(self, seconds: float) -> None:
+        """Until the controller's states are of so long after now: on a busy machine they wait."""
+        until = _now(self) + seconds
+        self.other.until(
+            lambda: self.states and _seconds(self.states[-1].header.stamp) > until,
+            "states of the controller",
+        )
+
     def ended(self, result: Any, timeout: float = 60.0) -> tuple[str, str, float]:
         """How a goal has ended, what was said of it, and after how long, s."""
         began = time.monotonic()
@@ -181,14 +201,12 @@ class Cell:
         """After a stop: the share of the weight that the last effort has, for how long the effort
         was less than nine tenths of it, s, and the greatest miss of the last one, relative.
         """
-        stamps = np.array([_seconds(m.header.stamp) for m in self.states])
         efforts = np.array([m.output.effort for m in self.states])
         moving = np.array([any(m.reference.velocities) for m in self.states])
+        stamps, share = self._shares()
         after = (stamps > since) & ~moving
         if not after.any():
             return np.nan, np.nan, np.nan
-        joint = int(np.abs(self.weight).argmax())
-        share = efforts[:, joint] / self.weight[joint]
         lost = float((after & (share < 0.9)).sum()) / self.rate
         miss = np.abs(efforts[-1] - self.weight).max() / np.abs(self.weight).max()
         return float(share[-1]), lost, float(miss)
@@ -207,7 +225,7 @@ def _say(cell: Cell, case: str, ended: tuple[str, str, float] | None, since: flo
     if ended is not None:
         words.append(f"{ended[0]} after {ended[2]:.2f} s, {ended[1]!r};")
     if since is not None:
-        cell.other.spin(0.7)
+        cell.pass_by(0.7)
         share, lost, miss = cell.weight_lost(since)
         words.append(
             f"effort at the end {share:.4f} of the weight (miss {miss:.1e}), "
@@ -250,9 +268,11 @@ def replaced(cell: Cell) -> None:
     _, first = cell.send(cell.goal())
     cell.until_moving()
     cell.other.spin(0.3)
+    since = _now(cell)
     _, second = cell.send(cell.goal(1.0))
     _say(cell, "replaced by another goal, the first", cell.ended(first), None)
-    _say(cell, "replaced by another goal, the second", cell.ended(second), None)
+    _say(cell, "replaced by another goal, the second", cell.ended(second), _now(cell))
+    print(f"  least effort since the second was sent: {cell.least_share(since):.2f} of the weight")
 
 
 def twin_ends(cell: Cell) -> None:
