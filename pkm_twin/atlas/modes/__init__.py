@@ -8,7 +8,7 @@ from pkm_twin.atlas.sweep import Kind
 
 KIND: Final = Kind(
     "modes", figures.FIGURES, page.page, page.title,
-    help="First plot: the frame at rest (grey) and in the chosen mode, magnified; squares are on the "
-    "ground. The button animates it, the slider stops it. Second plot: the frequency of the mode "
-    "over the workspace; at each pose the modes are numbered from the lowest frequency.",
+    help="First plot: the frame at rest (grey) and in the chosen mode, magnified; squares are on "
+    "the ground. The button animates it, the slider stops it. Second plot: the frequency of the "
+    "mode over the workspace; at each pose the modes are numbered from the lowest frequency.",
 )  # fmt: skip
