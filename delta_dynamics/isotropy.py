@@ -20,8 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.cones import largest
-from delta_dynamics.least_form import least_direction
+from delta_dynamics.least_form import MOST, largest, least_direction
 from delta_dynamics.terms import frictionless
 from delta_dynamics.virtual_work import body_mass_matrix, mass_matrix
 from pkm_twin.codegen.arrays import Array, doubles, finite, vectors
@@ -157,13 +156,14 @@ def max_driving_force_range(
 
     On the ellipsoid of Xdot with that energy, scaled to the unit sphere, every F_d is a
     quadratic form y' G y. The greatest |F_d| is an eigenvalue, exact. The least F_max is the
-    minimum of the largest of these forms (:func:`least_direction`): exact with up to three pose
-    coordinates, with more proven to be within a millionth of itself (``cones.RESOLUTION``).
+    minimum of the largest of these forms (:func:`least_direction`), exact too.
 
     :param pose: shape (..., m).
     :param acceleration: Xddot, a number or shape (..., m).
-    :raises SearchError: more than three pose coordinates, and forms that take too long.
+    :raises ParameterError: more than three pose coordinates.
     """
+    if len(robot.pose_names) > MOST:
+        raise ParameterError("pose", len(robot.pose_names), f"at most {MOST} pose coordinates")
     where = doubles(pose, "poses")
     platform, _ = energy_matrices(robot, where)
     back = np.sqrt(2 * _energy(energy)) * _inverse_root(robot, platform)

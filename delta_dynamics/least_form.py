@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The unit vector at which the largest of several quadratic forms is least.
 
-Of up to three coordinates every point where a minimum can be is known in closed form. Of more, what
-descents find is proven, or bettered, by a search of all directions (:mod:`.cones`).
+Of up to three coordinates every point where a minimum can be is known in closed form.
 """
 
 from __future__ import annotations
@@ -13,37 +12,28 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics.cones import largest, lowest
 from pkm_twin.codegen.arrays import Array
 
-_STARTS: Final = 256
-"""Directions that a descent begins from, best first, where no solution in closed form is known."""
-_DESCENTS: Final = 24
-_ROUNDS: Final = 8
-"""Most rounds of a descent."""
+MOST: Final = 3
+"""Coordinates of which every minimum is known."""
+
+
+def largest(forms: Array, y: Array) -> Array:
+    """max_a |y' G_a y|, shape (...); forms (..., n, m, m), y (..., m)."""
+    return np.asarray(np.abs(np.einsum("...i,...aij,...j->...a", y, forms, y)).max(-1), np.float64)
 
 
 def least_direction(forms: Array) -> Array:
     """Unit y, shape (m,), with the least max_a |y' G_a y| of symmetric forms G, shape (n, m, m).
 
-    At a minimum one form is stationary, or two are equal but for their sign and one of them is
-    stationary along the cone y' H y = 0 on which they are, or three are equal. For m up to 3 all
-    such points are known: eigenvectors; common points, in the projective plane, of the cone and
-    the cubic det(y, G y, H y) = 0; common points of two cones. The best of them all is the answer,
-    to rounding. For greater m it is the best of many descents and of a branch and bound, that
-    proves it: as :func:`.cones.lowest` says.
-
-    :raises SearchError: more than three coordinates, and forms that take too long.
+    For m up to 3. At a minimum one form is stationary, or two are equal but for their sign and one
+    of them is stationary along the cone y' H y = 0 on which they are, or three are equal. All such
+    points are known: eigenvectors; common points, in the projective plane, of the cone and the
+    cubic det(y, G y, H y) = 0; common points of two cones. The best of them all is the answer, to
+    rounding.
     """
     points = _candidates(forms)
-    if forms.shape[-1] <= 3:
-        return np.asarray(points[largest(forms, points).argmin()], np.float64)
-    start = np.random.default_rng(0).normal(size=(_STARTS, forms.shape[-1]))
-    start = np.concatenate([points, _units(start)])
-    order = np.argsort(largest(forms, start))[:_DESCENTS]
-    points = np.concatenate([points, [_descended(forms, y) for y in start[order]]])
-    best = points[largest(forms, points).argmin()]
-    return lowest(forms, best, lambda y: _descended(forms, y))
+    return np.asarray(points[largest(forms, points).argmin()], np.float64)
 
 
 def _units(vectors: Array) -> Array:
@@ -51,7 +41,7 @@ def _units(vectors: Array) -> Array:
 
 
 def _candidates(forms: Array) -> Array:
-    """Unit vectors, shape (k, m), among which the least one is if m is at most 3."""
+    """Unit vectors, shape (k, m), among which the least one is."""
     count, size = forms.shape[:2]
     pairs = list(itertools.combinations(range(count), 2))
     cones = [(a, forms[a] - sign * forms[b]) for a, b in pairs for sign in (1.0, -1.0)]
@@ -59,7 +49,7 @@ def _candidates(forms: Array) -> Array:
     for cone in (*forms, *(cone for _, cone in cones)):
         values, vectors = np.linalg.eigh(cone)
         if values[0] < 0.0 < values[-1]:
-            # Of two coordinates both lines of the cone, of more some.
+            # Of two coordinates both lines of the cone, of three some.
             x = math.sqrt(values[-1]) * vectors[:, 0]
             z = math.sqrt(-values[0]) * vectors[:, -1]
             found.append(np.stack([x + z, x - z]))
@@ -139,55 +129,3 @@ def _common_points(conic: Array, curve: Array) -> Array:
         half = -(b + np.copysign(np.sqrt(np.maximum(b * b - 4 * a * c, 0.0)), b)) / 2
         v = np.concatenate([half / a, c / half])
     return np.stack([np.ones(len(v)), np.concatenate([u, u]), v], -1)
-
-
-def _descended(forms: Array, start: Array) -> Array:
-    """A local minimum of max_a |y' G_a y| below a point, to rounding of the least form.
-
-    Least t with -t <= y' G_a y <= t. Each round counts in what the one before it has left: of forms
-    of several scales the small ones would be lost beside the large.
-    """
-    best, least = start, float(largest(forms, start))
-    for _ in range(_ROUNDS):
-        if not least > 0.0:
-            break
-        y = _descent(forms / least, best)
-        value = math.inf if y is None else float(largest(forms, y))
-        if y is None or not value < least * (1 - 1e-12):
-            break
-        best, least = y, value
-    return best
-
-
-def _descent(g: Array, start: Array) -> Array | None:
-    """One round from a point where the greatest form is one; None where it leads nowhere."""
-    size = len(start)
-
-    def room(x: Array) -> Array:
-        values = np.einsum("i,aij,j->a", x[:size], g, x[:size])
-        return np.concatenate([x[size] - values, x[size] + values])
-
-    def slope(x: Array) -> Array:
-        gradients = 2 * np.einsum("aij,j->ai", g, x[:size])
-        return np.column_stack([np.vstack([-gradients, gradients]), np.ones(2 * len(g))])
-
-    rules = (
-        {"type": "ineq", "fun": room, "jac": slope},
-        {
-            "type": "eq",
-            "fun": lambda x: x[:size] @ x[:size] - 1.0,
-            "jac": lambda x: np.append(2 * x[:size], 0.0),
-        },
-    )
-    # Here, as it is half of what a node's start would take.
-    from scipy.optimize import minimize  # type: ignore[import-untyped]
-
-    found = minimize(
-        lambda x: x[size],
-        np.append(start, 1.0),
-        jac=lambda x: np.append(np.zeros(size), 1.0),
-        constraints=rules,
-        method="SLSQP",
-        options={"ftol": 1e-15, "maxiter": 200},
-    ).x[:size]
-    return _units(found) if np.isfinite(found).all() and found.any() else None

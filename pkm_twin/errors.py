@@ -181,15 +181,6 @@ class SingularityError(PkmTwinError, ValueError):
         self.bound = bound
 
 
-class SearchError(PkmTwinError):
-    """A search that did not finish: ``done`` steps of at most ``most``."""
-
-    def __init__(self, what: str, done: int, most: int) -> None:
-        super().__init__(f"{what} not found in {done} steps, at most {most}")
-        self.done = done
-        self.most = most
-
-
 class MessageError(PkmTwinError, ValueError):
     """A ROS message that is rejected.
 

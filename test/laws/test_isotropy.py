@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the two isotropy indices, and the statements that the 3-PRRU paper makes of them."""
 
+import math
+
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from delta_dynamics import (
-    cones,
     dynamics_terms,
     energy,
     energy_matrices,
@@ -20,9 +22,8 @@ from delta_dynamics import (
     spread,
     tilted_pose,
 )
-from delta_dynamics.cones import largest
-from delta_dynamics.least_form import _descended, least_direction
-from pkm_twin.errors import ParameterError, SearchError, SingularityError
+from delta_dynamics.least_form import largest, least_direction
+from pkm_twin.errors import ParameterError, SingularityError
 from test.support import robots
 from test.support.robots import load, loaded, loaded_like, partly_long, random_joints
 
@@ -154,6 +155,55 @@ def test_max_driving_force_range_holds_all_samples_and_is_attained(name, robot, 
     assert (around >= ends.least[..., None] * (1 - 1e-11)).all()
 
 
+def descend(forms, start):
+    """A local minimum of max_a |y' G_a y| below a point, to rounding of the least form.
+
+    Least t with -t <= y' G_a y <= t. Each round counts in what the one before it has left: of forms
+    of several scales the small ones would be lost beside the large.
+    """
+    best, least = start, float(largest(forms, start))
+    for _ in range(8):
+        if not least > 0.0:
+            break
+        y = descent(forms / least, best)
+        value = math.inf if y is None else float(largest(forms, y))
+        if y is None or not value < least * (1 - 1e-12):
+            break
+        best, least = y, value
+    return best
+
+
+def descent(g, start):
+    """One round from a point where the greatest form is one; None where it leads nowhere."""
+    size = len(start)
+
+    def room(x):
+        values = np.einsum("i,aij,j->a", x[:size], g, x[:size])
+        return np.concatenate([x[size] - values, x[size] + values])
+
+    def slope(x):
+        gradients = 2 * np.einsum("aij,j->ai", g, x[:size])
+        return np.column_stack([np.vstack([-gradients, gradients]), np.ones(2 * len(g))])
+
+    rules = (
+        {"type": "ineq", "fun": room, "jac": slope},
+        {
+            "type": "eq",
+            "fun": lambda x: x[:size] @ x[:size] - 1.0,
+            "jac": lambda x: np.append(2 * x[:size], 0.0),
+        },
+    )
+    found = minimize(
+        lambda x: x[size],
+        np.append(start, 1.0),
+        jac=lambda x: np.append(np.zeros(size), 1.0),
+        constraints=rules,
+        method="SLSQP",
+        options={"ftol": 1e-15, "maxiter": 200},
+    ).x[:size]
+    return found / np.linalg.norm(found) if np.isfinite(found).all() and found.any() else None
+
+
 SCALES = ([1.0, 1.0, 1.0], [1.0, 1e-3, 30.0], [1e4, 1.0, 1e-4])
 
 
@@ -174,7 +224,7 @@ def test_the_least_direction_is_global(shift, scales):
         assert np.linalg.norm(y) == pytest.approx(1, abs=1e-14)
         sampled = largest(forms, dense)
         best = np.argsort(sampled)[:12]
-        descended = [float(largest(forms, _descended(forms, x))) for x in dense[best]]
+        descended = [float(largest(forms, descend(forms, x))) for x in dense[best]]
         # Forms that cancel leave the rounding of the largest one.
         rounding = 16 * np.finfo(float).eps * np.abs(forms).max()
         assert value <= min(descended) + 1e-9 * value + rounding
@@ -194,11 +244,11 @@ def test_the_least_direction_of_mirrored_limbs():
         value = largest(forms, least_direction(forms))
         sampled = largest(forms, dense)
         best = dense[np.argsort(sampled)[:8]]
-        assert value <= min(largest(forms, _descended(forms, x)) for x in best) + 1e-9 * value
+        assert value <= min(largest(forms, descend(forms, x)) for x in best) + 1e-9 * value
 
 
 @pytest.mark.parametrize("count", partly_long(range(1, 7), 1, 6))
-@pytest.mark.parametrize("size", partly_long([1, 2, 4, 6], 1, 2, 6))
+@pytest.mark.parametrize("size", [1, 2, 3])
 def test_the_least_direction_of_any_number_of_forms_and_coordinates(count, size):
     rng = np.random.default_rng(count)
     forms = rng.normal(size=(count, size, size))
@@ -210,73 +260,18 @@ def test_the_least_direction_of_any_number_of_forms_and_coordinates(count, size)
     assert largest(forms, y) <= largest(forms, dense).min() * (1 + 1e-12)
 
 
-def scaled_forms(seed, size, count=None):
-    """Random symmetric forms, each some ten times as large as the one before."""
-    forms = np.random.default_rng(seed).normal(size=(count or size, size, size))
-    scales = np.geomspace(1e-3, 30.0, len(forms))
-    return (forms + forms.swapaxes(-1, -2)) * scales[:, None, None]
-
-
-@pytest.mark.parametrize(("size", "seed", "times"), [(4, 9, 3.0), (5, 3, 35.0), (6, 4, 33.0)])
-def test_the_least_direction_of_forms_of_several_scales(size, seed, times):
-    """Far below what descents from six other places find, the best of 500."""
-    forms = scaled_forms(seed, size)
-    value = largest(forms, least_direction(forms))
-    start = np.random.default_rng(seed).normal(size=(500, size))
-    start /= np.linalg.norm(start, axis=-1, keepdims=True)
-    best = np.argsort(largest(forms, start))[:6]
-    others = min(float(largest(forms, _descended(forms, y))) for y in start[best])
-    assert times * value < others
-
-
-def test_no_cone_is_ruled_out_that_holds_a_lower_value(rng):
-    """Whatever is closed, its densest sample is not below the goal; and small ones are closed."""
-    closed = 0
-    for size, count in ((2, 2), (4, 4), (5, 3), (6, 6)):
-        forms = scaled_forms(size, size, count)
-        forms /= np.abs(forms).max()
-        centre = rng.normal(size=(60, 1, size))
-        corners = centre + np.geomspace(1e-3, 1.0, 60)[:, None, None] * rng.normal(
-            size=(60, size, size)
-        )
-        corners /= np.linalg.norm(corners, axis=-1, keepdims=True)
-        inside = rng.exponential(size=(60, 400, size)) @ corners
-        inside /= np.linalg.norm(inside, axis=-1, keepdims=True)
-        least = np.array([largest(forms, y).min() for y in inside])
-        for goal in np.quantile(least, [0.1, 0.5, 0.9]):
-            undecided = cones._open(forms, corners, float(goal))
-            assert (least[~undecided] >= goal).all()
-            closed += int((~undecided).sum())
-    assert closed > 100
-
-
-def test_halves_of_a_cone_are_the_cone(rng):
-    """Every direction of a cone is in one of its halves, and both are narrower."""
-    cone = rng.normal(size=(1, 5, 5))
-    cone /= np.linalg.norm(cone, axis=-1, keepdims=True)
-    halves = cones._halved(cone)
-    y = rng.exponential(size=(200, 5)) @ cone[0]
-    inside = [(np.linalg.solve(half.T, y.T) >= -1e-12).all(0) for half in halves]
-    assert (inside[0] | inside[1]).all() and inside[0].any() and inside[1].any()
-    edges = [(half @ half.T).min() for half in (cone[0], *halves)]
-    assert min(edges[1:]) >= edges[0]
-
-
-def test_a_search_without_end_says_so(monkeypatch):
-    monkeypatch.setattr(cones, "MOST", 100)
-    with pytest.raises(SearchError, match="at most 100"):
-        least_direction(scaled_forms(0, 6))
-
-
 @pytest.mark.parametrize("name", ["five_bar", "stewart"])
 def test_ranges_of_machines_of_two_and_six_freedoms(name, rng):
     robot = loaded(name)
     pose = robot.forward(random_joints(robot, rng, 1)[0])
     samples = rng.normal(size=(3000, len(pose)))
-    for range_of, index in (
-        (max_driving_force_range, max_driving_force),
-        (energy_transfer_range, energy_transfer),
-    ):
+    pairs = [(energy_transfer_range, energy_transfer)]
+    if len(pose) <= 3:
+        pairs.append((max_driving_force_range, max_driving_force))
+    else:
+        with pytest.raises(ParameterError, match="at most 3 pose coordinates"):
+            max_driving_force_range(robot, pose)
+    for range_of, index in pairs:
         ends, values = range_of(robot, pose), index(robot, pose, samples)
         assert ends.least <= values.min() and values.max() <= ends.greatest
         at = index(robot, pose, ends.directions)

@@ -51,10 +51,6 @@ ERRORS = {
         "keep `robot.singularity(q)` above 0.05 or more "
         "([singularity index](engine.md#singularities-kinematicssingularity))",
     ),
-    errors.SearchError: (
-        errors.SearchError("the least over all directions", 100000, 100000),
-        "use a machine with fewer actuated joints, or another pose",
-    ),
     errors.MessageError: (
         errors.MessageError("not finite", "position of arm_1 is nan"),
         "see the reasons below",
