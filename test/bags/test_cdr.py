@@ -232,7 +232,7 @@ def test_definitions_as_rosbag2_records_them() -> None:
     ("text", "expected"),
     [
         ("what?", "is not a field"),
-        ("other/Type x", "no definition of other/Type, which a/T holds"),
+        ("other/Type x", "no definition of other/Type, which a/T contains"),
         ("P p\n===\nMSG: a/P\nP p", "a/P contains itself"),
         ("T t", "a/T contains itself"),
         ("wstring w", "wstring"),

@@ -248,7 +248,7 @@ def nested(depth: int) -> bytes:
         ("p/msg/M", b"bool b\nbool b", "cannot be attributes"),
         ("p/msg/M", b"bool class", "cannot be attributes"),
         ("p/msg/M", b"nonsense " * 20_000, "is not a field|no definition"),
-        ("p/msg/M", b"p/M m", "holds itself"),
+        ("p/msg/M", b"p/M m", "contains itself"),
         ("", b"bool b", "not a type name"),
         ("M", b"bool b", "not a type name"),
         ("p/msg/M\0", b"bool b", "not a type name"),

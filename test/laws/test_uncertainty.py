@@ -137,7 +137,7 @@ def test_what_scales_all_scales_the_answer() -> None:
     ("entry", "text"),
     [
         ({"inertia.mass": {"deviation": 0.1}}, r"uncertainty\.inertia\.mass"),
-        ({"inertia": {"deviation": 0.1}}, "it stands for several numbers"),
+        ({"inertia": {"deviation": 0.1}}, "names several numbers"),
         ({"inertia.arm_mass": {}}, "expected either"),
         ({"inertia.arm_mass": {"deviation": -1.0}}, "at least 0"),
         ({"inertia.arm_mass": {"relative": 1.5}}, "at most 1"),
