@@ -114,7 +114,7 @@ def test_refusals(capsys, tmp_path, monkeypatch, without_wrench):
         assert done.code == 1, text
         assert text in done.one_line_error()
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "compliance,friction")
-    assert "compliance alone" in done.one_line_error()
+    assert "only compliance" in done.one_line_error()
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "compliance", "--payload", "1")
     assert "no --per-copy, --payload" in done.one_line_error()
     done = command(capsys, "fit", "upr_rpu", plain, "--what", "complience")
