@@ -186,7 +186,7 @@ def test_cut_at_every_byte(tmp_path: Path, make_bag: Callable[..., Path], step: 
     ("content", "reason", "text"),
     [
         (b"", "empty", "is empty"),
-        (MAGIC, "truncated", "nothing else"),
+        (MAGIC, "truncated", "contains only the MCAP mark"),
         (MAGIC[:5], "truncated", "cut short"),
         (b"SQLite format 3\x00" + bytes(100), "not_mcap", "SQLite"),
         (b"#ROSBAG V2.0\n", "not_mcap", "ROS 1"),
