@@ -11,9 +11,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +23,6 @@ from pkm_twin.apps import cli
 REPOSITORY = Path(__file__).parents[2]
 SHELL = (">", ">>", "<", "|", "&&", ";", "2>")
 """Words of a line that are the shell's."""
-LIBRARIES = ("matplotlib.pyplot", "scipy.optimize", "xarray")
-"""What commands import when they need it: once here, and not in each fork."""
 _FORK = multiprocessing.get_context("fork")
 
 # The tree of all commands takes longer to build than most commands to run.
@@ -86,9 +82,6 @@ def forked(
     :param limit: bytes at which its files end.
     :param out: a device that takes what it prints.
     """
-    for name in LIBRARIES:
-        with suppress(ImportError):
-            import_module(name)
     outputs = [folder / "stdout.txt", folder / "stderr.txt"]
     outputs[0].touch()
     opened = [Path(out) if out else outputs[0], outputs[1]]
