@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every shipped bag, played by `ros2 bag play --clock` into its nodes: the share that is answered.
 
-    python3 tools/cell_trial/bags.py [--rate 1.0] [BAG ...]
+    python3 tools/cell_trial/bags.py [--rate 1.0] [-p NAME:=VALUE] [BAG ...]
 
 Prints the table of the page on bags. Needs a sourced Jazzy workspace with pkm_twin and rosbag2.
 """
@@ -39,7 +39,9 @@ def folder() -> Path:
     return Path(__file__).resolve().parents[2] / "bags"
 
 
-def played(other: Peer, bag: Path, robot: str, name: str, rate: float) -> dict[str, str]:
+def played(
+    other: Peer, bag: Path, robot: str, name: str, rate: float, given: list[str]
+) -> dict[str, str]:
     """The values of a node's diagnostics after the whole bag."""
     told: dict[str, str] = {}
 
@@ -49,7 +51,7 @@ def played(other: Peer, bag: Path, robot: str, name: str, rate: float) -> dict[s
                 told.update({pair.key: pair.value for pair in status.values})
 
     heard = other.node.create_subscription(DiagnosticArray, "/diagnostics", diagnosed, 100)
-    parameters = (f"mechanism:={robot}", "use_sim_time:=true", *NODES[name][2])
+    parameters = (f"mechanism:={robot}", "use_sim_time:=true", *NODES[name][2], *given)
     twin = node(name, parameters=parameters)
     with closing(twin):
         other.until(lambda: told, lambda: f"{name}'s diagnostics\n{twin.output}")
@@ -68,6 +70,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("bags", nargs="*", help="names; default: all")
     parser.add_argument("--rate", type=float, default=1.0)
+    parser.add_argument("-p", "--parameter", action="append", default=[], help="of the nodes")
     given = parser.parse_args()
     print("| bag | node | messages in the bag | answered | rejected | lost |")
     print("|---|---|---|---|---|---|")
@@ -81,7 +84,7 @@ def main() -> None:
                 source, answered, _ = NODES[name]
                 if not inside[source]:
                     continue
-                told = played(other, bag, robot, name, given.rate)
+                told = played(other, bag, robot, name, given.rate, given.parameter)
                 rejects = [
                     f"{value} {key.partition(': ')[2]}"
                     for key, value in told.items()

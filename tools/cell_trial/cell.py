@@ -127,13 +127,19 @@ class Peer:
         what: str | Callable[[], str],
         timeout: float = DEADLINE,
         every: float = 0.005,
+        needs: Iterable[Process] = (),
     ) -> Any:
         """Take messages until the condition holds; its value.
 
+        :param needs: processes without which it cannot hold.
         :raises TimeoutError: it never did.
+        :raises RuntimeError: one of the processes has ended.
         """
         end = time.monotonic() + timeout
         while not (found := condition()):
+            for process in needs:
+                if not process.alive():
+                    raise RuntimeError(f"{process.process.args} has ended\n{process.output}")
             if time.monotonic() > end:
                 raise TimeoutError(what if isinstance(what, str) else what())
             self._executor.spin_once(timeout_sec=every)

@@ -74,7 +74,11 @@ def running(other: Peer, trials: int) -> int:
     for _ in range(trials):
         commands.clear()
         process = gate()
-        other.until(lambda: commands and list(commands[-1].data) == EFFORT, "torques forwarded")
+        other.until(
+            lambda: commands and list(commands[-1].data) == EFFORT,
+            "torques forwarded",
+            needs=[process],
+        )
         other.spin(random.uniform(0.0, 0.1))
         between = 10.0 ** random.uniform(-5, -0.7)
         process.signal(signal.SIGINT)

@@ -204,7 +204,9 @@ def cell(other: Peer, seconds: float, extra: tuple[str, ...], priority: int) -> 
     try:
         names = [f"/{s}/{n}" for s in MACHINES for n in path]
         other.until(
-            lambda: all(name in watch.values for name in names), lambda: f"nodes\n{cell_.output}"
+            lambda: all(name in watch.values for name in names),
+            lambda: f"nodes\n{cell_.output}",
+            needs=(*sims, cell_),
         )
         processes = _children(cell_) | {
             f"machine_sim {space}": sim.process.pid
@@ -236,7 +238,9 @@ def kilohertz(other: Peer, seconds: float, priority: int) -> bool:
         for name in ("delta_dynamics", "command_gate")
     }
     try:
-        other.until(lambda: len(watch.values) >= 3, "diagnostics of three nodes")
+        other.until(
+            lambda: len(watch.values) >= 3, "diagnostics of three nodes", needs=nodes.values()
+        )
         print(f"one machine at 1 kHz, {seconds:.0f} s:")
         return watched(watch, {name: p.process.pid for name, p in nodes.items()}, seconds)
     finally:
@@ -271,6 +275,7 @@ def stops(other: Peer, times: int, *, one: bool) -> bool:
                     f"torques through the gates; commands {watch.commands}, nodes "
                     f"{watch.messages}\n{launch.output[-2000:]}"
                 ),
+                needs=running,
             )
             other.spin(random.uniform(0.5, 1.5))
             count = len(_children(launch))
