@@ -30,7 +30,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 TRACED = {m.__file__ for m in (nodes, run, signals)}
 
 class Node:
-    made, parting = 0, False
+    made, parting, thread_priority = 0, False, 0
     def __init__(self):
         os.write(OUT, b"made ")
     def farewell(self):
