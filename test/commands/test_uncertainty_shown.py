@@ -8,7 +8,8 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin.apps.check import DEVIATIONS, motion, read_recording, residuals
+from pkm_twin.apps.check import DEVIATIONS, motion, residuals
+from pkm_twin.apps.recorded import read_recording
 from test.commands.conftest import DELTA, rewrite
 from test.support.command import command
 from test.support.robots import load, parameters_of
