@@ -70,14 +70,21 @@ def test_a_node_that_waits_for_its_turn_answers_everything(
     executor, beginning, tmp_path, monkeypatch
 ):
     starved = []
+    stage = dataclasses.replace(demo.STAGES[0], bag="beginning")
+    node, topic = executor.get_nodes()[0], stage.answer
 
     @contextmanager
     def process(command):
-        """As the demonstration's, and stopped for a while again and again."""
+        """As the demonstration's, and once it publishes stopped for a while again and again.
+
+        Before, it can hold what every new process on this machine needs.
+        """
         with demo_recorder.process(command) as child:
             ended = threading.Event()
 
             def starve():
+                while not (node.count_publishers(topic) or ended.wait(0.1)):
+                    pass
                 while not ended.wait(0.4):
                     os.kill(child.pid, signal.SIGSTOP)
                     time.sleep(0.4)
@@ -93,15 +100,14 @@ def test_a_node_that_waits_for_its_turn_answers_everything(
                 thread.join()
 
     monkeypatch.setattr(demo, "process", process)
-    stage = dataclasses.replace(demo.STAGES[0], bag="beginning")
     recording = tmp_path / "demo.mcap"
     with BagWriter(recording) as writer:
-        recorder = demo_recorder.Recorder(executor.get_nodes()[0], writer)
+        recorder = demo_recorder.Recorder(node, writer)
         demo.run_stage(stage, beginning, recorder, executor, Console(quiet=True))
     assert starved
     sent = [stamp_of(m.message.header) for m in read_messages(beginning, ["/joint_states"])]
-    topic = f"/beginning{stage.answer}"
-    answered = [stamp_of(m.message.header) for m in read_messages(recording, [topic])]
+    recorded = read_messages(recording, [f"/beginning{topic}"])
+    answered = [stamp_of(m.message.header) for m in recorded]
     # All but the window's first, and none of these out of turn.
     assert len(answered) > SAMPLES - FILLING
     assert answered == sent[SAMPLES - len(answered) :]
