@@ -8,6 +8,7 @@ import yaml
 
 from pkm_twin import load
 from pkm_twin.errors import FileError, ParameterError, one_line
+from test.support.robots import parameters_of
 
 MISSING = object()
 
@@ -50,3 +51,16 @@ def refusal(loader, *arguments):
     assert isinstance(error, FileError) or error.bound in str(error)
     assert "\n" not in str(error)
     return error
+
+
+@pytest.fixture
+def with_members(tmp_path):
+    """A shipped robot whose members section is replaced."""
+
+    def make(name, members):
+        data = parameters_of(name) | {"members": members}
+        path = tmp_path / "robot.yaml"
+        path.write_text(yaml.safe_dump(data))
+        return load(path)
+
+    return make
