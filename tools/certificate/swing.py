@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from bags.recording.pinocchio_models import DeltaEngine, LoopEngine, PrruEngine
+from bags.recording.pinocchio_delta import DeltaEngine
+from bags.recording.pinocchio_loops import LoopEngine
+from bags.recording.pinocchio_prru import PrruEngine
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import forward_dynamics
 from pkm_twin import Robot
