@@ -23,7 +23,7 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import forward_dynamics
 from pkm_twin import Robot
 from test.support.robots import parameters_of
-from tools.certificate.lagrange import energies
+from tools.certificate.lagrange_machines import energies
 from tools.certificate.machines import build
 
 DURATION = 10.0
