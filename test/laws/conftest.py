@@ -54,13 +54,6 @@ def refusal(loader, *arguments):
 
 
 @pytest.fixture
-def with_members(tmp_path):
+def with_members(load_data):
     """A shipped robot whose members section is replaced."""
-
-    def make(name, members):
-        data = parameters_of(name) | {"members": members}
-        path = tmp_path / "robot.yaml"
-        path.write_text(yaml.safe_dump(data))
-        return load(path)
-
-    return make
+    return lambda name, members: load_data(parameters_of(name) | {"members": members})

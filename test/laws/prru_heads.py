@@ -29,6 +29,13 @@ MACHINES: dict[str, dict[str, Any]] = {
         "limb_length": 0.7,
     },
 }
+LENGTHS = {"base_radius": 0.35, "platform_radius": 0.25, "limb_length": 0.6}
+MASSES = {
+    "slider_mass": 8.0,
+    "lower_link_mass": 3.5,
+    "upper_link_mass": 2.5,
+    "platform_mass": 25.0,
+}
 TILTED_INERTIA = ((0.6, 0.05, -0.02), (0.05, 0.5, 0.03), (-0.02, 0.03, 0.8))
 
 
@@ -36,12 +43,7 @@ def machine(
     name: str, symmetric: bool = False, geometry: Mapping[str, Any] = {}, **inertia: Any
 ) -> Prru:
     """A machine with all masses and inertias; ``symmetric``: equal for all three limbs."""
-    lengths = {"base_radius": 0.35, "platform_radius": 0.25, "limb_length": 0.6}
-    masses = {
-        "slider_mass": 8.0,
-        "lower_link_mass": 3.5,
-        "upper_link_mass": 2.5,
-        "platform_mass": 25.0,
+    details = {
         "link_com": 0.4,
         "lower_link_inertia": [0.11, 0.02],
         "upper_link_inertia": [0.08, 0.03],
@@ -53,8 +55,8 @@ def machine(
         Prru,
         {
             "mechanism": "prru",
-            "geometry": lengths | MACHINES[name] | dict(geometry),
-            "inertia": masses | inertia,
+            "geometry": LENGTHS | MACHINES[name] | dict(geometry),
+            "inertia": MASSES | details | inertia,
             "payload": {} if symmetric else payload,
         },
     )

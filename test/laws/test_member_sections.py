@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
@@ -17,12 +16,10 @@ from test.support.robots import ELASTIC, load, parameters_of
 @pytest.mark.parametrize(
     ("name", "section"), [("delta", "members"), ("prru", "members"), ("upr_rpu", "inertia")]
 )
-def test_a_file_without_the_section_loads_and_is_refused_by_name(name, section, tmp_path):
+def test_a_file_without_the_section_loads_and_is_refused_by_name(name, section, load_data):
     data = parameters_of(name)
     del data[section]
-    path = tmp_path / "robot.yaml"
-    path.write_text(yaml.safe_dump(data))
-    robot = load(path)
+    robot = load_data(data)
     with pytest.raises(ParameterError) as caught:
         natural_frequencies(robot, robot.home())
     assert caught.value.field == section

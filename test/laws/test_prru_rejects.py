@@ -12,9 +12,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
-from test.laws.prru_heads import THIRDS, TIMES, Motion, machine, place, sliders
-
-MASSES = ("slider_mass", "lower_link_mass", "upper_link_mass", "platform_mass")
+from test.laws.prru_heads import LENGTHS, MACHINES, MASSES, TIMES, Motion, machine, place, sliders
 
 
 def test_slider_out_of_reach() -> None:
@@ -103,13 +101,7 @@ def test_refused_parameters(section: str, key: str, value: object) -> None:
     robot = machine("paper")
     data = {
         "mechanism": "prru",
-        "geometry": {
-            "base_radius": 0.35,
-            "platform_radius": 0.25,
-            "limb_length": 0.6,
-            "azimuths": list(THIRDS),
-            "branch": "below",
-        },
+        "geometry": LENGTHS | MACHINES["paper"],
         "inertia": dict.fromkeys(MASSES, 1.0),
     }
     assert schema.build(Prru, data).joint_names == robot.joint_names
@@ -131,22 +123,7 @@ def test_defaults_are_thin_rods_and_a_thin_disc() -> None:
     )
     short = schema.build(
         Prru,
-        {
-            "mechanism": "prru",
-            "geometry": {
-                "base_radius": 0.35,
-                "platform_radius": 0.25,
-                "limb_length": 0.6,
-                "azimuths": list(THIRDS),
-                "branch": "below",
-            },
-            "inertia": {
-                "slider_mass": 8.0,
-                "lower_link_mass": 3.5,
-                "upper_link_mass": 2.5,
-                "platform_mass": 25.0,
-            },
-        },
+        {"mechanism": "prru", "geometry": LENGTHS | MACHINES["paper"], "inertia": MASSES},
     )
     state = Motion(short, 9)(TIMES)
     full = full.changed(payload={"mass": 0.0, "inertia": [0.0, 0.0, 0.0]})

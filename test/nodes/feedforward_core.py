@@ -4,11 +4,9 @@
 from itertools import permutations
 
 import numpy as np
-import pytest
 
 from delta_dynamics.feedforward import Feedforward
 from delta_dynamics.settings import Settings
-from pkm_twin.errors import MessageError
 from test.nodes.harness import SECOND
 from test.support.robots import load
 
@@ -63,12 +61,6 @@ def sample(make, index, order=(0, 1, 2), rates=True, measured=None, **changes):
 
 def answers(twin, make, indices, **options):
     return [twin.joint_state(*sample(make, i, **options)) for i in indices]
-
-
-def reject(call, *arguments):
-    with pytest.raises(MessageError) as caught:
-        call(*arguments)
-    return caught.value.reason, str(caught.value)
 
 
 def running(make, **changes):

@@ -14,11 +14,11 @@ from test.nodes.feedforward_core import (
     answers,
     core,
     motion,
-    reject,
     running,
     sample,
     trajectory,
 )
+from test.support.rejects import reject
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -18,11 +18,11 @@ from test.nodes.feedforward_core import (
     answers,
     core,
     motion,
-    reject,
     sample,
     trajectory,
 )
 from test.nodes.harness import SECOND, Maker, Plain
+from test.support.rejects import reject
 from test.support.robots import load
 
 pytestmark = pytest.mark.filterwarnings("error")

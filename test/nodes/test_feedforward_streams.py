@@ -19,11 +19,11 @@ from test.nodes.feedforward_core import (
     answers,
     core,
     motion,
-    reject,
     running,
     sample,
 )
 from test.nodes.harness import SECOND
+from test.support.rejects import reject
 
 pytestmark = pytest.mark.filterwarnings("error")
 

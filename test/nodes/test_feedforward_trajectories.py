@@ -15,12 +15,12 @@ from test.nodes.feedforward_core import (
     UNREACHABLE,
     core,
     motion,
-    reject,
     running,
     sample,
     trajectory,
 )
 from test.nodes.harness import SECOND
+from test.support.rejects import reject
 
 pytestmark = pytest.mark.filterwarnings("error")
 
