@@ -73,7 +73,7 @@ def _derivatives(
     robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array,
     by: Sequence[str], *, rows: bool,
 ) -> TorqueDerivatives:  # fmt: skip
-    inputs = _inputs(robot, motion, wrench, weights, rows=rows)
+    inputs = _inputs(motion, wrench, weights, rows=rows)
     by_q, by_qd, by_qdd = robot.evaluate(motion_gradient(robot), robot.inertial, *inputs)
     return TorqueDerivatives(by_q, by_qd, by_qdd, _by_paths(robot, inputs, by))
 
@@ -90,15 +90,14 @@ def torque_effects(
         )
         kept = robot.calls["torque effects"] = kernel, causes.slopes, np.eye(robot.joints_count)
     kernel, slopes, weights = kept
-    inputs = _inputs(robot, (q, qd, qdd), wrench, weights, rows=True)
+    inputs = _inputs((q, qd, qdd), wrench, weights, rows=True)
     (table,) = robot.evaluate(kernel, robot.inertial, *inputs)
     return np.asarray(table @ slopes, np.float64)
 
 
 def _inputs(
-    robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *,
-    rows: bool,
-) -> list[Array]:  # fmt: skip
+    motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *, rows: bool
+) -> list[Array]:
     load = np.zeros(6) if wrench is None else wrench
     inputs = [doubles(value) for value in (*motion, load)]
     if rows:
@@ -127,7 +126,7 @@ def torques_by_numbers(
     :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`numbers_slopes`.
         Others as of :func:`torque_derivatives`.
     """
-    inputs = _inputs(robot, (q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
+    inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
     return _by_numbers_table(robot, inputs) @ slopes
 
 

@@ -17,12 +17,7 @@ from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.messages.reading import (
-    JointReader,
-    JointSample,
-    Trajectory,
-    as_message_error,
-)
+from pkm_twin.messages.reading import JointReader, JointSample, Trajectory, as_message_error
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.continuity import Continuity

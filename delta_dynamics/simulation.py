@@ -17,8 +17,9 @@ from delta_dynamics.plant import Plant
 from delta_dynamics.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
-from pkm_twin.messages.reading import MAX_RATE, JointReader, as_message_error, read_wrench
+from pkm_twin.messages.reading import MAX_RATE, JointReader, as_message_error
 from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.messages.wrenches import read_wrench
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.path import JointPath

@@ -24,7 +24,7 @@ from bags.recording.capture import (
     require_within,
     wrench_stamped,
 )
-from bags.recording.pinocchio_models import DeltaEngine
+from bags.recording.pinocchio_delta import DeltaEngine
 from bags.recording.record_delta_cu import (
     APPROACH,
     DWELL,

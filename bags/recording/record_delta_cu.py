@@ -30,7 +30,7 @@ from bags.recording.capture import (
     smooth,
     steps,
 )
-from bags.recording.pinocchio_models import DeltaEngine
+from bags.recording.pinocchio_delta import DeltaEngine
 
 Array = NDArray[np.float64]
 

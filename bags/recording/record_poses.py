@@ -32,7 +32,7 @@ def record(
     count: int = 60,
 ) -> None:
     """Write the joints' positions and the platform's places by Pinocchio's closed loops."""
-    from bags.recording.pinocchio_models import DeltaEngine
+    from bags.recording.pinocchio_delta import DeltaEngine
 
     parameters = machine_parameters("delta_cu")
     geometry = parameters["geometry"]

@@ -33,7 +33,7 @@ from bags.recording.capture import (
     wrench_stamped,
 )
 from bags.recording.milling import Milling
-from bags.recording.pinocchio_models import PrruEngine
+from bags.recording.pinocchio_prru import PrruEngine
 
 Array = NDArray[np.float64]
 

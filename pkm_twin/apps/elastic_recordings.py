@@ -23,8 +23,9 @@ from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import BagError, MessageError, ParameterError, UnknownNameError, one_line
 from pkm_twin.identification.elastic_fit import AXES, Deflected
-from pkm_twin.messages.reading import MAX_FORCE, MAX_MOMENT, TINY
+from pkm_twin.messages.reading import TINY
 from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.messages.wrenches import MAX_FORCE, MAX_MOMENT
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.deflection import MAX_SHIFT, MAX_TURN, in_base_axes, read_deflection
 

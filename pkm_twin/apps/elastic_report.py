@@ -13,7 +13,8 @@ from rich.table import Table
 from pkm_twin.apps.fit_report import MOST_SAMPLES, Report, note_of
 from pkm_twin.atlas.plots import COLOURS, columns, label
 from pkm_twin.console import finite
-from pkm_twin.identification.elastic_fit import AXES, Combination, ElasticFit, Group
+from pkm_twin.identification.elastic_fit import AXES, ElasticFit
+from pkm_twin.identification.elastic_groups import Combination, Group
 
 Array = NDArray[np.float64]
 

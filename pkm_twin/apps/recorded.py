@@ -19,8 +19,9 @@ from pkm_twin.apps.topics import JOINT_STATE, Topics, choose_topics
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.errors import BagError, MessageError, ParameterError, one_line
-from pkm_twin.messages.reading import JointReader, JointSample, read_wrench
+from pkm_twin.messages.reading import JointReader, JointSample
 from pkm_twin.messages.stamps import StampRules, stamp_of
+from pkm_twin.messages.wrenches import read_wrench
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]

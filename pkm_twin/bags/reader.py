@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from pkm_twin.bags.cdr import MessageCodec
+from pkm_twin.bags.chunks import message_data
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.bags.format import (
     MESSAGE,
@@ -31,7 +32,6 @@ from pkm_twin.bags.format import (
     RecordReader,
     Schema,
     iterate_records,
-    message_data,
     message_head,
     utf8,
 )

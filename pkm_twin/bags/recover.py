@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
+from pkm_twin.bags.chunks import message_data, read_chunk
 from pkm_twin.bags.format import (
     ATTACHMENT,
     CHANNEL,
@@ -42,12 +43,10 @@ from pkm_twin.bags.format import (
     Records,
     Schema,
     iterate_records,
-    message_data,
     message_head,
     metadata,
     metadata_crc,
     opcode_name,
-    read_chunk,
 )
 from pkm_twin.bags.storage import BagFile, files_by_name, find_storage
 from pkm_twin.bags.strict import Check

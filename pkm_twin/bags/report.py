@@ -7,12 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pkm_twin.bags.chunks import read_chunk
 from pkm_twin.bags.definitions import parse_definition
-from pkm_twin.bags.format import (
-    FRAME,
-    RecordReader,
-    read_chunk,
-)
+from pkm_twin.bags.format import FRAME, RecordReader
 from pkm_twin.errors import BagError
 
 

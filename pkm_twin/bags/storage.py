@@ -19,7 +19,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any, Final
 
-from pkm_twin.bags.format import ZSTD_MAGIC, Budget, FormatError, RecordReader
+from pkm_twin.bags.chunks import ZSTD_MAGIC
+from pkm_twin.bags.format import Budget, FormatError, RecordReader
 from pkm_twin.bags.plain_yaml import load_plain
 from pkm_twin.errors import BagError
 from pkm_twin.files import STANDARD, open_regular

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from pkm_twin.bags.chunks import ZSTD_MAGIC, message_data, read_chunk
 from pkm_twin.bags.format import (
     ATTACHMENT,
     ATTACHMENT_INDEX,
@@ -35,18 +36,15 @@ from pkm_twin.bags.format import (
     SCHEMA,
     STATISTICS,
     SUMMARY_OFFSET,
-    ZSTD_MAGIC,
     Fields,
     FormatError,
     RecordReader,
     Records,
     iterate_records,
-    message_data,
     message_head,
     metadata,
     opcode_name,
     read_attachment,
-    read_chunk,
     read_magic,
 )
 from pkm_twin.bags.report import BagReport, Segment, TopicInfo, join_topic

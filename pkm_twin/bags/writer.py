@@ -19,8 +19,9 @@ from typing import Any, Self
 from mcap.writer import CompressionType, Writer
 
 from pkm_twin.bags.cdr import MessageCodec
+from pkm_twin.bags.chunks import FREE_BYTES, MAX_CHUNK_BYTES
 from pkm_twin.bags.definitions import live_type_name, message_definition
-from pkm_twin.bags.format import FREE_BYTES, MAX_CHUNK_BYTES, METADATA_CRC, metadata_crc
+from pkm_twin.bags.format import METADATA_CRC, metadata_crc
 from pkm_twin.errors import BagError
 from pkm_twin.files import require_replaceable
 

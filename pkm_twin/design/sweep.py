@@ -12,9 +12,10 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.design.optimise import Problem, sobol
+from pkm_twin.design.optimise import sobol
 from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.quantities import quantity_of
+from pkm_twin.design.search import Problem
 from pkm_twin.design.variables import Variables
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot

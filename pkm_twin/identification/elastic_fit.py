@@ -16,6 +16,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.elastic_groups import PRIOR, Group, groups_of
 from pkm_twin.identification.elastic_verdict import elastic_verdict, put_right
 from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import SURE, Judged, Number, known, refuse_faults
@@ -30,8 +31,6 @@ AXES: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
 LEAST_SAMPLES: Final = 12
 MOST_SAMPLES: Final = 2000
 """Of a recording: of more, every so many are taken."""
-PRIOR: Final = 1.0
-"""An element's compliance may be off by all of its value."""
 STIFFEST: Final = 0.02
 """Least factor at which the model is made linear."""
 STEPS: Final = 20
@@ -53,8 +52,6 @@ UNLIKE: Final = 0.3
 """Part of it from which a fault of the recording is looked for."""
 BETTER: Final = 0.85
 """A recording has a fault if without it so much less is left."""
-SHOWN: Final = 0.1
-"""Part of the greatest weight below which an element is no part of a combination."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,23 +73,6 @@ class Deflected:
         step = -(-len(self.time) // MOST_SAMPLES)
         cut = {k: getattr(self, k)[::step] for k in ("time", "q", "wrench", "deflection")}
         return replace(self, **cut)
-
-
-@dataclass(frozen=True)
-class Combination:
-    """A weighted sum of elements' factors, of weights with squares that sum to 1."""
-
-    weights: dict[str, float]
-    value: float
-    deviation: float
-
-
-@dataclass(frozen=True)
-class Group:
-    """Elements that the loads do not distinguish, and what is known of them together."""
-
-    elements: tuple[str, ...]
-    known: tuple[Combination, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -425,51 +405,3 @@ def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judg
     spread = np.sqrt(np.sum((slopes @ covariance) * slopes, -1).clip(0.0))
     measured = r.deflection[end] - zero
     return Judged(r.name, r.time[end], measured, before[end], after[end], spread[end])
-
-
-def groups_of(
-    names: Sequence[str], factors: Array, covariance: Array, wide: Array | None = None
-) -> tuple[Group, ...]:
-    """Elements that share a direction that is not known, and the directions that are.
-
-    :param factors: shape (elements,). ``covariance``: of them by the noise alone, and of more
-        behind them. ``wide``: with what the model does not explain; default the same.
-    """
-    count = len(names)
-    own = covariance[:count, :count] / PRIOR**2
-    full = own if wide is None else wide[:count, :count] / PRIOR**2
-    values, vectors = np.linalg.eigh(own)
-    unknown = vectors[:, values > SURE**2]
-    shared = np.abs(unknown @ unknown.T)
-    left, groups = set(np.flatnonzero(np.diag(shared) > SHOWN**2).tolist()), []
-    while left:
-        group, edge = set(), {min(left)}
-        while edge:
-            group |= edge
-            edge = {j for i in edge for j in left - group if shared[i, j] > SHOWN}
-        left -= group
-        if len(group) > 1:
-            groups.append(_group(sorted(group), names, factors, (own, full)))
-    return tuple(groups)
-
-
-def _group(
-    members: list[int], names: Sequence[str], factors: Array, covariances: tuple[Array, Array]
-) -> Group:
-    own, wide = covariances
-    values, vectors = np.linalg.eigh(own[np.ix_(members, members)])
-    told = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value > SURE**2:
-            continue
-        weights = vector * np.sign(vector[np.argmax(np.abs(vector))])
-        weights[np.abs(weights) < SHOWN * np.abs(weights).max()] = 0.0
-        weights /= np.linalg.norm(weights)
-        deviation = float(np.sqrt(weights @ wide[np.ix_(members, members)] @ weights)) * PRIOR
-        told.append(
-            Combination(
-                {names[k]: float(w) for k, w in zip(members, weights, strict=True) if w},
-                float(weights @ factors[members]), deviation,
-            )
-        )  # fmt: skip
-    return Group(tuple(names[k] for k in members), tuple(told))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to checked arrays, by attributes only: live messages and decoded ones alike.
+"""Joint messages to checked arrays, by attributes only: live messages and decoded ones alike.
 
 Every function either returns finite, complete, ordered data or raises
 :class:`~pkm_twin.errors.MessageError` with a short stable reason for counting. Times are
@@ -30,8 +30,6 @@ TINY: Final = sys.float_info.min
 MAX_RATE: Final = 1e4
 MAX_ACCELERATION: Final = 1e7
 MAX_EFFORT: Final = 1e7
-MAX_FORCE: Final = 1e7
-MAX_MOMENT: Final = 1e7
 MAX_POINTS: Final = 100_000
 ROUNDING: Final = 4.0 * sys.float_info.epsilon
 """Of a number that is converted there and back, relative."""
@@ -389,36 +387,6 @@ class JointReader:
             return MessageError("bounds", f"{what} of {name} is {value:g}, a denormal number")
         reason = "limit" if self._limited.get(what.split()[-1], False) else "bounds"
         return MessageError(reason, f"{what} of {name} is {value:g}, allowed {low:g} to {high:g}")
-
-
-@dataclass(frozen=True)
-class WrenchSample:
-    """A wrench as it came: force and moment, shape (6,), N and N m, in ``frame``'s axes."""
-
-    stamp: int
-    frame: str
-    wrench: Array
-
-
-def read_wrench(
-    message: Any, now: int, rules: StampRules, frame: str, accept_empty: bool
-) -> WrenchSample:
-    """A geometry_msgs/WrenchStamped in the expected frame; an empty frame only where allowed."""
-    given = message.header.frame_id
-    if given != frame and not (given == "" and accept_empty):
-        hint = "; set accept_empty_frame to allow it" if given == "" else ""
-        raise MessageError("frame", f"frame is {shown(given)}, expected {frame!r}{hint}")
-    stamp = rules.check(stamp_of(message.header), now)
-    force, torque = message.wrench.force, message.wrench.torque
-    values = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
-    labels = ("force.x", "force.y", "force.z", "torque.x", "torque.y", "torque.z")
-    for i, (label, value) in enumerate(zip(labels, values, strict=True)):
-        bound = MAX_FORCE if i < 3 else MAX_MOMENT
-        if not math.isfinite(value):
-            raise MessageError("not finite", f"{label} is {value}")
-        if abs(value) > bound or 0.0 < abs(value) < TINY:
-            raise MessageError("bounds", f"{label} is {value:g}, allowed up to {bound:g}")
-    return WrenchSample(stamp, given or frame, np.array(values, np.float64))
 
 
 def shown(name: str) -> str:

@@ -50,14 +50,6 @@ def stamp_of(header: Any) -> int:
     return _nanoseconds("stamp", header.stamp)
 
 
-def duration_of(duration: Any) -> int:
-    """A duration in nanoseconds; may be negative."""
-    nanosec = int(duration.nanosec)
-    if not 0 <= nanosec < SECOND:
-        raise MessageError("time", f"nanosec is {nanosec}, allowed 0 to {SECOND - 1}")
-    return int(duration.sec) * SECOND + nanosec
-
-
 def _nanoseconds(what: str, time: Any) -> int:
     sec, nanosec = time.sec, time.nanosec
     if sec < 0 or not 0 <= nanosec < SECOND:

@@ -135,9 +135,7 @@ def _description(
         joints[name] = _joint(joint, bodies, places, axes[name], home[name], name in urdf.actuated)
     for closure in urdf.closures:
         if bodies[closure.links[0]] != bodies[closure.links[1]]:
-            joints[closure.name] = _closure(
-                closure, bodies, view @ assembly.frame(closure, 0), view
-            )
+            joints[closure.name] = _closure(closure, bodies, view @ assembly.frame(closure, 0))
             if closure.axes is not None and closure.type == "universal":
                 second = view @ assembly.frame(closure, 1)
                 joints[closure.name]["axes"][1] = _snapped(second.rotation @ closure.axes[1])
@@ -245,7 +243,7 @@ def _friction(part: Joint | Closure, data: dict[str, Any]) -> dict[str, Any]:
     return {}
 
 
-def _closure(closure: Closure, bodies: dict[str, str], place: Pose, view: Pose) -> dict[str, Any]:
+def _closure(closure: Closure, bodies: dict[str, str], place: Pose) -> dict[str, Any]:
     data: dict[str, Any] = {
         "type": closure.type,
         "between": [bodies[link] for link in closure.links],

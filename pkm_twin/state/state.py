@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.passive import moving_state_program, state_program
-from pkm_twin.messages.reading import JointSample, WrenchSample, as_message_error
+from pkm_twin.messages.reading import JointSample, as_message_error
 from pkm_twin.messages.stamps import SECOND
+from pkm_twin.messages.wrenches import WrenchSample
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.pairing import PairingCore

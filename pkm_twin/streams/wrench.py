@@ -17,8 +17,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine import rotations
-from pkm_twin.messages.reading import WrenchSample, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
+from pkm_twin.messages.wrenches import WrenchSample, read_wrench
 from pkm_twin.streams.monitor import StreamMonitor
 from pkm_twin.streams.settings import FUTURE, SECONDS, ZERO_STAMP, setting
 

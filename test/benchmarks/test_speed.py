@@ -75,7 +75,7 @@ def test_platform_response(benchmark, name, count):
 def test_pinocchio_closed_loop(benchmark, name):
     """Assembly, velocities, accelerations and torques of one state, driven from Python."""
     pytest.importorskip("pinocchio")
-    from bags.recording.pinocchio_models import DeltaEngine
+    from bags.recording.pinocchio_delta import DeltaEngine
 
     engine = DeltaEngine(parameters_of(name))
     q, qd, qdd = motion(load(name), 1)
@@ -87,7 +87,7 @@ def test_pinocchio_closed_loop(benchmark, name):
 def test_pinocchio_rnea(benchmark, name):
     """Only the tree sweep, its state given: not the loops, not the torques."""
     pytest.importorskip("pinocchio")
-    from bags.recording.pinocchio_models import DeltaEngine
+    from bags.recording.pinocchio_delta import DeltaEngine
 
     engine = DeltaEngine(parameters_of(name))
     tree = engine.state(*motion(load(name), 1))

@@ -17,6 +17,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 DELTA = REPOSITORY / "bags/delta_cu_pick_and_place.mcap"
 MILLING = REPOSITORY / "bags/prru_milling.mcap"
 STIFFNESS = REPOSITORY / "bags/upr_rpu_milling.mcap"
+JOINTS = "/joint_states"
 
 
 @pytest.fixture(scope="session")

@@ -39,7 +39,7 @@ TRUTH = {
 def pinocchio_recording(duration: float) -> tuple[Recorded, Robot]:
     """Efforts by Pinocchio with loop constraints, and the robot as it is in truth."""
     pytest.importorskip("pinocchio")
-    from bags.recording.pinocchio_models import PrruEngine
+    from bags.recording.pinocchio_prru import PrruEngine
 
     data = parameters_of("prru") | TRUTH
     engine, near = PrruEngine(data), None

@@ -8,15 +8,14 @@ import math
 
 import numpy as np
 import pytest
-import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from stiffness_monitor import compliance
 from stiffness_monitor.beams import assemble
-from stiffness_monitor.modes import has_modes, modes, natural_frequencies
+from stiffness_monitor.modes import modes, natural_frequencies
 from stiffness_monitor.structure import Carried, Member, structural_model
-from test.support.robots import ELASTIC, elastic, load, parameters_of, random_joints
+from test.support.robots import elastic, load, parameters_of, random_joints
 
 DELTAS = ("delta", "delta_cu")
 
@@ -66,19 +65,6 @@ def test_static_compliance_is_that_of_the_compiled_frame(variant, rng):
             scale = np.sqrt(np.einsum("...ii->...i", expected))
             difference = (found - expected) / (scale[..., None] * scale[..., None, :])
             assert np.abs(difference).max() < 1e-9
-
-
-@pytest.fixture
-def with_members(tmp_path):
-    """A shipped robot whose members section is replaced."""
-
-    def make(name, members):
-        data = parameters_of(name) | {"members": members}
-        path = tmp_path / "robot.yaml"
-        path.write_text(yaml.safe_dump(data))
-        return load(path)
-
-    return make
 
 
 @pytest.fixture
@@ -423,20 +409,6 @@ def test_no_pose_has_no_frequencies():
     assert natural_frequencies(load("delta"), np.empty((0, 3))).shape == (0, 6)
 
 
-@pytest.mark.parametrize(
-    ("name", "section"), [("delta", "members"), ("prru", "members"), ("upr_rpu", "inertia")]
-)
-def test_a_file_without_the_section_loads_and_is_refused_by_name(name, section, tmp_path):
-    data = parameters_of(name)
-    del data[section]
-    path = tmp_path / "robot.yaml"
-    path.write_text(yaml.safe_dump(data))
-    robot = load(path)
-    with pytest.raises(ParameterError) as caught:
-        natural_frequencies(robot, robot.home())
-    assert caught.value.field == section
-
-
 def test_bad_arguments_are_refused():
     robot = load("delta")
     home = robot.home()
@@ -452,68 +424,3 @@ def test_bad_arguments_are_refused():
         natural_frequencies(robot, home, elements=0)
     with pytest.raises(ValueError, match="no pose"):
         modes(robot, np.empty((0, 3)))
-
-
-def test_the_wall_of_a_tube_follows_from_its_mass():
-    members = structural_model(load("delta_cu"), load("delta_cu").graph.home).parts
-    inner = {m.name: m.section.inner_diameter for m in members}
-    assert inner["arm I"] == pytest.approx(0.03110, abs=1e-5)
-    assert inner["forearm I a"] == pytest.approx(0.01389, abs=1e-5)
-    assert inner["forearm III"] == pytest.approx(0.01752, abs=1e-5)
-    masses = [m.section.mass_per_length * np.linalg.norm(m.end - m.start) for m in members]
-    assert sum(masses) == pytest.approx(3 * (0.2548 + 0.0771))
-
-
-@pytest.mark.parametrize(
-    ("changes", "field"),
-    [
-        ({"inner_diameter": 0.01}, "members.arm"),
-        ({"density": 0.0}, "members.arm.density"),
-        ({"outer_diameter": 0.0}, "members.arm.outer_diameter"),
-        ({"youngs_modulus": 10.0}, "members.arm.youngs_modulus"),
-        ({"wall": 0.01}, "members.arm.wall"),
-    ],
-)
-def test_tubes_that_cannot_be_are_refused(changes, field, variant):
-    members = parameters_of("delta")["members"]
-    members["arm"] |= changes
-    with pytest.raises(ParameterError) as caught:
-        variant("delta", members=members)
-    assert caught.value.field == field
-
-
-def test_an_inner_diameter_can_stand_for_the_density(with_members):
-    robot = load("delta")
-    members = parameters_of("delta")["members"]
-    del members["arm"]["density"]
-    members["arm"]["inner_diameter"] = (
-        structural_model(robot, robot.graph.home).parts[0].section.inner_diameter
-    )
-    other = with_members("delta", members)
-    assert natural_frequencies(other, robot.home()) == pytest.approx(
-        natural_frequencies(robot, robot.home())
-    )
-    members["arm"]["inner_diameter"] = 0.04
-    with pytest.raises(ParameterError) as caught:
-        with_members("delta", members)
-    assert caught.value.field == "members.arm.inner_diameter"
-    del members["arm"]["inner_diameter"]
-    with pytest.raises(ParameterError) as caught:
-        with_members("delta", members)
-    assert caught.value.value == "neither"
-
-
-def test_a_robot_whose_sections_do_not_fit_still_loads_and_has_no_modes(variant):
-    """Its dynamics need none of them."""
-    for name, changes, field in (
-        ("delta", {"geometry": {"closures": ["rod", "rod", "rcu"]}}, "members.rcu_forearm"),
-        ("delta", {"inertia": {"arm_mass": 3.0}}, "members.arm.density"),
-        ("delta", {"inertia": {"forearm_mass": 0.0}}, "members.forearm"),
-    ):
-        robot, _ = variant(name, **changes)
-        assert np.isfinite(inverse_dynamics(robot, np.zeros(3), np.zeros(3), np.ones(3))).all()
-        assert not has_modes(robot)
-        with pytest.raises(ParameterError) as caught:
-            natural_frequencies(robot, robot.home())
-        assert caught.value.field == field
-    assert {"delta", "delta_cu", "prru", "upr_rpu"} <= set(ELASTIC)

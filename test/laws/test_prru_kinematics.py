@@ -3,70 +3,28 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import energy
-from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.machine import schema
 from pkm_twin.mechanisms.prru import Prru
+from test.laws.prru_heads import (
+    MACHINES,
+    THIRDS,
+    TIMES,
+    Array,
+    Motion,
+    machine,
+    place,
+    poses,
+    rotations,
+    sliders,
+)
 from test.support.bodies import bodies
 from test.support.robots import partly_long
-
-Array = NDArray[np.float64]
-
-THIRDS = (math.pi, 5 * math.pi / 3, math.pi / 3)
-MACHINES: dict[str, dict[str, Any]] = {
-    "paper": {"azimuths": THIRDS, "branch": "below"},
-    "hanging": {"azimuths": THIRDS, "branch": "above"},
-    "turned": {"azimuths": (0.4 + 2 * math.pi / 3, 0.4, 0.4 - 2 * math.pi / 3), "branch": "below"},
-    "uneven": {"azimuths": (0.2, 1.9, 4.4), "branch": "above"},
-    "wide": {
-        "azimuths": THIRDS,
-        "branch": "below",
-        "base_radius": 0.3,
-        "platform_radius": 0.4,
-        "limb_length": 0.7,
-    },
-}
-TILTED_INERTIA = ((0.6, 0.05, -0.02), (0.05, 0.5, 0.03), (-0.02, 0.03, 0.8))
-
-
-MASSES = ("slider_mass", "lower_link_mass", "upper_link_mass", "platform_mass")
-
-
-def machine(
-    name: str, symmetric: bool = False, geometry: Mapping[str, Any] = {}, **inertia: Any
-) -> Prru:
-    """A machine with all masses and inertias; ``symmetric``: equal for all three limbs."""
-    lengths = {"base_radius": 0.35, "platform_radius": 0.25, "limb_length": 0.6}
-    masses = {
-        "slider_mass": 8.0,
-        "lower_link_mass": 3.5,
-        "upper_link_mass": 2.5,
-        "platform_mass": 25.0,
-        "link_com": 0.4,
-        "lower_link_inertia": [0.11, 0.02],
-        "upper_link_inertia": [0.08, 0.03],
-        "platform_com": [0, 0, 0.03] if symmetric else [0.02, -0.03, 0.05],
-        "platform_inertia": [0.5, 0.5, 0.8] if symmetric else [list(r) for r in TILTED_INERTIA],
-    }
-    payload = {"mass": 3.0, "com": [0.05, 0.02, 0.1], "inertia": [0.02, 0.03, 0.04]}
-    return schema.build(
-        Prru,
-        {
-            "mechanism": "prru",
-            "geometry": lengths | MACHINES[name] | dict(geometry),
-            "inertia": masses | inertia,
-            "payload": {} if symmetric else payload,
-        },
-    )
 
 
 @pytest.fixture(params=partly_long(MACHINES, "paper", "turned", "uneven"))
@@ -80,83 +38,6 @@ def reach(robot: Prru) -> float:
     return 40.0 if uneven else 60.0
 
 
-def poses(count: int, tilt: float, seed: int = 0) -> Array:
-    """Poses of any azimuth, tilted up to ``tilt`` (degrees), shape (count, 3)."""
-    rng = np.random.default_rng(seed)
-    lean = np.radians(tilt) * np.sqrt(rng.random(count))
-    azimuth = rng.uniform(0, 2 * math.pi, count)
-    x, y, z = np.sin(lean) * np.cos(azimuth), np.sin(lean) * np.sin(azimuth), np.cos(lean)
-    return np.stack([rng.uniform(-1, 1, count), np.arctan2(-y, z), np.arcsin(x)], axis=-1)
-
-
-def rotations(alpha: Array, beta: Array, gamma: Array) -> Array:
-    """Rx(alpha) Ry(beta) Rz(gamma), shape (..., 3, 3)."""
-    one, nil = np.ones_like(alpha), np.zeros_like(alpha)
-
-    def stack(rows: list[list[Array]]) -> Array:
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-    ca, sa, cb, sb, cg, sg = (f(x) for x in (alpha, beta, gamma) for f in (np.cos, np.sin))
-    rx = stack([[one, nil, nil], [nil, ca, -sa], [nil, sa, ca]])
-    ry = stack([[cb, nil, sb], [nil, one, nil], [-sb, nil, cb]])
-    rz = stack([[cg, -sg, nil], [sg, cg, nil], [nil, nil, one]])
-    return rx @ ry @ rz
-
-
-def place(robot: Prru, pose: Array) -> tuple[Array, Array, Array]:
-    """Centre, rotation and limb axes' ends of poses, by Newton's method on the three planes.
-
-    Shapes (n, 3), (n, 3, 3) and (n, 3 limbs, 3): nothing of the twin's formulas.
-    """
-    g = robot.geometry
-    e = np.stack([np.cos(g.azimuths), np.sin(g.azimuths), np.zeros(3)], axis=-1)
-    t = np.stack([-e[:, 1], e[:, 0], np.zeros(3)], axis=-1)
-    unknown = np.zeros((len(pose), 3))
-
-    def joints(u: Array) -> tuple[Array, Array, Array]:
-        rotation = rotations(pose[:, 1], pose[:, 2], u[:, 2])
-        centre = np.concatenate([u[:, :2], pose[:, :1]], axis=-1)
-        arms = -g.platform_radius * np.einsum("nij,kj->nki", rotation, e)
-        return centre, rotation, centre[:, None] + arms
-
-    for _ in range(20):
-        centre, rotation, ends = joints(unknown)
-        error = np.einsum("nki,ki->nk", ends, t)
-        slope = np.empty((len(pose), 3, 3))
-        slope[..., 0], slope[..., 1] = t[:, 0], t[:, 1]
-        turned = np.cross(rotation[:, None, :, 2], ends - centre[:, None])
-        slope[..., 2] = np.einsum("nki,ki->nk", turned, t)
-        unknown = unknown - np.linalg.solve(slope, error[..., None])[..., 0]
-    return joints(unknown)
-
-
-def sliders(robot: Prru, q: Array) -> Array:
-    """Slider joints C_i, shape (n, 3 limbs, 3)."""
-    g = robot.geometry
-    flat = -g.base_radius * np.stack([np.cos(g.azimuths), np.sin(g.azimuths)], axis=-1)
-    return np.concatenate([np.broadcast_to(flat, (*q.shape, 2)), q[..., None]], axis=-1)
-
-
-class Motion:
-    """A smooth motion of the sliders about a tilted pose."""
-
-    def __init__(self, robot: Prru, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        self.start = robot.inverse(poses(1, 25, seed)[0])
-        self.size = rng.uniform(0.03, 0.06, 3)
-        self.rate = rng.uniform(2.0, 5.0, 3)
-        self.phase = rng.uniform(0, 2 * math.pi, 3)
-
-    def __call__(self, t: Array) -> tuple[Array, Array, Array]:
-        angle = self.rate * t[..., None] + self.phase
-        return (
-            self.start + self.size * np.sin(angle),
-            self.size * self.rate * np.cos(angle),
-            -self.size * self.rate**2 * np.sin(angle),
-        )
-
-
-TIMES = np.linspace(0.0, 2.0, 25)
 STEP = 2e-3
 
 
@@ -400,141 +281,3 @@ def test_lifting_all_sliders_lifts_the_platform(robot: Prru) -> None:
     np.testing.assert_allclose(robot.forward(q + 0.3), lifted, atol=1e-12)
     rate = robot.platform_jacobian(q).sum(axis=-1)
     np.testing.assert_allclose(rate, np.tile([0, 0, 1.0, 0, 0, 0], (50, 1)), atol=1e-12)
-
-
-def test_slider_out_of_reach() -> None:
-    robot = machine("paper")
-    q = robot.inverse([0.7, 0.0, 0.0])
-    far = q + np.array([0.0, 1.2, 0.0])
-    with pytest.raises(UnreachableError, match="sample 1 is unreachable: limb II misses") as caught:
-        robot.forward([q, far])
-    assert caught.value.index == (1,)
-    for function in (robot.jacobian, robot.platform_jacobian):
-        with pytest.raises(UnreachableError):
-            function(far)
-    with pytest.raises(UnreachableError):
-        inverse_dynamics(robot, far, np.zeros(3), np.zeros(3))
-
-
-@pytest.mark.parametrize("away", [[0.5, -0.2, -0.3], [-0.4, 0.3, 0.1]])
-def test_miss_is_what_the_slider_has_to_come_back(away: list[float]) -> None:
-    """Back by the miss (towards the mean height) the machine can be assembled, short of it not."""
-    robot = machine("paper")
-    level = robot.inverse([0.7, 0.0, 0.0])
-    with pytest.raises(UnreachableError) as caught:
-        robot.forward(level + away)
-    assert caught.value.limb == "limb I"
-    edge = 1.0 - caught.value.miss / abs(away[0])
-    robot.forward(level + np.array(away) * (edge - 1e-5))
-    with pytest.raises(UnreachableError):
-        robot.forward(level + np.array(away) * (edge + 1e-5))
-
-
-def test_pose_beyond_the_limb() -> None:
-    robot = machine("paper", geometry={"limb_length": 0.15})
-    pose = np.array([0.7, 0.0, 1.0])
-    _, _, ends = place(robot, pose[None])
-    away = np.linalg.norm(ends[0, :, :2] - sliders(robot, np.zeros((1, 3)))[0, :, :2], axis=-1)
-    with pytest.raises(UnreachableError) as caught:
-        robot.inverse(pose)
-    limb = robot.limb_names.index(caught.value.limb)
-    assert caught.value.miss == pytest.approx(away[limb] - 0.15, abs=1e-13)
-    assert caught.value.miss > 0.0
-
-
-@pytest.mark.parametrize("pose", [[0.7, 0.0, 1.3], [0.7, -1.3, 0.0], [0.7, math.pi, 0.0]])
-def test_pose_beyond_the_singularity(pose: list[float]) -> None:
-    with pytest.raises(SingularityError) as caught:
-        machine("paper").inverse(pose)
-    assert caught.value.measure < caught.value.bound
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_not_finite(value: float) -> None:
-    robot = machine("paper")
-    with pytest.raises(ValueError, match="not finite"):
-        robot.inverse([0.7, value, 0.0])
-    with pytest.raises(ValueError, match="not finite"):
-        robot.rotation([0.7, value, 0.0])
-    for function in (robot.forward, robot.jacobian):
-        with pytest.raises(ValueError, match="not finite"):
-            function([0.1, 0.1, value])
-    with pytest.raises(ValueError, match="not finite"):
-        inverse_dynamics(robot, [0.1] * 3, [0.0, value, 0.0], np.zeros(3))
-
-
-@pytest.mark.parametrize("value", [1e9, 1e160, 1e300])
-def test_huge_values_end_in_a_fault(value: float) -> None:
-    robot = machine("paper")
-    for q in ([0.1, 0.1, value], [0.1, -value, value]):
-        with pytest.raises(ValueError, match=r"unreachable|not finite"):
-            robot.forward(q)
-
-
-@pytest.mark.parametrize(
-    ("section", "key", "value"),
-    [
-        ("geometry", "azimuths", [0.0, 0.0, 2.0]),
-        ("geometry", "azimuths", [0.0, 2.0, 2.0 + 2 * math.pi]),
-        ("geometry", "limb_length", 0.05),
-        ("geometry", "branch", "beside"),
-        ("inertia", "link_com", 1.5),
-        ("inertia", "slider_mass", -1.0),
-        ("inertia", "upper_link_inertia", [0.1, 0.3]),
-        ("inertia", "platform_inertia", [0.1, 0.1, 0.5]),
-    ],
-)
-def test_refused_parameters(section: str, key: str, value: object) -> None:
-    robot = machine("paper")
-    data = {
-        "mechanism": "prru",
-        "geometry": {
-            "base_radius": 0.35,
-            "platform_radius": 0.25,
-            "limb_length": 0.6,
-            "azimuths": list(THIRDS),
-            "branch": "below",
-        },
-        "inertia": dict.fromkeys(MASSES, 1.0),
-    }
-    assert schema.build(Prru, data).joint_names == robot.joint_names
-    data[section][key] = value  # type: ignore[index]
-    with pytest.raises(ParameterError) as caught:
-        schema.build(Prru, data)
-    assert caught.value.field.startswith(f"{section}.{key}")
-
-
-def test_defaults_are_thin_rods_and_a_thin_disc() -> None:
-    """Left out, the inertias are those of rods and a disc with the masses given."""
-    full = machine(
-        "paper",
-        link_com=0.5,
-        lower_link_inertia=[3.5 * 0.36 / 12, 0.0],
-        upper_link_inertia=[2.5 * 0.36 / 12, 0.0],
-        platform_com=[0.0, 0.0, 0.0],
-        platform_inertia=[25 * 0.0625 / 4, 25 * 0.0625 / 4, 25 * 0.0625 / 2],
-    )
-    short = schema.build(
-        Prru,
-        {
-            "mechanism": "prru",
-            "geometry": {
-                "base_radius": 0.35,
-                "platform_radius": 0.25,
-                "limb_length": 0.6,
-                "azimuths": list(THIRDS),
-                "branch": "below",
-            },
-            "inertia": {
-                "slider_mass": 8.0,
-                "lower_link_mass": 3.5,
-                "upper_link_mass": 2.5,
-                "platform_mass": 25.0,
-            },
-        },
-    )
-    state = Motion(short, 9)(TIMES)
-    full = full.changed(payload={"mass": 0.0, "inertia": [0.0, 0.0, 0.0]})
-    np.testing.assert_allclose(
-        inverse_dynamics(short, *state), inverse_dynamics(full, *state), rtol=1e-12
-    )

@@ -14,6 +14,7 @@ from pkm_twin.errors import MessageError, SingularityError
 from stiffness_monitor import compliance, monitor, platform_response
 from stiffness_monitor.monitor import Monitor, Settings
 from test.nodes.harness import SECOND, Maker, Plain
+from test.support.rejects import reject
 from test.support.robots import load
 
 NOW = 1_000 * SECOND
@@ -36,12 +37,6 @@ def watching(make, **changes):
     twin = Monitor(ROBOT, Settings(**changes))
     twin.joint_state(state(make), NOW)
     return twin
-
-
-def reject(call, *arguments):
-    with pytest.raises(MessageError) as caught:
-        call(*arguments)
-    return caught.value.reason, str(caught.value)
 
 
 class TestAnswers:

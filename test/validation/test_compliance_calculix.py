@@ -30,7 +30,8 @@ from stiffness_monitor.structure import (
 )
 from test.support.pages import numbers
 from test.support.robots import partly_long
-from tools.calculix import ABSENT, CCX, Mesh, disc_mesh, section_motion, solid_compliance
+from tools.calculix import ABSENT, CCX
+from tools.calculix_solids import Mesh, disc_mesh, section_motion, solid_compliance
 from tools.certificate.links import (
     BOUND,
     FACTORS,

@@ -9,7 +9,8 @@ from pkm_twin.errors import SingularityError, UnreachableError
 from test.support.robots import partly_long
 
 pytest.importorskip("pinocchio")
-from bags.recording.pinocchio_models import AssemblyError, DeltaEngine
+from bags.recording.pinocchio_delta import DeltaEngine
+from bags.recording.pinocchio_loops import AssemblyError
 
 MACHINES, STATES = partly_long([2, 10], 2), 20
 

@@ -12,7 +12,7 @@ from delta_dynamics.virtual_work import energy
 from test.support.robots import partly_long
 
 pytest.importorskip("mpmath")
-from tools.certificate.lagrange import energies
+from tools.certificate.lagrange_machines import energies
 from tools.certificate.machines import ROBOTS, friction, random_case
 
 

@@ -8,7 +8,7 @@ from delta_dynamics import inverse_dynamics
 from test.support.robots import partly_long
 
 pytest.importorskip("pinocchio")
-from bags.recording.pinocchio_models import PrruEngine
+from bags.recording.pinocchio_prru import PrruEngine
 from tools.certificate.machines import random_case
 
 MACHINES = 10

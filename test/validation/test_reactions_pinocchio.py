@@ -22,13 +22,9 @@ pytest.importorskip("pinocchio")
 
 import pinocchio as pin
 
-from bags.recording.pinocchio_models import (
-    DeltaEngine,
-    LoopEngine,
-    PerpendicularLoop,
-    PointLoop,
-    PrruEngine,
-)
+from bags.recording.pinocchio_delta import DeltaEngine
+from bags.recording.pinocchio_loops import LoopEngine, PerpendicularLoop, PointLoop
+from bags.recording.pinocchio_prru import PrruEngine
 
 MACHINES, STATES = partly_long([2, 12], 2), 8
 WIDTH = 0.07

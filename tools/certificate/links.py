@@ -18,7 +18,7 @@ from stiffness_monitor import compliance
 from stiffness_monitor.structure import structural_model
 from test.support.robots import parameters_of
 from test.validation.test_upr_rpu_paper import LOAD, TABLE_1
-from tools.calculix import Mesh, solid_compliance
+from tools.calculix_solids import Mesh, solid_compliance
 
 POSES = {
     "configuration 1": TABLE_1[0][0],

@@ -16,12 +16,14 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from bags.recording.pinocchio_models import DeltaEngine, LoopEngine, PrruEngine
+from bags.recording.pinocchio_delta import DeltaEngine
+from bags.recording.pinocchio_loops import LoopEngine
+from bags.recording.pinocchio_prru import PrruEngine
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.virtual_work import forward_dynamics
 from pkm_twin import Robot
 from test.support.robots import parameters_of
-from tools.certificate.lagrange import energies
+from tools.certificate.lagrange_machines import energies
 from tools.certificate.machines import build
 
 DURATION = 10.0

@@ -12,8 +12,7 @@ May import: pinocchio, numpy, the standard library.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -143,7 +142,7 @@ class LoopEngine:
             jacobian[row : row + 3] = self._frame_jacobian(a)[:3] - self._frame_jacobian(b)[:3]
             row += 3
         for a, x, b, y in self._perpendiculars:
-            normal = _cross(self.data.oMf[a].rotation @ x, self.data.oMf[b].rotation @ y)
+            normal = cross(self.data.oMf[a].rotation @ x, self.data.oMf[b].rotation @ y)
             relative = self._frame_jacobian(a)[3:] - self._frame_jacobian(b)[3:]
             jacobian[row] = normal @ relative
             row += 1
@@ -169,10 +168,8 @@ class LoopEngine:
             rate_b = pin.getFrameVelocity(self.model, self.data, b, _WORLD).angular
             spin_a = pin.getFrameAcceleration(self.model, self.data, a, _WORLD).angular
             spin_b = pin.getFrameAcceleration(self.model, self.data, b, _WORLD).angular
-            turning = _cross(_cross(rate_a, axis_a), axis_b) + _cross(
-                axis_a, _cross(rate_b, axis_b)
-            )
-            value = (spin_a - spin_b) @ _cross(axis_a, axis_b) + (rate_a - rate_b) @ turning
+            turning = cross(cross(rate_a, axis_a), axis_b) + cross(axis_a, cross(rate_b, axis_b))
+            value = (spin_a - spin_b) @ cross(axis_a, axis_b) + (rate_a - rate_b) @ turning
             drift.append(np.array([value]))
         return np.concatenate(drift)
 
@@ -340,14 +337,14 @@ class LoopEngine:
         for (a, x, b, y), couple in zip(
             self._perpendiculars, multipliers[3 * count :].tolist(), strict=True
         ):
-            normal = _cross(self.data.oMf[a].rotation @ x, self.data.oMf[b].rotation @ y)
+            normal = cross(self.data.oMf[a].rotation @ x, self.data.oMf[b].rotation @ y)
             loops[ends[PointLoop(a, b)]][3:] += couple * normal
         for (a, b), load in zip(self._points, loops, strict=True):
             for frame, sign in ((a, 1.0), (b, -1.0)):
                 joint = self.model.frames[frame].parentJoint
                 lever = self.data.oMf[frame].translation
                 about_origin = pin.Force(
-                    sign * load[:3], sign * (load[3:] + _cross(lever, load[:3]))
+                    sign * load[:3], sign * (load[3:] + cross(lever, load[:3]))
                 )
                 forces[joint] = forces[joint] + self.data.oMi[joint].actInv(about_origin)
         pin.rnea(self.model, self.data, tree.q, tree.v, tree.a, forces)
@@ -483,266 +480,7 @@ class LoopEngine:
             self._body(joint, mass, com, matrix3(payload.get("inertia", (0.0, 0.0, 0.0))))
 
 
-class DeltaEngine(LoopEngine):
-    """A Delta: three prismatic joints carry the platform, three arms and forearms hold it.
-
-    Closure ``rod``: two rotations between arm and forearm, the forearm's end on the platform's
-    point. Closure ``rcu``: the forearm slides along the elbow's axis, turns about it and stays at
-    a right angle to it. Both rods of a parallelogram move alike, so one thin rod of their mass in
-    the middle stands for them; it has no inertia about itself, and its spin no meaning.
-    """
-
-    def _build(self) -> None:
-        geometry = self.params["geometry"]
-        inertia = self.params["inertia"]
-        arm_length = float(geometry["arm_length"])
-        forearm_length = float(geometry["forearm_length"])
-        arm_mass = float(inertia["arm_mass"])
-        arm_com = float(inertia.get("arm_com", 0.5))
-        across = inertia.get("arm_inertia")
-        arm_inertia = arm_mass * arm_length**2 / 12.0 if across is None else float(across)
-        forearm_mass = float(inertia["forearm_mass"])
-        forearm_inertia = forearm_mass * forearm_length**2 / 12.0
-        closures: Sequence[str] = geometry.get("closures", ["rod"] * 3)
-
-        joint = 0
-        for name, kind in (
-            ("x", pin.JointModelPX()),
-            ("y", pin.JointModelPY()),
-            ("z", pin.JointModelPZ()),
-        ):
-            joint = self.model.addJoint(joint, kind, pin.SE3.Identity(), f"platform_{name}")
-            self._pose_joints.append(joint)
-        self._platform_joint = joint
-        self._body(joint, float(inertia["platform_mass"]), np.zeros(3), np.zeros((3, 3)))
-        self._payload(joint)
-
-        for limb, (azimuth, closure) in enumerate(
-            zip(geometry["azimuths"], closures, strict=True), start=1
-        ):
-            turn = pin.utils.rpyToMatrix(0.0, 0.0, float(azimuth))
-            base = pin.SE3(turn, turn @ np.array([float(geometry["base_radius"]), 0.0, 0.0]))
-            arm = self.model.addJoint(0, pin.JointModelRY(), base, f"arm_{limb}")
-            self._actuated_joints.append(arm)
-            self._set_armature(arm, float(inertia.get("rotor_inertia", 0.0)))
-            self._body(
-                arm,
-                arm_mass,
-                (arm_com * arm_length, 0.0, 0.0),
-                np.diag((0.0, arm_inertia, arm_inertia)),
-            )
-            elbow = pin.SE3(np.eye(3), np.array([arm_length, 0.0, 0.0]))
-            if closure == "rod":
-                first = self.model.addJoint(arm, pin.JointModelRY(), elbow, f"elbow_{limb}_swing")
-                forearm = self.model.addJoint(
-                    first, pin.JointModelRX(), pin.SE3.Identity(), f"elbow_{limb}_lean"
-                )
-            elif closure == "rcu":
-                first = self.model.addJoint(arm, pin.JointModelPY(), elbow, f"elbow_{limb}_slide")
-                forearm = self.model.addJoint(
-                    first, pin.JointModelRY(), pin.SE3.Identity(), f"elbow_{limb}_swing"
-                )
-            else:
-                raise ValueError(f"closure {closure!r} is neither 'rod' nor 'rcu'")
-            self._body(
-                forearm,
-                forearm_mass,
-                (0.0, 0.0, -forearm_length / 2.0),
-                np.diag((forearm_inertia, forearm_inertia, 0.0)),
-            )
-            end = self._frame(f"forearm_{limb}_end", forearm, (0.0, 0.0, -forearm_length))
-            hold = turn @ np.array([float(geometry["platform_radius"]), 0.0, 0.0])
-            corner = self._frame(f"platform_{limb}", self._platform_joint, hold)
-            self._points.append(PointLoop(end, corner))
-
-    def _guess(self, q: Array) -> Array:
-        """Put the platform where three spheres about the elbows meet, below them."""
-        geometry = self.params["geometry"]
-        azimuths = np.asarray(geometry["azimuths"], dtype=float)
-        length = float(geometry["forearm_length"])
-        reach = (
-            float(geometry["base_radius"])
-            - float(geometry["platform_radius"])
-            + float(geometry["arm_length"]) * np.cos(q)
-        )
-        centres = np.column_stack(
-            (
-                reach * np.cos(azimuths),
-                reach * np.sin(azimuths),
-                -float(geometry["arm_length"]) * np.sin(q),
-            )
-        )
-        side, other = centres[1] - centres[0], centres[2] - centres[0]
-        normal = _cross(side, other)
-        scale = normal @ normal
-        offset = (
-            (other @ other) * _cross(normal, -side) + (side @ side) * _cross(normal, other)
-        ) / (-2.0 * scale)
-        height = length**2 - offset @ offset
-        if height <= 0.0:
-            raise AssemblyError(f"the forearms do not reach each other at arm angles {q}")
-        downward = -normal / math.sqrt(scale) if normal[2] > 0.0 else normal / math.sqrt(scale)
-        position = centres[0] + offset + math.sqrt(height) * downward
-
-        configuration: Array = pin.neutral(self.model)
-        configuration[:3] = position
-        for limb, azimuth in enumerate(azimuths):
-            to_arm = pin.utils.rpyToMatrix(0.0, -q[limb], 0.0) @ pin.utils.rpyToMatrix(
-                0.0, 0.0, -azimuth
-            )
-            local = to_arm @ (position - centres[limb]) / length
-            swing = math.atan2(-local[0], -local[2])
-            joint = self._actuated_joints[limb] + 1
-            first, second = (self._place(joint + k) for k in (0, 1))
-            if self.model.joints[joint].shortname() == "JointModelPY":
-                configuration[first] = length * local[1]
-                configuration[second] = swing
-            else:
-                configuration[first] = swing
-                configuration[second] = math.asin(max(-1.0, min(1.0, float(local[1]))))
-        return configuration
-
-    def _home(self, pose: Array) -> Array:
-        """Start from level arms, or the nearest common angle that lets the forearms meet."""
-        for angle in np.linspace(0.0, 1.5, 16):
-            try:
-                return self._guess(np.full(3, angle))
-            except AssemblyError:
-                continue
-        raise AssemblyError(f"no symmetric assembly to reach {pose} from")
-
-    def _check_assembly(self, configuration: Array) -> None:
-        heights = []
-        pin.forwardKinematics(self.model, self.data, configuration)
-        for joint in self._actuated_joints:
-            heights.append(self.data.oMi[joint + 1].translation[2])
-        if not configuration[2] < float(np.mean(heights)):
-            raise AssemblyError("the loops closed with the platform above the elbows")
-
-    def platform_position(self, q: ArrayLike) -> Array:
-        """Return the platform's centre for arm angles ``q``, shape (3,), m."""
-        position: Array = self.assemble(q)[:3].copy()
-        return position
-
-
-class PrruEngine(LoopEngine):
-    """A 3-PRRU head: sliders along z, two links on one line in each limb, a tilting platform.
-
-    The first link swings about the limb's tangent, the second turns on the limb's own axis, and a
-    universal joint ties its end to the platform: their points coincide, and the joint's one axis,
-    the second link's x axis, stays at a right angle to the other, the platform's tangent. The
-    platform hangs on six joints whose third to fifth are its pose: z, alpha, beta.
-
-    Beside the keys of the parameter file, ``inertia`` takes ``lower_link_inertia`` and
-    ``upper_link_inertia``, each a pair: about the centre of mass across the limb and about the
-    limb, kg m2; by default a thin rod as long as the limb.
-    """
-
-    def _build(self) -> None:
-        geometry = self.params["geometry"]
-        inertia = self.params["inertia"]
-        self._base_radius = float(geometry["base_radius"])
-        self._platform_radius = float(geometry["platform_radius"])
-        self._limb_length = float(geometry["limb_length"])
-        self._azimuths = np.asarray(geometry["azimuths"], dtype=float)
-        branch = str(geometry.get("branch", "below"))
-        if branch not in ("above", "below"):
-            raise ValueError(f"branch {branch!r} is neither 'above' nor 'below'")
-        self._rise = 1.0 if branch == "below" else -1.0
-
-        joint = 0
-        for name, kind in (
-            ("x", pin.JointModelPX()),
-            ("y", pin.JointModelPY()),
-            ("z", pin.JointModelPZ()),
-            ("alpha", pin.JointModelRX()),
-            ("beta", pin.JointModelRY()),
-            ("gamma", pin.JointModelRZ()),
-        ):
-            joint = self.model.addJoint(joint, kind, pin.SE3.Identity(), f"platform_{name}")
-            if name in ("z", "alpha", "beta"):
-                self._pose_joints.append(joint)
-        self._platform_joint = joint
-        self._body(
-            joint,
-            float(inertia["platform_mass"]),
-            inertia.get("platform_com", (0.0, 0.0, 0.0)),
-            matrix3(inertia["platform_inertia"]),
-        )
-        self._payload(joint)
-
-        centre = np.array([0.0, 0.0, float(inertia.get("link_com", 0.5)) * self._limb_length])
-        for limb, azimuth in enumerate(self._azimuths, start=1):
-            turn = pin.utils.rpyToMatrix(0.0, 0.0, float(azimuth))
-            inward = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-            rail = pin.SE3(turn, -self._base_radius * inward)
-            slider = self.model.addJoint(0, pin.JointModelPZ(), rail, f"slider_{limb}")
-            self._actuated_joints.append(slider)
-            self._body(slider, float(inertia["slider_mass"]), np.zeros(3), np.zeros((3, 3)))
-            joint = slider
-            for link, kind in (("lower", pin.JointModelRY()), ("upper", pin.JointModelRZ())):
-                joint = self.model.addJoint(joint, kind, pin.SE3.Identity(), f"{link}_link_{limb}")
-                mass = float(inertia[f"{link}_link_mass"])
-                rod = (mass * self._limb_length**2 / 12.0, 0.0)
-                across, about = inertia.get(f"{link}_link_inertia") or rod
-                self._body(joint, mass, centre, np.diag((across, across, about)))
-            end = self._frame(f"limb_{limb}_end", joint, (0.0, 0.0, self._limb_length))
-            corner = self._frame(
-                f"platform_{limb}", self._platform_joint, -self._platform_radius * inward
-            )
-            tangent = np.array([-inward[1], inward[0], 0.0])
-            self._points.append(PointLoop(end, corner))
-            self._perpendiculars.append(
-                PerpendicularLoop(end, np.array([1.0, 0.0, 0.0]), corner, tangent)
-            )
-
-    def _guess(self, q: Array) -> Array:
-        """Lay a plane through the limbs' ends as if all limbs leaned as at rest."""
-        reach = self._base_radius - self._platform_radius
-        height = math.sqrt(max(self._limb_length**2 - reach**2, 0.0))
-        ends = q + self._rise * height
-        radius = self._platform_radius
-        plane = np.column_stack(
-            (np.ones(3), -radius * np.sin(self._azimuths), radius * np.cos(self._azimuths))
-        )
-        z, alpha, beta = np.linalg.solve(plane, ends)
-        configuration = self._home(np.array([z, *np.clip((alpha, beta), -0.9, 0.9)]))
-        configuration[self.actuated] = q
-        return configuration
-
-    def _home(self, pose: Array) -> Array:
-        z, alpha, beta = pose
-        configuration: Array = pin.neutral(self.model)
-        configuration[2:5] = pose
-        rotation = pin.utils.rpyToMatrix(alpha, 0.0, 0.0) @ pin.utils.rpyToMatrix(0.0, beta, 0.0)
-        for limb, azimuth in enumerate(self._azimuths):
-            inward = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-            corner = rotation @ (-self._platform_radius * inward) + np.array([0.0, 0.0, z])
-            reach = float(corner @ inward) + self._base_radius
-            rest = max(self._limb_length**2 - reach**2, 0.01 * self._limb_length**2)
-            rise = self._rise * math.sqrt(rest)
-            place = self.actuated[limb]
-            configuration[place] = corner[2] - rise
-            configuration[place + 1] = math.atan2(reach, rise)
-        return configuration
-
-    def _check_assembly(self, configuration: Array) -> None:
-        pin.forwardKinematics(self.model, self.data, configuration)
-        pin.updateFramePlacements(self.model, self.data)
-        for place, loop in zip(self.actuated, self._points, strict=True):
-            rise = self.data.oMf[loop.frame_a].translation[2] - configuration[place]
-            if not rise * self._rise > 0.0:
-                raise AssemblyError("a slider came out on the other side of its platform joint")
-        if not np.all(np.cos(configuration[3:6]) > 0.0):
-            raise AssemblyError("the loops closed with the platform turned over")
-
-    def pose(self, q: ArrayLike) -> Array:
-        """Return z, m, alpha and beta, rad, for slider heights ``q``, shape (3,)."""
-        pose: Array = self.assemble(q)[self.pose_places].copy()
-        return pose
-
-
-def _cross(one: Array, other: Array) -> Array:
+def cross(one: Array, other: Array) -> Array:
     product: Array = pin.skew(one) @ other
     return product
 

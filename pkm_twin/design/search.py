@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines of a box of variables on a path, and the search for the best of them near a start.
+
+The greatest piece of a quantity is made least by scipy's SLSQP (Kraft 1988) with exact derivatives,
+on the pieces that are near the greatest; pieces that pass it join, and it goes on (an exchange
+method, Hettich and Kortanek 1993). A machine that cannot follow the path ends a run; the next run
+starts in a smaller box around the best machine so far, so that the search stays where machines can
+follow the path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pkm_twin.design.pose_path import Followed, PosePath
+from pkm_twin.design.quantities import QUANTITIES, Constraint, Quantity
+from pkm_twin.design.variables import Variables
+from pkm_twin.design.variants import Variants
+from pkm_twin.errors import ParameterError
+from pkm_twin.robot.robot import Robot
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+ROUNDS: Final = 20
+SHRINKS: Final = 12
+NEAR: Final = 0.7
+"""Part of the greatest piece above which pieces are looked at."""
+MOST: Final = 40
+"""Pieces of a quantity that are looked at at a time."""
+KEPT: Final = 1e-6
+"""Miss of a bound, over it, that counts as none."""
+SAME: Final = 1e-7
+"""Relative gain below which the search ends."""
+BATCH: Final = 200_000
+"""Samples of all machines that are computed at a time."""
+
+
+@dataclass(frozen=True)
+class DesignPoint:
+    """One machine: values of the variables, of the quantities, and by how much it misses bounds."""
+
+    variables: Mapping[str, float]
+    numbers: Mapping[str, float]
+    """By path of the file."""
+    quantities: Mapping[str, float]
+    miss: float
+
+    @property
+    def feasible(self) -> bool:
+        """Whether it follows the path and keeps all bounds."""
+        return self.miss <= KEPT
+
+
+class _OutsideError(Exception):
+    """A machine that cannot follow the path."""
+
+
+class Problem:
+    """Machines of a box of variables (each 0 to 1) on a path."""
+
+    def __init__(self, robot: Robot, variables: Variables, path: PosePath) -> None:
+        self.robot, self.variables, self.path = robot, variables, path
+        corners = variables.values(np.array([np.zeros(len(variables)), np.ones(len(variables))]))
+        self._many = Variants(robot, dict(zip(variables.paths, corners.T, strict=True)))
+        self._checked = self._many.whole_box_fits
+        self.count = 0
+
+    def machines(self, y: Array) -> Variants:
+        """Of points (k, d)."""
+        self.count += len(y)
+        return self._many.with_values(self.variables.values(y), checked=self._checked)
+
+    def followed(self, y: Array) -> Followed:
+        """Machines of points (k, d) on the path."""
+        return Followed(self.machines(y), self.path)
+
+    def pieces(self, y: Array, quantities: Sequence[Quantity]) -> list[Array]:
+        """Of machines (k, d), in batches: of each quantity shape (k, pieces).
+
+        NaN of machines that cannot follow the path.
+        """
+        size = max(1, BATCH // len(self.path.time))
+        parts = []
+        for k in range(0, len(y), size):
+            followed = self.followed(y[k : k + size])
+            lost = np.asarray(~np.isfinite(followed.q).all((1, 2)))
+            found = [quantity.pieces(followed) for quantity in quantities]
+            parts.append([np.where(lost[:, None], np.nan, rows) for rows in found])
+        return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
+
+    def point(self, y: Array, constraints: Sequence[Constraint]) -> DesignPoint:
+        """A machine with all quantities that its file has data for."""
+        followed = self.followed(y[None])
+        found: dict[str, float] = {}
+        for name, quantity in QUANTITIES.items():
+            wanted = any(c.quantity is quantity for c in constraints)
+            if name == "deflection" and not (wanted or self.path.wrench.any()):
+                continue
+            try:
+                found[name] = float(quantity.worst(quantity.pieces(followed))[0])
+            except ParameterError:
+                if wanted:
+                    raise
+        misses = [c.misses(np.array(found[c.quantity.name])) for c in constraints]
+        values = self.variables.values(y[None])[0]
+        follows = bool(np.isfinite(followed.q).all())
+        return DesignPoint(
+            dict(zip(self.variables.names, self.variables.named(y), strict=True)),
+            dict(zip(self.variables.paths, values.tolist(), strict=True)),
+            found, max([0.0, *map(float, misses)]) if follows else np.inf,
+        )  # fmt: skip
+
+
+class Search:
+    """The least of one quantity under constraints."""
+
+    def __init__(self, problem: Problem, aim: Quantity, constraints: Sequence[Constraint]) -> None:
+        self.problem, self.aim, self.constraints = problem, aim, tuple(constraints)
+        self._all = [aim, *(c.quantity for c in constraints)]
+
+    def judged(self, y: Array) -> tuple[Array, Array, list[Array]]:
+        """Of machines (k, d): the aim, the greatest miss (infinite where one cannot follow)."""
+        pieces = self.problem.pieces(y, self._all)
+        misses = np.zeros(len(y))
+        for constraint, found in zip(self.constraints, pieces[1:], strict=True):
+            misses = np.maximum(misses, constraint.misses(constraint.quantity.worst(found)))
+        aims = self.aim.worst(pieces[0])
+        lost = ~(np.isfinite(aims) & np.isfinite(misses))
+        return np.where(lost, np.inf, aims), np.where(lost, np.inf, misses), pieces
+
+    def descend(self, y: Array) -> tuple[Array, float, float]:
+        """From a machine that follows the path: the best one near it, its aim and its miss."""
+        aims, misses, pieces = self.judged(y[None])
+        best, aim, miss = y, float(aims[0]), float(misses[0])
+        scale = max(abs(aim), 1e-300)
+        chosen = [np.zeros(0, np.intp) for _ in self._all]
+        radius, shrinks = 1.0, 0
+        for _ in range(ROUNDS):
+            chosen = [
+                np.union1d(old, self._near(k, found[0]))
+                for k, (old, found) in enumerate(zip(chosen, pieces, strict=True))
+            ]
+            run = _Run(self, chosen, scale, best, aim, radius)
+            found, outside = run.solved()
+            aims, misses, new = self.judged(found[None])
+            if better(float(aims[0]), float(misses[0]), aim, miss):
+                gain = abs(aim - float(aims[0])) / scale + max(0.0, miss - float(misses[0]))
+                bound = radius < 1.0 and np.abs(found - best).max() > 0.9 * radius
+                best, aim, miss, pieces = found, float(aims[0]), float(misses[0]), new
+                if bound:
+                    radius = min(1.0, 2.0 * radius)
+                elif gain < SAME and not outside:
+                    break
+                continue
+            passed = np.isfinite(aims[0]) and np.isfinite(misses[0])
+            fresh = passed and any(
+                len(np.setdiff1d(self._near(k, p[0]), old))
+                for k, (p, old) in enumerate(zip(new, chosen, strict=True))
+            )
+            step = float(np.abs(found - best).max())
+            if step < 1e-9 and not outside:
+                break
+            if fresh:
+                # Pieces that were not looked at grew: with them, the same again.
+                chosen = [
+                    np.union1d(old, self._near(k, p[0]))
+                    for k, (old, p) in enumerate(zip(chosen, new, strict=True))
+                ]
+            radius, shrinks = (
+                0.5 * max(min(radius, step if step > 0.0 else radius), 1e-9),
+                shrinks + 1,
+            )
+            if shrinks > SHRINKS:
+                break
+        return best, aim, miss
+
+    def _near(self, k: int, pieces: Array) -> Index:
+        """Pieces of a quantity that may be the greatest next: peaks in time near the worst."""
+        quantity = self._all[k]
+        if not quantity.sampled:
+            return np.arange(len(pieces))
+        count = len(self.problem.path.time)
+        table = (-pieces if quantity.least else pieces).reshape(count, -1)
+        padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
+        peaks = (table >= padded[:-2]) & (table >= padded[2:])
+        worst = float(table.max())
+        reach = worst - (1.0 - NEAR) * max(abs(worst), 0.3 if quantity.least else 0.0)
+        flat = table.ravel()
+        order = np.flatnonzero(peaks.ravel() & (flat >= reach))
+        return order[np.argsort(-flat[order], kind="stable")][:MOST]
+
+
+def better(aim: float, miss: float, old_aim: float, old_miss: float) -> bool:
+    """Whether a machine is better: a smaller miss, and a smaller aim where both miss nothing."""
+    if miss > KEPT or old_miss > KEPT:
+        return miss < old_miss or (miss <= KEPT and old_miss > KEPT)
+    return aim < old_aim
+
+
+class _Run:
+    """SLSQP on chosen pieces, in a box around a machine: variables y and the aim's bound s."""
+
+    def __init__(
+        self, search: Search, chosen: Sequence[Index], scale: float, centre: Array, aim: float,
+        radius: float,
+    ) -> None:  # fmt: skip
+        self.search, self.chosen, self.scale = search, chosen, scale
+        self.centre, self.aim, self.radius = centre, aim, radius
+        self._known: dict[bytes, tuple[Array, Array]] = {}
+        self._best: tuple[float, float, Array] = (np.inf, np.inf, centre)
+
+    def solved(self) -> tuple[Array, bool]:
+        """The best machine, and whether the run ended at one that cannot follow the path."""
+        from scipy.optimize import minimize  # type: ignore[import-untyped]
+
+        low = np.maximum(0.0, self.centre - self.radius)
+        high = np.minimum(1.0, self.centre + self.radius)
+        d = len(self.centre)
+        unit = np.append(np.zeros(d), 1.0)
+        try:
+            result = minimize(
+                lambda z: z[-1], np.append(self.centre, self.aim / self.scale), method="SLSQP",
+                jac=lambda z: unit, bounds=[*zip(low, high, strict=True), (None, None)],
+                constraints={
+                    "type": "ineq", "fun": lambda z: self._margins(z)[0],
+                    "jac": lambda z: self._margins(z)[1],
+                },
+                options={"maxiter": 60, "ftol": 0.1 * SAME},
+            )  # fmt: skip
+        except _OutsideError:
+            return self._best[2], True
+        y = np.clip(result.x[:d], low, high)
+        self._margins(np.append(y, result.x[-1]))
+        return self._best[2], False
+
+    def _margins(self, z: Array) -> tuple[Array, Array]:
+        """Above zero where s bounds the aim's pieces and constraints hold; and their slopes."""
+        y, s = np.clip(z[:-1], 0.0, 1.0), z[-1]
+        key = y.tobytes()
+        if key not in self._known:
+            self._known[key] = self._computed(y)
+        values, slopes = self._known[key]
+        first = len(self.chosen[0])
+        margins, table = -values, np.hstack([-slopes, np.zeros((len(values), 1))])
+        margins[:first] += s
+        table[:first, -1] = 1.0
+        return margins, table
+
+    def _computed(self, y: Array) -> tuple[Array, Array]:
+        search, problem = self.search, self.search.problem
+        values, slopes = [], []
+        many = problem.machines(y[None])
+        for k, (quantity, chosen) in enumerate(zip(search._all, self.chosen, strict=True)):
+            found, by = _pieces_at(problem, quantity, chosen, many)
+            if not (np.isfinite(found).all() and np.isfinite(by).all()):
+                raise _OutsideError
+            if k == 0:
+                values.append(found / self.scale)
+                slopes.append(by / self.scale)
+            else:
+                constraint = search.constraints[k - 1]
+                side = (-1.0 if quantity.least else 1.0) / constraint.scale
+                values.append(constraint.misses(found))
+                slopes.append(side * by)
+        aim = float(values[0].max())
+        miss = max([0.0, *(float(row.max()) for row in values[1:])])
+        if better(aim, miss, self._best[0], self._best[1]):
+            self._best = aim, miss, y
+        return np.concatenate(values), np.concatenate(slopes)
+
+
+def _pieces_at(
+    problem: Problem, quantity: Quantity, chosen: Index, one: Variants
+) -> tuple[Array, Array]:
+    """Chosen pieces of one machine and their slopes by the variables, shape (pieces, d)."""
+    if quantity.sampled:
+        width = quantity.width(problem.robot)
+        followed, places = Followed(one, problem.path.at(chosen // width)), chosen % width
+        found = quantity.of(followed)[0, np.arange(len(chosen)), places]
+    else:
+        followed, places = Followed(one, problem.path), chosen
+        found = quantity.pieces(followed)[0, chosen]
+    if not np.isfinite(found).all():
+        raise _OutsideError
+    return found, quantity.slopes(followed, places) @ problem.variables.slopes

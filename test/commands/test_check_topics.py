@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""check: which topics of a recording are judged, and which are left out."""
+
+import json
+
+import numpy as np
+
+from pkm_twin.apps.columns import read_columns
+from pkm_twin.apps.topics import JOINT_STATE, WRENCH
+from pkm_twin.bags.reader import BagWriter, open_bag
+from test.commands.conftest import DELTA, JOINTS, MILLING, rewrite
+from test.support.mapped import sides
+
+
+def with_others(source, target, seconds=0.5):
+    """A recording of everything: the machine, a gripper, and what the twin made of it."""
+    bag = open_bag(source)
+    definition = bag.report.topics[JOINTS].definition
+    first = bag.report.start_time
+    others = {
+        "/gripper/joint_states": {"name": ["finger"], "position": [0.1]},
+        "/delta_dynamics/joint_torques": {"effort": [1.0, 1.0, 1.0]},
+        "/cell/delta_dynamics/torque_residual": {"effort": [9.0, 9.0, 9.0]},
+        "/machine_state/joint_states": {"position": [9.0, 9.0, 9.0]},
+    }
+    with BagWriter(target, metadata=bag.report.metadata, flush_period=None) as writer:
+        for topic in (JOINTS, *others):
+            writer.add_topic(topic, JOINT_STATE, definition=definition)
+        for m in bag.messages(JOINTS):
+            if m.log_time - first > seconds * 1e9:
+                break
+            header, names = m.message.header, m.message.name
+            for topic, fields in others.items():
+                writer.write(topic, {"name": names, "header": header} | fields, m.log_time)
+            writer.write(JOINTS, m.data, m.log_time)
+    return target
+
+
+class TestTopics:
+    """Chosen by joint names, the twin's own left out, the choice told."""
+
+    def test_a_recording_of_everything_is_good(self, twin, tmp_path):
+        bag = with_others(DELTA, tmp_path / "all.mcap")
+        result = twin("check", bag)
+        assert (result.code, result.err) == (0, "")
+        first = result.out.splitlines()[0]
+        assert f"joint states {JOINTS}, wrench none" in first
+        assert "/gripper/joint_states (joints finger)" in first
+        data = json.loads(twin("check", bag, "--json").out)
+        assert data["topics"]["joint_states"] == JOINTS
+        assert len(data["topics"]["left_out"]) == 4
+        out = tmp_path / "t.csv"
+        assert twin("torques", "delta_cu", bag, "--no-picture", "--out", out).code == 0
+
+    def test_joints_are_those_of_the_controller(self, twin, tmp_path, variant):
+        """By name and number: the verdict and the table are those of the model's numbers."""
+        both = sides("delta_cu")
+        variant("delta_cu", joint_map=both.data["joint_map"])
+
+        def plain(topic, message, time):
+            return message if topic == JOINTS else None
+
+        def mapped(topic, message, time):
+            if topic != JOINTS:
+                return None
+            order = [both.plain.joint_names.index(name) for name in message.name]
+            back = np.argsort(order)
+            message.name = [both.names[k] for k in order]
+            for field, turn in (
+                ("position", both.positions), ("velocity", both.rates), ("effort", both.efforts)
+            ):  # fmt: skip
+                values = np.array(getattr(message, field))[back]
+                setattr(message, field, turn(values)[order].tolist())
+            return message
+
+        one = rewrite(DELTA, tmp_path / "plain.mcap", plain, seconds=0.3)
+        bag = rewrite(DELTA, tmp_path / "mapped.mcap", mapped, seconds=0.3)
+        robot = tmp_path / "delta_cu_variant.yaml"
+        result, expected = twin("check", bag, "--robot", robot), twin("check", one)
+        assert result.code == expected.code == 0
+        kept = [line for line in expected.out.splitlines() if "residual" in line]
+        assert kept and [line for line in result.out.splitlines() if "residual" in line] == kept
+        assert "'arm_1' is missing" in twin("check", bag).one_line_error()
+        tables = []
+        for name, source in (("delta_cu", one), (robot, bag)):
+            out = tmp_path / f"{source.stem}.csv"
+            assert twin("torques", name, source, "--no-picture", "--out", out).code == 0
+            tables.append(read_columns(out))
+        assert list(tables[1]) == list(tables[0])
+        for name, values in tables[0].items():
+            np.testing.assert_allclose(tables[1][name], values, rtol=1e-6, atol=1e-6)
+
+    def test_a_topic_can_be_named(self, twin, tmp_path):
+        bag = with_others(DELTA, tmp_path / "all.mcap")
+        assert twin("check", bag, "--topic", JOINTS).code == 0
+        named = twin("check", bag, "--topic", "/delta_dynamics/joint_torques")
+        assert "no positions" in named.one_line_error()
+        other = twin("check", bag, "--topic", "/gripper/joint_states").one_line_error()
+        assert "'arm_1' is missing" in other
+        assert "is not in the bag" in twin("check", bag, "--topic", "/nope").one_line_error()
+        both = twin("check", bag, "--topic", JOINTS, "--topic", "/gripper/joint_states")
+        assert "choose one" in both.one_line_error()
+
+    def test_two_that_fit_are_a_question(self, twin, tmp_path):
+        bag = open_bag(DELTA)
+        definition = bag.report.topics[JOINTS].definition
+        for names, code in ((("/a", "/b"), 1), (("/a", "/cell/joint_states"), 0)):
+            path = tmp_path / f"{code}.mcap"
+            with BagWriter(path, metadata=bag.report.metadata, flush_period=None) as writer:
+                for name in names:
+                    writer.add_topic(name, JOINT_STATE, definition=definition)
+                for index, m in enumerate(bag.messages(JOINTS)):
+                    if index == 100:
+                        break
+                    for name in names:
+                        writer.write(name, m.data, m.log_time)
+            result = twin("check", path)
+            assert result.code == code
+            if code:
+                assert "/a, /b; choose one with --topic" in result.one_line_error()
+                assert twin("check", path, "--topic", "/b").code == 0
+
+    def test_of_several_wrenches_the_twins_reactions_are_left_out(self, twin, tmp_path):
+        bag = open_bag(MILLING)
+        path = tmp_path / "w.mcap"
+        info = bag.report.topics["/wrench"]
+        own = "/delta_dynamics/reactions/foot_I"
+        with BagWriter(path, metadata=bag.report.metadata, flush_period=None) as writer:
+            for name, kind in ((JOINTS, JOINTS), ("/wrench", "/wrench"), (own, "/wrench")):
+                found = bag.report.topics[kind]
+                writer.add_topic(name, found.type, definition=found.definition)
+            for index, m in enumerate(bag.messages([JOINTS, "/wrench"])):
+                if index == 300:
+                    break
+                writer.write(m.topic, m.data, m.log_time)
+                if m.topic == "/wrench":
+                    writer.write(own, m.data, m.log_time)
+        assert info.type == WRENCH
+        data = json.loads(twin("check", path, "--json").out)
+        assert data["topics"]["wrench"] == "/wrench"
+        assert set(data["topics"]["left_out"]) == {own}

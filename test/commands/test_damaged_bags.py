@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Damaged bags and what is no bag: never good, never played, recovered as far as intact."""
+
+import json
+import os
+import random
+import re
+
+import pytest
+
+from pkm_twin.bags.reader import inspect
+from test.support.command import forked
+from test.support.robots import often
+
+
+class TestDamage:
+    @pytest.mark.parametrize("count", often(24, 200))
+    def test_flips_never_pass(self, twin, tiny, tmp_path, count):
+        whole = tiny.read_bytes()
+        assert twin("check", tiny).code == 0
+        draw = random.Random(20240229)
+        path = tmp_path / "flipped.mcap"
+        codes = []
+        for _ in range(count):
+            data = bytearray(whole)
+            bit = draw.randrange(8 * len(data))
+            data[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(data)
+            result = twin("check", path, "--json")
+            assert not json.loads(result.out)["good"]
+            result.one_line_error()
+            codes.append(result.code)
+        assert set(codes) <= {1, 3}
+        assert codes.count(3) > count / 4
+
+    @pytest.mark.parametrize("step", often(503, 37))
+    def test_cuts_never_pass(self, twin, tiny, tmp_path, step):
+        whole = tiny.read_bytes()
+        path = tmp_path / "cut.mcap"
+        codes = set()
+        for size in [*range(0, len(whole), step), len(whole) - 1]:
+            path.write_bytes(whole[:size])
+            result = twin("check", path)
+            assert result.out == ""
+            result.one_line_error()
+            codes.add(result.code)
+        assert codes == {1, 3}
+
+    @pytest.mark.parametrize("content", [b"", b"no bag at all", b"\x89MCAP0\r\n"])
+    def test_what_is_no_bag(self, twin, tmp_path, content):
+        path = tmp_path / "bad.mcap"
+        path.write_bytes(content)
+        result = twin("check", path, "--json")
+        data = json.loads(result.out)
+        assert result.code == 1
+        assert (data["good"], data["salvageable"]) == (False, 0)
+        assert data["error"] in result.one_line_error()
+
+    def test_missing_file(self, twin, tmp_path):
+        assert "does not exist" in twin("check", tmp_path / "absent.mcap").one_line_error()
+        assert twin("check").code == 2
+
+
+class TestRecover:
+    def test_then_check(self, twin, sample, tmp_path):
+        whole = sample.read_bytes()
+        cut, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
+        cut.write_bytes(whole[: len(whole) * 3 // 4])
+        refused = forked(tmp_path, "check", cut)
+        assert refused.code == 3
+        promised = int(re.search(r"(\d+) intact messages", refused.one_line_error())[1])
+        done = forked(tmp_path, "recover", cut, saved, "--json")
+        assert (done.code, done.err) == (3, "")
+        facts = json.loads(done.out)
+        assert not facts["lossless"]
+        assert facts["messages"] == promised == inspect(saved).message_count
+        assert promised > 800
+        assert cut.read_bytes() == whole[: len(whole) * 3 // 4]
+        assert twin("check", saved).code == 0
+
+    def test_a_sound_bag_loses_nothing(self, twin, tiny, tmp_path):
+        result = twin("recover", tiny, tmp_path / "copy.mcap")
+        assert (result.code, result.err) == (0, "")
+        assert "60 messages saved, nothing lost" in result.out
+        assert twin("check", tmp_path / "copy.mcap").code == 0
+
+    def test_loss_is_told_in_words(self, twin, tiny, tmp_path):
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(tiny.read_bytes()[:-10])
+        result = twin("recover", cut, tmp_path / "saved.mcap")
+        assert result.code == 3
+        assert "messages saved, " in result.out
+        assert "lost" in result.out
+
+    def test_refusals(self, twin, tiny, tmp_path):
+        target = tmp_path / "target.mcap"
+        target.write_text("mine")
+        assert "exists" in twin("recover", tiny, target).one_line_error()
+        assert target.read_text() == "mine"
+        assert twin("recover", tiny, target, "--overwrite").code == 0
+        assert inspect(target).message_count == 60
+        (tmp_path / "text").write_text("no bag")
+        for source in (tmp_path / "text", tmp_path / "absent"):
+            assert twin("recover", source, tmp_path / "new.mcap").code == 1
+            assert not (tmp_path / "new.mcap").exists()
+        assert twin("recover", tiny).code == 2
+
+
+class TestPlay:
+    """The player itself is tested over the middleware; here only what the command refuses."""
+
+    @pytest.mark.parametrize(
+        ("arguments", "code", "text"),
+        [
+            (("--remap", "no pair"), 2, "FROM:=TO"),
+            (("--rate", "fast"), 2, "rate"),
+            (("--rate", "0"), 1, "rate"),
+            (("--rate", "nan"), 1, "rate"),
+            (("--topic", "/absent"), 1, "/absent"),
+        ],
+    )
+    def test_refusals(self, twin, tiny, arguments, code, text):
+        result = twin("play", tiny, *arguments)
+        assert (result.code, result.out) == (code, "")
+        assert text in result.err
+        assert "Traceback" not in result.err
+
+    def test_a_damaged_bag_is_not_played(self, twin, tiny, tmp_path):
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(tiny.read_bytes()[:-10])
+        assert "recovered" in twin("play", cut).one_line_error()
+
+
+def test_only_regular_files(twin, tmp_path):
+    os.mkfifo(tmp_path / "x.mcap")
+    for path, kind in ((tmp_path / "x.mcap", "FIFO"), ("/dev/zero", "device")):
+        assert kind in twin("check", path).one_line_error()
+        assert kind in twin("recover", path, tmp_path / "new.mcap").one_line_error()

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the elements of a URDF, and of the YAML file next to it, become in the description."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pkm_twin.errors import ParameterError
+from pkm_twin.robot.urdf_read import read_urdf
+
+pytest.importorskip("pinocchio")
+
+
+from .sketches import Z, five_bar
+from .small_urdf import small
+
+pytestmark = pytest.mark.usefixtures("quickly_compiled")
+
+
+def test_limits_and_friction_are_read(tmp_path):
+    joints = read_urdf(five_bar().save(tmp_path))["joints"]
+    assert list(joints) == ["m2", "m1", "e1", "e2", "tip"]
+    # Nine radians either way are no limit.
+    assert joints["m1"]["limits"] == {"velocity": 7.0, "effort": 50.0}
+    assert "limits" not in joints["e1"]
+    assert joints["m1"]["friction"] == joints["e1"]["friction"] == {"viscous": 0.1, "coulomb": 0.2}
+    assert "friction" not in joints["tip"]
+
+
+def test_links_that_are_fixed_together_are_one_body(tmp_path):
+    data = read_urdf(small(tmp_path))
+    assert data["platform"] == "tool"
+    np.testing.assert_allclose(data["origin"], [0.5, 0.0, 0.5], atol=1e-14)
+    assert list(data["bodies"]) == ["tool"]
+    body = data["bodies"]["tool"]
+    assert body["mass"] == 4.0
+    np.testing.assert_allclose(body["com"], [(0.1 + 3 * 0.3) / 4, 0.0, 0.5], atol=1e-14)
+    # Two parts 0.2 m apart along x; the second one's x and z are the body's z and x.
+    across = 0.75 * 0.2**2
+    np.testing.assert_allclose(body["inertia"], [0.2, 0.2 + across, 0.3 + across], atol=1e-12)
+    assert data["joints"]["motor"] == {
+        "type": "revolute",
+        "between": ["base", "tool"],
+        "at": [0.0, 0.0, 0.5],
+        "axis": [0.0, 0.0, 1.0],
+        "actuated": True,
+        "limits": {"position": [-1.0, 1.0], "velocity": 4.0, "effort": 3.0},
+    }
+
+
+def test_another_link_can_be_the_ground(tmp_path):
+    data = read_urdf(small(tmp_path), platform="world", base="bob")
+    assert data["platform"] == "world"
+    np.testing.assert_allclose(data["origin"], [0.5, 0.0, -0.2], atol=1e-14)
+    assert data["bodies"]["world"]["mass"] == 2.0
+    assert data["joints"]["motor"]["between"] == ["world", "base"]
+    np.testing.assert_allclose(data["joints"]["motor"]["axis"], [-1.0, 0.0, 0.0], atol=1e-14)
+
+
+def test_a_moving_link_may_be_called_like_the_ground(tmp_path):
+    path = small(tmp_path, '"bob"', '"x"')
+    path.write_text(path.read_text().replace('"crank"', '"base"').replace('"tool"', '"end"'))
+    data = read_urdf(path, platform="base")
+    assert data["platform"] == "base_" and list(data["bodies"]) == ["base_"]
+
+
+def spinning(tmp_path):
+    """A five-bar whose tip is a pin between two hinges of one axis."""
+    path = five_bar().save(tmp_path)
+    pin_link = (
+        '<link name="pin"><inertial><mass value="0.1"/>'
+        '<inertia ixx="1e-4" iyy="1e-4" izz="1e-4"/></inertial></link>'
+        '<joint name="pin_joint" type="continuous"><parent link="fore_1"/><child link="pin"/>'
+    )
+    content = path.read_text()
+    start = content.index("<parent_origin", content.index("<constraint"))
+    origin = content[start : content.index("/>", start)]
+    axis_at = content.index('<parent_axis xyz="') + len('<parent_axis xyz="')
+    axis = content[axis_at : content.index('"', axis_at)]
+    pin_link += f'{origin.replace("parent_origin", "origin")}/><axis xyz="{axis}"/></joint>'
+    head, tail = content.split("<constraint", 1)
+    tail = tail.replace('<parent link="fore_1"/>', '<parent link="pin"/>', 1)
+    tail = tail.replace(origin + "/>", "", 1)
+    path.write_text(head + pin_link + "<constraint" + tail)
+    return path
+
+
+def test_a_pin_that_only_spins_about_itself_is_held(tmp_path):
+    with pytest.warns(UserWarning, match="held, .* spin about itself: pin_joint"):
+        data = read_urdf(spinning(tmp_path))
+    assert data["joints"]["pin_joint"]["type"] == "fixed"
+    assert [j["type"] for j in data["joints"].values()].count("revolute") == 5
+
+
+def test_what_hangs_loose_is_no_spin(tmp_path):
+    path = five_bar().save(tmp_path)
+    loose = (
+        '<link name="charm"><inertial><mass value="0.1"/>'
+        '<inertia ixx="1e-4" iyy="1e-4" izz="1e-4"/></inertial></link>'
+        '<joint name="chain" type="continuous"><parent link="arm_1"/><child link="charm"/>'
+        '<axis xyz="0 1 0"/></joint></robot>'
+    )
+    path.write_text(path.read_text().replace("</robot>", loose))
+    assert read_urdf(path)["joints"]["chain"]["type"] == "revolute"
+
+
+def test_a_chosen_type_of_the_yaml_file_replaces_a_joint(tmp_path):
+    beside = "name_mot: [motor]\njoint_name: [weld]\njoint_type: [SPHERICAL]\n"
+    path = small(tmp_path, beside=beside)
+    with pytest.raises(ParameterError, match="no loop closure, and passive joints: weld"):
+        read_urdf(path)
+    closed = beside.replace("SPHERICAL", "UJOINT_XZ") + "closed_loop: [[tip, world]]\ntype: [3d]\n"
+    path = small(tmp_path, 'xyz="0 0 0.3"', 'xyz="0 0 0.3"', closed)
+    path.write_text(path.read_text().replace('xyz="0 0 0.5"', 'xyz="0.5 0 0"'))
+    joints = read_urdf(path)["joints"]
+    assert joints["weld"]["type"] == "universal"
+    first, second = joints["weld"]["axes"]
+    assert abs(np.dot(first, second)) < 1e-12
+    assert joints["tip_world"]["type"] == "spherical" and joints["tip_world"]["at"] == [0, 0, 0]
+
+
+def test_an_empty_or_foreign_yaml_file_is_passed_over(tmp_path):
+    expected = read_urdf(small(tmp_path))
+    for content in ("", "mechanism: machine\nbodies: {}\n"):
+        assert read_urdf(small(tmp_path, beside=content)) == expected
+
+
+def test_what_looks_like_millimetres_or_degrees_is_asked(tmp_path):
+    with pytest.warns(UserWarning, match=r"joint.weld.origin: .* 200 m; .* millimetres\?"):
+        read_urdf(small(tmp_path, 'xyz="0.2 0 0"', 'xyz="200 0 0"'))
+    with pytest.warns(UserWarning, match=r"joint.weld.rpy: .*degrees\?"):
+        read_urdf(small(tmp_path, "1.5707963267948966", "90"))
+
+
+def test_a_quaternion_serves_as_well_as_angles(tmp_path):
+    expected = read_urdf(small(tmp_path))
+    half = repr(float(np.sqrt(0.5)))
+    turned = read_urdf(
+        small(tmp_path, 'rpy="0 1.5707963267948966 0"', f'quat_xyzw="0 {half} 0 {half}"')
+    )
+    np.testing.assert_allclose(
+        turned["bodies"]["tool"]["inertia"], expected["bodies"]["tool"]["inertia"]
+    )
+    np.testing.assert_allclose(turned["origin"], expected["origin"], atol=1e-14)
+
+
+def test_a_tree_whose_joints_are_all_driven_needs_no_closure(tmp_path):
+    assert np.allclose(read_urdf(small(tmp_path))["joints"]["motor"]["axis"], Z)

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Torques of streams by the feedforward core: rejects, stops, settings and clocks."""
+
+import math
+
+import numpy as np
+import pytest
+
+from delta_dynamics import feedforward, inverse_dynamics
+from delta_dynamics.settings import Settings
+from pkm_twin.errors import ParameterError, SingularityError
+from test.nodes.feedforward_core import (
+    NOW,
+    ORDERS,
+    ROBOT,
+    STEP,
+    UNREACHABLE,
+    WINDOW,
+    answers,
+    core,
+    motion,
+    running,
+    sample,
+)
+from test.nodes.harness import SECOND
+from test.support.rejects import reject
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+class TestStreams:
+    @pytest.mark.parametrize("differentiate", [False, True])
+    @pytest.mark.parametrize("rates", [False, True])
+    def test_efforts_are_those_of_the_motion(self, make, differentiate, rates):
+        twin = core(differentiate=differentiate)
+        if not (rates or differentiate):
+            assert reject(twin.joint_state, *sample(make, 0, rates=False))[0] == "no velocities"
+            return
+        results = answers(twin, make, range(20), rates=rates)
+        assert results[: WINDOW - 1] == [None] * (WINDOW - 1)
+        for i, result in enumerate(results[WINDOW - 1 :], WINDOW - 1):
+            assert result.stamp == NOW + i * STEP
+            exact = inverse_dynamics(ROBOT, *motion(i / 1000))
+            # Positions at 1 kHz lose six digits in a second derivative.
+            assert np.abs(result.effort - exact).max() < (1e-9 if rates else 1e-6)
+
+    @pytest.mark.parametrize("rates", [True, False])
+    def test_permuted_joints_have_bit_identical_efforts(self, make, rates):
+        options = {"rates": rates, "measured": (0.1, 0.2, 0.3)}
+        (expected,) = answers(core(differentiate=True), make, range(WINDOW), **options)[-1:]
+        for order in ORDERS:
+            twin = core(differentiate=True)
+            result = answers(twin, make, range(WINDOW), order=order, **options)[-1]
+            assert (result.effort == expected.effort).all()
+            assert (result.residual == expected.residual).all()
+
+    def test_the_residual_is_measured_less_predicted(self, make):
+        measured = np.array([0.5, -0.25, 1.0])
+        result = answers(core(), make, range(WINDOW), measured=measured)[-1]
+        assert (result.residual == measured - result.effort).all()
+        assert answers(core(), make, range(WINDOW))[-1].residual is None
+
+    @pytest.mark.parametrize("index", [9, 5])
+    def test_an_older_or_equal_stamp_is_dropped_and_counted(self, make, index):
+        twin = running(make)
+        message, _ = sample(make, index)
+        assert reject(twin.joint_state, message, NOW + 10 * STEP)[0] == "stamp order"
+        assert twin.dropped == 1
+        assert twin.joint_state(*sample(make, 10)) is not None
+
+    def test_older_stamps_that_go_on_stop_the_stream(self, make):
+        twin = running(make)
+        for _ in range(4):
+            assert not twin.stream.stopped
+            reject(twin.joint_state, sample(make, 5)[0], NOW + 10 * STEP)
+        assert twin.stream.stopped
+        assert twin.stream.stops == {"stamp order": 1}
+
+    def test_bad_samples_in_a_row_stop_until_good_ones_in_a_row(self, make):
+        twin = running(make)
+        nan = {"position": (math.nan, 0.0, 0.0)}
+        for i in range(10, 13):
+            reject(twin.joint_state, *sample(make, i, **nan))
+        assert not twin.stream.stopped
+        assert twin.joint_state(*sample(make, 13)) is not None
+        for i in range(14, 18):
+            reject(twin.joint_state, *sample(make, i, **nan))
+        assert twin.stream.stopped
+        # A bad sample begins the count of good ones anew.
+        assert answers(twin, make, range(18, 20)) == [None, None]
+        reject(twin.joint_state, *sample(make, 20, **nan))
+        results = answers(twin, make, range(21, 25))
+        assert [result is None for result in results] == [True, True, False, False]
+        assert twin.stream.rejected == {"not finite": 8}
+        assert twin.stream.stops == {"not finite": 1}
+
+    def test_after_a_reset_no_sample_from_before_is_used(self, make):
+        twin = running(make)
+        twin.reset()
+        results = answers(twin, make, range(WINDOW))  # Stamps begin again, as in a looped bag.
+        assert [result is None for result in results] == [True] * (WINDOW - 1) + [False]
+        exact = inverse_dynamics(ROBOT, *motion((WINDOW - 1) / 1000))
+        assert np.allclose(results[-1].effort, exact, atol=1e-9)
+
+    def test_a_gap_longer_than_stale_after_stops_and_fills_the_window_anew(self, make):
+        twin = running(make)
+        results = answers(twin, make, range(10 + 101, 10 + 101 + WINDOW + 2))
+        # The window is filled, then recovery_count is 3.
+        assert [result is None for result in results] == [True] * (WINDOW + 1) + [False]
+        assert twin.stream.stops == {"stale input": 1}
+        assert running(make).joint_state(*sample(make, 10 + 99)) is not None
+
+    def test_differentiated_rates_keep_the_velocity_limit(self, make):
+        twin = core(differentiate=True)
+        answers(twin, make, range(WINDOW - 1), rates=False)
+        q = motion((WINDOW - 2) / 1000)[0]
+        leap = sample(make, WINDOW - 1, rates=False, position=q + 0.09)
+        assert reject(twin.joint_state, *leap)[0] == "limit"
+
+    def test_an_unreachable_state_names_the_limb(self, make, limitless):
+        twin = core(limitless)
+        answers(twin, make, range(WINDOW))
+        bad = sample(make, 10, position=UNREACHABLE)
+        reason, text = reject(twin.joint_state, *bad)
+        assert (reason, "limb III" in text) == ("unreachable", True)
+
+    def test_a_singular_state_is_rejected_and_stops(self, make, monkeypatch):
+        def singular(*arguments):
+            raise SingularityError("joint state", (), 1e-12, 1e-9)
+
+        twin = running(make)
+        monkeypatch.setattr(feedforward, "inverse_dynamics", singular)
+        assert reject(twin.joint_state, *sample(make, 10))[0] == "singular"
+        assert twin.stream.stops == {"singular": 1}
+
+    def test_a_new_robot_is_used_from_the_next_sample(self, make):
+        twin = running(make)
+        heavy = ROBOT.changed(payload={"mass": 0.5}, limits={"effort": 5.0})
+        twin.change_robot(heavy)
+        result = twin.joint_state(*sample(make, 10))
+        exact = inverse_dynamics(heavy, *motion(0.010))
+        assert np.allclose(result.effort, exact, atol=1e-9)
+        assert not np.allclose(exact, inverse_dynamics(ROBOT, *motion(0.010)), atol=0.1)
+
+    def test_a_zero_stamp_is_the_arrival_time_where_allowed(self, make):
+        message, now = sample(make, 0, stamp=0)
+        assert reject(core().joint_state, message, now)[0] == "zero stamp"
+        twin = core(accept_zero_stamp=True)
+        for i in range(WINDOW):
+            message, now = sample(make, i, stamp=0)
+            result = twin.joint_state(message, now)
+        assert result.stamp == NOW + (WINDOW - 1) * STEP
+
+
+class TestRefusedSamples:
+    """What is refused moves nothing that a good sample is judged by."""
+
+    @pytest.mark.parametrize(
+        "bad",
+        [
+            {"position": (math.nan, 0.0, 0.0)},
+            {"velocity": ()},
+            {"position": UNREACHABLE},
+            {"velocity": (1e9, 0.0, 0.0)},
+            {"velocity": (14.0, -14.0, 14.0), "ahead": 1},
+            # As far as a joint may move, but not there and back.
+            {"position": motion(0.009)[0] + 0.09, "velocity": (14.0, -14.0, 14.0), "ahead": 1},
+            {"position": (0.4, 0.4, 0.4), "ahead": 1},
+        ],
+    )
+    def test_one_bad_sample_costs_none_but_itself(self, make, limitless, bad):
+        # As far ahead as stamps may be, but what is allowed of a move grows with its time.
+        bad = {"ahead": 99} | bad
+        ahead = bad.pop("ahead")
+        robot = ROBOT.changed(limits={"effort": 60.0})
+        robot = limitless if bad.get("position") is UNREACHABLE else robot
+        twin = core(robot, trip_count=10**6, limit_policy="reject", recovery_count=1)
+        answers(twin, make, range(10))
+        stamp = NOW + (9 + ahead) * STEP
+        for _ in range(3):
+            reject(twin.joint_state, sample(make, 9, stamp=stamp, **bad)[0], NOW + 9 * STEP)
+        # A jump ends the window, so that nothing is differentiated across it.
+        begins = WINDOW - 1 if twin.stream.rejected.keys() & {"jump", "unreachable"} else 0
+        results = answers(twin, make, range(10, 10 + WINDOW + 3))
+        assert [result is None for result in results] == [True] * begins + [False] * (
+            len(results) - begins
+        )
+        exact = inverse_dynamics(robot, *motion((10 + WINDOW + 2) / 1000))
+        assert np.abs(results[-1].effort - exact).max() < 1e-9
+        assert twin.stream.rejected.total() == 3
+
+    def test_a_reject_during_a_stop_leaves_its_reason(self, make):
+        twin = running(make)
+        for i in range(10, 14):
+            reject(twin.joint_state, *sample(make, i, position=(math.nan, 0.0, 0.0)))
+        before = twin.stream.reason, twin.stream.text
+        assert before[0] == "not finite"
+        reject(twin.joint_state, *sample(make, 14, names=("a", "b", "c")))
+        twin.time_jumped_forward()
+        assert (twin.stream.reason, twin.stream.text) == before
+        assert twin.stream.stops == {"not finite": 1}
+
+    def test_a_stop_that_is_ended_by_hand_answers_at_once(self, make):
+        twin = running(make)
+        for i in range(10, 14):
+            reject(twin.joint_state, *sample(make, i, position=(math.nan, 0.0, 0.0)))
+        assert twin.stream.resume()
+        assert not twin.stream.resume()
+        assert twin.joint_state(*sample(make, 14)) is not None
+
+    def test_a_torque_that_is_late_is_refused(self, make):
+        twin = running(make)
+        result = twin.joint_state(*sample(make, 10))
+        twin.check_age(result, result.stamp + SECOND // 10)
+        reason, _ = reject(twin.check_age, result, result.stamp + SECOND // 10 + 1)
+        assert reason == "late answer"
+        assert twin.stream.rejected == {"late answer": 1}
+
+
+class TestSettings:
+    def test_other_settings_hold_from_the_next_sample_on(self, make):
+        twin = running(make)
+        twin.change_settings(Settings(window=WINDOW, trip_count=1, singularity_warn=1.0))
+        assert twin.joint_state(*sample(make, 10)) is not None
+        assert twin.near_singular
+        reject(twin.joint_state, *sample(make, 11, position=(math.nan, 0.0, 0.0)))
+        assert twin.stream.stopped
+
+    def test_a_new_window_is_filled_anew(self, make):
+        twin = running(make)
+        twin.change_settings(Settings(window=WINDOW + 1, recovery_count=1))
+        results = answers(twin, make, range(10, 20))
+        assert [result is None for result in results] == [True] * WINDOW + [False] * (10 - WINDOW)
+
+
+class TestClocks:
+    def test_a_clock_that_goes_back_is_a_new_beginning(self, make):
+        twin = running(make)
+        for i in range(WINDOW):
+            message, now = sample(make, i)
+            message.header.stamp.sec -= 100
+            result = twin.joint_state(message, now - 100 * SECOND)
+            assert (result is None) is (i < WINDOW - 1)
+        exact = inverse_dynamics(ROBOT, *motion((WINDOW - 1) / 1000))
+        assert np.abs(result.effort - exact).max() < 1e-9
+        assert not twin.stream.rejected
+
+    def test_a_clock_that_goes_back_a_little_only_drops_older_stamps(self, make):
+        twin = running(make)
+        assert reject(twin.joint_state, *sample(make, 5))[0] == "stamp order"
+        assert twin.joint_state(*sample(make, 10)) is not None
+
+    def test_a_clock_that_leaps_stops_a_running_stream(self, make):
+        twin = running(make)
+        twin.time_jumped_forward()
+        assert twin.stream.stops == {"clock jump": 1}
+        late = NOW + 10 * SECOND
+        assert reject(twin.joint_state, sample(make, 10)[0], late)[0] == "stale stamp"
+        results = []
+        for i in range(WINDOW + 3):
+            message, now = sample(make, i)
+            message.header.stamp.sec += 10
+            results.append(twin.joint_state(message, now + 10 * SECOND))
+        assert [result is None for result in results] == [True] * (WINDOW + 1) + [False] * 2
+
+    def test_a_first_clock_is_no_leap(self):
+        twin = core()
+        twin.time_jumped_forward()
+        assert not twin.stream.stopped
+
+
+def test_a_window_too_short_for_its_order_is_refused():
+    with pytest.raises(ParameterError, match=r"differentiator\.window"):
+        Settings(order=3, window=4)
+    assert Settings(order=3, window=5)
