@@ -167,7 +167,7 @@ class TestCompliance:
         assert ("dominant elements, with equal shares" in text.out) == energy.tie
         level = parse(twin("compliance", "upr_rpu", -0.6, 0, 0, "--json").out)
         assert level["tie"] == ["1U", "2U"]
-        assert "elements 1U, 2U" in twin("compliance", "upr_rpu", -0.6, 0, 0).out
+        assert "shares: 1U, 2U" in twin("compliance", "upr_rpu", -0.6, 0, 0).out
 
     def test_beyond_limits_is_refused_or_marked(self, twin):
         close = "compliance", "upr_rpu", -0.25, 0, 0

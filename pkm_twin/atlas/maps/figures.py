@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 WIDE: float = 9.0
 """Of a picture, inches."""
-LETTERS: int = 100
+LETTERS: int = 110
 """In a line of a picture's title."""
 
 
@@ -52,10 +52,7 @@ def sentence(answer: dict[str, Any]) -> str:
     if answer["value"]:
         value, unit = figures.prefixed(np.array(answer["value"]), answer["unit"])
         shown = f"{float(value):.4g} {unit}"
-    return (
-        f"worst pose, {answer['case']}: {shown} at {pose}; direction ({way}), due to "
-        f"{answer['element']}"
-    )
+    return f"{answer['case']}: {shown} at {pose}; direction ({way}), due to {answer['element']}"
 
 
 def question(atlas: Dataset) -> str:
