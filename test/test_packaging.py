@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import venv
 import zipfile
 from functools import cache
@@ -57,10 +58,10 @@ def run(*command, cwd, **environment):
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory):
-    """A clean copy of the tree, without recordings and tests."""
+    """A clean copy of the tree, without tests."""
     target = tmp_path_factory.mktemp("workspace") / "src/pkm_twin"
     for name in tracked():
-        if name.parts[0] not in ("test", "docs"):
+        if name.parts[0] != "test":
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(REPOSITORY / name, target / name)
     return target
@@ -130,16 +131,39 @@ class TestWheel:
         assert all("extra ==" in line for line in required if line.startswith("ros-"))
 
 
-@pytest.fixture
-def sdist_wheel(copy, tmp_path):
-    """A wheel built from the source distribution."""
-    code = f"from setuptools import build_meta; print(build_meta.build_sdist({str(tmp_path)!r}))"
+@pytest.fixture(scope="module")
+def sdist(copy, tmp_path_factory):
+    """The source distribution."""
+    folder = tmp_path_factory.mktemp("sdist")
+    code = f"from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})"
     run(sys.executable, "-c", code, cwd=copy)
-    (source,) = tmp_path.glob("*.tar.gz")
-    command = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", source]
+    (source,) = folder.glob("*.tar.gz")
+    return source
+
+
+@pytest.fixture
+def sdist_wheel(sdist, tmp_path):
+    """A wheel built from the source distribution."""
+    command = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", sdist]
     run(sys.executable, *command, cwd=tmp_path)
     (built,) = tmp_path.glob("*.whl")
     return built
+
+
+def test_the_source_distribution_has_what_a_user_reads_and_runs(sdist):
+    folders = {"config", "docs", "examples", "launch", "pkm_twin", "resource"}
+    files = {"LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "package.xml", "setup.py"}
+    wanted = {
+        str(name)
+        for name in tracked()
+        if name.parts[0] in folders
+        or str(name) in files
+        or (name.parts[0] == "bags" and name.suffix in (".mcap", ".csv"))
+    }
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert not wanted - names
+    assert not {name for name in names if name.startswith("test/")}
 
 
 @pytest.mark.long

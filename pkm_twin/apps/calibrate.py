@@ -298,8 +298,8 @@ def _errors(errors: Errors) -> dict[str, float]:
 
 
 def _print(result: Calibration | PartialCalibration) -> None:
-    table = Table(title=Text("calibrated numbers"))
-    for column in ("number", "before", "after", "standard deviation", "unit", "observed"):
+    table = Table(title=Text("calibrated parameters"))
+    for column in ("parameter", "before", "after", "standard deviation", "unit", "determined"):
         table.add_column(column)
     for p in result.parameters:
         table.add_row(Text(p.name), *_row(p))
@@ -312,8 +312,8 @@ def _print(result: Calibration | PartialCalibration) -> None:
 
 
 def _print_errors(result: Calibration) -> None:
-    errors = Table(title=Text("distance of measured and computed poses"))
-    for column in ("poses", "rms before", "rms after", "worst before", "worst after"):
+    errors = Table(title=Text("distance between measured and computed poses"))
+    for column in ("poses", "RMS before", "RMS after", "worst before", "worst after"):
         errors.add_column(column)
     for name, (before, after) in (
         ("fitted", result.fitted),
@@ -329,7 +329,7 @@ def _print_errors(result: Calibration) -> None:
     noise = f"{1e3 * result.noise:.4f} mm"
     if result.noise_angle is not None:
         noise += f", {1e3 * result.noise_angle:.4f} mrad"
-    typer.echo(f"noise that is left, an axis: {noise}; condition number {result.condition:.3g}")
+    typer.echo(f"remaining noise per axis: {noise}; condition number {result.condition:.3g}")
     for one in result.outliers[:MOST_SHOWN]:
         typer.echo(f"outlier, with a small weight: {_outlier_text(one)}")
     if len(result.outliers) > MOST_SHOWN:
@@ -339,7 +339,7 @@ def _print_errors(result: Calibration) -> None:
 def _print_open(result: Estimate) -> None:
     open_lines = result.undetermined
     if open_lines:
-        typer.echo("the poses do not determine these numbers; the file's values stay:")
+        typer.echo("the poses do not determine these parameters, which keep the file's values:")
     for line in open_lines:
         typer.echo(fill(line, WIDTH, initial_indent="  ", subsequent_indent="    "))
 

@@ -60,13 +60,17 @@ def certify(
         print_json(result.as_json())
     else:
         which = f"{result.robot} and {variants} variants" if variants else result.robot
-        table = Table(title=Text(f"{which}: {result.states} states, seed {result.seed}"))
+        table = Table(
+            title=Text(
+                f"{which}: differences from pkm_twin at {result.states} states, seed {result.seed}"
+            )
+        )
         for column in ("engine", "what", "worst", "median", "bound", "verdict"):
             table.add_column(column)
         for item in result.items:
             verdict = Text("good", "green") if item.good else Text("bad", "red")
             values = (f"{value:.1e}" for value in (item.worst, item.median, item.bound))
-            table.add_row(item.engine, item.what, *values, verdict)
+            table.add_row(item.engine, item.what.replace("_", " "), *values, verdict)
         table_console().print(table)
         for name, reason in result.missing.items():
             typer.echo(f"{name} was not used: {reason}")

@@ -137,8 +137,8 @@ def _file(r: Recording, bounds: Bounds) -> list[Item]:
     items = [
         Item(
             "file",
-            "; ".join(report.warnings) or "every byte whole, counts agree",
-            "CRCs, counts and times agree",
+            "; ".join(report.warnings) or "complete; checksums and counts agree",
+            "complete and consistent",
             Verdict.UNKNOWN if report.warnings else Verdict.GOOD,
         )
     ]
@@ -243,7 +243,7 @@ def _residuals(r: Recording, bounds: Bounds) -> tuple[list[Item], dict[str, Mode
         _item(
             f"{what} of {name}",
             f"RMS {rms[i]:.4g} {units[i]}, {100 * rms[i] / max(peak[i], 1e-12):.2f} % of "
-            f"{peak[i]:.4g}{f'; {bands[name]}' if bands else ''}{'' if good[i] else hint}",
+            f"peak {peak[i]:.4g}{f'; {bands[name]}' if bands else ''}{'' if good[i] else hint}",
             bound,
             bool(good[i]),
         )

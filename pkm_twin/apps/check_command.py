@@ -181,7 +181,7 @@ def check(
         print_json(report.as_json())
     else:
         typer.echo(f"{report.topics}")
-        typer.echo(f"payload: {report.load or 'the robot file alone'}")
+        typer.echo(f"payload: {report.load or 'as in the robot file'}")
         if not report.unsure:
             typer.echo("uncertainty: none in the robot file, so the model has no uncertainty band")
         table_console().print(items_table(f"{report.bag}: {report.robot}", "limit", report.items))

@@ -102,7 +102,7 @@ def compliance(
     typer.echo(f"deflection (um, urad): {', '.join(moved)}")
     shares = sorted(zip(energy.factors, energy.elements, strict=True), key=lambda pair: -pair[0])
     dominant = (
-        f"a tie of the dominant elements {', '.join(tied)}"
+        f"dominant elements, with equal shares: {', '.join(tied)}"
         if tied
         else f"dominant element {energy.dominant}"
     )

@@ -124,12 +124,12 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
         ("robot", f"{data['name']}: {data['description']}"),
         ("mobility", data["mobility"]),
         ("bodies and rods", ", ".join(data["bodies"])),
-        ("closures", _closures(data)),
+        ("loop constraints", _closures(data)),
         ("pose", pose),
         ("actuated joints", ", ".join(f"{name} ({unit})" for name, unit in joint_units.items())),
         ("home pose", _pairs(data["home_pose"], data["pose"])),
         ("home joints", _pairs(data["home_joints"], joint_units)),
-        ("singularity index at home", f"{data['singularity_at_home']:.3f} (1 is best)"),
+        ("singularity index at home", f"{data['singularity_at_home']:.3f} (0 singular, 1 best)"),
     ]
     if data["home_choice"]:
         rows.append(("home", data["home_choice"]))
@@ -138,7 +138,7 @@ def lines(data: dict[str, Any]) -> list[tuple[str, str]]:
         ("overconstrained", "no: rigid-body equations determine every reaction")
     ]
     found = [Finding(**finding).text for finding in data["plausibility"]]
-    rows += [("plausibility", text) for text in found or ["nothing implausible"]]
+    rows += [("plausibility", text) for text in found or ["no implausible value"]]
     for section, value in data["parameters"].items():
         if section not in ("mechanism", "name") and not (
             section == "joints" and isinstance(value, list)
@@ -156,7 +156,7 @@ def _closures(data: dict[str, Any]) -> str:
     text = f"{data['closures']} equations of rank {data['rank']}, {redundant} redundant"
     if redundant and data["assumed_joints"] and not data["overconstrained"]:
         joints = ", ".join(data["assumed_joints"])
-        text += f" in the model only: its joint {joints} repeats what the limbs constrain"
+        text += f" in the model only, where joint {joints} repeats constraints of the limbs"
     return text
 
 

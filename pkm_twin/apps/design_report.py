@@ -274,19 +274,23 @@ def budget(robot: Robot, sigma: Mapping[str, float], path: Path | None) -> tuple
         "worst_pose": robot.forward(q[worst]).tolist(),
     }  # fmt: skip
     lines = [
-        f"{robot.name}: standard deviations of the platform's pose over {where}, {len(q)} states",
-        f"{'':34}{'sigma':>12}{'rms mm':>10}{'max mm':>10}{'rms mrad':>10}{'share':>8}",
+        f"{robot.name}: standard deviation of the platform's position (mm) and rotation (mrad) "
+        f"over {where}, {len(q)} states",
+        f"{'value':34}{'sigma':>12} {'unit':8}{'RMS mm':>10}{'max mm':>10}{'RMS mrad':>10}"
+        f"{'share':>8}",
     ]
     for name, row in rows.items():
         lines.append(
-            f"{name:34}{row['sigma']:12.4g}{1e3 * row['rms_position_m']:10.4g}"
+            f"{name:34}{row['sigma']:12.4g} {row['unit']:8}{1e3 * row['rms_position_m']:10.4g}"
             f"{1e3 * row['greatest_position_m']:10.4g}{1e3 * row['rms_angle_rad']:10.4g}"
             f"{100 * row['share']:7.3g}%"
         )
     lines.append(
-        f"{'all':34}{'':12}{1e3 * data['rms_position_m']:10.4g}"
+        f"{'all':34}{'':21}{1e3 * data['rms_position_m']:10.4g}"
         f"{1e3 * data['greatest_position_m']:10.4g}{1e3 * data['rms_angle_rad']:10.4g}"
     )
     pose = zip(robot.pose_names, data["worst_pose"], strict=True)
-    lines.append("greatest at " + ", ".join(f"{name} {value:.4g}" for name, value in pose))
+    lines.append(
+        "largest position deviation at " + ", ".join(f"{name} {value:.4g}" for name, value in pose)
+    )
     return data, "\n".join(lines)

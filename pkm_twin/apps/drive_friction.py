@@ -27,14 +27,14 @@ def drive_friction_command(
     ],
     lever: Annotated[
         float,
-        typer.Option(help="of mass_kg: metres of travel a radian of the motor (spool radius)"),
+        typer.Option(help="for mass_kg: travel per radian of the motor (spool radius), m"),
     ] = 0.0,
     as_json: Json = False,
 ) -> None:
     """Fit a drive's torque constant and friction to slow traverses with weights, up and down.
 
-    Friction that grows with the load is accepted where a constant (Coulomb, and viscous at one
-    speed) is rejected by an F test at 5 % and leaves more of the runs that are held out one by one.
+    Load-dependent friction is accepted if an F test at 5 % rejects constant friction (Coulomb, and
+    viscous at one speed), and if it predicts left-out runs better. Each run is left out once.
     """
     from pkm_twin.identification.hanging_mass import drive_friction, lines
 
@@ -46,7 +46,7 @@ def drive_friction_command(
         torque = columns["torque_nm"]
     elif "mass_kg" in columns:
         if not lever > 0.0:
-            raise ParameterError("lever", lever, "metres per radian, above 0, for a column mass_kg")
+            raise ParameterError("--lever", lever, "m per rad, above 0, for a column mass_kg")
         torque = GRAVITY * lever * columns["mass_kg"]
     else:
         raise ParameterError(str(table), ", ".join(columns), "a column 'mass_kg' or 'torque_nm'")

@@ -28,7 +28,7 @@ def elastic_report(result: ElasticFit, recordings: Sequence[str]) -> Report:
     names = [str(n.key[-1]) for n in result.numbers]
     factors = tuple(f"the factor of {name}" for name in names)
     table = Table(box=None)
-    for name in ("compliance over the file's", "before", "now", "+-"):
+    for name in ("factor on the compliance of", "in the file", "fitted", "standard deviation"):
         table.add_column(name, justify="right")
     table.add_column("")
     for name, n in zip(names, result.numbers, strict=True):
@@ -42,17 +42,17 @@ def elastic_report(result: ElasticFit, recordings: Sequence[str]) -> Report:
         data_before={}, data_after=_data(result), table=table,
         residuals=[_residuals(result, k) for k in range(len(result.judged))],
         residuals_header=(
-            "recording", "direction", "rms before", "rms now", "peak deflection", "unit",
+            "recording", "direction", "RMS before", "RMS now", "peak deflection", "unit",
         ),
         figure=lambda k: _deflections(result, k), groups=list(map(_group_text, result.groups)),
         fitted="Elastic elements fitted", heading="Compliance of the elements", excited_by="loads",
-        counted=f"condition number {e.condition:.3g}, {result.told} combinations",
-        about=f"Each number multiplies what the file says of an element's compliance. "
-        f"{result.told} combinations are told by {result.samples} deflections; condition number "
-        f"{e.condition:.3g}. +- is one standard deviation, of the noise and of what the file said "
-        "before.",
-        bound="held by a bound: the data alone want a negative compliance",
-        bound_of_page="The data alone want a negative compliance; the nearest are shown.",
+        counted=f"condition number {e.condition:.3g} of {result.told} identifiable combinations",
+        about=f"Each factor multiplies the compliance that the file gives an element. "
+        f"{result.samples} deflections identify {result.told} combinations; condition number "
+        f"{e.condition:.3g}. The standard deviation includes noise and the file's prior values.",
+        bound="some factors are at a bound: without it the fit would give a negative compliance",
+        bound_of_page="Without bounds the fit would give a negative compliance; the nearest "
+        "possible values are shown.",
     )  # fmt: skip
 
 

@@ -126,9 +126,10 @@ def _report(
         "picture": None if drawing is None else str(drawing),
     }  # fmt: skip
     title = (
-        f"{robot.name}: {motion.duration:.4g} s, feed up to {1e3 * s.speed.max():.4g} mm/s, "
-        f"deflection up to {1e6 * most:.4g} of {1e6 * tolerance:.4g} µm; a constant feed in the "
-        f"tolerance is {1e3 * even:.4g} mm/s"
+        f"{robot.name}: duration {motion.duration:.4g} s, feed at most "
+        f"{1e3 * s.speed.max():.4g} mm/s, deflection at most {1e6 * most:.4g} µm "
+        f"(tolerance {1e6 * tolerance:.4g} µm); the largest "
+        f"constant feed within the tolerance is {1e3 * even:.4g} mm/s"
     )
     if drawing is not None:
         from pkm_twin.atlas import plots

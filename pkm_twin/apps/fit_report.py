@@ -149,7 +149,8 @@ class Report:
                 typer.echo(line)
             for name, channel, before, after, _, unit in rows:
                 typer.echo(
-                    f"{name}, held out, {channel}: residual {before} before, {after} {unit} now"
+                    f"{name}, held out, {channel}: RMS residual {before} {unit} with the file's "
+                    f"values, {after} {unit} with the fitted ones"
                 )
 
     def page(self, notes: Sequence[str] = ()) -> str:
@@ -167,7 +168,7 @@ class Report:
             self._verdict(),
             f"<h2>{self.heading}</h2>",
             html_table(
-                ("number", "before", "now", "+-", "unit", ""),
+                ("parameter", "in the file", "fitted", "standard deviation", "unit", ""),
                 [
                     (n.name, f"{n.before:.6g}", f"{n.after:.6g}", n.spread, n.unit, note_of(n))
                     for n in self.shown
@@ -183,7 +184,10 @@ class Report:
                 f"<p>Not excited by the {self.excited_by}, the file's value stays: {idle}.</p>"
             )
         parts += [f"<p>{html.escape(text)}.</p>" for text in self.groups]
-        parts += ["<h2>Numbers, before and now</h2>", picture(changes_figure(self.shown))]
+        parts += [
+            "<h2>Parameters, in the file and fitted</h2>",
+            picture(changes_figure(self.shown)),
+        ]
         parts.append("<h2>Held out: the last third of each recording</h2>")
         parts.append(html_table(self.residuals_header, [row for k in self.residuals for row in k]))
         parts += [self.held_out] if self.held_out else []
@@ -204,7 +208,7 @@ class Report:
             for c, unit in zip(verdict.channels, self.units, strict=True)
         ]  # fmt: skip
         header = (
-            "", "residual in the band of the motion (rms)", "noise there (rms)", "unit",
+            "", "RMS residual in the band of the motion", "RMS noise there", "unit",
             "variation without a known cause", "held out over fitted",
         )  # fmt: skip
         return f"<ul>{text}</ul>{html_table(header, rows)}"
@@ -215,8 +219,8 @@ def effort_report(result: Fit, recordings: Sequence[str]) -> Report:
     joints, units = result.robot.joint_names, result.robot.effort_units
     parameters, e = result.parameters, result.estimate
     table = Table(box=None)
-    table.add_column("")
-    for name in ("before", "now", "+-"):
+    table.add_column("parameter")
+    for name in ("in the file", "fitted", "standard deviation"):
         table.add_column(name, justify="right")
     table.add_column("unit")
     table.add_column("")
@@ -264,21 +268,21 @@ def effort_report(result: Fit, recordings: Sequence[str]) -> Report:
             ],
         },
         table=table, residuals=[_joint_residuals(judged, result.robot) for judged in result.judged],
-        residuals_header=("recording", "joint", "rms before", "rms now", "peak effort", "unit"),
+        residuals_header=("recording", "joint", "RMS before", "RMS now", "peak effort", "unit"),
         figure=lambda k: _efforts(result.judged[k], result.robot),
         late=[
-            f"{judged.name}: efforts late by {1e3 * delay:.3g} ms"
+            f"{judged.name}: efforts are {1e3 * delay:.3g} ms later than the positions"
             for judged, delay in zip(result.judged, result.delays, strict=True)
         ],
         fitted="Fitted", heading="What was fitted", excited_by="motion",
-        counted=f"condition number {e.condition:.3g} over {e.directions} combinations",
+        counted=f"condition number {e.condition:.3g} of {e.directions} identifiable combinations",
         about=f"{result.samples} filtered samples identify {e.directions} combinations of "
-        f"parameters; condition number {e.condition:.3g}. +- is one standard deviation. It "
+        f"parameters; condition number {e.condition:.3g}. The standard deviation "
         "includes noise, differentiation and the file's prior values.",
-        bound="at a physical bound: the data alone would give negative friction or an impossible "
-        "body",
-        bound_of_page="The data alone want negative friction, or masses and inertias that no body "
-        "has; these are the nearest possible ones.",
+        bound="some values are at a physical bound: without it the fit would give negative "
+        "friction or an impossible body",
+        bound_of_page="Without physical bounds the fit would give negative friction, or masses and "
+        "inertias that no body has; these are the nearest possible ones.",
         held_out="<p>The band is two standard deviations of the model's own torques, by what the "
         "fit does not know of its numbers; noise of the measured efforts is not in it.</p>",
         signals="<h2>What was done to the signals</h2>\n" + html_table(filters_header, filters)

@@ -87,9 +87,9 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> GuardReport:
     came = Verdict.GOOD if a.count else Verdict.BAD
     items = [
         Item("messages", f"{a.count}{rate}", "1 or more", came),
-        item("longest silence", f"{a.longest_silence / 1e6:.1f} ms{beyond}", least, not a.silences),
+        item("longest gap", f"{a.longest_silence / 1e6:.1f} ms{beyond}", least, not a.silences),
         item(
-            "age on arrival", f"mean {1e3 * mean:.1f}, most {a.oldest / 1e6:.1f} ms", least,
+            "age on arrival", f"mean {1e3 * mean:.1f}, largest {a.oldest / 1e6:.1f} ms", least,
             not a.late,
         ),
         item("lost messages", str(a.topic.missed), "0", not a.topic.missed),

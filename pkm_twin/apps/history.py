@@ -19,7 +19,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.check import modelled
 from pkm_twin.apps.describe import why_no_torques
 from pkm_twin.apps.recorded import Recording
-from pkm_twin.errors import ParameterError, PkmTwinError
+from pkm_twin.errors import FileError, PkmTwinError
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -32,6 +32,7 @@ DISTINCT: Final = 1e-4
 """Least singular value, of unit columns, of numbers that a motion tells apart."""
 SINCE: Final = 1e17
 """Stamps above this, ns, are since 1970; smaller ones are since a start."""
+HISTORY: Final = "a history that `pkm-twin check --history` wrote"
 _TABLES: Final = """
 CREATE TABLE IF NOT EXISTS checks (
     id INTEGER PRIMARY KEY, recorded REAL NOT NULL, judged TEXT NOT NULL, machine TEXT NOT NULL,
@@ -66,6 +67,19 @@ class Series:
     time: Array
     value: Array
     deviation: Array
+
+    @property
+    def label(self) -> str:
+        """Machine, quantity and part in words."""
+        return f"{self.machine}: {WORDS.get(self.quantity, self.quantity)} of {self.part}"
+
+
+WORDS: Final = {
+    "friction viscous": "viscous friction",
+    "friction coulomb": "Coulomb friction",
+    "payload beyond the load": "unknown payload",
+}
+"""Quantities whose name in a history's file is not the field's."""
 
 
 def measure(recording: Recording) -> list[Measured]:
@@ -175,7 +189,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         with closing(sqlite3.connect(path, timeout=WAIT, isolation_level=None)) as base:
             yield base
     except sqlite3.Error as error:
-        raise ParameterError(str(path), str(error), "a history that --history wrote") from None
+        raise FileError(path, error, HISTORY) from None
 
 
 def append(
@@ -227,7 +241,7 @@ def read_history(path: Path, machine: str | None = None) -> list[Series]:
     :raises ParameterError: no such file, or no history.
     """
     if not path.is_file():
-        raise ParameterError(str(path), None, "a history that `pkm-twin check --history` wrote")
+        raise FileError(path, FileNotFoundError(), HISTORY)
     with _opened(path) as base:
         rows = base.execute(
             "SELECT machine, quantity, part, unit, recorded, value, deviation FROM numbers "

@@ -192,7 +192,7 @@ def report(
     }  # fmt: skip
     lines = [
         f"{robot.name}: {len(motion.time)} samples, {data['duration_s']:.4g} s; payload: "
-        f"{motion.load or 'the robot file alone'}"
+        f"{motion.load or 'as in the robot file'}"
     ]
     for load in loads:
         open_axes = [a for k, a in enumerate(AXES) if not np.isfinite(load.own[:, k]).all()]
@@ -214,7 +214,7 @@ def report(
         ranges = {a: v for a, v in entry["equivalent_range"].items() if a[0] == "f"}
         if ranges:
             worst = max(ranges, key=lambda a: ranges[a])
-            text += f" equivalent range {ranges[worst]:.4g} N ({worst})"
+            text += f" equivalent load range {ranges[worst]:.4g} N ({worst})"
         if open_axes:
             text += f" undetermined: {', '.join(open_axes)}"
         if load.name in bearings:
@@ -232,7 +232,7 @@ def report(
         lines.append(text)
     if any(entry["undetermined"] for entry in data["joints"].values()):
         lines.append(
-            "undetermined: rigid bodies leave it open, and no elastic member or joint decides"
+            "undetermined: neither rigid-body equations nor elastic members or joints determine it"
         )
     return data, "\n".join(lines)
 
@@ -302,7 +302,7 @@ def loads(
         OptionalPath, typer.Option(help="YAML of bearings by joint: C (N), p, and X, Y")
     ] = None,
     exponent: Annotated[
-        float, typer.Option(help="Woehler exponent of the equivalent range", min=1.0, max=50.0)
+        float, typer.Option(help="Woehler exponent of the equivalent load range", min=1.0, max=50.0)
     ] = 5.0,
     payload: Payload = None,
     load_times: LoadTimes = None,
@@ -322,12 +322,12 @@ def loads(
 ) -> None:
     """Report forces and moments in the joints along a motion.
 
-    For each joint peak and RMS force and moment, and the range of the one cycle that does the
-    damage of all that rainflow counting finds, in axes that turn with the joint's inner body. With
-    --bearings also equivalent load and L10 life (ISO 281).
+    For each joint it prints peak and RMS force and moment, and the equivalent load range: one cycle
+    of this range does the same damage as all cycles of the motion (rainflow counting, in axes that
+    turn with the joint's inner body). With --bearings also equivalent load and L10 life (ISO 281).
 
-    What rigid bodies leave open in an overconstrained machine follows from the elasticity of its
-    members and joints; without these it is named as undetermined.
+    In an overconstrained machine the elasticity of members and joints determines what rigid-body
+    equations do not. Without elasticity these components are reported as undetermined.
     """
     from pkm_twin import load
 

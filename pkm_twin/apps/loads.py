@@ -69,8 +69,8 @@ class Load:
 
     def __str__(self) -> str:
         at = "" if self.com is None else " at " + ", ".join(f"{v:g}" for v in self.com) + " m"
-        spans = ", ".join(f"{begin:g} to {end:g} s" for begin, end in self.times) or "all the time"
-        told = "from the bag" if self.source == "bag" else "as asked for"
+        spans = ", ".join(f"{begin:g} to {end:g} s" for begin, end in self.times) or "throughout"
+        told = "from the recording" if self.source == "bag" else "from --payload"
         return f"{self.mass:g} kg{at}, {spans}, {told}"
 
 

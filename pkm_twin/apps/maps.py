@@ -139,7 +139,7 @@ class PathMap:
             return
         typer.echo(f"{robot.name}: {quantity.question} {len(self.q)} samples of {self.source}")
         for answer in worst:
-            typer.echo(f"{sentence(answer)}; at {answer['time_s']:.4g} s")
+            typer.echo(f"worst pose, {sentence(answer)}; at {answer['time_s']:.4g} s")
         if beyond:
             typer.echo(f"{beyond} samples are beyond limits, near a singularity or limbs meet")
         for name in files:

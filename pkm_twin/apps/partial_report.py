@@ -113,7 +113,7 @@ def partial_data(result: PartialCalibration) -> dict[str, Any]:
 
 def print_partial(result: PartialCalibration) -> None:
     """The residuals of each kind, the scale, outliers."""
-    table = Table(title=Text("measured minus computed, root mean square"))
+    table = Table(title=Text("measured minus computed, RMS"))
     for column in ("measurement", "count", "before", "after", "left out", "worst", "noise", "unit"):
         table.add_column(column)
     for a in result.agreements:
@@ -161,10 +161,12 @@ def plan_data(plan: Plan, accuracy: float | None) -> dict[str, Any]:
 
 def print_plan(plan: Plan, accuracy: float | None) -> None:
     """How well the machine will be known after so many measurements."""
-    table = Table(title=Text("standard deviations after so many measurements, over the workspace"))
+    table = Table(
+        title=Text("predicted standard deviations over the workspace, by number of measurements")
+    )
     table.add_column("measurements")
     table.add_column("position*, worst axis, mm")
-    table.add_column("distances, mm in 100 mm")
+    table.add_column("distances, mm per 100 mm")
     for name in plan.quantity:
         unit, _ = SIZES[KINDS[name].unit]
         table.add_column(f"{name}, {unit}")

@@ -99,27 +99,27 @@ def report(
             "kind": motion.shaper, "added_s": motion.added, "lowest_hz": low, "highest_hz": high,
         }  # fmt: skip
         note = (
-            f"; {motion.added:.4g} s of it for the shaper {motion.shaper} of {low:.4g} to "
-            f"{high:.4g} Hz"
+            f", of which the {motion.shaper} shaper for {low:.4g} to {high:.4g} Hz takes "
+            f"{motion.added:.4g} s"
         )
     count = len(motion.runs)
     lines = [
         f"{robot.name}: {motion.path.kind}, {motion.path.length:.4g} m, "
-        f"{count} stretch{'' if count == 1 else 'es'} from rest to rest, law {motion.law}",
-        f"duration {motion.duration:.6g} s{note}; payload: {carried or 'the robot file alone'}",
+        f"{count} segment{'' if count == 1 else 's'} from stop to stop, motion law {motion.law}",
+        f"duration {motion.duration:.6g} s{note}; payload: {carried or 'as in the robot file'}",
         "limits that bind:",
     ]
     for bound in motion.bounds:
-        what = bound.what or f"none (at most {100 * bound.used:.0f} % of one)"
+        what = bound.what or f"none (largest fraction of a limit: {100 * bound.used:.0f} %)"
         lines.append(f"  {bound.begin:8.4f} to {bound.end:8.4f} s  {what}")
-    lines.append("greatest values:")
+    lines.append("peak values:")
     for joint, values in peaks.items():
         words = ", ".join(f"{word} {v:.4g} {unit}" for word, (v, unit) in values.items())
         lines.append(f"  {joint}: {words}")
     lines.append(f"  tool point: speed {fine.speed.max():.4g} m/s")
     worst = sorted(motion.worst.items(), key=lambda item: -item[1])
     shown = ", ".join(f"{name} {100 * value:.4g} %" for name, value in worst[:6])
-    lines.append(f"largest used fractions of limits: {shown or 'there are no limits'}")
+    lines.append(f"largest fractions of the limits: {shown or 'no limits in the robot file'}")
     lines += [str(target) for target in (out, drawing) if target is not None]
     return data, "\n".join(lines)
 
@@ -143,7 +143,7 @@ def draw_limits(motion: TimedPath, path: Path) -> None:
             for ax in (top, low):
                 ax.axvspan(bound.begin, bound.end, color=colour, alpha=0.15, lw=0)
     title = f"{motion.robot.name}: which limit binds when ({motion.law}, {motion.duration:.4g} s)"
-    plots.label(top, "time (s)", "part of the limit (%)", title)
+    plots.label(top, "time (s)", "fraction of the limit (%)", title)
     top.set_ylim(0, 105)
     if shown:
         top.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)

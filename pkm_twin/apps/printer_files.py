@@ -97,7 +97,10 @@ def printer_of(robot: Robot) -> Printer:
     :raises ParameterError: no linear Delta, leaning towers, or joints with a ratio.
     """
     if robot.mechanism != "linear_delta":
-        raise ParameterError("mechanism", robot.mechanism, "linear_delta, a delta printer")
+        raise ParameterError(
+            f"{robot.name}: mechanism", robot.mechanism,
+            "linear_delta, as in a file that `pkm-twin printer` writes",
+        )  # fmt: skip
     g: Any = vars(robot)["geometry"]
     own = robot.controller
     if g.leans is not None and np.any(g.leans):

@@ -140,7 +140,7 @@ def _anonymise(
         typer.echo(f"{topic}: {count} messages")
     for topic, why in dropped.items():
         typer.echo(f"left out: {topic} ({why})")
-    typer.echo(f"{out}: check that numbers alone do not identify the product you record")
+    typer.echo(f"{out}: before you publish it, check that its numbers do not identify the product")
 
 
 class _Names:

@@ -166,7 +166,7 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     :raises ParameterError: no robot is given, a column is missing, or a value is no finite number.
     """
     if robot is None:
-        raise ParameterError("robot", None, "--robot, because a table names no robot")
+        raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
     machine = robot if isinstance(robot, Robot) else load(robot)
     columns = read_columns(path, machine)
 

@@ -75,13 +75,15 @@ def size(
 ) -> None:
     """Size the drives for a motion.
 
-    Prints for each drive: peak and RMS effort (RMS heats the motor), speed, power, energy supplied
-    and regenerated, and the machine's inertia at the joint. If the robot's file has a section drive
-    (inertia, ratio or lead, efficiency), or with --ratio or --lead, it prints the same at the
-    motor, and the inertia ratio. The shipped robots have no gear in their files.
+    Prints for each drive: peak and RMS effort (RMS heats the motor), speed, power, net energy
+    (supplied minus regenerated), and the machine's inertia at the joint. If the robot's file has a
+    section drive (inertia, ratio or lead, efficiency), or with --ratio or --lead, it prints the
+    same at the motor, and the inertia ratio. The shipped robots have no gear in their files.
 
-    --drives compares each motor of a file with the needs of each drive: torque curve, continuous
-    torque against RMS torque, and speed. The motor's rotor replaces the one in the robot's file.
+    --drives compares each motor of a file with the needs of each drive, in percent of what the
+    motor can do: peak torque against its torque curve, RMS torque against its continuous torque,
+    and speed. The inertia ratio is that of load to rotor. The motor's rotor replaces the one in the
+    robot's file.
 
     The motion is a CSV of `pkm-twin path` or `pkm-twin torques`, a bag of joint states, or a bag
     with a JointTrajectory.
@@ -96,6 +98,8 @@ def size(
         refuse_existing(picture, overwrite, motion)
     if (motion is None) == (over_workspace is None):
         raise typer.BadParameter("give a recording or path, or --over-workspace")
+    if motor and drives is None:
+        raise typer.BadParameter("--motor selects from a drives file; give --drives too")
     carried = load_of(payload, load_times)
     machine = load(robot, platform=platform)
     motors = [] if drives is None else sizes.read_motors(drives, motor)

@@ -156,7 +156,7 @@ def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], s
     }  # fmt: skip
     lines = [
         f"{m.robot.name}: {len(m.time)} samples, {duration:.4g} s; efforts: {taken.source}; "
-        f"payload: {m.load or 'the robot file alone'}"
+        f"payload: {m.load or 'as in the robot file'}"
     ]
     for d in result:
         force, rate, inertia = ("N", "m/s", "kg") if d.slides else ("N m", "rad/s", "kg m2")
@@ -170,12 +170,12 @@ def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], s
                 lines.append(f"  inertia ratio, load to rotor: {d.inertia_ratio:.4g}")
         for fit in sorted(d.fits, key=lambda f: (not f.good, f.motor.continuous)):
             lines.append(
-                f"  {'fits' if fit.good else 'too small'}: {fit.motor.name}: torque "
-                f"{100 * fit.torque:.4g} %, continuous torque {100 * fit.thermal:.4g} %, speed "
-                f"{100 * fit.speed:.4g} %, inertia ratio {fit.inertia_ratio:.3g}"
+                f"  {'fits' if fit.good else 'too small'}: {fit.motor.name}: peak torque "
+                f"{100 * fit.torque:.4g} %, RMS torque {100 * fit.thermal:.4g} %, speed "
+                f"{100 * fit.speed:.4g} % of the motor's, inertia ratio {fit.inertia_ratio:.3g}"
             )
     lines.append(
-        f"all drives: energy {sum(total):.4g} J ({data['regenerated_J']:.4g} J regenerated), "
+        f"all drives: net energy {sum(total):.4g} J ({data['regenerated_J']:.4g} J regenerated), "
         f"mean power {data['mean_power_W']:.4g} W"
     )
     lines += list(m.notes)
@@ -193,7 +193,7 @@ def _words(duty: Any, force: str, rate: str) -> str:
     return (
         f"effort peak {duty.peak:.4g}, RMS {duty.rms:.4g} {force}; speed peak {duty.speed:.4g}, "
         f"mean {duty.mean_speed:.4g} {rate}; power peak {duty.power:.4g}, regenerated peak "
-        f"{duty.braking:.4g} W; energy {duty.energy:.4g} J ({duty.returned:.4g} J regenerated)"
+        f"{duty.braking:.4g} W; net energy {duty.energy:.4g} J ({duty.returned:.4g} J regenerated)"
     )
 
 

@@ -118,7 +118,7 @@ def motion_of_bag(
         r.load,
         (
             str(r.topics),
-            f"payload: {r.load or 'the robot file alone'}",
+            f"payload: {r.load or 'as in the robot file'}",
             *(
                 [f"rejected messages, left out: {refused}; first: {r.first_reject}"]
                 if refused

@@ -173,7 +173,7 @@ def trend(
         elif few < len(results):
             typer.echo(f"no drift in {len(results) - few} series")
         else:
-            typer.echo("no verdict")
+            typer.echo("drift unknown: too few recordings")
         if picture is not None:
             typer.echo(str(picture))
     if drifting:
@@ -182,16 +182,16 @@ def trend(
 
 def _line(one: Judged) -> str:
     s = one.series
-    name = f"{s.machine}: {s.quantity} of {s.part}"
+    name = s.label
     last = f"{s.value[-1]:.4g} {s.unit}"
     if len(s.value) < FEWEST:
-        return f"{name}: {last}, too few recordings: {len(s.value)}"
-    text = f"{name}: {last}, limits {one.low:.4g} to {one.high:.4g}"
+        return f"{name}: {last}, not judged"
+    text = f"{name}: {last}, control limits {one.low:.4g} to {one.high:.4g}"
     if one.change is not None:
         when = _day(s.time[one.change])
         text += f"; DRIFT: from {one.before:.4g} to {one.after:.4g} {s.unit} on {when}"
     elif one.drifts:
-        text += "; DRIFT: the last recording is outside"
+        text += "; DRIFT: the last recording is outside the control limits"
     return text
 
 
@@ -222,7 +222,7 @@ def draw(results: Sequence[Judged], path: Path) -> None:
             ax.axhspan(one.low, one.high, color=plots.COLOURS[2], alpha=0.15, lw=0)
         if one.change is not None:
             ax.axvline(days[one.change], color=plots.COLOURS[1], ls="--", lw=1.2)
-        ax.set_title(f"{s.machine}: {s.quantity} of {s.part}", fontsize=11)
+        ax.set_title(s.label, fontsize=11)
         ax.set_ylabel(s.unit)
         ax.tick_params(axis="x", labelrotation=30, labelsize=9)
         ax.grid(alpha=0.3)

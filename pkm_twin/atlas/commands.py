@@ -251,7 +251,7 @@ def _present(file: Path, picture: bool, html: bool, as_json: bool, out: Path | N
         typer.echo(about)
         if table is not None:
             Console().print(table)
-        for line in [*map(sentence, worst), *map(str, drawn)]:
+        for line in [*(f"worst pose, {sentence(one)}" for one in worst), *map(str, drawn)]:
             typer.echo(line)
 
 

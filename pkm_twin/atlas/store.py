@@ -363,7 +363,7 @@ def _opened(xarray: Any, path: Path) -> Dataset:
 
 def _damage(error: Exception) -> str:
     what = " ".join(str(error).split())[:200]
-    return f"damaged or no map: {type(error).__name__}: {what}"
+    return f"no map of `pkm-twin atlas`, or damaged: {what}"
 
 
 def open_atlas(path: Path) -> Dataset:
@@ -396,7 +396,7 @@ def open_atlas(path: Path) -> Dataset:
         with reading(path):
             wrong = nonsense(data)
         if wrong:
-            raise AtlasError(path, f"damaged or no map: {wrong}")
+            raise AtlasError(path, f"no map of `pkm-twin atlas`, or damaged: {wrong}")
     except AtlasError:
         data.close()
         raise

@@ -348,12 +348,12 @@ def read_magic(reader: RecordReader) -> None:
         )
     if not head.startswith(MAGIC):
         raise FormatError(
-            "this is not an MCAP file: it does not start with the MCAP mark", 0, "not_mcap"
+            "this is not an MCAP file: its first bytes are not the MCAP signature", 0, "not_mcap"
         )
     reader.seek(len(MAGIC))
     reader.crc = zlib.crc32(MAGIC)
     if reader.size == len(MAGIC):
-        raise FormatError("the file contains only the MCAP mark", 0, "truncated")
+        raise FormatError("the file contains only the MCAP signature", 0, "truncated")
 
 
 def read_attachment(reader: RecordReader, at: int, length: int) -> tuple[bytes, tuple[object, ...]]:

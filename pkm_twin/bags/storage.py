@@ -60,7 +60,7 @@ class BagFile:
                 budget = Budget(size)
                 yield RecordReader(content, os.fstat(unpacked.fileno()).st_size, budget)
         except FileNotFoundError as error:
-            raise BagError("does not exist", path=self.path, reason="not_found") from error
+            raise BagError("no such file", path=self.path, reason="not_found") from error
         except OSError as error:
             raise BagError(
                 f"cannot be read: {error.strerror or error}", path=self.path, reason="io"

@@ -366,7 +366,7 @@ class Check:
     def _read_end(self) -> None:
         at = self._reader.position
         if self._reader.read(len(MAGIC), "closing mark") != MAGIC:
-            raise FormatError("the file does not end with the MCAP mark", at)
+            raise FormatError("the file does not end with the MCAP signature", at)
         if self._reader.position != self._reader.size:
             left = self._reader.size - self._reader.position
             raise FormatError(f"{left} bytes follow the end of the bag", self._reader.position)

@@ -96,17 +96,17 @@ def faults_of(
     if noise[0] > most:
         faults.append(
             Fault(
-                f"{noise[0]:.3g} m an axis left over",
-                f"poses of this machine, in m and rad, leave {most:.3g} m at most",
+                f"RMS residual {noise[0]:.3g} m per axis after the fit",
+                f"expected at most {most:.3g} m for poses of this machine in m and rad",
             )
         )
     steepest = max(prior / size, TWISTED)
     if len(noise) > 1 and noise[1] > steepest:
         faults.append(
             Fault(
-                f"{noise[1]:.3g} rad an axis left over",
-                "rotations of this machine from its home, in rad and in the columns' order and "
-                f"axes, leave {steepest:.3g} rad at most",
+                f"RMS residual {noise[1]:.3g} rad per axis after the fit",
+                f"expected at most {steepest:.3g} rad for rotations of this machine from its "
+                "home, in rad and in the order and axes of the columns",
             )
         )
     if len(outliers) > MOST * count:

@@ -288,5 +288,5 @@ def _unit(group: Shared, key: Key) -> str:
         return group.units[0]
     last = words[-1]
     if last.endswith("com"):
-        return "m" if len(key) > 2 and isinstance(key[-1], int) else "1"
+        return "m" if len(key) > 2 and isinstance(key[-1], int) else ""
     return "kg" if last.endswith("mass") else "kg m2"

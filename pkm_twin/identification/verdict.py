@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -15,6 +15,10 @@ from pkm_twin.codegen.arrays import Array
 
 Answer = Literal["explains", "explains partly", "does not explain"]
 Deviations = Literal["as estimated", "widened", "withheld"]
+SENTENCE: Final[dict[Answer, str]] = {
+    "explains": "explains", "explains partly": "partly explains",
+    "does not explain": "does not explain",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -129,12 +133,12 @@ class Verdict:
 
         :param units: of the channels' measurements.
         """
-        told = [f"the model {self.answer} the recordings"]
-        told += [f"found: {one}" for one in self.findings]
+        told = [f"the model {SENTENCE[self.answer]} the recordings"]
+        told += [f"likely cause: {one}" for one in self.findings]
         if self.slow:
             told.append(
-                "the motion is too slow to show inertia above the noise: numbers of inertia are "
-                "undetermined, and a wrong rate of time would not show"
+                "the motion is too slow to show inertia above the noise: inertia parameters are "
+                "undetermined, and a wrong time scale would not show"
             )
         for channel, unit in zip(self.channels, units, strict=True):
             if channel.left_ratio > 1.0 or self.answer == "does not explain":
@@ -157,9 +161,9 @@ class Verdict:
         for one in self.blind:
             change = f"{abs(one.change):.2g} {units[one.index]}".rstrip()
             told.append(
-                f"these recordings would not show {one.suspect} of "
-                f"{_sized(one.suspect.usual or 0.0, one.suspect.unit)}, which would change "
-                f"{names[one.index]} by {change}: standard deviations include it"
+                f"these recordings cannot show: {one.suspect}. "
+                f"{_sized(one.suspect.usual or 0.0, one.suspect.unit)} of it would change "
+                f"{names[one.index]} by {change}; the standard deviations include this"
             )
         return told
 

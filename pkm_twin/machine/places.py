@@ -93,7 +93,7 @@ def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -
             old = None
         leaf = () in deeper
         if isinstance(old, bool | str | None) or leaf != np.isscalar(old):
-            raise ParameterError(here, None, "a number that the robot's file gives")
+            raise ParameterError(here, None, "a number of the robot's file, see `pkm-twin info`")
         result[name] = deeper[()] if leaf else placed(old, deeper, here)
     if whole:
         made = object.__new__(type(section))
@@ -149,7 +149,7 @@ def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
     except (KeyError, IndexError, TypeError):
         data = None
     if isinstance(data, bool) or not isinstance(data, int | float):
-        raise ParameterError(path, None, "a number that the robot's file gives")
+        raise ParameterError(path, None, "a number of the robot's file, see `pkm-twin info`")
     return float(data)
 
 

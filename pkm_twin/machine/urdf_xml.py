@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import re
 import stat
@@ -57,7 +58,7 @@ def elements(path: Path) -> ET.Element:
     """
     try:
         if not stat.S_ISREG(path.stat().st_mode):
-            raise OSError("not a file")
+            raise OSError(errno.EISDIR, "a folder or device, not a file")
         with path.open("rb") as file:
             content = file.read(MAX_FILE_SIZE + 1)
     except OSError as error:

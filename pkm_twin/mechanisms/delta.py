@@ -82,7 +82,7 @@ class Delta(Robot):
     def description(self) -> str:
         """What machine it is, with its closures."""
         kinds = ", ".join(self.geometry.closures)
-        return f"Delta robot, three arms with forearms, the platform translates; closures {kinds}"
+        return f"Delta robot, the platform translates; forearms of limbs 1 to 3: {kinds}"
 
     @property
     def size(self) -> float:

@@ -231,7 +231,8 @@ class Machine(Robot):
         g = self.graph
         counts = {"bodies": len(g.bodies), "joints": len(g.joints), "rods": len(g.rods)}
         parts = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-        return f"machine with {len(g.actuated)} actuated joints: {parts}"
+        pose = ", ".join(self.pose)
+        return f"{len(g.actuated)} actuated joints, the platform moves in {pose}; {parts}"
 
     @property
     def mobility(self) -> str:

@@ -180,8 +180,10 @@ class Place:
     names: tuple[str, ...]
 
     def __str__(self) -> str:
-        numbers = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.names, self.pose, strict=True))
-        return f"after {self.way:.4g} m of the path ({numbers})"
+        numbers = ", ".join(
+            f"{n} {round(v, 12) + 0.0:.4g}" for n, v in zip(self.names, self.pose, strict=True)
+        )
+        return f"{self.way:.4g} m after the start ({numbers})"
 
 
 def place_at(robot: Robot, q: Array, way: float) -> Place:

@@ -187,7 +187,7 @@ def test_cut_at_every_byte(tmp_path: Path, make_bag: Callable[..., Path], step: 
     ("content", "reason", "text"),
     [
         (b"", "empty", "is empty"),
-        (MAGIC, "truncated", "contains only the MCAP mark"),
+        (MAGIC, "truncated", "contains only the MCAP signature"),
         (MAGIC[:5], "truncated", "cut short"),
         (b"SQLite format 3\x00" + bytes(100), "not_mcap", "SQLite"),
         (b"#ROSBAG V2.0\n", "not_mcap", "ROS 1"),
@@ -206,7 +206,7 @@ def test_what_is_no_bag(tmp_path: Path, content: bytes, reason: str, text: str) 
 
 
 def test_missing_file_and_folder(tmp_path: Path, make_bag: Callable[..., Path]) -> None:
-    with pytest.raises(BagError, match="does not exist"):
+    with pytest.raises(BagError, match="no such file"):
         inspect(tmp_path / "nothing.mcap")
     make_bag(tmp_path / "inside.mcap", 1)
     with pytest.raises(BagError, match=r"folder.*inside\.mcap"):

@@ -78,7 +78,7 @@ def test_a_machine_is_found_that_was_not_built_as_drawn(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("scale", "copies", "text"),
-    [(1e3, 1, "m an axis left over"), (1.0, 40, "1 different ones")],
+    [(1e3, 1, "m per axis after"), (1.0, 40, "1 different ones")],
 )
 def test_poses_of_no_use_are_refused(scale: float, copies: int, text: str) -> None:
     robot = load("delta_cu")
@@ -168,8 +168,8 @@ def test_only_numbers_that_there_are_can_be_chosen(tmp_path: Path) -> None:
         ("x y z", lambda v: 1e300 * v, "up to 1e+04 in size"),
         ("roll pitch yaw", lambda v: 1e300 * v, "up to 6.28 in size"),
         ("roll pitch yaw", np.degrees, "up to 6.28 in size"),
-        ("roll pitch yaw", lambda v: v + 3.1, "rad an axis left over"),
-        ("x y z", lambda v: -v, "left over"),
+        ("roll pitch yaw", lambda v: v + 3.1, "rad per axis after"),
+        ("x y z", lambda v: -v, "per axis after"),
         ("limb_1 limb_2 limb_3", lambda v: v - 0.12, "--beyond-limits"),
     ],
 )

@@ -291,7 +291,7 @@ class TestPayload:
 
     def test_the_option_goes_before_the_bag(self, twin, sample):
         text = twin("check", sample, "--payload", "0").out
-        assert "payload: 0 kg, all the time, as asked for" in text
+        assert "payload: 0 kg, throughout, from --payload" in text
 
     @pytest.mark.parametrize(
         ("name", "value"),

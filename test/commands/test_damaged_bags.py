@@ -57,7 +57,7 @@ class TestDamage:
         assert data["error"] in result.one_line_error()
 
     def test_missing_file(self, twin, tmp_path):
-        assert "does not exist" in twin("check", tmp_path / "absent.mcap").one_line_error()
+        assert "no such file" in twin("check", tmp_path / "absent.mcap").one_line_error()
         assert twin("check").code == 2
 
 

@@ -116,11 +116,11 @@ def test_closures_that_are_redundant_make_a_machine_overconstrained(name):
     data = describe(load(name))
     shown = dict(lines(data))
     redundant, open_reactions = data["redundant_closures"], data["overconstrained"]
-    repeats = f" in the model only: its joint {'+'.join(data['assumed_joints'])} repeats"
-    assert (repeats in shown["closures"]) == bool(redundant and not open_reactions)
-    assert bool(redundant) == bool(open_reactions or repeats in shown["closures"])
+    repeats = f"joint {'+'.join(data['assumed_joints'])} repeats"
+    assert (repeats in shown["loop constraints"]) == bool(redundant and not open_reactions)
+    assert bool(redundant) == bool(open_reactions or repeats in shown["loop constraints"])
     # The Delta-CU's is the one that has both: its third limb holds the turn about the vertical.
-    assert (repeats in shown["closures"]) == (name == "delta_cu")
+    assert (repeats in shown["loop constraints"]) == (name == "delta_cu")
 
 
 class TestCompliance:
@@ -164,10 +164,10 @@ class TestCompliance:
         data = parse(twin("compliance", "upr_rpu", *POSE, "--json").out)
         energy = strain_energy(load("upr_rpu"), POSE, [0, 0, 1, 0, 0, 0])
         assert energy.tie == bool(data["tie"])
-        assert ("a tie of the dominant elements" in text.out) == energy.tie
+        assert ("dominant elements, with equal shares" in text.out) == energy.tie
         level = parse(twin("compliance", "upr_rpu", -0.6, 0, 0, "--json").out)
         assert level["tie"] == ["1U", "2U"]
-        assert "elements 1U, 2U" in twin("compliance", "upr_rpu", -0.6, 0, 0).out
+        assert "shares: 1U, 2U" in twin("compliance", "upr_rpu", -0.6, 0, 0).out
 
     def test_beyond_limits_is_refused_or_marked(self, twin):
         close = "compliance", "upr_rpu", -0.25, 0, 0

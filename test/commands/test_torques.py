@@ -377,7 +377,7 @@ def test_parquet_has_the_same_columns(twin, tmp_path):
         ("delta_cu", DELTA, "t.txt", ".csv or .parquet"),
         ("delta_cu", DELTA, "absent/t.csv", "there is no folder"),
         ("delta_cu", "absent.csv", "t.csv", "absent.csv"),
-        ("delta_cu", "absent.mcap", "t.csv", "does not exist"),
+        ("delta_cu", "absent.mcap", "t.csv", "no such file"),
         ("prru", DELTA, "t.csv", "slider_1"),
         ("massless", STIFFNESS, "t.csv", "inertia"),
     ],

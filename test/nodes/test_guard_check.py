@@ -69,7 +69,7 @@ def test_a_deadline_that_the_node_does_not_promise_is_bad(twin, check):
     code, data, _ = stream_until_end(twin, process)
     assert code == 1
     verdicts = {item["what"]: item["verdict"] for item in data["items"]}
-    assert verdicts["longest silence"] == verdicts["age on arrival"] == "bad"
+    assert verdicts["longest gap"] == verdicts["age on arrival"] == "bad"
     assert verdicts["deadline offered"] == verdicts["lifespan offered"] == "bad"
     assert verdicts["faults"] == verdicts["lost messages"] == "good"
 

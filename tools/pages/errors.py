@@ -128,7 +128,8 @@ def page() -> str:
         cells = [f"`{kind.__name__}`", bases, " ".join(meaning.split()), f"`{example}`", hint]
         lines.append("| " + " | ".join(cells) + " |")
     text = (
-        "\n\n## Reasons of rejected messages\n\n| reason | meaning | what to do |\n|---|---|---|\n"
+        "\n\n## Reasons of rejected messages: stale, lost, invalid\n\n"
+        "| reason | meaning | what to do |\n|---|---|---|\n"
     )
     rows = [f"| {reason} | {what} | {hint} |" for reason, (what, hint) in sorted(REASONS.items())]
     return HEAD + "\n".join(lines) + text + "\n".join(rows) + "\n"

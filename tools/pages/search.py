@@ -18,6 +18,8 @@ BRIEF = {
     "parameters", "scale",
 }  # fmt: skip
 """Pages of long tables and lists: a section's first paragraph and its names are indexed."""
+REFERENCE = {"api", "certificate", "commands", "errors", "parameters", "scale"}
+"""Pages that rank below those that explain."""
 ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):<code>(~?)([\w.]+)</code>")
 """A reference of a docstring, which Markdown does not know."""
 LARGEST = 300_000
@@ -63,6 +65,8 @@ def on_post_build(config: Any) -> None:
     for entry in index["docs"]:
         page = entry["location"].split("#")[0].removesuffix(".html")
         entry["text"] = entry_text(page, entry["text"])
+        if page in REFERENCE:
+            entry["boost"] = 0.2
         entry["title"] = " ".join(re.sub(r"<[^>]+>", "", entry["title"]).split())
     data = json.dumps(index, ensure_ascii=False, separators=(",", ":")).encode()
     path.write_bytes(data)

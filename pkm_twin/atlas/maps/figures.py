@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 WIDE: float = 9.0
 """Of a picture, inches."""
-LETTERS: int = 100
+LETTERS: int = 110
 """In a line of a picture's title."""
 
 
@@ -52,7 +52,7 @@ def sentence(answer: dict[str, Any]) -> str:
     if answer["value"]:
         value, unit = figures.prefixed(np.array(answer["value"]), answer["unit"])
         shown = f"{float(value):.4g} {unit}"
-    return f"{answer['case']}: {shown} at {pose}; along ({way}); {answer['element']}"
+    return f"{answer['case']}: {shown} at {pose}; direction ({way}), due to {answer['element']}"
 
 
 def question(atlas: Dataset) -> str:
@@ -103,7 +103,7 @@ def _planes(atlas: Dataset) -> Figure:
                 at = [turn(answer["pose"][n]) for turn, n in zip(turns, one.names, strict=True)]
                 ax.plot(*at, "*", color="red", mec="white", ms=13)
     star = "slice" not in atlas.dims
-    text = [f"{question(atlas)} (star: the worst pose)" if star else question(atlas)]
+    text = [f"{question(atlas)} (star: worst pose)" if star else question(atlas)]
     for answer in answers(atlas):
         text += textwrap.wrap(sentence(answer), LETTERS)
     figure.suptitle("\n".join(text), fontsize=11)

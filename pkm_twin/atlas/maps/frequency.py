@@ -31,7 +31,7 @@ FREQUENCY: Final = Quantity(
     first_frequency,
     _elements,
     lambda robot, case: "Hz",
-    no_wrench("free"),
+    no_wrench("unloaded"),
     largest=False,
     points=1000,
     chunk=256,

@@ -196,8 +196,8 @@ def strain_energy_sweep(
     base = _layers(robot, step)
     if points is None:
         return _sweep(robot, load, base, TILT_STEP, AZIMUTHS)
-    if points < 100:
-        raise ParameterError("points", points, "100 or more")
+    if points < 300:
+        raise ParameterError("points", points, "300 or more")
     base_points = float(AZIMUTHS * (np.floor(base[1] / TILT_STEP) + 1).sum())
     scale = (points / base_points) ** (1 / 3)
     layers = min(FINEST, max(1, round(scale)))
