@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+from types import SimpleNamespace
 
 import pytest
 
@@ -53,6 +54,15 @@ def test_an_index_that_is_too_large_is_an_error_in_a_strict_build(tmp_path, capl
         assert not caplog.records
         shortened(tmp_path, [{"location": "maps.html", "title": "Maps", "text": text}])
     assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize("url", ["index.html", "api/robot.html"])
+def test_search_in_pages_that_are_opened_as_files_needs_no_network(url, tmp_path):
+    script = '<script src="https://cdn.example/iframe-worker/shim"></script>'
+    found = search.on_post_page(f"<head>{script}</head>", page=SimpleNamespace(url=url))
+    shortened(tmp_path, [])
+    address = re.search(r'src="([^"]+)"', found)[1]
+    assert (tmp_path / url).parent.joinpath(address).resolve().stat().st_size > 500
 
 
 def test_references_of_docstrings_become_names():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A hook of MkDocs: a search index that opens fast, and docstrings without Sphinx's roles.
+"""A hook of MkDocs: search that opens fast and without a network, and docstrings without roles.
 
 Every page and every heading stay findable. The index has text without markup and without code
 blocks; of reference pages it has names, and the first paragraph under each heading.
@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,9 @@ ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):<code>(~?)([\w.]+)</code>
 """A reference of a docstring, which Markdown does not know."""
 LARGEST = 300_000
 """Of the index, bytes."""
+SHIM = re.compile(r"https://[^\"' ]*/iframe-worker/shim")
+"""What the theme's search loads where pages are opened as files."""
+OWN_SHIM = "assets/javascripts/iframe_worker.js"
 
 
 def brief(text: str) -> str:
@@ -55,12 +59,20 @@ def on_page_content(html: str, **_: Any) -> str:
     return ROLE.sub(lambda m: f"<code>{m[2].split('.')[-1] if m[1] else m[2]}</code>", html)
 
 
+def on_post_page(output: str, page: Any, **_: Any) -> str:
+    """A page that loads the shim from the site."""
+    return SHIM.sub("../" * page.url.count("/") + OWN_SHIM, output)
+
+
 def on_post_build(config: Any) -> None:
-    """Shorten the index that the search plugin wrote.
+    """Shorten the index that the search plugin wrote, and copy the shim.
 
     Logs a warning if it is still too large: an error in a strict build.
     """
-    path = Path(config["site_dir"]) / "search" / "search_index.json"
+    site = Path(config["site_dir"])
+    (site / OWN_SHIM).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(Path(__file__).parent / "iframe_worker" / "shim.js", site / OWN_SHIM)
+    path = site / "search" / "search_index.json"
     index = json.loads(path.read_text(encoding="utf-8"))
     for entry in index["docs"]:
         page = entry["location"].split("#")[0].removesuffix(".html")
