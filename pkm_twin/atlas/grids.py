@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -35,6 +36,8 @@ COARSE: Final = 33
 """Poses along each coordinate of the grid that bounds a workspace."""
 FULL: Final = 3
 """Most pose coordinates of which a whole grid is made."""
+KEPT: Final = 16
+"""Answers that are kept: maps of one robot ask for the same box and the same circles."""
 
 
 def cylinder(robot: Robot, what: str) -> PoseGrid:
@@ -63,8 +66,11 @@ def largest_distance(robot: Robot) -> float:
     return float(np.abs(robot.search_box()[lateral]).max())
 
 
+@lru_cache(maxsize=KEPT)
 def workspace_box(robot: Robot) -> Array:
     """Bounds of all reachable poses, limb interference aside, a little wider; shape (m, 2).
+
+    Read-only, as it is kept.
 
     From poses of joint states all over the limits and, for few coordinates, from a grid of poses.
     Lateral coordinates of a cylinder are bounded alike on both sides of the axis.
@@ -80,7 +86,7 @@ def workspace_box(robot: Robot) -> Array:
     if len(bounds) > FULL:
         if len(found):
             box = _around(found, 0.1 * np.ptp(found, axis=0), bounds)
-        return box
+        return _fixed(box)
     # Twice: a machine may reach a small part of what its lengths allow.
     for _ in range(2):
         ticks = [np.linspace(low, high, COARSE) for low, high in box]
@@ -93,7 +99,14 @@ def workspace_box(robot: Robot) -> Array:
             # The axis stays in the middle, and on the grid: workspaces end in tips there.
             half = np.abs(box[lateral]).max(1)
             box[lateral] = np.stack([-half, half], -1)
-    return box
+    return _fixed(box)
+
+
+def _fixed(values: Array) -> Array:
+    """A read-only copy."""
+    copy = values.copy()
+    copy.setflags(write=False)
+    return copy
 
 
 def _around(poses: Array, margin: Array, bounds: Array) -> Array:
@@ -189,12 +202,17 @@ def circles(
     :param least_clearance: what the limbs' clearance has to be above, m.
     """
     z = np.atleast_1d(np.asarray(heights, np.float64))
+    return _circles(robot, tuple(z.tolist()), steps, max(least, CLEAR), least_clearance)
+
+
+@lru_cache(maxsize=KEPT)
+def _circles(
+    robot: Robot, heights: tuple[float, ...], steps: int, least: float, least_clearance: float
+) -> Reach:
     cylinder(robot, "circles about it")
-    step = largest_distance(robot) / steps
-    radius = circle_radii(
-        robot, z, step, steps, least=max(least, CLEAR), least_clearance=least_clearance
-    )
-    return Reach(z, radius)
+    step, z = largest_distance(robot) / steps, np.array(heights)
+    radius = circle_radii(robot, z, step, steps, least=least, least_clearance=least_clearance)
+    return Reach(_fixed(z), _fixed(radius))
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def browser():
     program = find_browser()
     if program is None:
         pytest.skip("no chromium or chrome on this machine; apt-get install chromium brings one")
-    with Browser(program) as made:
+    with Browser(program, scale=0.5) as made:
         yield made
 
 

@@ -172,7 +172,7 @@ def test_nothing_undefined_happens(name, tmp_path):
     """In states of all kinds, under the sanitizers of addresses and undefined behaviour."""
     robot = robot_of(name)
     package = Package(tmp_path, c_package(robot))
-    program = package.build("-O1", *SANITIZED)
+    program = package.build(*PLAIN, *SANITIZED)
     rng = np.random.default_rng(7)
     home = robot.graph.home
     far = [size * wild(robot, rng, 5) for size in (1.0, 4.0, 1e3, 1e12, 1e300)]
@@ -246,7 +246,7 @@ def test_another_payload_by_parameters(name, tmp_path, rng):
 """.replace("@", package.prefix))  # fmt: skip
     driver = re.sub(rf"(\(double\){package.prefix}_\w+)\(", r"\1_with(parameters, ", driver)
     (package.folder / "driver.c").write_text(driver)
-    program = package.build("-O1")
+    program = package.build(*PLAIN)
     load_section = {"mass": mass, "com": com.tolist(), "inertia": inertia.tolist()}
     other = robot.changed(payload=load_section)
     asked = functions(other)

@@ -125,7 +125,7 @@ def browser():
     program = find_browser()
     if program is None:
         pytest.skip("no browser: set PKM_TWIN_BROWSER to a Chromium")
-    with Browser(program, (1000, 700)) as browser:
+    with Browser(program, (1000, 700), 0.5) as browser:
         browser.slow_down(1.0)
         browser.call("Network.enable")
         yield browser
