@@ -8,8 +8,8 @@ A robot tells how its poses are laid out (``robot.grid()``) and where they end
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -36,8 +36,6 @@ COARSE: Final = 33
 """Poses along each coordinate of the grid that bounds a workspace."""
 FULL: Final = 3
 """Most pose coordinates of which a whole grid is made."""
-KEPT: Final = 16
-"""Answers that are kept: maps of one robot ask for the same box and the same circles."""
 
 
 def cylinder(robot: Robot, what: str) -> PoseGrid:
@@ -66,17 +64,26 @@ def largest_distance(robot: Robot) -> float:
     return float(np.abs(robot.search_box()[lateral]).max())
 
 
-@lru_cache(maxsize=KEPT)
 def workspace_box(robot: Robot) -> Array:
     """Bounds of all reachable poses, limb interference aside, a little wider; shape (m, 2).
-
-    Read-only, as it is kept.
 
     From poses of joint states all over the limits and, for few coordinates, from a grid of poses.
     Lateral coordinates of a cylinder are bounded alike on both sides of the axis.
 
     :raises ParameterError: nothing bounds the workspace, or it is empty.
     """
+    return _once(robot, "box", lambda: _workspace_box(robot)).copy()
+
+
+def _once(robot: Robot, key: Hashable, make: Callable[[], Array]) -> Array:
+    """What maps of one robot ask for again and again, computed once a robot."""
+    kept: dict[Hashable, Array] = robot.calls.setdefault("workspace", {})
+    if key not in kept:
+        kept[key] = make()
+    return kept[key]
+
+
+def _workspace_box(robot: Robot) -> Array:
     bounds = np.asarray(robot.search_box(), np.float64)
     # With what interference takes away, which atlases show.
     found = _from_joints(robot)
@@ -86,7 +93,7 @@ def workspace_box(robot: Robot) -> Array:
     if len(bounds) > FULL:
         if len(found):
             box = _around(found, 0.1 * np.ptp(found, axis=0), bounds)
-        return _fixed(box)
+        return box
     # Twice: a machine may reach a small part of what its lengths allow.
     for _ in range(2):
         ticks = [np.linspace(low, high, COARSE) for low, high in box]
@@ -99,14 +106,7 @@ def workspace_box(robot: Robot) -> Array:
             # The axis stays in the middle, and on the grid: workspaces end in tips there.
             half = np.abs(box[lateral]).max(1)
             box[lateral] = np.stack([-half, half], -1)
-    return _fixed(box)
-
-
-def _fixed(values: Array) -> Array:
-    """A read-only copy."""
-    copy = values.copy()
-    copy.setflags(write=False)
-    return copy
+    return box
 
 
 def _around(poses: Array, margin: Array, bounds: Array) -> Array:
@@ -202,17 +202,14 @@ def circles(
     :param least_clearance: what the limbs' clearance has to be above, m.
     """
     z = np.atleast_1d(np.asarray(heights, np.float64))
-    return _circles(robot, tuple(z.tolist()), steps, max(least, CLEAR), least_clearance)
-
-
-@lru_cache(maxsize=KEPT)
-def _circles(
-    robot: Robot, heights: tuple[float, ...], steps: int, least: float, least_clearance: float
-) -> Reach:
     cylinder(robot, "circles about it")
-    step, z = largest_distance(robot) / steps, np.array(heights)
-    radius = circle_radii(robot, z, step, steps, least=least, least_clearance=least_clearance)
-    return Reach(_fixed(z), _fixed(radius))
+    least, step = max(least, CLEAR), largest_distance(robot) / steps
+    radius = _once(
+        robot,
+        (z.tobytes(), steps, least, least_clearance),
+        lambda: circle_radii(robot, z, step, steps, least=least, least_clearance=least_clearance),
+    )
+    return Reach(z, radius.copy())
 
 
 @dataclass(frozen=True)

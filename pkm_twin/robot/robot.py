@@ -137,7 +137,7 @@ class Robot(Mechanism):
 
     @cached_property
     def calls(self) -> dict[str, Any]:
-        """Functions for one sample, made once a robot, by name."""
+        """What is made once a robot, by name: functions for one sample, tables, maps' bounds."""
         return {}
 
     def call_one(
