@@ -108,7 +108,11 @@ def test_refusals():
         (ROBOT, [1, 2, 3], None),
         (ROBOT, [0, 0, np.nan, 0, 0, 0], None),
         (ROBOT, "P1", 3),
+        # The next ones would leave the paper's plane with its axis alone.
+        (ROBOT, "P1", 100),
+        (ROBOT, "P1", 122),
         (ROBOT.changed(limits={"joint_angle": 0.05}), "P1", None),
     ):
         with pytest.raises(ParameterError):
             strain_energy_sweep(robot, wrench, points)
+    assert len(strain_energy_sweep(ROBOT, "P1", 125).tilts) > 1

@@ -10,16 +10,12 @@ import numpy as np
 
 from pkm_twin.atlas import figures, plots
 from pkm_twin.atlas.strain_energy.stored import lateral_of, load_case, wrench_of
-from pkm_twin.atlas.strain_energy.sweep import table_2
+from pkm_twin.atlas.strain_energy.sweep import nearest_height, table_2
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from xarray import Dataset
-
-
-PLANE: Final = -0.6
-"""Height of the paper's figures, m."""
 
 
 def plane(
@@ -37,7 +33,7 @@ def plane(
         the first and the last colour.
     """
     ax = figures.axes_or_new(ax)
-    layer = atlas.isel(z=nearest_height(atlas, z))
+    layer = atlas.isel(z=nearest_height(atlas.z.values, z))
     tilt = figures.thin(atlas.tilt.values)
     azimuth = figures.thin(atlas.azimuth.values)
     steps = {
@@ -144,7 +140,7 @@ def _energy_slices(atlas: Dataset) -> Figure:
 def _factor_plane(atlas: Dataset) -> Figure:
     """The four elements with the greatest shares at this height, on one scale."""
     figure, axes = figures.subplots(2, 2, figsize=(9, 7.6), layout="constrained")
-    layer = nearest_height(atlas, None)
+    layer = nearest_height(atlas.z.values)
     greatest = atlas.factor.isel(z=layer).max(("tilt", "azimuth"))
     names = greatest.sortby(greatest, ascending=False).element.values[:4]
     for name, ax in zip(sorted(names), axes.ravel(), strict=True):
@@ -161,14 +157,6 @@ def _global(atlas: Dataset) -> Figure:
     global_factors(atlas, ax)
     figure.suptitle(f"{load_case(atlas)}: global strain-energy factors")
     return figure
-
-
-def nearest_height(atlas: Dataset, z: float | None) -> int:
-    """Index of the height nearest to z; default -0.6 m, or the middle where that is outside."""
-    heights = atlas.z.values
-    if z is None:
-        z = PLANE if heights.min() <= PLANE <= heights.max() else float(heights.mean())
-    return int(np.abs(heights - z).argmin())
 
 
 FIGURES: Final = {

@@ -56,6 +56,8 @@ LEAST_RADIUS: Final = math.radians(10.0)
 """Circles below this are no part of the regular workspace (2UPR-RPU paper, section 4)."""
 TILT_STEP: Final = math.radians(1.0)
 AZIMUTHS: Final = 72
+PLANE: Final = -0.6
+"""Height of the paper's figures, m."""
 FINEST: Final = 8
 """Most layers that one coarse step of height is divided into."""
 
@@ -196,8 +198,8 @@ def strain_energy_sweep(
     base = _layers(robot, step)
     if points is None:
         return _sweep(robot, load, base, TILT_STEP, AZIMUTHS)
-    if points < 300:
-        raise ParameterError("points", points, "300 or more")
+    if points < 100:
+        raise ParameterError("points", points, "100 or more")
     base_points = float(AZIMUTHS * (np.floor(base[1] / TILT_STEP) + 1).sum())
     scale = (points / base_points) ** (1 / 3)
     layers = min(FINEST, max(1, round(scale)))
@@ -207,7 +209,19 @@ def strain_energy_sweep(
     rungs = points / azimuths
     # Each height has its axis, so the count is not quite linear in the step.
     tilt_step = float(heights[1].sum()) / max(rungs - len(heights[0]) / 2, 1.0)
+    layer = nearest_height(heights[0])
+    if tilt_step > heights[1][layer]:
+        raise ParameterError(
+            "points", points, f"more, so that the plane z = {heights[0][layer]:.4g} m has two tilts"
+        )
     return _sweep(robot, load, heights, tilt_step, azimuths)
+
+
+def nearest_height(heights: Array, z: float | None = None) -> int:
+    """Index of the height nearest to z; default -0.6 m, or the middle where that is outside."""
+    if z is None:
+        z = PLANE if heights.min() <= PLANE <= heights.max() else float(heights.mean())
+    return int(np.abs(heights - z).argmin())
 
 
 def has_paper_elements(robot: Robot) -> bool:
