@@ -9,10 +9,8 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from pkm_twin.apps.options import Json, RobotName
+from pkm_twin.apps.options import REFUSED, Json, RobotName
 from pkm_twin.console import print_json, progress, table_console
-
-REFUSED = 1
 
 
 def certify(

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from pkm_twin.apps.options import BagTopics, Json, LoadTimes, OptionalRobot, Payload, load_of
+from pkm_twin.apps.options import (
+    REFUSED,
+    SALVAGED,
+    BagTopics,
+    Json,
+    LoadTimes,
+    OptionalRobot,
+    Payload,
+    load_of,
+)
 from pkm_twin.console import print_json, progress, table_console, tell
 from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.options import OptionalPath, OptionalText
@@ -22,7 +31,6 @@ if TYPE_CHECKING:
     from pkm_twin.apps.check import CheckReport
     from pkm_twin.apps.loads import Load
 
-REFUSED, SALVAGED = 1, 3
 METADATA: Final = "metadata.yaml"
 """What makes a folder a rosbag2 bag."""
 

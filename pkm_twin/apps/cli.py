@@ -28,6 +28,8 @@ from pkm_twin.apps.groups import Tasks, greet
 from pkm_twin.apps.guard_check import guard_check
 from pkm_twin.apps.joint_loads import loads
 from pkm_twin.apps.options import (
+    REFUSED,
+    SALVAGED,
     BagPath,
     BagTopics,
     BeyondLimits,
@@ -69,8 +71,6 @@ app = Commands(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-REFUSED, SALVAGED = 1, 3
 
 
 def _version(asked: bool) -> None:

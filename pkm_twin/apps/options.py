@@ -14,6 +14,9 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD
 from pkm_twin.options import OptionalPath, OptionalText, file_name
 
+REFUSED, SALVAGED = 1, 3
+"""Exit codes: rejected; damaged, with messages that `recover` saves."""
+
 RobotName = Annotated[
     str, typer.Argument(help="a robot's name (see `pkm-twin robots`), a YAML file or a URDF")
 ]
