@@ -182,7 +182,10 @@ def _moved(t: Traced | _AtHome) -> Any:
     twist = rates.motion_of(graph.platform)
     table = _gram([{("u", j): v for j, v in enumerate(row)} for row in twist], n)
     lower = {(a, b): table[a, b] for a in range(n) for b in range(a + 1)}
-    root = SparseCholesky(lower, list(np.diag(table)))
+    # Pivots stay above zero where the platform stands still while a joint moves.
+    size = t.motion.tree.size
+    lengths = [1.0 if graph.joints[name].slides else size * size for name in graph.actuated]
+    root = SparseCholesky(lower, [table[k, k] + length for k, length in enumerate(lengths)])
     farthest: Any = float(n)
     for name in graph.bodies:
         if name != graph.platform:
