@@ -44,7 +44,16 @@ def take_options(command: Callable[..., Any], options: Iterable[inspect.Paramete
 
 
 class Commands(typer.Typer):
-    """Commands as typer of Ubuntu 24.04 needs them: it evaluates no annotations and shows None."""
+    """Commands as typer of Ubuntu 24.04 needs them: it evaluates no annotations and shows None.
+
+    Help is plain text, and errors are this package's own.
+    """
+
+    def __init__(self, *, add_completion: bool = False, **settings: Any) -> None:
+        super().__init__(
+            add_completion=add_completion, pretty_exceptions_enable=False, rich_markup_mode=None,
+            **settings,
+        )  # fmt: skip
 
     def command(self, *names: Any, **settings: Any) -> Callable[[Command], Command]:
         """As typer's."""

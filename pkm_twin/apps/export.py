@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from pkm_twin.apps.options import RobotName
+from pkm_twin.apps.printer import export_printer
 from pkm_twin.console import refuse_existing
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.files import replace_file
@@ -174,3 +175,6 @@ def _accelerations(robot: Robot) -> list[float]:
     inertia = np.diag(mass_matrix(robot, q))
     with np.errstate(divide="ignore"):
         return list(SHARE * np.maximum(limits - weight, 0.0) / inertia)
+
+
+app.command("printer")(export_printer)

@@ -23,7 +23,7 @@ from pkm_twin.apps.vibration import (
     Up,
     process_of,
 )
-from pkm_twin.atlas.commands import Alone, kind
+from pkm_twin.atlas.commands import Alone, app, kind, show
 from pkm_twin.console import numbers, print_json, refuse_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.options import OptionalPath, OptionalText, options_of, take_options
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from pkm_twin.atlas.maps.quantity import Case, Found, Quantity
     from pkm_twin.atlas.sweep import Sweep
     from pkm_twin.robot.robot import Robot
+
+__all__ = ["app", "show"]
 
 Array = NDArray[np.float64]
 
