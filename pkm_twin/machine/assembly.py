@@ -15,9 +15,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.joints import TYPES
+from pkm_twin.machine.loop_tree import Closure, Joint, LoopTree
 from pkm_twin.machine.rotations import skew
-from pkm_twin.machine.urdf_file import Joint, Urdf
-from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
 
 ROUNDS: Final = 100
@@ -45,7 +44,7 @@ class Assembly:
     turn. ``size``: of the drawing, m.
     """
 
-    def __init__(self, urdf: Urdf) -> None:
+    def __init__(self, urdf: LoopTree) -> None:
         self.urdf = urdf
         least, most = CLOSED
         self.closed = min(most, max(least, ROUNDED * urdf.accuracy))
@@ -262,7 +261,7 @@ class Assembly:
         return extent if extent > 1e-6 else 1.0
 
 
-def _order(urdf: Urdf) -> list[Joint]:
+def _order(urdf: LoopTree) -> list[Joint]:
     """The joints from the root outwards, each level in the file's order."""
     hanging: dict[str, list[Joint]] = {}
     for joint in urdf.joints.values():

@@ -19,9 +19,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, install, warn
 from pkm_twin.machine import urdf_xml
+from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
 from pkm_twin.machine.rotations import about, from_quaternion
-from pkm_twin.machine.urdf_file import Joint, Link, Urdf
-from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import Pose
 
 _ENDLESS: Final = re.compile(
@@ -36,7 +35,7 @@ MAX_PARTS: Final = 100_000
 """Most of anything that a file asks for by a number: elements, copies, pixels along a side."""
 
 
-def read(path: Path) -> Urdf:
+def read(path: Path) -> LoopTree:
     """Read an MJCF file with its closures.
 
     :raises ParameterError: no mujoco package, a model that it does not compile, or a part of it
@@ -113,7 +112,7 @@ class _Reader:
             int(kinds.mjJNT_HINGE): "revolute",
         }
 
-    def urdf(self) -> Urdf:
+    def urdf(self) -> LoopTree:
         locks = self._locks()
         for body in range(1, self.model.nbody):
             self._body(body, locks)
@@ -125,7 +124,7 @@ class _Reader:
             place = Pose(_rotation(self.model.site_quat[site]), self.model.site_pos[site])
             owner = self._body_name(self.model.site_bodyid[site])
             self._joint(f"{name}_frame", "fixed", owner, name, place)
-        return Urdf(
+        return LoopTree(
             self.path.stem,
             WORLD,
             self.links,

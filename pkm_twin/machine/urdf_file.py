@@ -5,18 +5,16 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import urdf_loops, urdf_xml
+from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
 from pkm_twin.machine.strict_yaml import read_yaml
-from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_xml import UNLIMITED, Pose
 
 _PLACES: Final = ("axis", "parent_axis", "child_axis")
@@ -28,57 +26,7 @@ MOST_MOVING: Final = 1000
 JOINTS: Final = ("revolute", "continuous", "prismatic", "fixed", "spherical")
 
 
-@dataclass(frozen=True, eq=False)
-class Link:
-    """A link: ``mass`` (kg), ``com`` (3,) m and ``inertia`` (3, 3) about it, link axes."""
-
-    name: str
-    mass: float
-    com: Array
-    inertia: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Joint:
-    """A joint of the tree; ``axes``: unit vectors, shape (count, 3), joint frame.
-
-    ``type``: also ``free``, of a body that closures alone hold. ``limits``: those of position,
-    velocity and effort that the file states. ``rotor_inertia``: kg m2 or kg.
-    """
-
-    name: str
-    type: str
-    parent: str
-    child: str
-    origin: Pose
-    axes: Array
-    limits: dict[str, Any]
-    viscous: float
-    coulomb: float
-    rotor_inertia: float = 0.0
-    offset: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Urdf:
-    """A file's content; ``root``: the link that has no parent; ``gravity``: m/s2, if it tells.
-
-    ``initial``: values that ``<ros2_control>`` begins with, of the joints for which it has them.
-    ``accuracy``: half of the last digit of its places and directions, m or rad.
-    """
-
-    name: str
-    root: str
-    links: dict[str, Link]
-    joints: dict[str, Joint]
-    closures: tuple[Closure, ...]
-    actuated: tuple[str, ...]
-    gravity: list[float] | None = None
-    initial: Mapping[str, float] = field(default_factory=dict)
-    accuracy: float = 0.0
-
-
-def read(path: Path, robot: ET.Element) -> Urdf:
+def read(path: Path, robot: ET.Element) -> LoopTree:
     """The links, joints and closures of a URDF file.
 
     :param robot: the file's top element; the path is for what stands beside the file.
@@ -130,7 +78,7 @@ def read(path: Path, robot: ET.Element) -> Urdf:
             rotor_inertia=rotors.get(joint.name, 0.0),
             offset=offsets.get(joint.name, 0.0),
         )
-    return Urdf(
+    return LoopTree(
         name, root, links, joints, tuple(closures.values()), actuated, initial=initial,
         accuracy=_accuracy(robot),
     )  # fmt: skip

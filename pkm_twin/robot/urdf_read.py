@@ -14,8 +14,7 @@ from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph
-from pkm_twin.machine.urdf_file import Joint, Link, Urdf
-from pkm_twin.machine.urdf_loops import Closure
+from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
 from pkm_twin.machine.urdf_visuals import Visual, visuals
 from pkm_twin.machine.urdf_xml import Pose
 from pkm_twin.robot.urdf_home import Home, HomeSearch
@@ -168,7 +167,7 @@ def _take(data: dict[str, Any], home: Home, graph: Graph) -> None:
                 joint["axis"] = axes[0]
 
 
-def _platform(urdf: Urdf, asked: str | None) -> str:
+def _platform(urdf: LoopTree, asked: str | None) -> str:
     if asked is not None:
         return urdf_xml.known_link("platform", asked, urdf.links)
     lower = {name.lower(): name for name in urdf.links}
@@ -180,7 +179,7 @@ def _platform(urdf: Urdf, asked: str | None) -> str:
     )
 
 
-def _bodies(urdf: Urdf, order: list[Joint], tool: str, ground: str) -> dict[str, str]:
+def _bodies(urdf: LoopTree, order: list[Joint], tool: str, ground: str) -> dict[str, str]:
     """Each link's body, named by its link nearest to the root; the tool's is named by the tool.
 
     :raises ParameterError: the tool is fixed to the ground.
@@ -259,7 +258,7 @@ def _closure(closure: Closure, bodies: dict[str, str], place: Pose) -> dict[str,
 
 
 def _masses(
-    urdf: Urdf, bodies: dict[str, str], places: dict[str, Pose]
+    urdf: LoopTree, bodies: dict[str, str], places: dict[str, Pose]
 ) -> dict[str, dict[str, Any]]:
     """Masses, centres (m) and inertias about them of all bodies but the ground, base axes."""
     result: dict[str, dict[str, Any]] = {}
