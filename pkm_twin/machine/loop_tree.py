@@ -7,7 +7,7 @@ URDF, MJCF and SDF are read into this one form; :mod:`pkm_twin.robot.urdf_read` 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,7 +30,8 @@ class Joint:
     """A joint of the tree; ``axes``: unit vectors, shape (count, 3), joint frame.
 
     ``type``: also ``free``, of a body that closures alone hold. ``limits``: those of position,
-    velocity and effort that the file states. ``rotor_inertia``: kg m2 or kg.
+    velocity and effort that the file states. ``rotor_inertia``: kg m2 or kg. ``beyond``: the child
+    link's frame in the joint's. ``pitch``: of a helical joint, m a rad.
     """
 
     name: str
@@ -44,6 +45,8 @@ class Joint:
     coulomb: float
     rotor_inertia: float = 0.0
     offset: float = 0.0
+    beyond: Pose = field(default_factory=Pose)
+    pitch: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,3 +84,25 @@ class LoopTree:
     gravity: list[float] | None = None
     initial: Mapping[str, float] = field(default_factory=dict)
     accuracy: float = 0.0
+
+
+def ordered(root: str, joints: Iterable[Joint]) -> list[Joint]:
+    """The joints from the root outwards, each level in the file's order."""
+    hanging: dict[str, list[Joint]] = {}
+    for joint in joints:
+        hanging.setdefault(joint.parent, []).append(joint)
+    order: list[Joint] = []
+    level = [root]
+    while level:
+        found = [joint for link in level for joint in hanging.get(link, [])]
+        order += found
+        level = [joint.child for joint in found]
+    return order
+
+
+def drawn(root: str, joints: Mapping[str, Joint]) -> dict[str, Pose]:
+    """The links' frames in the root's with all joints at zero."""
+    places = {root: Pose()}
+    for joint in ordered(root, joints.values()):
+        places[joint.child] = places[joint.parent] @ joint.origin @ joint.beyond
+    return places

@@ -35,7 +35,7 @@ MAX_PARTS: Final = 100_000
 """Most of anything that a file asks for by a number: elements, copies, pixels along a side."""
 
 
-def read(path: Path) -> LoopTree:
+def read(path: Path, top: ET.Element) -> LoopTree:
     """Read an MJCF file with its closures.
 
     :raises ParameterError: no mujoco package, a model that it does not compile, or a part of it
@@ -47,7 +47,7 @@ def read(path: Path) -> LoopTree:
         raise ParameterError(
             str(path), "an MJCF file without the mujoco package", install("mjcf")
         ) from None
-    _require_bounded(path)
+    _require_bounded(path, top, path.parent)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
@@ -56,12 +56,12 @@ def read(path: Path) -> LoopTree:
     return _Reader(mujoco, model, path).urdf()
 
 
-def _require_bounded(path: Path, depth: int = 0) -> None:
+def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) -> None:
     """Look at a file, and at what it includes, before MuJoCo does, which waits and counts for ever.
 
+    :param folder: of the model; what is included is below it.
     :raises ParameterError: something is named that is no regular file, or asked for too often.
     """
-    top = urdf_xml.elements(path)
     if depth > MAX_INCLUDES:
         raise ParameterError(str(path), "nested includes", f"a nesting of at most {MAX_INCLUDES}")
     names = {element.get("name") for element in top.iter()}
@@ -78,8 +78,13 @@ def _require_bounded(path: Path, depth: int = 0) -> None:
         for place in places:
             if place.exists() and not place.is_file():
                 raise ParameterError(f"{element.tag}.{key}", text, "a regular file")
-        if element.tag == "include" and key == "file" and places[0].exists():
-            _require_bounded(places[0], depth + 1)
+        if element.tag == "include" and key == "file":
+            # MuJoCo looks beside the model.
+            included = folder / text
+            if not included.resolve().is_relative_to(folder.resolve()):
+                raise ParameterError("include.file", text, f"a file below {folder}")
+            if included.exists():
+                _require_bounded(included, urdf_xml.elements(included), folder, depth + 1)
         if key in REPEATED and math.prod(map(_whole, text.split())) > MAX_PARTS:
             raise ParameterError(f"{element.tag}.{key}", text, f"at most {MAX_PARTS}")
     if _copies(top) > MAX_PARTS:

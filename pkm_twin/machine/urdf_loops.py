@@ -40,8 +40,6 @@ LOOPS: Final = {
     name: CONSTRAINTS[name]
     for name in ("revolute", "continuous", "prismatic", "fixed", "spherical")
 }
-BESIDE: Final = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
-"""What a YAML file beside a URDF can say."""
 
 
 def closures(

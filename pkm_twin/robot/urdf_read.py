@@ -11,9 +11,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn
-from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
+from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.joints import TURN
 from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
 from pkm_twin.machine.urdf_visuals import Visual, visuals
 from pkm_twin.machine.urdf_xml import Pose
@@ -83,7 +84,8 @@ def read_tree(
     """
     path = Path(path)
     top = urdf_xml.elements(path)
-    urdf = mjcf_file.read(path) if top.tag == "mujoco" else urdf_file.read(path, top)
+    readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
+    urdf = readers.get(top.tag, urdf_file.read)(path, top)
     tool = _platform(urdf, platform)
     ground = urdf.root if base is None else base
     ground = urdf_xml.known_link("base", ground, urdf.links)
@@ -106,7 +108,7 @@ def read_tree(
             notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
     view = assembly.links[ground].inverse()
     places = {name: view @ pose for name, pose in assembly.links.items()}
-    shown = () if top.tag == "mujoco" else visuals(path, top, places, bodies)
+    shown = () if top.tag in readers else visuals(path, top, places, bodies)
     return UrdfReading(data, home.text, tuple(notes), tuple(shown))
 
 
@@ -138,7 +140,9 @@ def _description(
             if closure.axes is not None and closure.type == "universal":
                 second = view @ assembly.frame(closure, 1)
                 joints[closure.name]["axes"][1] = _snapped(second.rotation @ closure.axes[1])
-    gravity = {} if urdf.gravity is None else {"gravity": urdf.gravity}
+    gravity = {}
+    if urdf.gravity is not None:
+        gravity = {"gravity": _snapped(view.rotation @ urdf.gravity)}
     return {
         "mechanism": "machine",
         **gravity,
@@ -218,6 +222,8 @@ def _joint(
         data["axes"] = [_snapped(axis) for axis in axes]
     elif joint.type != "spherical":
         data["axis"] = _snapped(axes[0])
+        if joint.pitch:
+            data["lead"] = joint.pitch * TURN
         if actuated:
             data["actuated"] = True
         value = round(home, 14) + 0.0
