@@ -14,7 +14,7 @@ from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph
-from pkm_twin.machine.joints import TURN
+from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
 from pkm_twin.machine.urdf_visuals import Visual, visuals
 from pkm_twin.machine.urdf_xml import Pose
@@ -35,6 +35,8 @@ PLATFORMS: Final = (
     "tcp",
 )
 """Names of links that are taken for the platform, the first that is there."""
+SINGLE: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
+"""Joint types of one degree of freedom."""
 GROUND: Final = "base"
 """The ground's name in a description."""
 
@@ -94,7 +96,7 @@ def read_tree(
     home = HomeSearch(assembly, lambda: _description(assembly, bodies, tool, ground)).home()
     assembly.place(home.values)
     data = _description(assembly, bodies, tool, ground, home.values)
-    notes = []
+    notes = _left_out(urdf)
     if home.miss > EXACT:
         notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
     if home.graph is not None:
@@ -110,6 +112,22 @@ def read_tree(
     places = {name: view @ pose for name, pose in assembly.links.items()}
     shown = () if top.tag in readers else visuals(path, top, places, bodies)
     return UrdfReading(data, home.text, tuple(notes), tuple(shown))
+
+
+def _left_out(tree: LoopTree) -> list[str]:
+    """Of friction and rotors in joints that the engine has none for."""
+    found = []
+    for part in (*tree.joints.values(), *tree.closures):
+        values = {
+            "damping": part.viscous,
+            "friction": part.coulomb,
+            "rotor inertia": getattr(part, "rotor_inertia", 0.0),
+        }
+        if part.type not in (*SINGLE, "fixed"):
+            found += [f"{key} {value:g} of {part.name}" for key, value in values.items() if value]
+    if not found:
+        return []
+    return [f"ignored, because the joint has several degrees of freedom: {', '.join(found)}"]
 
 
 def _description(
@@ -242,8 +260,7 @@ def _joint(
 
 def _friction(part: Joint | Closure, data: dict[str, Any]) -> dict[str, Any]:
     """The entry of a joint of one freedom that has friction."""
-    single = data["type"] in ("revolute", "prismatic")
-    if single and (part.viscous > 0.0 or part.coulomb > 0.0):
+    if data["type"] in SINGLE and (part.viscous > 0.0 or part.coulomb > 0.0):
         return {"friction": {"viscous": part.viscous, "coulomb": part.coulomb}}
     return {}
 
