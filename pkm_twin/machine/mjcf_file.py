@@ -216,7 +216,7 @@ class _Reader:
             if kind in ("revolute", "prismatic"):
                 # The file's frames are those at ``ref``; a joint's origin is where its value is 0.
                 origin @= _moved(kind, axis, -self._start(joint))
-            more = self._resistance(joint)
+            more: dict[str, Any] = self._resistance(joint)
             if joint in locks:
                 kind, origin, more = "fixed", origin @ _moved(kind, axis, locks[joint]), {}
             elif kind in ("revolute", "prismatic"):
@@ -267,7 +267,7 @@ class _Reader:
             most = min(most, abs(float(m.actuator_gainprm[i][0])) * control)
         return most
 
-    def _resistance(self, joint: int) -> dict[str, float]:
+    def _resistance(self, joint: int) -> dict[str, Any]:
         """Friction and rotor of a joint, with its actuators' as the joint has them."""
         m = self.model
         dof = m.jnt_dofadr[joint]
@@ -279,8 +279,9 @@ class _Reader:
         }
         for key, own in (("viscous", "actuator_damping"), ("rotor_inertia", "actuator_armature")):
             values = getattr(m, own, None)
-            for i in self._drives(joint) if values is not None else ():
-                found[key] += float(values[i] * m.actuator_gear[i][0] ** 2)
+            if values is not None:
+                gears = {i: float(m.actuator_gear[i][0]) for i in self._drives(joint)}
+                found[key] += sum(float(values[i]) * gear**2 for i, gear in gears.items())
         return found
 
     def _warn(self, locks: Mapping[int, float]) -> None:

@@ -117,7 +117,8 @@ def read_tree(
 def _left_out(tree: LoopTree) -> list[str]:
     """Of friction and rotors in joints that the engine has none for."""
     found = []
-    for part in (*tree.joints.values(), *tree.closures):
+    parts: list[Joint | Closure] = [*tree.joints.values(), *tree.closures]
+    for part in parts:
         values = {
             "damping": part.viscous,
             "friction": part.coulomb,
