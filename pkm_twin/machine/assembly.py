@@ -225,22 +225,33 @@ class Assembly:
         self.place(values)
         if miss > self.closed:
             raise self._open()
+        values = self.relaxed(values)
+        return values, self.miss()
+
+    def relaxed(self, values: Array, held: Mask | None = None) -> Array:
+        """The values nearest to zero to which closed loops can move from these, and place them.
+
+        :param held: steps that keep their values, shape (count,); by default none does.
+        """
+        free = np.ones(len(self.steps), bool) if held is None else ~held
+        self.place(values)
+        miss = max(self.miss(), 1e-12)
         for _ in range(ROUNDS):
-            _, rates = self.residuals()
-            slope = values - np.linalg.lstsq(rates, rates @ values, rcond=RANKS[0])[0]
+            rates, own = self.residuals()[1] * free, values * free
+            slope = own - np.linalg.lstsq(rates, rates @ own, rcond=RANKS[0])[0]
             if float(np.abs(slope).max(initial=0.0)) < 1e-12:
                 break
             size = float(values @ values)
             for share in (1.0, 0.5, 0.25, 0.1, 0.01):
-                other, less = self.close(values - share * slope)
-                if less <= max(miss, 1e-12) and float(other @ other) < size * (1.0 - 1e-14):
+                other, less = self.close(values - share * slope, held)
+                if less <= miss and float(other @ other) < size * (1.0 - 1e-14):
                     values = other
                     break
             else:
                 break
             self.place(values)
         self.place(values)
-        return values, self.miss()
+        return values
 
     def _open(self) -> ParameterError:
         """The error of loops that do not close, with the one that misses the most."""

@@ -37,6 +37,8 @@ PLATFORMS: Final = (
 """Names of links that are taken for the platform, the first that is there."""
 SINGLE: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
 """Joint types of one degree of freedom."""
+BALANCED: Final = 1e-6
+"""Mass times distance from the axis of a part that is balanced, kg m."""
 GROUND: Final = "base"
 """The ground's name in a description."""
 
@@ -108,6 +110,12 @@ def read_tree(
             )
         if home.held:
             notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
+        heavy = {name: value for name, value in home.held.items() if value > BALANCED}
+        if heavy:
+            notes.append(
+                "efforts depend on the angle at which parts with their mass off the axis are held: "
+                + ", ".join(f"{name} ({value:.3g} kg m)" for name, value in heavy.items())
+            )
     view = assembly.links[ground].inverse()
     places = {name: view @ pose for name, pose in assembly.links.items()}
     shown = () if top.tag in readers else visuals(path, top, places, bodies)
