@@ -207,8 +207,8 @@ class Assembly:
         """How far the loops are open at the placed values, m or rad."""
         return float(np.abs(self.residuals(rates=False)[0]).max(initial=0.0))
 
-    def nearest(self) -> tuple[Array, float]:
-        """The closed values nearest to zero, shape (count,), and how far they still miss.
+    def anywhere(self) -> tuple[Array, float]:
+        """Values that close the loops, the nearest to zero that are found at once, and their miss.
 
         :raises ParameterError: a loop that does not close, by how much.
         """
@@ -225,8 +225,7 @@ class Assembly:
         self.place(values)
         if miss > self.closed:
             raise self._open()
-        values = self.relaxed(values)
-        return values, self.miss()
+        return values, miss
 
     def relaxed(self, values: Array, held: Mask | None = None) -> Array:
         """The values nearest to zero to which closed loops can move from these, and place them.

@@ -136,6 +136,9 @@ class HomeSearch:
         drawn = self._drawn()
         if drawn is not None and drawn.how == "drawn" and drawn.index >= SMALL:
             return drawn
+        if drawn is None:
+            # What closes nowhere is rejected before much is tried.
+            closed = self.assembly.anywhere()[0]
         found = [] if drawn is None else [drawn]
         found += self._others(found)
         chosen = self._chosen(found)
@@ -147,8 +150,8 @@ class HomeSearch:
         if chosen is not None:
             return chosen
         # No assembly is sound: the reason is the machine's, and told where it is looked at whole.
-        values, miss = self.assembly.nearest()
-        return self._home(values, miss, "near")
+        values = self.assembly.relaxed(closed)
+        return self._home(values, self.assembly.miss(), "near")
 
     def _drawn(self) -> Home | None:
         """The assembly that the drawing leads to, with the actuated joints where they should be."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -13,7 +14,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
-from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.graph import Graph, groups
 from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
 from pkm_twin.machine.urdf_visuals import Visual, visuals
@@ -95,6 +96,7 @@ def read_tree(
     ground = urdf_xml.known_link("base", ground, urdf.links)
     assembly = Assembly(urdf)
     bodies = _bodies(urdf, assembly.order, tool, ground)
+    _require_moving(urdf, bodies, tool)
     home = HomeSearch(assembly, lambda: _description(assembly, bodies, tool, ground)).home()
     assembly.place(home.values)
     data = _description(assembly, bodies, tool, ground, home.values)
@@ -120,6 +122,38 @@ def read_tree(
     places = {name: view @ pose for name, pose in assembly.links.items()}
     shown = () if top.tag in readers else visuals(path, top, places, bodies)
     return UrdfReading(data, home.text, tuple(notes), tuple(shown))
+
+
+def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
+    """Reject actuated joints that do not move the platform, before a home is looked for.
+
+    A joint moves it where joints and closures make a circle through it, the platform and the
+    ground: then no body stands between them, whose absence would part them.
+
+    :raises ParameterError: such joints, with the joints at which they can be cut out.
+    """
+    joints = [joint for joint in tree.joints.values() if joint.type != "free"]
+    ends = {joint.name: (joint.parent, joint.child) for joint in joints}
+    ends |= {closure.name: closure.links for closure in tree.closures}
+    pairs = {name: (bodies[a], bodies[b]) for name, (a, b) in ends.items()}
+    pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+    target = {GROUND, bodies[tool]}
+    every = [*pairs.values(), (GROUND, bodies[tool])]
+    degree = Counter(body for pair in every for body in pair)
+    moving = set(pairs)
+    for gone in [body for body, count in degree.items() if count > 2]:
+        parts = groups([body for body in degree if body != gone], every)
+        own = next(part for part in parts if target - {gone} <= set(part))
+        moving = {name for name in moving if set(pairs[name]) - {gone} <= set(own)}
+    apart = [name for name in tree.actuated if name not in moving]
+    if not apart:
+        return
+    whole = {end for name in moving for end in pairs[name]} | target
+    cuts = [name for name, pair in pairs.items() if name not in moving and whole & set(pair)]
+    raise ParameterError(
+        "actuated", f"{', '.join(apart)}", f"joints that move the platform {tool!r}: close a "
+        f"missing loop, or cut out the other parts at {', '.join(cuts)}, with their motors"
+    )  # fmt: skip
 
 
 def _left_out(tree: LoopTree) -> list[str]:

@@ -10,6 +10,7 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
+from pkm_twin.machine.assembly import Assembly
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot.urdf_read import read_tree
 from test.support.robots import often, partly_long, random_joints
@@ -266,13 +267,37 @@ def test_bars_between_two_balls_are_kept_from_spinning(tmp_path):
         np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
-def test_an_open_loop_is_named_with_its_gap(tmp_path):
+def test_what_moves_another_part_than_the_platform_is_named(tmp_path):
+    """A second leg at the ground, and a motor on the arm that moves a flap."""
+    path = five_bar().save(tmp_path)
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+    for parent, at in (("ground", "flap"), ("arm_1", "flap"), ("platform", "flap")):
+        more = (
+            f'<link name="{at}">{inertial}</link><joint name="hinge" type="continuous">'
+            f'<parent link="{parent}"/><child link="{at}"/></joint><ros2_control name="x">'
+            '<joint name="hinge"><command_interface name="effort"/></joint></ros2_control></robot>'
+        )
+        other = path.with_name(f"{parent}.urdf")
+        other.write_text(path.read_text().replace("</robot>", more))
+        with pytest.raises(ParameterError) as error:
+            read_tree(other)
+        assert error.value.field == "actuated"
+        assert error.value.value == "hinge" and "at hinge" in error.value.bound
+
+
+def test_an_open_loop_is_named_with_its_gap(tmp_path, monkeypatch):
+    tries, real = [], Assembly.close
+    monkeypatch.setattr(
+        Assembly, "close", lambda self, *given: tries.append(given) or real(self, *given)
+    )
     path = five_bar().save(tmp_path)
     path.write_text(path.read_text().replace('<child_origin xyz="', '<child_origin xyz="5'))
     with warnings.catch_warnings(), pytest.raises(ParameterError) as error:
         warnings.simplefilter("ignore")
         read_tree(path)
     assert error.value.field == "tip"
+    # A second look at every start of the search would be of no use.
+    assert len(tries) <= 2 * 11
     assert re.search(r"open by \d[\d.e+]* mm", str(error.value))
 
 
