@@ -264,6 +264,7 @@ def torques(
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
     load_times: LoadTimes = None,
+    platform: Platform = None,
     beyond_limits: BeyondLimits = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="replace the table and the picture")
@@ -282,6 +283,7 @@ def torques(
     determine is empty. With --beyond-limits, the column beyond_limits is 1 where a joint is outside
     its limits.
     """
+    from pkm_twin import load
     from pkm_twin.apps.limits import beyond_limits as find_beyond
     from pkm_twin.apps.limits import refuse_beyond
     from pkm_twin.apps.torques import check_target, motion_of, table, write_table
@@ -296,7 +298,7 @@ def torques(
     carried = load_of(payload, load_times)
     if topic and not is_bag(motion):
         raise typer.BadParameter(f"--topic is for bags; {motion} is read as CSV")
-    data = motion_of(motion, robot, topic, carried)
+    data = motion_of(motion, load(robot, platform=platform), topic, carried)
     _, found = find_beyond(data.robot, data.q, data.qd)
     if not beyond_limits:
         refuse_beyond(found)
