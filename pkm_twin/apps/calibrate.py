@@ -106,7 +106,7 @@ def calibrate_command(
         ),
     ] = [],  # noqa: B006  typer copies it
     unit: Annotated[
-        str, typer.Option(help="of x, y and z where their headers have none: m, cm, mm or um")
+        str, typer.Option(help="of x, y and z where their headers have none: m, cm, mm or µm (um)")
     ] = "m",
     measure: Annotated[
         list[str],

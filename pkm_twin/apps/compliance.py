@@ -100,7 +100,7 @@ def compliance(
         for name, v in zip(axes, energy.deflection, strict=True)
     )
     typer.echo(f"\nunder the wrench {wrench} (N, N m)")
-    typer.echo(f"deflection (um, urad): {', '.join(moved)}")
+    typer.echo(f"deflection (µm, µrad): {', '.join(moved)}")
     shares = sorted(zip(energy.factors, energy.elements, strict=True), key=lambda pair: -pair[0])
     dominant = (
         f"dominant elements, with equal shares: {', '.join(tied)}"
