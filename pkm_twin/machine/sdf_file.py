@@ -38,6 +38,8 @@ KINDS: Final = {
     "screw": "helical", "universal": "universal", "revolute2": "universal", "ball": "spherical",
 }  # fmt: skip
 """SDF's joint types and ours."""
+FOREIGN: Final = re.compile(r"drake:.*(joint|constraint|bushing).*")
+"""Drake's own elements that make another machine."""
 WELDS: Final = {
     "DetachableJoint": ("parent_link", "child_link"), "AttachLinks": ("parent", "child")
 }  # fmt: skip
@@ -101,16 +103,19 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     links = {WORLD: Link(WORLD, 0.0, np.zeros(3), np.zeros((3, 3)))}
     links |= {name: _link(path, part, name) for name, part in model.all("link")}
     places = {name: model.place(name) for name in links}
-    edges = {edge.name: edge for edge in model.edges(path)}
+    edges: dict[str, Edge] = {}
+    welded = welds(path, top, element.get("name", ""), places)
+    for edge in (*model.edges(path), *welded):
+        if edge.name in edges:
+            raise ParameterError(f"joint.{edge.name}", edge.name, "a unique name")
+        edges[edge.name] = edge
     for name, _ in model.all("frame"):
         owner = model.link(name)
         if owner in links and name not in links:
             links[name] = Link(name, 0.0, np.zeros(3), np.zeros((3, 3)))
             places[name] = model.place(name)
-            edge = f"{name}_frame"
-            edges[edge] = Edge(edge, "fixed", (owner, name), places[name])
-    for weld in welds(path, top, element.get("name", ""), places):
-        edges[weld.name] = weld
+            own = f"{name}_frame"
+            edges[own] = Edge(own, "fixed", (owner, name), places[name])
     if not any(WORLD in edge.links for edge in edges.values()):
         held = model.link(MODEL)
         warn(path, f"no joint holds the model in the world: link {held} is taken for the ground")
@@ -118,9 +123,8 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     types = {name: edge.type for name, edge in edges.items()}
     actuated = actuated_joints(path, top, read_beside(path), types, effort_limited(edges))
     joints, closures = spanned(edges, actuated, places)
-    apart = next((name for name in links if name not in {WORLD, *(j.child for j in joints)}), None)
-    if apart is not None:
-        raise ParameterError(f"link.{apart}", None, "a joint that connects it")
+    for name in dict.fromkeys(links).keys() - {WORLD, *(joint.child for joint in joints)}:
+        raise ParameterError(f"link.{name}", None, "a joint that connects it")
     return LoopTree(
         element.get("name") or path.stem, WORLD, links, {joint.name: joint for joint in joints},
         tuple(edge.closure(places) for edge in closures), actuated,
@@ -307,12 +311,9 @@ class Model:
         """The joints, nested models' too; the path is for warnings."""
         for part in self.element.findall("joint"):
             yield _edge(path, part, self)
-        for part in self.element.findall("drake:weld_constraint"):
-            ends = [f"{self.prefix}{_end(part, end)}" for end in ("parent", "child")]
-            name = "_".join(ends)
-            raise ParameterError(
-                f"drake:weld_constraint.{name}", name, 'a joint of the type "fixed" or one body'
-            )
+        for part in self.element:
+            if FOREIGN.fullmatch(part.tag):
+                raise ParameterError(part.tag, part.get("name"), "joints and closures of SDF alone")
         for one in self.models.values():
             yield from one.edges(path)
 

@@ -23,8 +23,6 @@ _PLACES: Final = ("axis", "parent_axis", "child_axis")
 LARGE: Final = 10.0
 """Offsets beyond this, m, look like millimetres."""
 
-MOST_MOVING: Final = 1000
-"""Most joints that are not fixed: assembling takes the cube of their number."""
 JOINTS: Final = ("revolute", "continuous", "prismatic", "fixed", "spherical")
 
 
@@ -55,9 +53,6 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
         )
     beside = read_beside(path)
     joints = _retyped(joints, beside)
-    moving = sum(joint.type != "fixed" for joint in joints.values())
-    if moving > MOST_MOVING:
-        raise ParameterError(str(path), f"{moving} joints that move", f"at most {MOST_MOVING}")
     closures = urdf_loops.closures(
         robot, beside, links, {name: joint.child for name, joint in joints.items()}
     )
@@ -69,13 +64,6 @@ def read(path: Path, robot: ET.Element) -> LoopTree:
     actuated = actuated_joints(
         path, robot, beside, {name: joint.type for name, joint in joints.items()}
     )
-    idle = [j.name for j in joints.values() if j.type != "fixed" and j.name not in actuated]
-    if not closures and idle:
-        raise ParameterError(
-            str(path),
-            f"no loop closure, and passive joints: {', '.join(idle)}",
-            "<constraint> or <loop> elements, or closed_loop in a YAML file next to it",
-        )
     name = robot.get("name") or path.stem
     initial = _parameters(robot, actuated, "initial_value")
     rotors = _parameters(robot, actuated, "rotor_inertia")
@@ -218,18 +206,8 @@ def _retyped(joints: dict[str, Joint], beside: dict[str, Any]) -> dict[str, Join
             changed, axes = str(kind).lower(), []
         else:
             raise UnknownNameError("joint_type", kind, ["SPHERICAL", "FIXED", *universal])
-        old = joints[name]
-        joints[name] = Joint(
-            name,
-            changed,
-            old.parent,
-            old.child,
-            old.origin,
-            np.reshape(axes, (-1, 3)),
-            {},
-            old.viscous,
-            old.coulomb,
-        )
+        axes = np.reshape(axes, (-1, 3))
+        joints[name] = replace(joints[name], type=changed, axes=axes, limits={})
     return joints
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A URDF or MJCF with its loop closures as plain data of a ``mechanism: machine`` description."""
+"""URDF, MJCF and SDF with loop closures as plain data of a ``mechanism: machine`` description."""
 
 from __future__ import annotations
 
@@ -38,6 +38,8 @@ PLATFORMS: Final = (
 """Names of links that are taken for the platform, the first that is there."""
 SINGLE: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
 """Joint types of one degree of freedom."""
+MOST_MOVING: Final = 1000
+"""Most joints that are not fixed: assembling takes the cube of their number."""
 BALANCED: Final = 1e-6
 """Mass times distance from the axis of a part that is balanced, kg m."""
 GROUND: Final = "base"
@@ -76,7 +78,8 @@ def read_tree(
 ) -> UrdfReading:
     """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
 
-    A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package.
+    A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package, and one of
+    ``<sdf>`` as SDF.
 
     Links that fixed joints hold together are one body. Home: see :mod:`pkm_twin.robot.urdf_home`;
     ``home`` of a joint is its value there, so that joint values are the URDF's. Parts that only
@@ -91,6 +94,7 @@ def read_tree(
     top = urdf_xml.elements(path)
     readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
     urdf = readers.get(top.tag, urdf_file.read)(path, top)
+    _require_closed(path, urdf)
     tool = _platform(urdf, platform)
     ground = urdf.root if base is None else base
     ground = urdf_xml.known_link("base", ground, urdf.links)
@@ -122,6 +126,23 @@ def read_tree(
     places = {name: view @ pose for name, pose in assembly.links.items()}
     shown = () if top.tag in readers else visuals(path, top, places, bodies)
     return UrdfReading(data, home.text, tuple(notes), tuple(shown))
+
+
+def _require_closed(path: Path, tree: LoopTree) -> None:
+    """Reject what is too large to be assembled, and passive joints that no closure holds.
+
+    :raises ParameterError: by their number, or by name.
+    """
+    moving = [joint.name for joint in tree.joints.values() if joint.type != "fixed"]
+    if len(moving) > MOST_MOVING:
+        raise ParameterError(str(path), f"{len(moving)} joints that move", f"at most {MOST_MOVING}")
+    idle = [name for name in moving if name not in tree.actuated]
+    if idle and not tree.closures:
+        raise ParameterError(
+            str(path),
+            f"no loop closure, and passive joints: {', '.join(idle)}",
+            "<constraint> or <loop> elements, or closed_loop in a YAML file next to it",
+        )
 
 
 def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
