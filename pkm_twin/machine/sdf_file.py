@@ -199,9 +199,9 @@ class Model:
         own = element.get("name", "")
         self.prefix: str = "" if outer is None else f"{outer.prefix}{own}::"
         self.parts: dict[str, ET.Element] = {}
-        for part in element:
+        for part in sorted(element, key=lambda part: part.tag == "joint"):
             if part.tag in ("link", "joint", "frame", "model"):
-                # Until 1.6 a joint and a link could have one name; poses never meant the joint.
+                # Until 1.6 a joint and a link could have one name; it meant the link.
                 name = urdf_xml.name(part, self.parts if version >= (1, 7) else ())
                 self.parts.setdefault(name, part)
         nested = element.findall("model")

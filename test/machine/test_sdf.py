@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -175,6 +176,47 @@ def test_a_model_in_a_world_with_a_loop(tmp_path):
     # Mirrored limbs carry the same weight with opposite efforts.
     effort = inverse_dynamics(robot, *np.zeros((3, 2)))
     assert effort[0] == pytest.approx(-effort[1], rel=1e-9) and abs(effort[0]) > 0.1
+
+
+@pytest.mark.parametrize("way", ["placement_frame", "pose"])
+def test_a_limb_in_a_nested_model_is_the_same_machine(way, tmp_path):
+    robot = load(five_bar(tmp_path))
+    path = five_bar(tmp_path)
+    head, _, tail = path.read_text().partition('<link name="arm_1">')
+    limb, joint, tail = tail.partition('<link name="arm_2">')
+    pose = re.search(r"<pose relative_to=\"__model__\">([^<]*)</pose>", limb)
+    model = f'<model name="limb"><pose>{pose[1]}</pose><link name="arm_1">'
+    inner = "<pose/>"
+    if way == "placement_frame":
+        model = model.replace('"limb"', '"limb" placement_frame="arm_1"')
+        inner = "<pose>0.7 0.2 -0.3 0.4 0.5 0.6</pose>"
+    for name in ("fore_1", "m1"):
+        tail = tail.replace(f">{name}<", f">limb::{name}<")
+    tail = tail.replace('attached_to="fore_1"', 'attached_to="limb::fore_1"')
+    path.write_text(head + model + limb.replace(pose[0], inner) + "</model>" + joint + tail)
+    nested = load(path, platform="tool")
+    assert nested.joint_names == ("m2", "limb::m1")
+    motion = random_motion(robot, np.random.default_rng(8), 5)
+    np.testing.assert_allclose(
+        inverse_dynamics(nested, *motion), inverse_dynamics(robot, *motion), rtol=1e-8, atol=1e-10
+    )
+
+
+def test_a_joint_may_have_a_link_s_name_until_1_6(tmp_path):
+    path = five_bar(tmp_path)
+    text = path.read_text().replace('name="e1"', 'name="arm_1"')
+    at = text.index('<joint name="arm_1"')
+    end = text.index("</joint>", at) + len("</joint>")
+    # Before the link, which it must not hide.
+    joint, text = text[at:end], text[:at] + text[end:]
+    text = text.replace('<link name="arm_1">', f'{joint}<link name="arm_1">')
+    right = inverse_dynamics(load(path), *np.zeros((3, 2)))
+    path.write_text(text.replace('version="1.9"', 'version="1.6"'))
+    np.testing.assert_allclose(inverse_dynamics(load(path), *np.zeros((3, 2))), right, rtol=1e-9)
+    path.write_text(text)
+    with pytest.raises(ParameterError) as error:
+        read_urdf(path)
+    assert error.value.value == "arm_1"
 
 
 def test_a_joint_from_the_moving_link_to_the_ground_counts_the_other_way(tmp_path):
