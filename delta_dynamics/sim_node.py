@@ -28,7 +28,7 @@ from delta_dynamics.simulation import (
 )
 from delta_dynamics.topics import SIMULATION
 from pkm_twin.bags.definitions import message_definition
-from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.errors import MessageError, ParameterError, short
 from pkm_twin.messages.intake import DoublesTemplate, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
@@ -361,7 +361,7 @@ class MachineSim(TwinNode):
     def _publish_drawn(self) -> None:
         """What was drawn: into the log, and kept on a topic for who comes late."""
         drawn = self._variation.drawn
-        values = [KeyValue(key=name, value=f"{value!r}") for name, value in drawn.items()]
+        values = [KeyValue(key=name, value=short(value)) for name, value in drawn.items()]
         status = DiagnosticStatus(name=self.get_fully_qualified_name(), values=values)
         status.message = f"{len(drawn)} parameters drawn"
         status.hardware_id = self._simulation.robot.name

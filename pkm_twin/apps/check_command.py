@@ -20,10 +20,11 @@ from pkm_twin.apps.options import (
     LoadTimes,
     OptionalRobot,
     Payload,
+    Platform,
     load_of,
 )
 from pkm_twin.console import print_json, progress, table_console, tell
-from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.options import OptionalPath, OptionalText
 from pkm_twin.threads import one_blas_thread_for_children
 
@@ -45,6 +46,7 @@ class Request:
     carried: Load | None
     history: Path | None
     machine: str | None
+    platform: str | None = None
 
 
 def bags_of(folder: Path) -> list[Path]:
@@ -64,12 +66,16 @@ def is_collection(path: Path) -> bool:
 
 def check_one(path: Path, request: Request, update: Any = None) -> CheckReport:
     """Judge a recording, and append it to the history; errors as ``read_recording``."""
+    from pkm_twin import load
     from pkm_twin.apps.check import Bounds, judged
     from pkm_twin.apps.recorded import read_recording
 
-    recording = read_recording(
-        path, request.robot, update, topics=request.topics, carried=request.carried
-    )
+    robot: Any = request.robot
+    if request.platform is not None:
+        if robot is None:
+            raise ParameterError("--robot", None, "a file, for the platform that --platform names")
+        robot = load(robot, platform=request.platform)
+    recording = read_recording(path, robot, update, topics=request.topics, carried=request.carried)
     report = judged(recording, Bounds(residual=request.residual))
     if request.history is not None:
         from pkm_twin.apps.history import append, measure, recorded_at
@@ -152,6 +158,7 @@ def check(
     machine: Annotated[
         OptionalText, typer.Option(help="name in the history; default: the robot's")
     ] = None,
+    platform: Platform = None,
     jobs: Annotated[int, typer.Option(help="processes for a folder of bags", min=1)] = 1,
     as_json: Json = False,
 ) -> None:
@@ -170,7 +177,7 @@ def check(
     from pkm_twin.bags.reader import DamagedBagError
 
     carried = load_of(payload, load_times)
-    request = Request(robot, residual, tuple(topic), carried, history, machine)
+    request = Request(robot, residual, tuple(topic), carried, history, machine, platform)
     if is_collection(bag):
         if not _check_folder(bag, request, jobs, as_json):
             raise typer.Exit(REFUSED)

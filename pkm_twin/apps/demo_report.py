@@ -236,7 +236,7 @@ def report_stiffness(
         )
     )
     largest = np.linalg.norm(fixed, axis=1).max()
-    findings.append(Finding(prefix, "largest deflection", f"{1e6 * largest:.2f} um"))
+    findings.append(Finding(prefix, "largest deflection", f"{1e6 * largest:.2f} µm"))
     findings.append(share(prefix, "deflections with ground truth", len(judged), len(truth)))
     if judged:
         place = np.searchsorted(common, judged)
@@ -248,7 +248,7 @@ def report_stiffness(
             Finding(
                 prefix,
                 "RMS difference to the frame's deflection",
-                f"{100 * error:.1f} % (frame's largest {greatest:.2f} um)",
+                f"{100 * error:.1f} % (frame's largest {greatest:.2f} µm)",
                 f"below {100 * MAX_DEFLECTION_ERROR:g} %",
                 bool(error < MAX_DEFLECTION_ERROR),
             )

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from pkm_twin.apps.limits import beyond_limits as find_beyond
 from pkm_twin.apps.limits import refuse_beyond
-from pkm_twin.apps.options import Accept, BagTopics, BeyondLimits, Json, LoadTimes, Payload, load_of
+from pkm_twin.apps.options import (
+    Accept,
+    BagTopics,
+    BeyondLimits,
+    Json,
+    LoadTimes,
+    Payload,
+    Platform,
+    load_of,
+)
 from pkm_twin.console import print_json, progress, refuse_existing, writing
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError, one_line
 from pkm_twin.files import replace_file
@@ -74,6 +83,7 @@ def fit(
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
     load_times: LoadTimes = None,
+    platform: Platform = None,
     beyond_limits: BeyondLimits = False,
     accept: Accept = False,
     overwrite: Annotated[
@@ -124,7 +134,7 @@ def fit(
                 "what", what, "no --per-copy, --payload or --load-times, which are for efforts"
             )
         _fit_compliance(
-            robot, recordings, what, topic, out, page, json_output, beyond_limits, accept
+            robot, platform, recordings, what, topic, out, page, json_output, beyond_limits, accept
         )
         return
     from pkm_twin.apps.fit_files import robot_text
@@ -132,7 +142,7 @@ def fit(
     from pkm_twin.identification.friction_laws import laws_of
 
     kinds, laws = kinds_of(what), laws_of(friction)
-    text, machine = robot_text(robot, per_copy=per_copy)
+    text, machine = robot_text(robot, platform=platform, per_copy=per_copy)
     carried = load_of(payload, load_times)
     with progress("fit", 2 * len(recordings)) as update:
         result, beyond, choices = fit_recordings(
@@ -217,8 +227,9 @@ def _beyond(machine: Any, recordings: Sequence[tuple[str, Array]], limited: bool
 
 
 def _fit_compliance(
-    robot: str, recordings: Sequence[Path], what: str, topics: Sequence[str], out: Path,
-    page: Path | None, json_output: bool, beyond_limits: bool, accept: bool,
+    robot: str, platform: str | None, recordings: Sequence[Path], what: str,
+    topics: Sequence[str], out: Path, page: Path | None, json_output: bool,
+    beyond_limits: bool, accept: bool,
 ) -> None:  # fmt: skip
     """The fit of elastic elements, its files and what it says."""
     from pkm_twin.apps.elastic_recordings import read_deflected
@@ -230,7 +241,7 @@ def _fit_compliance(
         raise ParameterError(
             "what", what, "only compliance, because it is fitted to other recordings"
         )
-    text, machine = robot_text(robot)
+    text, machine = robot_text(robot, platform=platform)
     _ = machine.elastic
     with progress("fit", 2 * len(recordings)) as update:
         read = []

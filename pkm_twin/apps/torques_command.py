@@ -13,6 +13,7 @@ from pkm_twin.apps.options import (
     BeyondLimits,
     LoadTimes,
     Payload,
+    Platform,
     RobotName,
     load_of,
 )
@@ -35,6 +36,7 @@ def torques(
     topic: BagTopics = [],  # noqa: B006  typer copies it
     payload: Payload = None,
     load_times: LoadTimes = None,
+    platform: Platform = None,
     beyond_limits: BeyondLimits = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="replace the table and the picture")
@@ -53,6 +55,7 @@ def torques(
     determine is empty. With --beyond-limits, the column beyond_limits is 1 where a joint is outside
     its limits.
     """
+    from pkm_twin import load
     from pkm_twin.apps.limits import beyond_limits as find_beyond
     from pkm_twin.apps.limits import refuse_beyond
     from pkm_twin.apps.torques import check_target, motion_of, table, write_table
@@ -67,7 +70,7 @@ def torques(
     carried = load_of(payload, load_times)
     if topic and not is_bag(motion):
         raise typer.BadParameter(f"--topic is for bags; {motion} is read as CSV")
-    data = motion_of(motion, robot, topic, carried)
+    data = motion_of(motion, load(robot, platform=platform), topic, carried)
     _, found = find_beyond(data.robot, data.q, data.qd)
     if not beyond_limits:
         refuse_beyond(found)

@@ -8,10 +8,10 @@ import math
 import re
 import stat
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Container
+from collections.abc import Collection, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from xml.parsers import expat
 
 import numpy as np
@@ -225,3 +225,51 @@ def friction(element: ET.Element, where: str) -> tuple[float, float]:
                 positive(dynamics.get("friction", "0"), f"{where}.{tag}.friction"),
             )
     return 0.0, 0.0
+
+
+def boolean(text: str, where: str) -> bool:
+    """A truth value, in the spellings of XML schemas and of Python."""
+    value = {"true": True, "1": True, "false": False, "0": False}.get(text.strip().lower())
+    if value is None:
+        raise ParameterError(where, text, "true or false")
+    return value
+
+
+def limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, Any]:
+    """What is stated; no width and zero are empty entries, what is far off is no limit either."""
+    found: dict[str, Any] = {}
+    if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
+        low, high = (
+            _bound(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper")
+        )
+        if low > high:
+            raise ParameterError(f"{where}.limit", [low, high], "lower below upper")
+        far = UNLIMITED[kind]
+        if low < high and (low > -far or high < far):
+            found["position"] = [max(low, -far), min(high, far)]
+    for key in ("velocity", "effort"):
+        value = _bound(limit.get(key, "0"), f"{where}.limit.{key}")
+        if value < 0.0:
+            raise ParameterError(f"{where}.limit.{key}", value, "zero or more")
+        if 0.0 < value < UNLIMITED[key]:
+            found[key] = value
+    return found
+
+
+def _bound(text: str, where: str) -> float:
+    """A limit, which alone of all numbers may be infinite."""
+    endless = text.strip().lower().lstrip("+-") in ("inf", "infinity")
+    return float(text) if endless else number(text, where)
+
+
+def accuracy(words: Iterable[str]) -> float:
+    """Half of the last digit of the longest of a file's numbers, m or rad; of whole ones none."""
+    longest = max(map(_decimals, words), default=0)
+    return 0.5 * 10.0**-longest if longest else 0.0
+
+
+def _decimals(word: str) -> int:
+    """How many digits stand behind the point."""
+    mantissa, _, exponent = word.lower().partition("e")
+    places = len(mantissa.partition(".")[2]) - int(exponent or 0)
+    return min(max(places, 0), 18)

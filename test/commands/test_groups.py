@@ -26,6 +26,23 @@ def test_help_lists_every_purpose_whole(twin):
     assert "..." not in words.split("Robots:")[1]
 
 
+def leaves(command, words=()):
+    inner = getattr(command, "commands", {})
+    for name, one in inner.items():
+        yield from leaves(one, (*words, name))
+    if not inner:
+        yield words, {parameter.name for parameter in command.params}
+
+
+def test_every_command_that_takes_a_robot_takes_the_platform_of_a_urdf():
+    """But for printers, which are no URDFs."""
+    lacking = {
+        words[-1] for words, names in leaves(get_command(app))
+        if "robot" in names and "platform" not in names
+    }  # fmt: skip
+    assert lacking == {"printer"}
+
+
 def test_each_line_of_the_greeting_is_a_command_that_runs(twin, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     alone = twin()
