@@ -47,7 +47,14 @@ from pkm_twin.machine.graph_file import (
 from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure
-from pkm_twin.machine.places import check_number, full_keys, given, number_in, placed
+from pkm_twin.machine.places import (
+    check_number,
+    full_keys,
+    given,
+    number_in,
+    path_of,
+    placed,
+)
 from pkm_twin.machine.reach import PassiveLimit
 from pkm_twin.machine.sections import DriveSpec, Payload
 from pkm_twin.machine.shared import (
@@ -167,15 +174,21 @@ class Machine(Robot):
         """
         specs = {kind: dict(entries) for kind, entries in self.specs.items()}
         rest, origin = {}, self.described.origin
+        # Of an entry: numbers of its limb, then its azimuth, then the copy's own, each at once.
+        changes: dict[tuple[str, str, int, str, float], dict[Key, Any]] = {}
         for path, value in values.items():
             keys = full_keys(path)
             found = list(self._named(keys))
             for kind, name, where, azimuth in found:
-                specs[kind][name] = numbered_entry(specs[kind][name], where, value, azimuth, path)
+                order = 2 if keys[0] == kind else 1 if where == ("azimuth",) else 0
+                place = path_of(keys[: len(keys) - len(where)])
+                changes.setdefault((kind, name, order, place, azimuth), {})[where] = value
             if not found and keys[0] == "origin":
                 origin = placed({"origin": origin}, {tuple(keys): value})["origin"]
             elif not found:
                 rest[path] = value
+        for (kind, name, _, place, azimuth), new in sorted(changes.items(), key=lambda c: c[0][2]):
+            specs[kind][name] = numbered_entry(specs[kind][name], new, azimuth, place)
         described = dataclasses.replace(
             graph_of_entries({"platform": self.described.platform}, specs), origin=origin
         )
