@@ -231,9 +231,9 @@ class Frame:
             chain = self.rigid_chain
             raise ParameterError(
                 f"joints.{chain[0]}.compliance" if chain else "joints", None,
-                "a compliance where the joint is rigid: the platform hangs on the base by rigid "
-                f"bodies alone ({', '.join(chain) or 'closures'}), so it has directions without "
-                "compliance",
+                "a compliance of this joint: a chain of rigid bodies connects the base and the "
+                f"platform ({', '.join(chain) or 'closures'}), so the platform has directions "
+                "without compliance",
             )  # fmt: skip
         # First what closures let through, which is in one equation or two alone.
         weight = np.where(np.arange(PLATFORM, self.size) < self.last, 1.0, 10.0)

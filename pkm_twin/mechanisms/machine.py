@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, TypeVar
@@ -178,7 +178,7 @@ class Machine(Robot):
         changes: dict[tuple[str, str, int, str, float], dict[Key, Any]] = {}
         for path, value in values.items():
             keys = full_keys(path)
-            found = list(self._named(keys))
+            found = list(self.named(keys))
             for kind, name, where, azimuth in found:
                 order = 2 if keys[0] == kind else 1 if where == ("azimuth",) else 0
                 place = path_of(keys[: len(keys) - len(where)])
@@ -198,7 +198,7 @@ class Machine(Robot):
     def check_number(self, path: str) -> None:
         """As a file's, in each of the entries that have it."""
         keys = full_keys(path)
-        named = list(self._named(keys))
+        named = list(self.named(keys))
         for kind, name, where, _ in named:
             if where != ("azimuth",):
                 check_number(self.specs[kind][name], where, path)
@@ -210,12 +210,13 @@ class Machine(Robot):
         keys = full_keys(path)
         if keys[0] == "origin":
             return number_in(self.described.origin.tolist(), keys[1:], path)
-        for kind, name, where, azimuth in self._named(keys):
+        for kind, name, where, azimuth in self.named(keys):
             return number_of_entry(self.specs[kind][name], where, azimuth, path)
         return super().number(path)
 
-    def _named(self, keys: list[str | int]) -> Iterator[tuple[str, str, Key, float]]:
-        """The entries that a path is about: kind, name, keys in it, and the limb's azimuth."""
+    def named(self, keys: Sequence[str | int]) -> Iterator[tuple[str, str, Key, float]]:
+        """As of every robot; of a limb's entry all copies; keys ``azimuth`` for a limb's own."""
+        keys = list(keys)
         for (kind, name), source in self.sources.items():
             if keys[:2] == [kind, name]:
                 yield kind, name, tuple(keys[2:]), 0.0
@@ -266,6 +267,11 @@ class Machine(Robot):
     def without_home(self) -> frozenset[str]:
         """Joints of which the file does not say where they count from."""
         return frozenset(n for n, joint in self.specs["joints"].items() if joint.home is None)
+
+    @property
+    def without_point(self) -> frozenset[str]:
+        """Joints without ``at``."""
+        return frozenset(n for n, joint in self.specs["joints"].items() if joint.at is None)
 
     @property
     def drives(self) -> tuple[DriveSpec | None, ...]:
