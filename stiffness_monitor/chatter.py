@@ -345,11 +345,12 @@ def lobes_between(
     found = _limits(plane, milling, new, last, safe)
     while True:
         n, depth = found.speeds, found.depths
-        lowest = np.concatenate([[True], np.diff(depth) <= 0.0]) & np.concatenate(
-            [np.diff(depth) >= 0.0, [True]]
-        )
         ratio = np.maximum(depth[1:], depth[:-1]) / np.minimum(depth[1:], depth[:-1])
-        split = (ratio > STEEP) | ((lowest[1:] | lowest[:-1]) & (ratio > FLAT))
+        before, after = np.append(1.0, ratio), np.append(ratio, 1.0)
+        falls = np.append(True, np.diff(depth) <= 0.0)
+        lowest = falls & np.append(np.diff(depth) >= 0.0, True)
+        unsure = lowest & (np.maximum(before, after) > FLAT)
+        split = (ratio > STEEP) | unsure[1:] | unsure[:-1]
         split &= np.diff(n) > FINE * n[1:]
         if not split.any():
             return found

@@ -97,7 +97,7 @@ def _effects(
         case "joints", ("at" | "axis") as what, int(k) if k < (3 if what == "at" else 2):
             joint = graph.joints[name]
             if joint.given:
-                raise ParameterError(path, name, "a joint that is a part of its own")
+                raise ParameterError(path, name, "a joint that does not stand for others")
             if what == "at":
                 moved = np.asarray(turn @ np.eye(3)[k])
                 return {("inner", name): moved}, f"centre of {name} on {joint.inner}", "m"
@@ -223,7 +223,7 @@ class Assembly:
         found: list[Row] = []
         names = list(self.graph.actuated)
         for joint in self.graph.joints.values():
-            if only is not None and joint.name not in only:
+            if joint.given or (only is not None and joint.name not in only):
                 continue
             value = q[..., names.index(joint.name)] if joint.actuated else None
             found += self._joint(joint, placed, value, errors)
@@ -240,12 +240,27 @@ class Assembly:
             far = np.linalg.norm(apart, axis=-1)
             longer = errors.get(("length", rod.name), np.zeros(1))[..., 0]
             long = float(np.linalg.norm(rod.ends[1] - rod.ends[0])) + longer
+            along = apart / far[..., None]
             found.append(
                 Row(
                     rod.name, (far - long) / self.size, rod.inner, rod.outer, end,
-                    apart / (far[..., None] * self.size), np.zeros(3),
+                    along / self.size, np.zeros(3),
                 )
             )  # fmt: skip
+            if rod.pair is not None:
+                # Two rods as long as each other: their middle stands across the difference of the
+                # directions in which they are side by side on both bodies.
+                first, second = (
+                    np.asarray((np.eye(3) if body == BASE else placed.rotation[body]) @ rod.pair)
+                    for body in (rod.inner, rod.outer)
+                )
+                value = (along * (second - first)).sum(-1)
+                found.append(
+                    Row(
+                        rod.name, value, rod.inner, rod.outer, end, np.zeros(3),
+                        np.cross(second, along),
+                    )
+                )  # fmt: skip
         return found
 
     def _point(self, placed: Placed, body: str, at: Array, error: Array | None) -> Array:

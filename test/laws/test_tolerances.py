@@ -17,9 +17,11 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.robot.catalogue import robot_of_data
 from stiffness_monitor import platform_response
 from test.machine.random_machines import NAMES, variant
+from test.machine.test_helical import driven, slide
+from test.machine.test_planar import puck
 from test.support.robots import load, partly_long
 
-PATHS = 14
+PATHS = 8
 """Errors of a machine that are tried, of all that it may have."""
 CARRIER = {"mass": 0.0, "com": [0.0, 0.0, 0.0], "inertia": [0.0, 0.0, 0.0]}
 
@@ -148,7 +150,7 @@ def states_of(robot, rng, count):
 
 @pytest.mark.parametrize(
     "name",
-    partly_long(NAMES, "rrr3_planar", "rrr3_spherical", "linear_delta"),
+    partly_long(NAMES, "rrr3_planar", "rsur"),
 )
 def test_an_error_of_a_part_is_a_drive_that_makes_it(name, rng):
     data = variant(name, rng)
@@ -156,7 +158,9 @@ def test_an_error_of_a_part_is_a_drive_that_makes_it(name, rng):
     data.setdefault("origin", data["bodies"][data["platform"]]["com"])
     robot = robot_of_data(data, name)
     q, fitting = states_of(robot, rng, 2), 0
-    for path in rng.permutation(list(paths_of(data)))[:PATHS]:
+    paths = rng.permutation(list(paths_of(data))).tolist()
+    lengths = [path for path in paths if path.endswith(("length", "offset"))]
+    for path in dict.fromkeys([*paths[:PATHS], *lengths[:3]]):
         made = with_drives(data, path)
         expected = [None if made is None else slope_of(data, path, one) for one in q]
         if any(row is None for row in expected):
@@ -302,9 +306,63 @@ def test_what_is_no_part_or_does_not_fit_is_rejected(name, path):
 
 
 def test_a_wrench_adds_the_deflection_of_the_machine_itself():
-    robot, load_on = load("stewart"), [0.0, 0.0, -100.0, 0.0, 0.0, 0.0]
+    robot, load_on = load("delta"), [0.0, 0.0, -100.0, 0.0, 0.0, 0.0]
     q = robot.graph.home
-    found = tolerances(robot, {"joints.leg_a_1.offset": 1e-5}, q, load_on)
+    found = tolerances(robot, {"joints.arm_1.offset": 1e-5}, q, load_on)
     expected = platform_response(robot, q, load_on).deflection
     np.testing.assert_array_equal(found.deflection, expected)
-    assert tolerances(robot, {"joints.leg_a_1.offset": 1e-5}, q).deflection is None
+    assert tolerances(robot, {"joints.arm_1.offset": 1e-5}, q).deflection is None
+
+
+def test_parallelograms_are_their_two_rods():
+    """A tilted arm turns the platform, which the file's machine itself cannot."""
+    robot = load("delta")
+    graph = robot.graph
+    data = {
+        "mechanism": "machine", "platform": graph.platform, "origin": graph.origin.tolist(),
+        "pose": ["x", "y", "z"],
+        "bodies": {n: CARRIER | {"mass": 1.0, "inertia": [0.01] * 3} for n in graph.bodies},
+        "joints": {
+            name: {
+                "type": joint.kind, "between": [joint.inner, joint.outer], "at": joint.at.tolist(),
+                "axis": joint.axes[0].tolist(), "actuated": True, "home": joint.home,
+            }
+            for name, joint in graph.joints.items() if joint.actuated
+        },
+        "rods": {
+            f"{name} {side}": {
+                "between": [rod.inner, rod.outer], "mass": 0.1,
+                "ends": (rod.ends + side * 0.5 * rod.width * rod.pair).tolist(),
+            }
+            for name, rod in graph.rods.items() for side in (-1, 1)
+        },
+    }  # fmt: skip
+    other = robot_of_data(data, "rods")
+    q = graph.home + np.array([0.1, -0.2, 0.05])
+    same = [f"joints.arm_2.{what}" for what in ("at[0]", "at[1]", "axis[0]", "axis[1]", "offset")]
+    one = tolerances(robot, dict.fromkeys([*same, "rods.forearm I.length"], 1e-4), q).sensitivity
+    pair = ["rods.forearm I -1.length", "rods.forearm I 1.length"]
+    two = tolerances(other, dict.fromkeys([*same, *pair], 1e-4), q).sensitivity
+    for path in same:
+        np.testing.assert_allclose(one[path], two[path], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        one["rods.forearm I.length"], two[pair[0]] + two[pair[1]], rtol=0, atol=1e-9
+    )
+    assert np.abs(one["joints.arm_2.axis[1]"][3:]).max() > 0.1
+
+
+def test_a_zero_moves_the_platform_as_the_drive_does():
+    """Of joint types that the judge does not know, screws over several turns too."""
+    for robot, turns in ((slide(0.008), 7.0), (driven(-0.005, [0.0, 0.1, 0.0]), 3.0), (puck(1), 0)):
+        q = robot.graph.home + 0.05 + 2.0 * np.pi * turns
+        columns = robot.platform_jacobian(q)
+        for k, name in enumerate(robot.joint_names):
+            path = f"joints.{name}.offset"
+            found = tolerances(robot, {path: 1e-4}, q).sensitivity[path]
+            np.testing.assert_allclose(found, columns[:, k], rtol=0, atol=1e-9)
+            exact = drawn(robot, {path: 1e-4}, q, 3)[:, 0]
+            assert np.abs(exact).max() > 0.0
+            np.testing.assert_allclose(
+                exact / exact[:, [np.abs(exact).max(0).argmax()]],
+                np.tile(found / found[np.abs(exact).max(0).argmax()], (3, 1)), atol=1e-3,
+            )  # fmt: skip
