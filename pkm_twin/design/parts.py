@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError
+from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnknownNameError
 from pkm_twin.machine.graph import BASE, Joint, rotation_about_z
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.places import full_keys
@@ -62,19 +62,25 @@ def part_of(robot: Robot, path: str) -> Part | None:
     if keys[0] not in ("bodies", "joints", "rods", "limbs"):
         return None
     effects: dict[Effect, Array] = {}
-    text = name = unit_ = ""
+    texts, unit_ = [], ""
     for kind, name, where, azimuth in robot.named(keys):
         found = _effects(robot, kind, name, where, rotation_about_z(azimuth), path)
         if found is None:
             break
         effects |= found[0]
-        text, unit_ = (text and f"{text.split(',')[0]}, and its copies alike") or found[1], found[2]
+        texts.append(found[1])
+        unit_ = found[2]
+    if not effects and len(keys) > 1 and keys[0] != "limbs":
+        known = getattr(robot.graph, str(keys[0]))
+        if keys[1] not in known:
+            raise UnknownNameError(f"tolerance {path}", str(keys[1]), known)
     if not effects:
         raise ParameterError(
             path, None, "a part: rods.NAME.length, bodies.NAME.length, joints.NAME.at[0..2], "
             "joints.NAME.axis[0..1] or joints.NAME.offset, of all copies with limbs. before"
         )  # fmt: skip
-    return Part(effects, text, unit_)
+    alike = ", and its copies alike" if len(texts) > 1 else ""
+    return Part(effects, texts[0] + alike, unit_)
 
 
 def _effects(
