@@ -8,7 +8,7 @@ forms of the start and of the inverse with the branch rules.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, TypeVar
@@ -28,6 +28,7 @@ from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.places import (
+    Key,
     check_number,
     full_keys,
     given,
@@ -207,6 +208,20 @@ class Mechanism:
     def without_home(self) -> frozenset[str]:
         """Joints of which the file should say where they count from, and does not."""
         return frozenset()
+
+    @property
+    def without_point(self) -> frozenset[str]:
+        """Joints that have no point of their own in the file."""
+        return frozenset()
+
+    def named(self, keys: Sequence[Key]) -> Iterator[tuple[str, str, tuple[Key, ...], float]]:
+        """Entries of the graph that a path's keys are about: kind, name, keys in it, azimuth.
+
+        The azimuth is a limb's, by which the entry's vectors are turned about base z.
+        """
+        kind, name, *where = [*keys, "", ""][: max(2, len(keys))]
+        if kind in ("bodies", "joints", "rods") and name in getattr(self.graph, str(kind)):
+            yield str(kind), str(name), tuple(where), 0.0
 
     @property
     def drives(self) -> tuple[DriveSpec | None, ...]:
