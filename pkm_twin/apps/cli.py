@@ -33,6 +33,7 @@ from pkm_twin.apps.options import (
     BagPath,
     BagTopics,
     BeyondLimits,
+    Follow,
     Json,
     LoadTimes,
     Payload,
@@ -262,6 +263,7 @@ def torques(
     ] = Path("torques.csv"),
     picture: Annotated[bool, typer.Option(help="plot efforts and terms as a PNG")] = True,
     topic: BagTopics = [],  # noqa: B006  typer copies it
+    follow: Follow = None,
     payload: Payload = None,
     load_times: LoadTimes = None,
     beyond_limits: BeyondLimits = False,
@@ -296,7 +298,7 @@ def torques(
     carried = load_of(payload, load_times)
     if topic and not is_bag(motion):
         raise typer.BadParameter(f"--topic is for bags; {motion} is read as CSV")
-    data = motion_of(motion, robot, topic, carried)
+    data = motion_of(motion, robot, topic, carried, follow)
     _, found = find_beyond(data.robot, data.q, data.qd)
     if not beyond_limits:
         refuse_beyond(found)

@@ -11,6 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.apps.loads import Load
+from pkm_twin.apps.sizes import compared
 from pkm_twin.apps.torques import motion_of
 from pkm_twin.atlas import plots
 from pkm_twin.atlas.extras import require
@@ -20,7 +22,7 @@ from pkm_twin.design import QUANTITIES, Design, DesignPoint, PosePath, Sweep, po
 from pkm_twin.design.pose_path import Followed
 from pkm_twin.design.tolerance import workspace_states
 from pkm_twin.design.variants import Variants
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, warn
 from pkm_twin.robot.edited import Chosen, edited_yaml, write_edited
 from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
@@ -33,19 +35,25 @@ FILE_DIGITS: Final = 12
 """Significant digits of a number that is written."""
 
 
-def read_path(path: Path, robot: Robot, wrench: Sequence[float] | None) -> tuple[Robot, PosePath]:
+def read_path(
+    path: Path, robot: Robot, wrench: Sequence[float] | None, carried: Load | None
+) -> tuple[Robot, PosePath]:
     """The robot with the motion's payload, and the platform's path.
 
+    :param carried: in place of the motion's payload.
     :raises ParameterError: a table that is no motion, or a payload that is held part of the time.
     :raises BagError: a bag without a motion.
     """
-    motion = motion_of(path, robot)
+    motion = motion_of(path, robot, (), carried)
     if motion.load is not None:
-        if motion.load.times:
+        held = motion.load.held(motion.time)
+        if not held.all():
             raise ParameterError(
                 f"{path}: payload", str(motion.load), "one that is held throughout"
             )
         robot = motion.load.on(robot)
+    if robot.has_masses and (unlike := compared(motion, "file").unlike):
+        warn(path, unlike)
     load = motion.wrench + (np.zeros(6) if wrench is None else np.asarray(wrench))
     way = PosePath.of_joints(robot, motion.time, motion.q, motion.qd, motion.qdd, load)
     return robot, way
@@ -248,7 +256,7 @@ def budget(robot: Robot, sigma: Mapping[str, float], path: Path | None) -> tuple
     if path is None:
         q, where = workspace_states(robot, STATES), "the workspace"
     else:
-        q, where = robot.inverse(read_path(path, robot, None)[1].pose), path.name
+        q, where = robot.inverse(read_path(path, robot, None, None)[1].pose), path.name
     found = pose_errors(robot, q, sigma)
     units = {name: entries(robot).get(name, (0.0, ""))[1] for name in sigma}
     order = sorted(sigma, key=lambda name: -found.share(name))

@@ -78,10 +78,7 @@ class Curve:
             robot.forward(q)
         else:
             q = _joints(robot, place, self.begin + s)
-            jacobian = robot.jacobian(q)
-            first = np.linalg.solve(jacobian, slope[..., None])[..., 0]
-            own = robot.pose_acceleration(q, first, np.zeros_like(q))
-            second = np.linalg.solve(jacobian, (bend - own)[..., None])[..., 0]
+            first, second = joint_rates(robot, q, slope, bend)
         check_positions(robot, s, q, self.begin, self.singularity)
         twist = velocity_of(robot, q, first)
         travel = np.linalg.norm(twist, axis=1)
@@ -174,6 +171,15 @@ class JointPath:
             part = (np.arange(len(at)) - np.repeat(np.cumsum(count) - count, count)) / count[at]
             grid.append(np.append(own[at] + part * np.diff(own)[at], own[-1]))
         return self.curve.at(grid)
+
+
+def joint_rates(robot: Robot, q: Array, rate: Array, change: Array) -> tuple[Array, Array]:
+    """First and second derivatives of joints (k, n) by those of the pose, shape (k, m) each."""
+    jacobian = robot.jacobian(q)
+    first = np.asarray(np.linalg.solve(jacobian, rate[..., None])[..., 0], np.float64)
+    own = robot.pose_acceleration(q, first, np.zeros_like(first))
+    second = np.linalg.solve(jacobian, (change - own)[..., None])[..., 0]
+    return first, np.asarray(second, np.float64)
 
 
 def velocity_of(robot: Robot, q: Array, qd: Array) -> Array:

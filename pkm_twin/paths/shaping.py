@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.paths.joint_path import check_positions
+from pkm_twin.paths.joint_path import check_positions, joint_rates, velocity_of
 from pkm_twin.paths.motion import Moments, Samples, TimedPath, peaks
 
 DELAYS: Final = {"zv": 1, "zvd": 2}
@@ -129,15 +129,11 @@ class ShapedPath(TimedPath):
             rate += amplitude * own_rate * first[:, None]
             change += amplitude * (own_change * (first**2)[:, None] + own_rate * second[:, None])
         q = robot.inverse(pose)
-        jacobian = robot.jacobian(q)
-        qd = np.asarray(np.linalg.solve(jacobian, rate[..., None])[..., 0], np.float64)
-        rest = robot.pose_acceleration(q, qd, np.zeros_like(qd))
-        qdd = np.asarray(np.linalg.solve(jacobian, (change - rest)[..., None])[..., 0], np.float64)
+        qd, qdd = joint_rates(robot, q, rate, change)
         effort = None
         if robot.has_masses:
             effort = inverse_dynamics(robot, q, qd, qdd, self.wrench)
-        moved = (robot.platform_jacobian(q)[:, :3] @ qd[..., None])[..., 0]
-        speed = np.linalg.norm(moved, axis=1)
+        speed = np.linalg.norm(velocity_of(robot, q, qd), axis=1)
         return Samples(t, q, qd, qdd, effort, pose, speed, speed)
 
 
