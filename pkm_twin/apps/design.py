@@ -120,7 +120,7 @@ def design_command(
     for target in (out, picture):
         if target is not None:
             refuse_existing(target, overwrite, path)
-    machine, _ = loaded(robot, platform, payload)
+    machine, carried = loaded(robot, platform, payload)
     load_on = None if wrench is None else numbers(wrench, 6, "fx,fy,fz,mx,my,mz")
     if tolerance:
         if vary or minimise or sweep or subject_to or out or picture:
@@ -135,7 +135,7 @@ def design_command(
         raise typer.BadParameter("--monte-carlo needs --tolerance")
     if path is None:
         raise typer.BadParameter("give the motion with --path, see `pkm-twin path`")
-    machine, way = report.read_path(path, machine, load_on)
+    machine, way = report.read_path(path, machine, load_on, carried)
     box = parse_vary(vary)
     if sweep is not None:
         if sweep not in SWEEPS:

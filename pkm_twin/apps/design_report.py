@@ -11,6 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.apps.loads import Load
+from pkm_twin.apps.sizes import compared
 from pkm_twin.apps.torques import motion_of
 from pkm_twin.atlas import plots
 from pkm_twin.atlas.extras import require
@@ -19,7 +21,7 @@ from pkm_twin.console import finite
 from pkm_twin.design import QUANTITIES, Design, DesignPoint, PosePath, Sweep
 from pkm_twin.design.pose_path import Followed
 from pkm_twin.design.variants import Variants
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, warn
 from pkm_twin.robot.edited import Chosen, edited_yaml, write_edited
 from pkm_twin.robot.entries import entries
 from pkm_twin.robot.robot import Robot
@@ -30,19 +32,25 @@ FILE_DIGITS: Final = 12
 """Significant digits of a number that is written."""
 
 
-def read_path(path: Path, robot: Robot, wrench: Sequence[float] | None) -> tuple[Robot, PosePath]:
+def read_path(
+    path: Path, robot: Robot, wrench: Sequence[float] | None, carried: Load | None
+) -> tuple[Robot, PosePath]:
     """The robot with the motion's payload, and the platform's path.
 
+    :param carried: in place of the motion's payload.
     :raises ParameterError: a table that is no motion, or a payload that is held part of the time.
     :raises BagError: a bag without a motion.
     """
-    motion = motion_of(path, robot)
+    motion = motion_of(path, robot, (), carried)
     if motion.load is not None:
-        if motion.load.times:
+        held = motion.load.held(motion.time)
+        if not held.all():
             raise ParameterError(
                 f"{path}: payload", str(motion.load), "one that is held throughout"
             )
         robot = motion.load.on(robot)
+    if robot.has_masses and (unlike := compared(motion, "file").unlike):
+        warn(path, unlike)
     load = motion.wrench + (np.zeros(6) if wrench is None else np.asarray(wrench))
     way = PosePath.of_joints(robot, motion.time, motion.q, motion.qd, motion.qdd, load)
     return robot, way

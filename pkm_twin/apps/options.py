@@ -48,6 +48,13 @@ LoadTimes = Annotated[
         "default: always"
     ),
 ]
+Follow = Annotated[
+    OptionalText,
+    typer.Option(
+        help="which columns of a table with joint positions and pose are the motion: joints, or "
+        "pose, which plans it again for this robot; default: both, which have to agree"
+    ),
+]
 BeyondLimits = Annotated[
     bool,
     typer.Option(

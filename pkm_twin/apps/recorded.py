@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pkm_twin import load, robot_names
 from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
-from pkm_twin.apps.loads import Load, metadata_error, told_load
+from pkm_twin.apps.loads import Load, load_of_columns, metadata_error, told_load
 from pkm_twin.apps.topics import JOINT_STATE, Topics, choose_topics
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import is_bag
@@ -161,7 +161,8 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     """A recording as a CSV with columns ``time`` and ``JOINT.position``.
 
     Optionally ``JOINT.velocity`` and ``.acceleration``, ``JOINT.measured`` or else
-    ``JOINT.effort``, and the wrench ``fx fy fz mx my mz``; other columns are left alone.
+    ``JOINT.effort``, the wrench ``fx fy fz mx my mz``, and the payload as in ``motion_of_csv``;
+    other columns are left alone.
 
     :raises ParameterError: no robot is given, a column is missing, or a value is no finite number.
     """
@@ -187,7 +188,8 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     if any(axis in columns for axis in WRENCH_AXES):
         wrench = np.stack([columns.get(axis, np.zeros(len(time))) for axis in WRENCH_AXES], -1)
     return Recording(
-        robot=machine, bag=None, topics=Topics("columns of the table"), load=carried,
+        robot=machine, bag=None, topics=Topics("columns of the table"),
+        load=carried or load_of_columns(path, time, columns),
         stamps=np.round(time * 1e9).astype(np.int64), time=time, q=q, qd=qd,
         effort=stack("effort") if measured is None else measured, wrench=wrench,
         rejected=Counter(), first_reject="", source=str(path), qdd=stack("acceleration"),

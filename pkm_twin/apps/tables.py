@@ -92,9 +92,11 @@ def in_si(columns: Mapping[str, Array], robot: Robot | None) -> dict[str, Array]
     if robot is None:
         raise ParameterError("units", ", ".join(units), "none for this table")
     kinds = {"time": "time"}
-    pairs = [(f"{n}.{what}", u) for n, u in zip(robot.joint_names, robot.joint_units, strict=True)
-             for what in RATES]  # fmt: skip
-    for name, unit in [*pairs, *zip(robot.pose_names, robot.pose_units, strict=True)]:
+    of_joints = zip(robot.joint_names, robot.joint_units, strict=True)
+    of_pose = zip(robot.pose_names, robot.pose_units, strict=True)
+    for name, unit in (*of_joints, *of_pose):
+        kinds |= dict.fromkeys((f"{name}.{what}" for what in RATES), UNITS[unit][0])
+    for name, unit in zip(robot.pose_names, robot.pose_units, strict=True):
         kinds[name] = UNITS[unit][0]
     for name, kind in kinds.items():
         if name in result and kind in units:

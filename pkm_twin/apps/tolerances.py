@@ -61,7 +61,7 @@ def budget(
     if path is None:
         q, where = workspace_states(robot, STATES, seed), "the workspace"
     else:
-        q, where = robot.inverse(read_path(path, robot, None)[1].pose), path.name
+        q, where = robot.inverse(read_path(path, robot, None, None)[1].pose), path.name
     found = tolerances(robot, sigma, q, wrench)
     variance = {name: float((found.part(name)[..., :3] ** 2).sum()) for name in sigma}
     whole = sum(variance.values())

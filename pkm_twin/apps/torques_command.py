@@ -11,6 +11,7 @@ import typer
 from pkm_twin.apps.options import (
     BagTopics,
     BeyondLimits,
+    Follow,
     LoadTimes,
     Payload,
     Platform,
@@ -34,6 +35,7 @@ def torques(
     ] = Path("torques.csv"),
     picture: Annotated[bool, typer.Option(help="plot efforts and terms as a PNG")] = True,
     topic: BagTopics = [],  # noqa: B006  typer copies it
+    follow: Follow = None,
     payload: Payload = None,
     load_times: LoadTimes = None,
     platform: Platform = None,
@@ -70,7 +72,7 @@ def torques(
     carried = load_of(payload, load_times)
     if topic and not is_bag(motion):
         raise typer.BadParameter(f"--topic is for bags; {motion} is read as CSV")
-    data = motion_of(motion, load(robot, platform=platform), topic, carried)
+    data = motion_of(motion, load(robot, platform=platform), topic, carried, follow)
     _, found = find_beyond(data.robot, data.q, data.qd)
     if not beyond_limits:
         refuse_beyond(found)

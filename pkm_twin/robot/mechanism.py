@@ -36,6 +36,7 @@ from pkm_twin.machine.places import (
     number_in,
     numbers_of,
     placed,
+    unknown_number,
 )
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import PassiveLimit, position_box
@@ -390,10 +391,10 @@ class Mechanism:
         """
         keys = full_keys(path)
         sections = {f.name for f in dataclasses.fields(self) if "check" in f.metadata}
-        known = keys and keys[0] in sections
-        return number_in(
-            schema.plain(getattr(self, str(keys[0]))) if known else None, keys[1:], path
-        )
+        if not keys or keys[0] not in sections:
+            numbers = numbers_of(self.parameter_sections(), self.parameter_units())
+            raise unknown_number(path, numbers)
+        return number_in(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
 
     def check_number(self, path: str) -> None:
         """Judge a number of :meth:`numbered` as a file's is.
