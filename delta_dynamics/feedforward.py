@@ -299,7 +299,7 @@ class Feedforward:
             )
         if silence > self.settings.stale_after * SECOND:
             if self._last_stamp:
-                text = f"no joint state for {silence / SECOND:.3f} s by their stamps"
+                text = f"no accepted joint state for {silence / SECOND:.3f} s, by the stamps"
                 self.stream.stop("stale input", text)
             self._begin_anew()
         wrench = None if self.wrenches is None else self.wrenches.require(sample.stamp)

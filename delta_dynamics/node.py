@@ -92,9 +92,8 @@ class DeltaDynamics(TwinNode):
             self._prepare,
             self._take,
         )
-        self._last_heard = 0
-        self._measured: Any = None
-        """The newest joint state that was taken."""
+        self._accepted: tuple[int, Any] | None = None
+        """The last accepted joint state, and when it came by the steady clock, ns."""
         self._watchdog: Any = None
         self._watch_every(stale_after)
         # A step after which no stamp that was good before is good now.
@@ -124,13 +123,13 @@ class DeltaDynamics(TwinNode):
         """A stream begins anew."""
         self._feedforward.reset()
         self._estimates.reset()
-        self._last_heard = 0
+        self._accepted = None
 
     def deactivated(self) -> None:
         """A stream that ran is stopped; goals that wait are ended."""
         if self._action is not None:
             self._action.deactivated()
-        if self._last_heard:
+        if self._accepted is not None:
             self._stop("inactive", "the node was deactivated")
 
     def farewell(self) -> None:
@@ -149,7 +148,7 @@ class DeltaDynamics(TwinNode):
     def reset_stop(self) -> str:
         """End a stop without waiting for good samples."""
         stream = self._feedforward.stream
-        return f"{stream.reason}: {stream.text}" if stream.resume() else ""
+        return stream.status if stream.resume() else ""
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, message and values of the node's diagnostic status."""
@@ -164,7 +163,7 @@ class DeltaDynamics(TwinNode):
         if core.near_singular:
             message = f"close to a singularity or the edge of the workspace: index {measure:.3g}"
         if core.stream.stopped:
-            level, message = health.ERROR, f"stopped: {core.stream.reason}: {core.stream.text}"
+            level, message = health.ERROR, f"stopped: {core.stream.status}"
         values: dict[str, object] = {
             "robot": core.robot.name,
             "payload mass": core.robot.payload.mass,
@@ -228,11 +227,16 @@ class DeltaDynamics(TwinNode):
 
     def _place(self) -> dict[str, float] | None:
         """Where the joints are, by the controller's names and numbers; None where not measured."""
-        silent = (time.monotonic_ns() - self._last_heard) / SECOND
-        state = self._measured
-        if state is None or silent > self._feedforward.settings.stale_after:
+        if self._accepted is None or self._silence() > self._feedforward.settings.stale_after:
             return None
+        state = self._accepted[1]
         return dict(zip(state.name, map(float, state.position), strict=True))
+
+    def _silence(self) -> float:
+        """Since the last accepted joint state, by the steady clock, s; 0 before the first."""
+        if self._accepted is None:
+            return 0.0
+        return (time.monotonic_ns() - self._accepted[0]) / SECOND
 
     def _create_wrenches(self, settings: Settings) -> WrenchWindow | None:
         """The measured wrench, where the parameter asks for it."""
@@ -339,8 +343,7 @@ class DeltaDynamics(TwinNode):
         self._trajectory.publish(raw.with_effort(efforts))
 
     def _on_joint_state(self, data: bytes) -> None:
-        core = self._feedforward
-        self._last_heard = time.monotonic_ns()
+        core, came = self._feedforward, time.monotonic_ns()
         running = not core.stream.stopped
         try:
             try:
@@ -349,11 +352,13 @@ class DeltaDynamics(TwinNode):
                 core.refuse_joint_state(error)
                 raise
             torques = core.joint_state(message, self.now())
-            self._measured = message
+            if torques is not None:
+                # The process may have stood still since.
+                core.check_age(torques, self.now())
+            # A rejected message, such as another machine's, is no sign of life of this one.
+            self._accepted = came, message
             if torques is None:
                 return
-            # The process may have stood still since.
-            core.check_age(torques, self.now())
         finally:
             if running and core.stream.stopped:
                 self._send_stop()
@@ -397,10 +402,9 @@ class DeltaDynamics(TwinNode):
 
     def _watch(self) -> None:
         """Stop a stream that has gone silent; runs on the steady clock."""
-        core = self._feedforward
-        silent = (time.monotonic_ns() - self._last_heard) / 1e9
-        if self._last_heard and not core.stream.stopped and silent > core.settings.stale_after:
-            self._stop("stale input", f"no joint state for {silent:.3f} s")
+        core, silent = self._feedforward, self._silence()
+        if not core.stream.stopped and silent > core.settings.stale_after:
+            self._stop("stale input", f"no accepted joint state for {silent:.3f} s")
 
     def _stop(self, reason: str, text: str) -> None:
         with self._telling_stop():
@@ -409,7 +413,7 @@ class DeltaDynamics(TwinNode):
 
     def _send_stop(self) -> None:
         core = self._feedforward
-        self.log_throttled("stop", f"stopped: {core.stream.reason}: {core.stream.text}")
+        self.log_throttled("stop", f"stopped: {core.stream.status}")
         model = core.stop_effort()
         if model is None:
             return
