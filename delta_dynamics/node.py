@@ -341,6 +341,8 @@ class DeltaDynamics(TwinNode):
                 break
         yield
         self._trajectory.publish(raw.with_effort(efforts))
+        if self._action is not None:
+            self._action.other_motion()
 
     def _on_joint_state(self, data: bytes) -> None:
         core, came = self._feedforward, time.monotonic_ns()
