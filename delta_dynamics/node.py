@@ -33,6 +33,7 @@ from pkm_twin.ros.run import run
 from pkm_twin.ros.turns import Task
 from pkm_twin.ros.wrench import declare_mounts
 from pkm_twin.streams.matched import WrenchWindow
+from pkm_twin.streams.pace import Pace
 from pkm_twin.streams.settings import SECONDS, changeable, with_parameters
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 
@@ -108,6 +109,7 @@ class DeltaDynamics(TwinNode):
         """No torque across the seam: the stream starts anew."""
         self._feedforward.reset()
         self._estimates.reset()
+        self._reactions_pace.reset()
 
     def time_jumped_forward(self) -> None:
         """What was fresh is stale now: a running stream stops."""
@@ -121,8 +123,7 @@ class DeltaDynamics(TwinNode):
 
     def activated(self) -> None:
         """A stream begins anew."""
-        self._feedforward.reset()
-        self._estimates.reset()
+        self.time_jumped_backward()
         self._accepted = None
 
     def deactivated(self) -> None:
@@ -295,8 +296,7 @@ class DeltaDynamics(TwinNode):
             high=1e4,
             read_only=True,
         )
-        self._reactions_period = round(SECOND / rate)
-        self._reactions_due = 0
+        self._reactions_pace = Pace(rate)
         if not wanted:
             return {}
         rest = np.zeros((2, len(robot.joint_names)))
@@ -380,8 +380,8 @@ class DeltaDynamics(TwinNode):
 
     def _tell_reactions(self, torques: Torques) -> None:
         """At a rate of their own: a dense solve a sample is too much for the stream's."""
-        if self._reactions and abs(torques.stamp - self._reactions_due) >= self._reactions_period:
-            self._reactions_due = torques.stamp
+        if self._reactions and self._reactions_pace.due(torques.stamp):
+            self._reactions_pace.answered(torques.stamp)
             self._publish_reactions(Time(nanoseconds=torques.stamp).to_msg(), torques)
 
     def _publish_reactions(self, stamp: Any, torques: Torques) -> None:

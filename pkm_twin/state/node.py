@@ -14,7 +14,6 @@ from pkm_twin.bags.definitions import message_definition
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
 from pkm_twin.messages.intake import JointStateDecoder
-from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_urdf
 from pkm_twin.ros import health, outputs
@@ -85,7 +84,6 @@ class MachineStateNode(TwinNode):
         )  # fmt: skip
         self._urdf = robot_urdf(robot, hardware)
         self._transforms = self._create_transforms()
-        self._transforms_due = 0
         self._drawn = 0
         """Stamp of the state that was drawn last."""
         self._create_markers()
@@ -114,7 +112,8 @@ class MachineStateNode(TwinNode):
     def time_jumped_backward(self) -> None:
         """No state across the seam."""
         self._core.reset()
-        self._transforms_due = self._drawn = 0
+        self._transforms_pace.reset()
+        self._drawn = 0
 
     def activated(self) -> None:
         """What does not change is told once; nothing from before is."""
@@ -161,7 +160,7 @@ class MachineStateNode(TwinNode):
             "platform", unit="Hz", low=0.1, high=1e4,
             read_only=True,
         )  # fmt: skip
-        self._transforms_period = round(SECOND / rate)
+        self._transforms_pace = Pace(rate)
         if wanted == "none":
             return None
         try:
@@ -203,8 +202,8 @@ class MachineStateNode(TwinNode):
             self._twist.publish(outputs.twist(stamp, base, state.twist))
         if self._transforms is None or not self._transforms.platform:
             return
-        if abs(state.stamp - self._transforms_due) >= self._transforms_period:
-            self._transforms_due = state.stamp
+        if self._transforms_pace.due(state.stamp):
+            self._transforms_pace.answered(state.stamp)
             self._transforms.send_platform(stamp, state.position, quaternion)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
