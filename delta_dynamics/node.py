@@ -93,6 +93,7 @@ class DeltaDynamics(TwinNode):
             self._prepare,
             self._take,
         )
+        self._told_window = 0
         self._accepted: tuple[int, Any] | None = None
         """The last accepted joint state, and when it came by the steady clock, ns."""
         self._watchdog: Any = None
@@ -174,7 +175,8 @@ class DeltaDynamics(TwinNode):
             "older stamps dropped": core.dropped,
             "close to a singularity": core.near_singularities,
             "singularity index": "" if measure is None else f"{measure:.4f}",
-            "acceleration delay (samples)": core.differentiator_delay,
+            "acceleration delay (samples)": core.differentiator.delay,
+            "acceleration window": self._window_text(),
         }
         values |= {f"joint states rejected: {k}": v for k, v in core.stream.rejected.items()}
         values |= {f"trajectories rejected: {k}": v for k, v in core.trajectories.rejected.items()}
@@ -192,6 +194,21 @@ class DeltaDynamics(TwinNode):
             if level == health.OK and core.wrenches.last_reject:
                 level, message = health.WARN, f"last reject: {core.wrenches.last_reject}"
         return level, message, values
+
+    def _window_text(self) -> str:
+        """How long the differentiator's window is and what it costs; a new length is logged."""
+        fit = self._feedforward.differentiator
+        if fit.period == 0.0:
+            return ""
+        length, error = fit.period * (fit.window - 1), 100.0 * fit.sine_error(1.0)
+        text = (
+            f"{fit.window} samples, {1e3 * length:.3g} ms: error for a sine of 1 Hz {error:.2g} % "
+            "of the peak acceleration"
+        )
+        if fit.window != self._told_window:
+            self._told_window = fit.window
+            self.get_logger().info(f"joint states at {1.0 / fit.period:.4g} Hz, window {text}")
+        return text
 
     def _create_action(self) -> Any:
         """The action ``~/follow_joint_trajectory``, where a controller is named."""
