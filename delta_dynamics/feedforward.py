@@ -24,6 +24,7 @@ from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import StreamMonitor
+from pkm_twin.streams.rates import RateAgreement
 from pkm_twin.streams.rest import RestWatch, fit_gain, gradient_gain, rate_doubt
 from pkm_twin.streams.wrench import counting
 
@@ -84,6 +85,7 @@ class Feedforward:
         self.differentiator = _differentiator(s)
         self._window = s.window
         self._rest = RestWatch(_slope_gain(self.differentiator))
+        self.rates = RateAgreement(self.robot)
         self._reach = friction_reach(self.robot)
         self._rules = s.stamp_rules
         self._reader = JointReader(self.robot, extra_joints=s.extra_joints)
@@ -267,6 +269,7 @@ class Feedforward:
     def _restart_fit(self) -> None:
         self.differentiator.reset()
         self._rest.reset()
+        self.rates.reset()
         if self.wrenches is not None:
             self.wrenches.restart()
 
@@ -332,6 +335,8 @@ class Feedforward:
             self._continuity.retract()
             raise
         self._last_stamp = sample.stamp
+        if sample.qd is not None:
+            self.rates.push(sample.stamp, sample.q, sample.qd)
         self.near_singular = near_singular
         self.near_singularities += near_singular
         if rates is None:

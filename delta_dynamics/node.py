@@ -162,6 +162,9 @@ class DeltaDynamics(TwinNode):
             message = "an effort exceeded its limit"
         if core.last_reject:
             message = f"last reject: {core.last_reject}"
+        if core.rates.fault:
+            level, message = health.WARN, core.rates.fault
+            self.log_throttled("rates", core.rates.fault)
         if core.near_singular:
             message = f"close to a singularity or the edge of the workspace: index {measure:.3g}"
         if core.stream.stopped:
