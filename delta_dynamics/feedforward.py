@@ -82,7 +82,7 @@ class Feedforward:
         self._last_stamp = 0
         self._last_now = 0
         self._last_good: Array | None = None
-        self.differentiator = _differentiator(s)
+        self.differentiator = _differentiator(s, self.robot)
         self._window = s.window
         self._rest = RestWatch(_slope_gain(self.differentiator))
         self.rates = RateAgreement(self.robot)
@@ -113,7 +113,7 @@ class Feedforward:
         if self.wrenches is not None:
             self.wrenches.change_stamps(settings.accept_zero_stamp, settings.future_tolerance)
         if (before.order, before.window) != (settings.order, settings.window):
-            self.differentiator = _differentiator(settings)
+            self.differentiator = _differentiator(settings, self.robot)
             self._window = settings.window
             self._rest = RestWatch(_slope_gain(self.differentiator))
             if self.wrenches is not None:
@@ -362,8 +362,10 @@ class Feedforward:
         return self._rest.push(sample.stamp, sample.q, sample.qd, rate)
 
 
-def _differentiator(s: Settings) -> Differentiator:
-    return Differentiator(s.order, s.window, time=s.window_time)
+def _differentiator(s: Settings, robot: Robot) -> Differentiator:
+    made = Differentiator(s.order, s.window, time=s.window_time)
+    made.prepare(robot.joints_count)
+    return made
 
 
 def _slope_gain(fit: Differentiator) -> float:

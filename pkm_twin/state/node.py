@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 
+import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.duration import Duration
 from rclpy.time import Time
@@ -70,7 +71,7 @@ class MachineStateNode(TwinNode):
         )  # fmt: skip
         self._scene = Scene(robot, self.declare_settings(Scales, fixed=True))
         self._elastic = _is_elastic(robot)
-        _warm_up(robot)
+        _warm_up(robot, self._elastic)
         self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
         self._joints = self.create_guarded_publisher("~/joint_states")
         self._pose = self.create_guarded_publisher("~/pose")
@@ -253,11 +254,14 @@ def _is_elastic(robot: Robot) -> bool:
     return True
 
 
-def _warm_up(robot: Robot) -> None:
-    """Compile, or load, what a sample needs before there is a topic to be found by."""
+def _warm_up(robot: Robot, elastic: bool) -> None:
+    """Compile, or load, what samples and markers call, before there is a topic to be found by."""
     for kernel in (state_kernel(robot), moving_state_kernel(robot)):
         kernel.warm_up()
-    robot.placements(robot.inverse(robot.home()))
+    home = robot.inverse(robot.home())
+    robot.placements(home)
+    if elastic:
+        member_deflections(robot, home, np.zeros(6))
 
 
 NODE = MachineStateNode

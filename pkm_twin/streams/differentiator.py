@@ -76,6 +76,11 @@ class Differentiator:
             return (self.window - 1) / 2
         return float(self.window - 1 - self.window // 2) if self.middle else 0.0
 
+    def prepare(self, joints: int) -> None:
+        """Compile, or load, what samples of so many joints call, with rates and without."""
+        for degree in (self.order, self.order + 1):
+            _Fit(degree, self.window, joints)
+
     def reset(self) -> None:
         """Forget all samples."""
         self._count = 0
@@ -176,6 +181,8 @@ class _Fit:
         size = degree + 1
         self._nothing = np.zeros(2 * degree + 1 + size * joints)
         self._blocks = -(-window // BLOCK)
+        if self._blocks > 1:
+            self._sums.warm_up()
         self._all = np.ones(BLOCK)
         # Of the oldest block, those of the window alone.
         self._oldest = np.zeros(BLOCK)
