@@ -40,6 +40,7 @@ from pkm_twin import Robot, load
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.export.ros2_control import CONTROLLER as FEEDFORWARD
 from pkm_twin.export.ros2_control import TRAJECTORIES, package_name
+from pkm_twin.ros.arguments import check_launch_arguments
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 HERE = Path(__file__).parent
@@ -81,6 +82,7 @@ def generate_launch_description() -> LaunchDescription:
 def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     """Everything, once the arguments have their values."""
     leave_interrupts_to_launch()
+    check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     namespace = given["namespace"]
     gate = given["command_gate"].lower()

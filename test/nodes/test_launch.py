@@ -10,7 +10,9 @@ import contextlib
 import os
 import re
 import signal
+import sys
 from importlib.util import find_spec
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,8 +21,10 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
+from pkm_twin.errors import UnknownNameError
 from pkm_twin.machine import rotations
 from pkm_twin.robot.robot_urdf import robot_urdf
+from pkm_twin.ros.arguments import check_launch_arguments
 from test.nodes.harness import REPOSITORY, Command, Maker, Ros
 from test.support.robots import load
 
@@ -77,6 +81,28 @@ class TestText:
             source = "".join((REPOSITORY / file).read_text(encoding="utf-8") for file in files)
             assert all(re.search(rf"\b{name}\b", source) for name in names)
             assert set(names) <= set(arguments)
+
+    @pytest.mark.parametrize("name", FILES)
+    def test_an_argument_that_a_file_lacks_is_rejected_where_the_command_line_names_it(
+        self, monkeypatch, name
+    ):
+        """A user's own file, which includes it, has arguments of its own."""
+        file, declared = str(LAUNCH / f"{name}.launch.py"), literal(name, "ARGUMENTS")
+        for words in (["pkm_twin", f"{name}.launch.py"], [file]):
+            monkeypatch.setattr(sys, "argv", ["ros2", "launch", *words])
+            check_launch_arguments(file, [f"{key}:=x" for key in declared], declared)
+            for key in declared:
+                with pytest.raises(UnknownNameError) as error:
+                    check_launch_arguments(file, [f"{key}:=x", f"{key}x:=y"], declared)
+                assert error.value.closest == key
+        monkeypatch.setattr(sys, "argv", ["ros2", "launch", "cell", f"{name}.launch.py"])
+        check_launch_arguments(file, ["speed:=x"], declared)
+        calls = [
+            node.func.id
+            for node in ast.walk(ast.parse(Path(file).read_text(encoding="utf-8")))
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        ]
+        assert "check_launch_arguments" in calls
 
     def test_what_a_cell_passes_on_a_twin_takes(self):
         assert set(literal("cell", "ARGUMENTS")) - {"machines"} <= set(literal("twin", "ARGUMENTS"))
@@ -408,6 +434,7 @@ class TestRunning:
             ("twin", "respawn:=maybe", "respawn: 'maybe' is neither true nor false"),
             ("cell", "machines:=a", "machines: 'a' is not NAMESPACE=ROBOT"),
             ("cell", "machines:=a=delta,a=prru", "two share a namespace"),
+            *((name, "robto:=delta", "unknown launch argument 'robto'") for name in FILES),
         ],
     )
     def test_a_bad_argument_is_refused_by_name(self, launched, name, argument, said):
