@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.codegen.elementary import MAX_ANGLE
 from pkm_twin.codegen.expressions import GEOMETRY, OPERATIONS, PARAMETERS, Expression, ordered, uses
 from pkm_twin.codegen.program import (
     CHANGE,
@@ -36,12 +37,20 @@ def _sign(value: float) -> float:
     return (value > 0.0) - (value < 0.0)
 
 
+def _one(function: Callable[[float], float]) -> Callable[[float], float]:
+    return lambda x: function(x) if abs(x) < MAX_ANGLE else math.nan
+
+
+def _many(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    return lambda x: function(np.where(np.abs(x) < MAX_ANGLE, x, np.nan))
+
+
 _ONE: Final = {
-    "sqrt": math.sqrt, "sin": math.sin, "cos": math.cos, "fabs": abs, "sign": _sign,
+    "sqrt": math.sqrt, "sin": _one(math.sin), "cos": _one(math.cos), "fabs": abs, "sign": _sign,
     "atan2": math.atan2, "fmin": min, "fmax": max, "inf": math.inf, "nan": math.nan,
 }  # fmt: skip
 _MANY: Final = {
-    "sqrt": np.sqrt, "sin": np.sin, "cos": np.cos, "fabs": np.abs, "sign": np.sign,
+    "sqrt": np.sqrt, "sin": _many(np.sin), "cos": _many(np.cos), "fabs": np.abs, "sign": np.sign,
     "atan2": np.arctan2, "fmin": np.minimum, "fmax": np.maximum, "inf": math.inf, "nan": math.nan,
 }  # fmt: skip
 
