@@ -20,6 +20,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations
+from pkm_twin.machine.urdf_control import Control, add_drives
 from pkm_twin.machine.urdf_xml import UNLIMITED
 
 GROUND: Final = "base_link"
@@ -122,13 +123,17 @@ class UrdfTree:
     screws: tuple[tuple[str, str, float], ...] = ()
 
 
-def write_urdf(tree: UrdfTree, hardware: str = MOCK, prefix: str = "") -> str:
+def write_urdf(
+    tree: UrdfTree, hardware: str = MOCK, prefix: str = "", controls: Iterable[Control] = ()
+) -> str:
     """The URDF of a tree.
 
     The root is ``base_link``; ``platform`` is a link without mass on the reference point, fixed
     to the platform's body.
 
     :param hardware: plugin of the ``<ros2_control>`` element, empty: no such element.
+    :param controls: what a controller calls the actuated joints, for the ``<ros2_control>``
+        element, see :mod:`pkm_twin.machine.urdf_control`.
     :param prefix: of the names of all links, joints and closures, for several machines in one file.
     """
     robot = ET.Element("robot", name=tree.name)
@@ -150,10 +155,11 @@ def write_urdf(tree: UrdfTree, hardware: str = MOCK, prefix: str = "") -> str:
         _closure(robot, closure, places)
     if hardware:
         _control(robot, tree, hardware)
+        add_drives(robot, controls)
     if prefix:
         for element in robot.iter():
-            for key in ("name", "link"):
-                if key in element.attrib and (key == "link" or element.tag in NAMED):
+            for key in ("name", "link", "joint"):
+                if key in element.attrib and (key != "name" or element.tag in NAMED):
                     element.set(key, prefix + element.attrib[key])
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"

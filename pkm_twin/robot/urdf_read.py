@@ -14,6 +14,7 @@ from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import mjcf_file, urdf_file, urdf_xml
 from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.urdf_control import take_drives
 from pkm_twin.machine.urdf_file import Joint, Link, Urdf
 from pkm_twin.machine.urdf_loops import Closure
 from pkm_twin.machine.urdf_visuals import Visual, visuals
@@ -84,6 +85,7 @@ def read_tree(
     """
     path = Path(path)
     top = urdf_xml.elements(path)
+    controller = take_drives(top)
     urdf = mjcf_file.read(path) if top.tag == "mujoco" else urdf_file.read(path, top)
     tool = _platform(urdf, platform)
     ground = urdf.root if base is None else base
@@ -105,6 +107,8 @@ def read_tree(
             )
         if home.held:
             notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
+    if controller:
+        data["joint_map"] = controller
     view = assembly.links[ground].inverse()
     places = {name: view @ pose for name, pose in assembly.links.items()}
     shown = () if top.tag == "mujoco" else visuals(path, top, places, bodies)
