@@ -139,11 +139,11 @@ def write_urdf(
     robot = ET.Element("robot", name=tree.name)
     places = {GROUND: np.zeros(3)} | {joint.child: joint.point for joint in tree.joints}
     ground = ET.SubElement(robot, "link", name=GROUND)
-    _visuals(ground, places[GROUND], (c for c in tree.capsules if c.body == GROUND))
+    _shapes(ground, places[GROUND], (c for c in tree.capsules if c.body == GROUND))
     for body in tree.bodies:
         link = ET.SubElement(robot, "link", name=body.name)
         _inertial(link, body, places[body.name])
-        _visuals(link, places[body.name], (c for c in tree.capsules if c.body == body.name))
+        _shapes(link, places[body.name], (c for c in tree.capsules if c.body == body.name))
     ET.SubElement(robot, "link", name=PLATFORM)
     for joint in tree.joints:
         _joint(robot, joint, places)
@@ -178,7 +178,8 @@ def _inertial(link: ET.Element, body: UrdfBody, place: Array) -> None:
     ET.SubElement(inertial, "inertia", values)
 
 
-def _visuals(link: ET.Element, place: Array, capsules: Iterable[UrdfCapsule]) -> None:
+def _shapes(link: ET.Element, place: Array, capsules: Iterable[UrdfCapsule]) -> None:
+    """Bars to look at, which are also what must not collide."""
     round_ends: list[Array] = []
     for capsule in capsules:
         along = capsule.end - capsule.start
@@ -193,13 +194,13 @@ def _visuals(link: ET.Element, place: Array, capsules: Iterable[UrdfCapsule]) ->
                 continue
             if shape == "sphere":
                 round_ends.append(centre)
-            visual = ET.SubElement(link, "visual")
-            ET.SubElement(visual, "origin", xyz=number_text(centre - place), rpy=rpy)
-            geometry = ET.SubElement(visual, "geometry")
             size = {"radius": radius}
             if shape == "cylinder":
                 size["length"] = number_text([length])
-            ET.SubElement(geometry, shape, size)
+            for purpose in ("visual", "collision"):
+                element = ET.SubElement(link, purpose)
+                ET.SubElement(element, "origin", xyz=number_text(centre - place), rpy=rpy)
+                ET.SubElement(ET.SubElement(element, "geometry"), shape, size)
 
 
 def rpy_along(direction: Array) -> str:
