@@ -20,6 +20,7 @@ from pkm_twin.codegen.program import (
     CHANGE,
     CLOSED,
     CONTRACTION,
+    LARGE,
     RESIDUAL,
     STEPPED,
     TURNS,
@@ -191,7 +192,7 @@ class PlainCode:
             values, (residual, *branch) = values[:at], values[at:]
             if not (residual <= RESIDUAL**2 and all(value > 0.0 for value in branch)):
                 return nothing, (1.0, reached)
-        if not all(map(math.isfinite, [*values, *(v for row in inputs for v in row)])):
+        if not sum(map(abs, [*values, *(v for row in inputs for v in row)])) < LARGE:
             return nothing, (2.0, reached)
         return self._split(values), (0.0, reached)
 
@@ -240,11 +241,10 @@ class PlainCode:
             good = good & (residual <= RESIDUAL**2)
             for value in branch:
                 good = good & (value > 0.0)
-        finite = np.ones(count, bool)
-        for row in inputs:
-            finite &= np.isfinite(row).all(-1)
-        for value in values:
-            finite &= np.isfinite(value)
+        total = np.zeros(count)
+        for value in [*values, *(column for row in inputs for column in row.T)]:
+            total = total + np.abs(value)
+        finite = total < LARGE
         code = np.where(good, np.where(finite, 0.0, 2.0), 1.0)
         outputs = [
             np.where((good & finite)[:, None], _table(row, count).T, np.nan)
