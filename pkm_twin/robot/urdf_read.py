@@ -17,6 +17,7 @@ from pkm_twin.machine.assembly import EXACT, Assembly
 from pkm_twin.machine.graph import Graph, groups
 from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
+from pkm_twin.machine.urdf_control import take_drives
 from pkm_twin.machine.urdf_visuals import Visual, visuals
 from pkm_twin.machine.urdf_xml import Pose
 from pkm_twin.robot.urdf_home import Home, HomeSearch
@@ -92,6 +93,7 @@ def read_tree(
     """
     path = Path(path)
     top = urdf_xml.elements(path)
+    controller = take_drives(top)
     readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
     urdf = readers.get(top.tag, urdf_file.read)(path, top)
     _require_closed(path, urdf)
@@ -122,6 +124,8 @@ def read_tree(
                 "efforts depend on the angle at which parts with their mass off the axis are held: "
                 + ", ".join(f"{name} ({value:.3g} kg m)" for name, value in heavy.items())
             )
+    if controller:
+        data["joint_map"] = controller
     view = assembly.links[ground].inverse()
     places = {name: view @ pose for name, pose in assembly.links.items()}
     shown = () if top.tag in readers else visuals(path, top, places, bodies)

@@ -16,7 +16,7 @@ from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.machine import rotations
 from pkm_twin.messages.intake import JointStateDecoder
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.robot_urdf import robot_urdf
+from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
 from pkm_twin.ros import health, outputs
 from pkm_twin.ros.changes import follow_changes
 from pkm_twin.ros.node import TwinNode
@@ -84,6 +84,7 @@ class MachineStateNode(TwinNode):
             "empty: no such element", read_only=True,
         )  # fmt: skip
         self._urdf = robot_urdf(robot, hardware)
+        self._names = joint_names(robot, hardware)
         self._transforms = self._create_transforms()
         self._drawn = 0
         """Stamp of the state that was drawn last."""
@@ -196,8 +197,7 @@ class MachineStateNode(TwinNode):
         stamp = Time(nanoseconds=state.stamp).to_msg()
         base = self._core.settings.base_frame
         quaternion = rotations.to_quaternion(state.rotation)
-        names = self._core.joint_names
-        self._joints.publish(outputs.joint_state(stamp, names, state.joints, state.rates))
+        self._joints.publish(outputs.joint_state(stamp, self._names, state.joints, state.rates))
         self._pose.publish(outputs.pose(stamp, base, state.position, quaternion))
         if state.twist is not None:
             self._twist.publish(outputs.twist(stamp, base, state.twist))
