@@ -139,7 +139,11 @@ def _file(r: Recording, bounds: Bounds) -> list[Item]:
             "file",
             "; ".join(report.warnings) or "complete; checksums and counts agree",
             "complete and consistent",
-            Verdict.UNKNOWN if report.warnings else Verdict.GOOD,
+            Verdict.BAD
+            if report.miscounts
+            else Verdict.UNKNOWN
+            if report.warnings
+            else Verdict.GOOD,
         )
     ]
     refused = sum(r.rejected.values())

@@ -48,6 +48,7 @@ from pkm_twin.apps.tables import tables
 from pkm_twin.apps.trend import trend
 from pkm_twin.apps.vibration import frf, lobes
 from pkm_twin.apps.view.command import view
+from pkm_twin.apps.wrench_frames import wrench_frames
 from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
     flush_output,
@@ -250,6 +251,7 @@ def convert(robot: RobotName, platform: Platform = None) -> None:
 
 @app.command()
 @tables
+@wrench_frames
 def torques(
     robot: RobotName,
     motion: Annotated[Path, typer.Argument(help="a bag, or a CSV with a header row")],
@@ -357,16 +359,16 @@ app.command("design")(design_command)
 app.command("drive-friction")(drive_friction_command)
 app.command("path")(tables(path_command))
 app.command()(tables(feed))
-app.command()(tables(size))
-app.command()(tables(loads))
+app.command()(tables(wrench_frames(size)))
+app.command()(tables(wrench_frames(loads)))
 app.command()(frf)
 app.command()(lobes)
 app.command("monitor-torques")(guard_check)
 app.command("guard-check", hidden=True, help="The older name of `monitor-torques`.")(guard_check)
-app.command()(tables(check))
+app.command()(tables(wrench_frames(check)))
 app.command()(trend)
 app.command()(view)
-app.command()(tables(fit))
+app.command()(tables(wrench_frames(fit)))
 app.command()(excite)
 app.command()(record_kit)
 app.command()(atlases.show)

@@ -350,6 +350,11 @@ def _of_bag(path: Path, machine: Any, topics: Sequence[str], carried: Any) -> tu
             f"no efforts on {r.topics.joint_states}: a fit needs the efforts of the drives",
             path=path, reason="no efforts",
         )  # fmt: skip
+    if r.topics.wrench is not None and r.wrench is None:
+        raise BagError(
+            f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}", path=path,
+            reason="frames",
+        )  # fmt: skip
     return Recorded(one_line(path.name, 100), r.time, r.q, r.effort, r.wrench), r.load
 
 
