@@ -158,11 +158,15 @@ def read_recording(
     )
 
 
-def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) -> Recording:
+def recorded_table(
+    path: Path, robot: str | Robot | None, carried: Load | None,
+    efforts: Sequence[str] = ("measured", "effort"),
+) -> Recording:  # fmt: skip
     """A recording as a CSV with columns ``time`` and ``JOINT.position``.
 
-    Optionally ``JOINT.velocity`` and ``.acceleration``, ``JOINT.measured`` or else
-    ``JOINT.effort``, and the wrench ``fx fy fz mx my mz``; other columns are left alone.
+    Optionally ``JOINT.velocity`` and ``.acceleration``, the wrench ``fx fy fz mx my mz``, and of
+    the columns of ``efforts``, ``JOINT.measured`` or else ``JOINT.effort``, the first that are
+    there; other columns are left alone.
 
     :raises ParameterError: no robot is given, a column is missing, or a value is no finite number.
     """
@@ -182,7 +186,8 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     if q is None or "time" not in columns:
         needed = ", ".join(f"{joint}.position" for joint in machine.joint_names)
         raise ParameterError(str(path), ", ".join(columns), f"columns time, {needed}")
-    time, qd, measured = times_of(path, columns["time"]), stack("velocity"), stack("measured")
+    time, qd = times_of(path, columns["time"]), stack("velocity")
+    found = (values for what in efforts if (values := stack(what)) is not None)
     check_motion_times(path, time, q, qd)
     wrench = None
     if any(axis in columns for axis in WRENCH_AXES):
@@ -190,7 +195,7 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     return Recording(
         robot=machine, bag=None, topics=Topics("columns of the table"), load=carried,
         stamps=np.round(time * 1e9).astype(np.int64), time=time, q=q, qd=qd,
-        effort=stack("effort") if measured is None else measured, wrench=wrench,
+        effort=next(found, None), wrench=wrench,
         rejected=Counter(), first_reject="", source=str(path), qdd=stack("acceleration"),
     )  # fmt: skip
 
