@@ -126,7 +126,7 @@ def fit(
     accept: bool = False,
     progress: Callable[[int], None] | None = None,
     trial: Verdict | None = None,
-    possible: bool = False,
+    accepted: Sequence[str] | None = None,
 ) -> Fit:
     """Fit some kinds of numbers of a robot's file.
 
@@ -134,7 +134,8 @@ def fit(
     :param accept: fit recordings that this machine cannot have made, too.
     :param progress: called with the number of recordings that are worked on, twice each.
     :param trial: the verdict of a fit before: this fit only predicts and is not judged again.
-    :param possible: a fit before has found that the machine can have made the recordings.
+    :param accepted: what a fit before found of the recordings; None: ask whether this machine can
+        have made them.
     :raises PkmTwinError: recordings that are too short, that show nothing, or that this machine
         cannot have made.
     """
@@ -158,8 +159,8 @@ def fit(
             rows_of(robot, everything, recording, how.window)[0]
             for recording, how in zip(recordings, filtering, strict=True)
         ]
-    faults = []
-    for recording, made in () if possible else zip(recordings, whole, strict=True):
+    faults = [*(accepted or ())]
+    for recording, made in zip(recordings, whole, strict=True) if accepted is None else ():
         fault = recording_fault(robot, everything, recording, made)
         if fault is not None:
             faults.append(f"{recording.name}: {fault}")
@@ -176,6 +177,8 @@ def fit(
         again = solve(parameters, [made.only(chosen, everything.values) for made in other])
         result = _less_sure(result, again.estimate.values - result.values)
     verdict = trial or verdict_of(robot, recordings, everything, chosen, whole, solved)
+    if faults:
+        verdict = replace(verdict, answer="does not explain")
     numbers = _numbers(parameters, result, verdict) if trial is None else ()
     if trial is None:
         result = replace(result, covariance=verdict.widened(result.covariance))

@@ -116,7 +116,9 @@ def fit_with_laws(
         for name in names:
             try:
                 found, opened = _opened(best, recordings, what, name)
-                one = fit(opened, recordings, what, **options, trial=best.verdict, possible=True)
+                one = fit(
+                    opened, recordings, what, **options, trial=best.verdict, accepted=best.accepted
+                )
             except PkmTwinError:
                 if asked:
                     raise
@@ -131,8 +133,7 @@ def fit_with_laws(
         choices.append(choice)
         if not choice.taken:
             break
-        result = fit(opened, recordings, what, **options, possible=True)
-        result = replace(result, accepted=best.accepted)
+        result = fit(opened, recordings, what, **options, accepted=best.accepted)
         more += _searched(best.robot, result, choice.law, found)
         wider |= _widened(result, found)
         own = (
