@@ -160,7 +160,7 @@ def _compared(name: str, before: Fit, after: Fit) -> Choice:
     sums = np.zeros(5)
     band = np.array([max(channel.noise, 1e-300) for channel in before.verdict.channels])
     for one, other in zip(before.judged, after.judged, strict=True):
-        old, change = one.measured - one.after, other.after - one.after
+        old, change = one.measured - one.least, other.least - one.least
         sums += (
             np.sum((old / band) ** 2), np.sum(((old - change) / band) ** 2), old.size,
             np.sum(old * change / one.noise**2), np.sum((change / one.noise) ** 2),
