@@ -192,9 +192,12 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
     rate = 1.0 / period
     begin = UNFILTERED * rate if how.cutoff is None else how.cutoff
     loudest = np.zeros(shaken.shape[1])
-    spectra = [_spectrum(piece, rate) for piece in residual]
-    density = np.mean([own for _, own in spectra], 0)
-    frequency, passed = _spectrum(shaken, rate)
+    # Half of the samples are in pieces of a segment or more, so that all pieces have one grid.
+    lengths = np.sort([len(piece) for piece in residual])
+    half = int(np.searchsorted(np.cumsum(lengths), 0.5 * lengths.sum()))
+    segment = min(SEGMENT, int(lengths[half]), len(shaken))
+    frequency, density = _spectrum(residual, rate, segment)
+    _, passed = _spectrum([shaken], rate, segment)
     while begin < 0.9 * HIGHEST * rate:
         inside = (frequency >= begin) & (frequency < min(2.0 * begin, HIGHEST * rate))
         if np.count_nonzero(inside) > 2:
@@ -217,7 +220,7 @@ def resonances_of(
     segment = min(RESOLVED, len(whole) // 4)
     if segment < 64:
         return ()
-    frequency, density = _spectrum(whole, rate, segment)
+    frequency, density = _spectrum([whole], rate, segment)
     # Segments overlap by half, with a Hann window: so many independent ones.
     freedoms = 2.0 * 0.95 * max(1.0, 2.0 * len(whole) / segment - 1.0)
     begin = UNFILTERED * rate if how.cutoff is None else PASSED * how.cutoff
@@ -250,11 +253,17 @@ def resonances_of(
     return tuple(found)
 
 
-def _spectrum(values: Array, rate: float, segment: int = SEGMENT) -> tuple[Array, Array]:
-    """Frequencies, and two-sided spectral densities by channel (Welch), (frequencies, n)."""
-    size = min(segment, len(values))
-    frequency, density = scipy.signal.welch(values, rate, nperseg=size, axis=0, detrend="linear")
-    return np.asarray(frequency, np.float64), np.asarray(0.5 * density, np.float64)
+def _spectrum(pieces: Sequence[Array], rate: float, segment: int) -> tuple[Array, Array]:
+    """Frequencies, and two-sided spectral densities by channel (Welch), (frequencies, n).
+
+    Of the pieces that are as long as a segment, each by its length.
+    """
+    used = [piece for piece in pieces if len(piece) >= segment]
+    both = [
+        scipy.signal.welch(piece, rate, nperseg=segment, axis=0, detrend="linear") for piece in used
+    ]
+    density = np.average([own for _, own in both], 0, [len(piece) for piece in used])
+    return np.asarray(both[0][0], np.float64), np.asarray(0.5 * density, np.float64)
 
 
 def suspects_of(robot: Robot) -> list[Suspect]:
