@@ -16,8 +16,8 @@ from rich.table import Table
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
-from pkm_twin.apps.check import motion
 from pkm_twin.apps.recorded import Recording, read_recording
+from pkm_twin.apps.recorded_motion import motion
 from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.messages.stamps import stamp_of
 from pkm_twin.robot.robot import Robot

@@ -22,11 +22,13 @@ WIDE: Final = 200
 class Entry:
     """A command's module below ``pkm_twin.apps``, and its function or group there.
 
-    ``tables``: it reads tables and takes the options of their dialect. ``settings``: of typer.
+    ``tables``: it reads tables and takes the options of their dialect. ``wrenches``: it reads
+    wrenches of bags and takes the options of their frames. ``settings``: of typer.
     """
 
     place: str
     tables: bool = False
+    wrenches: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def app(self, name: str) -> typer.Typer:
@@ -35,6 +37,10 @@ class Entry:
         found = getattr(import_module(f"pkm_twin.apps.{module}"), attribute)
         if isinstance(found, typer.Typer):
             return found
+        if self.wrenches:
+            from pkm_twin.apps.wrench_frames import wrench_frames
+
+            found = wrench_frames(found)
         if self.tables:
             from pkm_twin.apps.tables import tables
 
@@ -54,11 +60,11 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
         "convert": Entry("robots:convert"),
     },
     "Torques, paths and drives": {
-        "torques": Entry("torques_command:torques", tables=True),
+        "torques": Entry("torques_command:torques", tables=True, wrenches=True),
         "path": Entry("path:path_command", tables=True),
         "feed": Entry("feed:feed", tables=True),
-        "size": Entry("size:size", tables=True),
-        "loads": Entry("joint_loads:loads", tables=True),
+        "size": Entry("size:size", tables=True, wrenches=True),
+        "loads": Entry("joint_loads:loads", tables=True, wrenches=True),
     },
     "Stiffness, workspace and vibration": {
         # A negative number is no option.
@@ -72,7 +78,7 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
         "lobes": Entry("vibration:lobes"),
     },
     "Recordings": {
-        "check": Entry("check_command:check", tables=True),
+        "check": Entry("check_command:check", tables=True, wrenches=True),
         "trend": Entry("trend:trend"),
         "recover": Entry("replay:recover"),
         "play": Entry("replay:play"),
@@ -85,7 +91,7 @@ TASKS: Final[Mapping[str, Mapping[str, Entry]]] = {
     "Identification and calibration": {
         "record-kit": Entry("record_kit:record_kit"),
         "excite": Entry("excite:excite"),
-        "fit": Entry("fit:fit", tables=True),
+        "fit": Entry("fit:fit", tables=True, wrenches=True),
         "drive-friction": Entry("drive_friction:drive_friction_command"),
         "calibrate": Entry("calibrate:calibrate_command"),
         "printer": Entry("printer:printer_command"),

@@ -14,7 +14,6 @@ import typer
 
 from pkm_twin.apps.excite import write_motion
 from pkm_twin.apps.options import Json, Platform
-from pkm_twin.apps.recorded import BASE_FRAME, PLATFORM_FRAME
 from pkm_twin.apps.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, WRENCH, is_output
 from pkm_twin.apps.trajectories import SECOND
 from pkm_twin.bags.reader import Bag, BagWriter, open_bag
@@ -22,6 +21,7 @@ from pkm_twin.console import print_json, refuse_existing, writing
 from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.options import OptionalPath, OptionalText
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.wrench import PLATFORM, WrenchSettings
 
 KEPT: Final = {
     JOINT_STATE: "/joint_states", WRENCH: "/wrench", TRAJECTORY: "/joint_trajectory",
@@ -33,7 +33,7 @@ ONE_CLOCK: Final = 60 * SECOND
 """Stamps and log times that begin further apart are of two clocks, ns."""
 DAY: Final = 86_400 * SECOND
 """Times further apart are of two clocks, ns."""
-FRAMES: Final = ("", BASE_FRAME, PLATFORM_FRAME)
+FRAMES: Final = ("", WrenchSettings.base_frame, PLATFORM)
 """Frames that keep their names: readers depend on them."""
 
 

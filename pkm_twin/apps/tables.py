@@ -7,20 +7,19 @@ What a file's header row makes certain is found by itself, and reported; the res
 from __future__ import annotations
 
 import csv
-import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.options import OptionalText, options_of, take_options
+from pkm_twin.options import OptionalText, shared_options
 from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -151,17 +150,5 @@ def _options(
     del separator, decimal, columns, units, time
 
 
-def tables(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that reads tables the options of their dialect."""
-    names = options_of(_options)
-
-    @functools.wraps(command)
-    def wrapped(**given: Any) -> None:
-        token = CHOSEN.set(_dialect(*(given.pop(name) for name in names)))
-        try:
-            command(**given)
-        finally:
-            CHOSEN.reset(token)
-
-    take_options(wrapped, [*options_of(command).values(), *options_of(_options).values()])
-    return wrapped
+tables = shared_options(_options, CHOSEN, _dialect)
+"""Gives a command that reads tables the options of their dialect."""

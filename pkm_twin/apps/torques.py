@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
 from delta_dynamics.rest import friction_reach, moving_rates
 from pkm_twin import load
-from pkm_twin.apps.check import at_rest, motion
 from pkm_twin.apps.columns import check_motion_times, read_columns, times_of
 from pkm_twin.apps.limits import beyond_limits
 from pkm_twin.apps.loads import Load, by_load, load_of_columns, payload_columns, told_load
 from pkm_twin.apps.recorded import WRENCH_AXES, read_recording, robot_of
+from pkm_twin.apps.recorded_motion import at_rest, motion
 from pkm_twin.apps.topics import JOINT_STATE
 from pkm_twin.apps.trajectories import read_trajectory
 from pkm_twin.bags.reader import open_bag
