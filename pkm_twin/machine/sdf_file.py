@@ -128,7 +128,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     return LoopTree(
         element.get("name") or path.stem, WORLD, links, {joint.name: joint for joint in joints},
         tuple(edge.closure(places) for edge in closures), actuated,
-        _gravity(model, gravity, edges), accuracy=urdf_xml.accuracy(
+        _gravity(path, model, gravity, edges), accuracy=urdf_xml.accuracy(
             word for part in element.iter() if part.tag in ("pose", "xyz")
             for word in (part.text or "").split()
         ),
@@ -168,7 +168,7 @@ def _of_include(element: ET.Element) -> ParameterError:
 
 
 def _gravity(
-    model: Model, stated: list[float] | None, edges: Mapping[str, Edge]
+    path: Path, model: Model, stated: list[float] | None, edges: Mapping[str, Edge]
 ) -> list[float] | None:
     """The world's gravity, or none where no link that can move has weight.
 
@@ -183,7 +183,10 @@ def _gravity(
     off = [name for name in moving if not weight[name]]
     if off and len(off) < len(moving):
         raise ParameterError(f"link.{off[0]}.gravity", "false", "all moving links alike")
-    return [0.0, 0.0, 0.0] if off else stated
+    if not off:
+        return stated
+    warn(path, "gravity is switched off on every link that can move")
+    return [0.0, 0.0, 0.0]
 
 
 def _flag(element: ET.Element, tag: str, default: bool) -> bool:

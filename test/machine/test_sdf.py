@@ -261,6 +261,13 @@ def test_a_weld_of_a_plugin_closes_a_loop_as_a_joint_does(tmp_path):
     )
 
 
+def test_links_without_weight_are_a_machine_without_gravity_and_said(tmp_path):
+    path = five_bar(tmp_path)
+    path.write_text(path.read_text().replace("<inertial>", "<gravity>0</gravity><inertial>"))
+    with pytest.warns(UserWarning, match="gravity is switched off"):
+        assert read_urdf(path)["gravity"] == [0.0, 0.0, 0.0]
+
+
 def test_what_is_left_out_is_a_kilogram_and_said(tmp_path):
     with pytest.warns(UserWarning, match="fore_2 has no mass and no inertia"):
         path = five_bar(tmp_path)
