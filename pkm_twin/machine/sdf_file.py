@@ -23,7 +23,7 @@ from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
 from pkm_twin.machine.motors import actuated_joints, read_beside
-from pkm_twin.machine.rotations import from_quaternion, from_rpy
+from pkm_twin.machine.rotations import from_rpy
 from pkm_twin.machine.urdf_xml import Pose
 
 WORLD: Final = "world"
@@ -338,10 +338,7 @@ def pose(element: ET.Element | None, where: str) -> Pose:
         raise UnknownNameError(f"{where}.rotation_format", turn, ["euler_rpy", "quat_xyzw"])
     values = urdf_xml.vector(text, where, 7 if turn == "quat_xyzw" else 6)
     if turn == "quat_xyzw":
-        size = float(np.linalg.norm(values[3:]))
-        if not size > 1e-9:
-            raise ParameterError(where, text, "a quaternion that is not zero")
-        return Pose(from_quaternion(*(values[3:] / size).tolist()), values[:3])
+        return Pose(urdf_xml.quaternion(values[3:], where), values[:3])
     degrees = urdf_xml.boolean(element.get("degrees", "false"), f"{where}.degrees")
     return Pose(from_rpy(np.radians(values[3:]) if degrees else values[3:]), values[:3])
 
