@@ -23,7 +23,7 @@ from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import Closure, Joint, Link, LoopTree
 from pkm_twin.machine.motors import actuated_joints, read_beside
-from pkm_twin.machine.rotations import from_quaternion, from_rpy
+from pkm_twin.machine.rotations import from_rpy
 from pkm_twin.machine.urdf_xml import Pose
 
 WORLD: Final = "world"
@@ -128,7 +128,7 @@ def read(path: Path, top: ET.Element) -> LoopTree:
     return LoopTree(
         element.get("name") or path.stem, WORLD, links, {joint.name: joint for joint in joints},
         tuple(edge.closure(places) for edge in closures), actuated,
-        _gravity(model, gravity, edges), accuracy=urdf_xml.accuracy(
+        _gravity(path, model, gravity, edges), accuracy=urdf_xml.accuracy(
             word for part in element.iter() if part.tag in ("pose", "xyz")
             for word in (part.text or "").split()
         ),
@@ -168,7 +168,7 @@ def _of_include(element: ET.Element) -> ParameterError:
 
 
 def _gravity(
-    model: Model, stated: list[float] | None, edges: Mapping[str, Edge]
+    path: Path, model: Model, stated: list[float] | None, edges: Mapping[str, Edge]
 ) -> list[float] | None:
     """The world's gravity, or none where no link that can move has weight.
 
@@ -183,7 +183,10 @@ def _gravity(
     off = [name for name in moving if not weight[name]]
     if off and len(off) < len(moving):
         raise ParameterError(f"link.{off[0]}.gravity", "false", "all moving links alike")
-    return [0.0, 0.0, 0.0] if off else stated
+    if not off:
+        return stated
+    warn(path, "gravity is switched off on every link that can move")
+    return [0.0, 0.0, 0.0]
 
 
 def _flag(element: ET.Element, tag: str, default: bool) -> bool:
@@ -335,10 +338,7 @@ def pose(element: ET.Element | None, where: str) -> Pose:
         raise UnknownNameError(f"{where}.rotation_format", turn, ["euler_rpy", "quat_xyzw"])
     values = urdf_xml.vector(text, where, 7 if turn == "quat_xyzw" else 6)
     if turn == "quat_xyzw":
-        size = float(np.linalg.norm(values[3:]))
-        if not size > 1e-9:
-            raise ParameterError(where, text, "a quaternion that is not zero")
-        return Pose(from_quaternion(*(values[3:] / size).tolist()), values[:3])
+        return Pose(urdf_xml.quaternion(values[3:], where), values[:3])
     degrees = urdf_xml.boolean(element.get("degrees", "false"), f"{where}.degrees")
     return Pose(from_rpy(np.radians(values[3:]) if degrees else values[3:]), values[:3])
 

@@ -206,8 +206,8 @@ def _retyped(joints: dict[str, Joint], beside: dict[str, Any]) -> dict[str, Join
             changed, axes = str(kind).lower(), []
         else:
             raise UnknownNameError("joint_type", kind, ["SPHERICAL", "FIXED", *universal])
-        axes = np.reshape(axes, (-1, 3))
-        joints[name] = replace(joints[name], type=changed, axes=axes, limits={})
+        rows = np.reshape(axes, (-1, 3))
+        joints[name] = replace(joints[name], type=changed, axes=rows, limits={})
     return joints
 
 

@@ -20,7 +20,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, ParameterError, UnknownNameError
 from pkm_twin.files import decimal
 from pkm_twin.machine import schema
-from pkm_twin.machine.rotations import from_rpy
+from pkm_twin.machine.rotations import from_quaternion, from_rpy
 
 MAX_FILE_SIZE: Final = 4 * 1024 * 1024
 """Largest URDF that is read, bytes."""
@@ -175,17 +175,19 @@ def origin(element: ET.Element | None, where: str) -> Pose:
     if element is None:
         return Pose()
     position = vector(element.get("xyz", "0 0 0"), f"{where}.xyz", 3)
-    quaternion = element.get("quat_xyzw")
-    if quaternion is not None:
-        x, y, z, w = vector(quaternion, f"{where}.quat_xyzw", 4)
-        size = math.sqrt(x * x + y * y + z * z + w * w)
-        if not size > 1e-9:
-            raise ParameterError(f"{where}.quat_xyzw", quaternion, "a quaternion that is not zero")
-        x, y, z, w = x / size, y / size, z / size, w / size
-        skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return Pose(np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew, position)
+    turned = element.get("quat_xyzw")
+    if turned is not None:
+        return Pose(quaternion(vector(turned, f"{where}.quat_xyzw", 4), where), position)
     angles = vector(element.get("rpy", "0 0 0"), f"{where}.rpy", 3)
     return Pose(from_rpy(angles), position)
+
+
+def quaternion(values: Array, where: str) -> Array:
+    """The rotation of a quaternion x, y, z, w of any length but zero, shape (3, 3)."""
+    size = float(np.linalg.norm(values))
+    if not size > 1e-9:
+        raise ParameterError(f"{where}.quat_xyzw", values.tolist(), "a quaternion that is not zero")
+    return from_quaternion(*(values / size).tolist())
 
 
 def vector(text: str | None, where: str, size: int) -> Array:

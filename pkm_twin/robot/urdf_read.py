@@ -25,7 +25,9 @@ from pkm_twin.robot.urdf_home import Home, HomeSearch
 PLATFORMS: Final = (
     "platform",
     "moving_platform",
+    "platform_link",
     "end_effector",
+    "endeffector",
     "effector",
     "end_effector_link",
     "ee_link",

@@ -140,29 +140,6 @@ def test_a_body_on_a_free_joint_is_held_by_closures_alone(tmp_path):
     assert {data["joints"][n]["type"] for n in held} == {"spherical"}
 
 
-def test_it_is_a_machine_of_the_engine(tmp_path):
-    robot = Machine.from_data(read_urdf(save(tmp_path, hexapod()), platform="tool"), "hexapod")
-    assert robot.mobility == "6: x, y, z, roll, pitch, yaw"
-    weight = inverse_dynamics(robot, robot.inverse(robot.home()), np.zeros(6), np.zeros(6))
-    np.testing.assert_allclose(robot.forward(robot.inverse(robot.home())), robot.home(), atol=1e-12)
-    # Virtual work: the rate at which gravity's work grows with each slide.
-    step = 1e-6
-    for k in range(6):
-        q = robot.inverse(robot.home())
-        up, down = (total_height(robot, q + s * step * np.eye(6)[k]) for s in (1, -1))
-        assert weight[k] == pytest.approx(9.81 * (up - down) / (2 * step), abs=1e-5)
-
-
-def total_height(robot, q):
-    """Sum of mass times height, kg m."""
-    rotations, origins = robot.placements(q)
-    total = 0.0
-    for name, body in robot.graph.bodies.items():
-        arm = body.com - robot.engine.tree.at[name]
-        total += body.mass * (origins[name] + rotations[name] @ arm)[2]
-    return total
-
-
 def test_a_weld_and_a_lock_hold(tmp_path):
     weld = '<weld name="tip" body1="fore_1" body2="fore_2" relpose="0.3 0 0 0.6 0 0 0.8"/>'
     # Two bars that are welded at an angle of their own: one motor must go.

@@ -261,6 +261,32 @@ def test_a_weld_of_a_plugin_closes_a_loop_as_a_joint_does(tmp_path):
     )
 
 
+def test_links_without_weight_are_a_machine_without_gravity_and_said(tmp_path):
+    path = five_bar(tmp_path)
+    path.write_text(path.read_text().replace("<inertial>", "<gravity>0</gravity><inertial>"))
+    with pytest.warns(UserWarning, match="gravity is switched off"):
+        assert read_urdf(path)["gravity"] == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("mark", ["effort", "name_mot"])
+def test_motors_without_a_plugin(mark, tmp_path):
+    path = five_bar(tmp_path, motors="")
+    if mark == "name_mot":
+        path.with_suffix(".yaml").write_text("name_mot: [m2, m1]\n")
+    else:
+        axis = "<axis><xyz>0 0 1</xyz></axis>"
+        text, limit = path.read_text(), "<limit><effort>5</effort><velocity>-1</velocity></limit>"
+        path.write_text(text.replace(axis, axis.replace("</axis>", f"{limit}</axis>")))
+    joints = read_urdf(path)["joints"]
+    assert {n for n, joint in joints.items() if joint.get("actuated")} == {"m1", "m2"}
+    assert joints["m1"].get("limits", {"effort": 5.0}) == {"effort": 5.0}
+
+
+def test_a_model_without_motors_is_rejected(tmp_path):
+    with pytest.raises(ParameterError, match="no actuated joint"):
+        read_urdf(five_bar(tmp_path, motors=""))
+
+
 def test_what_is_left_out_is_a_kilogram_and_said(tmp_path):
     with pytest.warns(UserWarning, match="fore_2 has no mass and no inertia"):
         path = five_bar(tmp_path)
