@@ -215,6 +215,9 @@ def urdf(
     The URDF is a tree with all joints, actuated and passive, and a <constraint> element for each
     loop that was cut. Parsers that know only trees ignore these elements. The base is the link
     base_link, the platform the link platform. The same robot always gives the same bytes.
+
+    The ros2_control element has the controller's joints: with a joint_map they have their own names
+    and numbers, and the joints of the tree follow them through <mimic>.
     """
     from pkm_twin import load
     from pkm_twin.robot.robot_urdf import robot_urdf

@@ -76,9 +76,9 @@ def ros2_control(
 ) -> None:
     """Write a package of C++ plugins for ros2_control.
 
-    A chainable feedforward controller (inverse dynamics plus PD), a kinematics_interface and an
-    inverse_dynamics_solver use the robot's exported C. Build the package with colcon; it builds
-    and runs without pkm_twin.
+    A chainable feedforward controller (inverse dynamics plus PD), a gravity controller to fall back
+    to, a kinematics_interface and an inverse_dynamics_solver use the robot's exported C. Build the
+    package with colcon; it builds and runs without pkm_twin.
     """
     from pkm_twin import load
     from pkm_twin.export.ros2_control import ros2_control_package

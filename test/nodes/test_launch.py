@@ -22,6 +22,7 @@ from pkm_twin import robot_names
 from pkm_twin.machine import rotations
 from pkm_twin.robot.robot_urdf import robot_urdf
 from test.nodes.harness import REPOSITORY, Command, Maker, Ros
+from test.support.mapped import sides
 from test.support.robots import load
 
 LAUNCH = REPOSITORY / "launch"
@@ -106,27 +107,6 @@ def installed(package):
     except PackageNotFoundError:
         return False
     return True
-
-
-def mock_hardware(names, positions):
-    """A URDF with these joints side by side, under mock hardware that stands where told."""
-    limit = '<limit lower="-3" upper="3" velocity="20" effort="50"/>'
-    links = "".join(
-        f'<link name="l{i}"/><joint name="{name}" type="revolute"><parent link="base_link"/>'
-        f'<child link="l{i}"/><axis xyz="0 1 0"/>{limit}</joint>'
-        for i, name in enumerate(names)
-    )
-    joints = "".join(
-        f'<joint name="{name}"><command_interface name="effort"/><state_interface name="position">'
-        f'<param name="initial_value">{position}</param></state_interface>'
-        '<state_interface name="velocity"/><state_interface name="effort"/></joint>'
-        for name, position in zip(names, positions, strict=True)
-    )
-    return (
-        f'<robot name="mock"><link name="base_link"/>{links}<ros2_control name="mock" '
-        'type="system"><hardware><plugin>mock_components/GenericSystem</plugin></hardware>'
-        f"{joints}</ros2_control></robot>"
-    )
 
 
 class Launched(Command):
@@ -327,9 +307,12 @@ class TestRunning:
         listener.unregister()
 
     @pytest.mark.skipif(not installed("controller_manager"), reason="ros2_control is not installed")
-    @pytest.mark.parametrize("space", ["", "left"])
-    def test_a_controller_gets_the_efforts_of_a_goal(self, launched, peer, tmp_path, space):
-        """Through the twin's action to joint_trajectory_controller on mock hardware."""
+    @pytest.mark.parametrize(("space", "mapped"), [("", False), ("left", True)])
+    def test_a_controller_gets_the_efforts_of_a_goal(self, launched, peer, tmp_path, space, mapped):
+        """Through the twin's action to joint_trajectory_controller on mock hardware.
+
+        ``mapped``: names, signs, ratios and offsets of the controller are its own.
+        """
         from action_msgs.msg import GoalStatus
         from control_msgs.action import FollowJointTrajectory
         from control_msgs.msg import JointTrajectoryControllerState
@@ -337,12 +320,13 @@ class TestRunning:
         from rclpy.qos import DurabilityPolicy, QoSProfile
         from std_msgs.msg import String
 
-        from test.nodes.twin import NAMES, ROBOT, Q, trajectory
+        from test.nodes.twin import ROBOT, trajectory
 
         prefix = f"/{space}".rstrip("/")
-        description = mock_hardware(NAMES, Q)
-        file = tmp_path / "robot.urdf"
-        file.write_text(description)
+        both = sides(ROBOT.name)
+        robot = both.mapped if mapped else ROBOT
+        given = both.write(tmp_path) if mapped else ROBOT.name
+        description = robot_urdf(robot)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         publisher = peer.node.create_publisher(String, f"{prefix}/robot_description", latched)
         publisher.publish(String(data=description))
@@ -351,9 +335,7 @@ class TestRunning:
         action = f"{prefix}/delta_dynamics/follow_joint_trajectory"
         client = ActionClient(peer.node, FollowJointTrajectory, action)
         chosen = [f"namespace:={space}"] if space else []
-        process = launched(
-            "control", f"description:={file}", "robot_state_publisher:=false", *chosen
-        )
+        process = launched("control", f"robot:={given}", "robot_state_publisher:=false", *chosen)
 
         def ready():
             assert process.alive(), process.output
@@ -364,7 +346,15 @@ class TestRunning:
             peer.received(state).clear()
             sent = trajectory(count=5)
             # The controller takes none that does not end at rest.
-            sent.points[-1].velocities = [0.0] * len(NAMES)
+            sent.points[-1].velocities = [0.0] * robot.joints_count
+            rows = [(p.positions, p.velocities, p.accelerations) for p in sent.points]
+            q, qd, qdd = (np.array(values) for values in zip(*rows, strict=True))
+            controller = robot.controller
+            sent.joint_names = list(controller.names)
+            for point, row in zip(sent.points, zip(q, qd, qdd, strict=True), strict=True):
+                point.positions = controller.controller_positions(row[0]).tolist()
+                point.velocities = controller.controller_rates(row[1]).tolist()
+                point.accelerations = controller.controller_rates(row[2]).tolist()
 
             def answer():
                 goal = client.send_goal_async(FollowJointTrajectory.Goal(trajectory=sent))
@@ -378,17 +368,17 @@ class TestRunning:
             while last.result.error_string.startswith("no action server"):
                 last = answer()
             assert last.status == GoalStatus.STATUS_SUCCEEDED, last.result.error_string
-            rows = [(p.positions, p.velocities, p.accelerations) for p in sent.points]
-            q, qd, qdd = (np.array(values) for values in zip(*rows, strict=True))
             efforts = inverse_dynamics(ROBOT, q, qd, qdd)
             least = 1e-4 * np.abs(efforts).max()
 
             def outputs():
-                return np.array([m.output.effort for m in peer.received(state)])
+                found = np.array([m.output.effort for m in peer.received(state)])
+                return found * both.factors if mapped else found
 
             # The controller runs over the points. The last one accelerates: what bears the weight
             # where the mock hardware stands takes its place.
-            weight = inverse_dynamics(ROBOT, Q, 0 * qd[0], 0 * qd[0])
+            home = ROBOT.graph.home
+            weight = inverse_dynamics(ROBOT, home, 0 * home, 0 * home)
             peer.until(lambda: np.abs(outputs()[-1] - weight).max() < least)
             efforts = np.vstack((efforts, weight))
             moving = outputs()[np.abs(outputs()).max(1) > 0.0]
