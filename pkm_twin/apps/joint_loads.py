@@ -114,7 +114,7 @@ def _angles(rotations: Array) -> Array:
     step = rotations[:-1].swapaxes(-1, -2) @ rotations[1:]
     skew = np.stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
     sine = np.linalg.norm(skew, axis=-1)
-    return np.arctan2(sine, np.trace(step, axis1=-2, axis2=-1) - 1.0)
+    return np.asarray(np.arctan2(sine, np.trace(step, axis1=-2, axis2=-1) - 1.0), np.float64)
 
 
 class Summary:
