@@ -96,7 +96,7 @@ def feed(
     def slowdown(q: Array, way: Array) -> Array:
         return np.maximum(1.0, speed / tolerance * bend_per_feed(machine, force, q, way))
 
-    way = read_waypoints(waypoints, machine, blend)
+    way = read_waypoints(waypoints, machine, blend, carried)
     motion = fastest(machine, way, speed=speed, share=share, slowdown=slowdown)
     with writing(out):
         if out is not None:

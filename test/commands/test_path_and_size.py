@@ -371,6 +371,12 @@ def test_way_points_are_lines_or_a_smooth_curve(twin, tmp_path):
     path.write_text(f"{joints}\n0.1,0.1,0.1\n0.2,0.3,0.1\n")
     data = json.loads(good(twin("path", "delta", path, "--law", "s-curve", "--json")).out)
     assert data["law"] == "s-curve"
+    # The table of a motion is a path too, whose payload is asked for.
+    out = tmp_path / "circle.csv"
+    line = ("path", "delta", "--circle", "0.04", "--duration", "1", "--payload", "0.2")
+    good(twin(*line, "--rate", "50", "--out", out, "--no-picture"))
+    assert "--payload" in good(twin("path", "delta", out, "--fastest")).err
+    assert not good(twin("path", "delta", out, "--fastest", "--payload", "0.2")).err
 
 
 @pytest.mark.parametrize(
