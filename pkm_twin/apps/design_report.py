@@ -36,7 +36,7 @@ FILE_DIGITS: Final = 12
 
 
 def read_path(
-    path: Path, robot: Robot, wrench: Sequence[float] | None, carried: Load | None
+    path: Path, robot: Robot, wrench: Sequence[float] | None, carried: Load | None = None
 ) -> tuple[Robot, PosePath]:
     """The robot with the motion's payload, and the platform's path.
 
@@ -256,7 +256,7 @@ def budget(robot: Robot, sigma: Mapping[str, float], path: Path | None) -> tuple
     if path is None:
         q, where = workspace_states(robot, STATES), "the workspace"
     else:
-        q, where = robot.inverse(read_path(path, robot, None, None)[1].pose), path.name
+        q, where = robot.inverse(read_path(path, robot, None)[1].pose), path.name
     found = pose_errors(robot, q, sigma)
     units = {name: entries(robot).get(name, (0.0, ""))[1] for name in sigma}
     order = sorted(sigma, key=lambda name: -found.share(name))

@@ -161,8 +161,7 @@ def recorded_table(path: Path, robot: str | Robot | None, carried: Load | None) 
     """A recording as a CSV with columns ``time`` and ``JOINT.position``.
 
     Optionally ``JOINT.velocity`` and ``.acceleration``, ``JOINT.measured`` or else
-    ``JOINT.effort``, the wrench ``fx fy fz mx my mz``, and the payload as in ``motion_of_csv``;
-    other columns are left alone.
+    ``JOINT.effort``, and the wrench ``fx fy fz mx my mz``; other columns are left alone.
 
     :raises ParameterError: no robot is given, a column is missing, or a value is no finite number.
     """
