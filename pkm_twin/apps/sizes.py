@@ -26,8 +26,6 @@ from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
-MOST_EFFORT: Final = 1e9
-"""Greatest effort of a drive that a file can have, N m or N."""
 MOST_PERCENT: Final = 1000.0
 """A used part of more is printed as more."""
 SHIPPED: Final = "shipped"
@@ -78,12 +76,6 @@ def compared(motion: Motion, efforts: str) -> Taken:
             machine, motion.q[part], motion.qd[part], motion.qdd[part], motion.wrench[part]
         )
     given = motion.measured if motion.planned is None else motion.planned
-    if given is not None and efforts == "file" and not np.abs(given).max() <= MOST_EFFORT:
-        row, joint = np.unravel_index(int(np.abs(given).argmax()), given.shape)
-        raise ParameterError(
-            f"{motion.robot.joint_names[joint]}.effort, sample {row}", float(given[row, joint]),
-            f"at most {MOST_EFFORT:g} {motion.robot.effort_units[joint]}",
-        )  # fmt: skip
     if given is not None and efforts == "file":
         return Taken(motion, given, "the file's", model)
     return Taken(motion, model, "the model's", model)

@@ -303,16 +303,18 @@ def test_a_motor_that_cannot_be_is_rejected_by_its_field(tmp_path, change):
     assert "drives.one" in error.value.field
 
 
-def test_efforts_that_no_drive_has_are_rejected(twin, tmp_path):
+@pytest.mark.parametrize("column", ["arm_2.effort", "fx"])
+def test_efforts_that_no_drive_has_are_rejected(twin, tmp_path, column):
     out = tmp_path / "cycle.csv"
     good(twin(*CYCLE, "--out", out, "--no-picture"))
     columns = table(out)
-    columns["arm_2.effort"][3] = 1e300
+    columns[column] = columns.get(column, 0.0 * columns["time"])
+    columns[column][3] = 1e300
     write_table(columns, out)
-    result = twin("size", "delta", out)
-    assert result.code == 1
-    assert "arm_2" in result.one_line_error()
-    good(twin("size", "delta", out, "--efforts", "model"))
+    for command in ("size", "loads"):
+        result = twin(command, "delta", out)
+        assert result.code == 1
+        assert "sample 3" in result.one_line_error()
 
 
 def test_a_recording_is_sized_by_its_measured_efforts(twin):
