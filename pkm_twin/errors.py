@@ -93,6 +93,20 @@ _warned: dict[str, dict[Any, Any]] = {}
 """The warnings given for each file, so that a file that is loaded again does not repeat them."""
 
 
+LEAST_LIMIT: Final = 1e-9
+MOST_LIMIT: Final = 1e12
+"""Least and greatest limit that a machine can have, in any unit."""
+
+
+def check_limit(field: str, value: float, unit: str = "") -> None:
+    """Reject a limit that no machine has: zero, a negative one, NaN, or one out of range.
+
+    :raises ParameterError: by the field.
+    """
+    if not LEAST_LIMIT <= value <= MOST_LIMIT:
+        raise ParameterError(field, value, f"{LEAST_LIMIT:g} to {MOST_LIMIT:g} {unit}".strip())
+
+
 def warn(path: str | Path, text: str) -> None:
     """Warn about a robot's file; the warning names the file, not a line of the program."""
     known = _warned.setdefault(str(path), {})

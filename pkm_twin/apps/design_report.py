@@ -33,7 +33,7 @@ FILE_DIGITS: Final = 12
 
 
 def read_path(
-    path: Path, robot: Robot, wrench: Sequence[float] | None, carried: Load | None
+    path: Path, robot: Robot, wrench: Sequence[float] | None, carried: Load | None = None
 ) -> tuple[Robot, PosePath]:
     """The robot with the motion's payload, and the platform's path.
 

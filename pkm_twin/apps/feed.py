@@ -24,7 +24,7 @@ from pkm_twin.apps.options import (
 )
 from pkm_twin.apps.path import ENDINGS, read_waypoints
 from pkm_twin.console import answer, writing
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import check_limit
 from pkm_twin.files import STANDARD
 from pkm_twin.options import OptionalFloat
 
@@ -88,16 +88,15 @@ def feed(
     from pkm_twin.apps.path_report import write
     from pkm_twin.paths import fastest
 
-    for name, value in (("tolerance", tolerance), ("speed", speed)):
-        if not 0.0 < value < np.inf:
-            raise ParameterError(name, value, "a number above 0")
+    for name, value, unit in (("tolerance", tolerance, "m"), ("speed", speed, "m/s")):
+        check_limit(name, value, unit)
     drawing = drawing_of(out, picture, overwrite, ENDINGS, waypoints)
     machine, carried = loaded(robot, platform, payload)
 
     def slowdown(q: Array, way: Array) -> Array:
         return np.maximum(1.0, speed / tolerance * bend_per_feed(machine, force, q, way))
 
-    way = read_waypoints(waypoints, machine, blend)
+    way = read_waypoints(waypoints, machine, blend, carried)
     motion = fastest(machine, way, speed=speed, share=share, slowdown=slowdown)
     with writing(out):
         if out is not None:

@@ -7,10 +7,11 @@ import csv
 import fnmatch
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
@@ -30,16 +31,14 @@ from pkm_twin.apps.options import (
     load_of,
 )
 from pkm_twin.apps.torques import Motion, motion_of
-from pkm_twin.console import answer, finite, refuse_existing, writing
+from pkm_twin.console import answer, finite, progress, refuse_existing, writing
 from pkm_twin.errors import ParameterError
-from pkm_twin.files import STANDARD, replace_file
+from pkm_twin.files import STANDARD, replace_file, replacing
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE
 from pkm_twin.options import OptionalPath, file_name
+from pkm_twin.paths.durability import Cycles, Life, Reversals, bearing_life, rainflow
 from pkm_twin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from pkm_twin.paths.durability import Life
 
 Array = NDArray[np.float64]
 
@@ -69,57 +68,98 @@ class BearingSpec:
 
 @dataclass(frozen=True, eq=False)
 class JointLoad:
-    """Of one joint, what its inner body applies to its outer one at its point.
+    """Of one joint, what its inner body applies to its outer one at its point, some samples.
 
     ``wrench``: base axes, ``own``: axes that turn with the inner body, (k, 6), N and N m; NaN where
     undetermined. ``turned``: between samples, the outer body against the inner one, rad, (k - 1,).
     """
 
     name: str
-    inner: str
     wrench: Array
     own: Array
     turned: Array
 
+
+def joint_loads(motion: Motion) -> Iterator[list[JointLoad]]:
+    """Loads of all joints along a motion in blocks, each from the last sample of the one before.
+
+    Errors as ``reactions``.
+    """
+    last: dict[str, tuple[Array, ...]] = {}
+    for robot, rows in by_load(motion.robot, motion.load, motion.time, BLOCK):
+        q = motion.q[rows]
+        found = elastic_reactions(robot, q, motion.qd[rows], motion.qdd[rows], motion.wrench[rows])
+        rotations, _ = motion.robot.placements(q)
+        turn = {BASE: np.broadcast_to(np.eye(3), (len(q), 3, 3)), **rotations}
+        order = list(found.names)
+        for rod in motion.robot.graph.rods.values():
+            # What a rod turns is its direction; its spin is idle.
+            start, end = (found.points[:, order.index(name)] for name in rod.joint_names)
+            turn[rod.name] = _swung(rod.ends[1] - rod.ends[0], end - start)
+        result = []
+        for k, (name, (inner, outer)) in enumerate(zip(found.names, found.bodies, strict=True)):
+            back = turn[inner].swapaxes(-1, -2)
+            wrench = found.wrenches[:, k]
+            own = np.concatenate([_times(back, wrench[:, :3]), _times(back, wrench[:, 3:])], -1)
+            parts: tuple[Array, ...] = (wrench, own, back @ turn[outer])
+            if name in last:
+                parts = tuple(map(np.concatenate, zip(last[name], parts, strict=True)))
+            last[name] = tuple(part[-1:] for part in parts)
+            result.append(JointLoad(name, parts[0], parts[1], _angles(parts[2])))
+        yield result
+
+
+def _angles(rotations: Array) -> Array:
+    """Angles between neighbouring rotations (k, 3, 3), shape (k - 1,), rad."""
+    step = rotations[:-1].swapaxes(-1, -2) @ rotations[1:]
+    skew = np.stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
+    sine = np.linalg.norm(skew, axis=-1)
+    return np.asarray(np.arctan2(sine, np.trace(step, axis1=-2, axis2=-1) - 1.0), np.float64)
+
+
+class Summary:
+    """What is kept of one joint's loads: peaks, sums of squares, reversals, and its bearing's."""
+
+    def __init__(self, robot: Robot, name: str, spec: BearingSpec | None) -> None:
+        self.name, self.spec = name, spec
+        self.axis = None if spec is None else bearing_axis(robot, name, spec)
+        self.samples, self.turned = 0, 0.0
+        self.peaks, self.squares = np.zeros(2), np.zeros(2)
+        self.determined = np.ones(len(AXES), np.bool_)
+        self.reversals = [Reversals() for _ in AXES]
+        self.sizes: list[Array] = []
+        self.bearing: list[tuple[Array, Array]] = []
+
+    def add(self, load: JointLoad) -> None:
+        """The next block."""
+        fresh = slice(1 if self.samples else 0, None)
+        size = np.linalg.norm(load.wrench[fresh].reshape(-1, 2, 3), axis=-1)
+        self.samples += len(size)
+        self.turned += float(load.turned.sum())
+        self.peaks = np.maximum(self.peaks, size.max(0))
+        self.squares += (size**2).sum(0)
+        self.sizes.append(size[:, 0].astype(np.float32))
+        self.determined &= np.isfinite(load.own).all(0)
+        for k in np.flatnonzero(self.determined):
+            self.reversals[k].add(load.own[fresh, k])
+        if self.spec is not None:
+            amount = bearing_load(load.own[:, :3], self.spec, self.axis)
+            self.bearing.append(((amount[1:] + amount[:-1]) / 2.0, load.turned))
+
     @property
     def known(self) -> bool:
         """Whether its force is determined in all samples."""
-        return bool(np.isfinite(self.wrench[:, :3]).all())
+        return bool(np.isfinite(self.peaks[0]))
 
+    def cycles(self, axis: int) -> Cycles:
+        """Rainflow cycles of one component."""
+        return rainflow(self.reversals[axis].values)
 
-def joint_loads(motion: Motion) -> list[JointLoad]:
-    """Loads of all joints along a motion; errors as ``reactions``."""
-    parts: list[tuple[Array, Array]] = []
-    names: tuple[str, ...] = ()
-    bodies: tuple[tuple[str, str], ...] = ()
-    for robot, rows in by_load(motion.robot, motion.load, motion.time, BLOCK):
-        found = elastic_reactions(
-            robot, motion.q[rows], motion.qd[rows], motion.qdd[rows], motion.wrench[rows]
-        )
-        names, bodies = found.names, found.bodies
-        parts.append((found.wrenches, found.points))
-    wrenches, points = (np.concatenate(column) for column in zip(*parts, strict=True))
-    robot = motion.robot
-    rotations, _ = robot.placements(motion.q)
-    still = np.broadcast_to(np.eye(3), (len(motion.q), 3, 3))
-    turn = {BASE: still, **rotations}
-    order = list(names)
-    for rod in robot.graph.rods.values():
-        # What a rod turns is its direction; its spin is idle.
-        start, end = (points[:, order.index(name)] for name in rod.joint_names)
-        turn[rod.name] = _swung(rod.ends[1] - rod.ends[0], end - start)
-    result = []
-    for k, (name, (inner, outer)) in enumerate(zip(names, bodies, strict=True)):
-        back = turn[inner].swapaxes(-1, -2)
-        wrench = wrenches[:, k]
-        own = np.concatenate([_times(back, wrench[:, :3]), _times(back, wrench[:, 3:])], -1)
-        relative = back @ turn[outer]
-        step = relative[:-1].swapaxes(-1, -2) @ relative[1:]
-        skew = np.stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
-        sine = np.linalg.norm(skew, axis=-1)
-        angle = np.arctan2(sine, np.trace(step, axis1=-2, axis2=-1) - 1.0)
-        result.append(JointLoad(name, inner, wrench, own, angle))
-    return result
+    def life(self, duration: float) -> Life:
+        """L10 of its bearing, whose load between samples is their mean."""
+        assert self.spec is not None  # noqa: S101  asked for joints with a bearing
+        load, turned = (np.concatenate(column) for column in zip(*self.bearing, strict=True))
+        return bearing_life(load, turned, duration, self.spec.C, self.spec.p)
 
 
 def _times(matrices: Array, vectors: Array) -> Array:
@@ -162,38 +202,34 @@ def read_bearings(path: Path, names: tuple[str, ...]) -> dict[str, BearingSpec]:
     return found
 
 
-def life_of(robot: Robot, load: JointLoad, spec: BearingSpec, time: Array) -> Life:
-    """L10 of a joint's bearing, its load between samples their mean.
+def bearing_axis(robot: Robot, name: str, spec: BearingSpec) -> Array | None:
+    """The axis of a joint's bearing, base axes at home, of length 1; None where none is needed.
 
     :raises ParameterError: Y without an axis.
     """
-    from pkm_twin.paths.durability import bearing_life
+    if spec.Y is None:
+        return None
+    joint = {j.label or j.name: j for j in robot.graph.joints.values()}.get(name)
+    axis = spec.axis
+    if axis is None and joint is not None and len(joint.axes) == 1:
+        axis = joint.axes[0]
+    if axis is None:
+        raise ParameterError(f"bearings.{name}.axis", None, "the bearing's axis, for Y")
+    return np.asarray(axis / np.linalg.norm(axis), np.float64)
 
-    force = load.own[:, :3]
+
+def bearing_load(force: Array, spec: BearingSpec, axis: Array | None) -> Array:
+    """Equivalent load of a bearing under forces (k, 3), in axes of the inner body, (k,), N."""
     amount = np.linalg.norm(force, axis=-1)
-    if spec.Y is not None:
-        joint = {j.label or j.name: j for j in robot.graph.joints.values()}.get(load.name)
-        axis = spec.axis
-        if axis is None and joint is not None and len(joint.axes) == 1:
-            axis = joint.axes[0]
-        if axis is None:
-            raise ParameterError(f"bearings.{load.name}.axis", None, "the bearing's axis, for Y")
-        along = force @ (axis / np.linalg.norm(axis))
-        across = np.sqrt(np.maximum(amount**2 - along**2, 0.0))
-        amount = spec.X * across + spec.Y * np.abs(along)
-    middle = (amount[1:] + amount[:-1]) / 2.0
-    return bearing_life(middle, load.turned, float(time[-1] - time[0]), spec.C, spec.p)
+    if axis is None or spec.Y is None:
+        return np.asarray(amount)
+    along = force @ axis
+    across = np.sqrt(np.maximum(amount**2 - along**2, 0.0))
+    return np.asarray(spec.X * across + spec.Y * np.abs(along), np.float64)
 
 
-def report(
-    motion: Motion,
-    loads: list[JointLoad],
-    bearings: Mapping[str, BearingSpec],
-    exponent: float,
-) -> tuple[dict[str, Any], str]:
+def report(motion: Motion, loads: Sequence[Summary], exponent: float) -> tuple[dict[str, Any], str]:
     """The result as plain data and as text."""
-    from pkm_twin.paths.durability import rainflow
-
     robot = motion.robot
     data: dict[str, Any] = {
         "robot": robot.name, "samples": len(motion.time),
@@ -204,19 +240,18 @@ def report(
         f"{motion.load or 'as in the robot file'}"
     ]
     for load in loads:
-        open_axes = [a for k, a in enumerate(AXES) if not np.isfinite(load.own[:, k]).all()]
-        entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": float(load.turned.sum())}
+        open_axes = [axis for axis, good in zip(AXES, load.determined, strict=True) if not good]
+        entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": load.turned}
         text = f"{load.name}:"
-        for what, unit, part in (("force", "N", slice(0, 3)), ("moment", "N_m", slice(3, 6))):
-            size = np.linalg.norm(load.wrench[:, part], axis=-1)
-            known = bool(np.isfinite(size).all())
-            peak = float(size.max()) if known else None
-            rms = float(np.sqrt(np.mean(size**2))) if known else None
+        for what, unit, k in (("force", "N", 0), ("moment", "N_m", 1)):
+            known = bool(np.isfinite(load.peaks[k]))
+            peak = float(load.peaks[k]) if known else None
+            rms = math.sqrt(load.squares[k] / load.samples) if known else None
             entry |= {f"{what}_peak_{unit}": peak, f"{what}_rms_{unit}": rms}
             if known:
                 text += f" {what} peak {peak:.4g}, RMS {rms:.4g} {unit.replace('_', ' ')};"
         entry["equivalent_range"] = {
-            axis: rainflow(load.own[:, k]).equivalent_range(exponent)
+            axis: load.cycles(k).equivalent_range(exponent)
             for k, axis in enumerate(AXES)
             if axis not in open_axes
         }
@@ -226,12 +261,12 @@ def report(
             text += f" equivalent load range {ranges[worst]:.4g} N ({worst})"
         if open_axes:
             text += f" undetermined: {', '.join(open_axes)}"
-        if load.name in bearings:
+        if load.spec is not None:
             if not load.known:
                 entry["life"] = None
                 text += "; no life, as the force is undetermined"
             else:
-                life = life_of(robot, load, bearings[load.name], motion.time)
+                life = load.life(data["duration_s"])
                 entry["life"] = {
                     "equivalent_load_N": life.load, "turns": life.turns,
                     "L10_turns": finite(life.life_turns), "L10_hours": finite(life.life_hours),
@@ -246,60 +281,77 @@ def report(
     return data, "\n".join(lines)
 
 
-def table(motion: Motion, loads: list[JointLoad]) -> str:
-    """Wrenches over time in base axes, as CSV; empty where undetermined."""
-    header = ["time", *(f"{load.name}.{axis}" for load in loads for axis in AXES)]
-    rows = np.concatenate([motion.time[:, None], *(load.wrench for load in loads)], -1)
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(header)
-    writer.writerows([["" if math.isnan(v) else v for v in row] for row in rows.tolist()])
-    return text.getvalue()
+def write_rows(writer: Any, time: Array, loads: Sequence[JointLoad]) -> None:
+    """Wrenches over time in base axes, as rows of a CSV; empty where undetermined."""
+    rows = np.concatenate([time[:, None], *(load.wrench[-len(time) :] for load in loads)], -1)
+    writer.writerows([["" if v != v else v for v in row] for row in rows.tolist()])
 
 
-def spectra(loads: list[JointLoad]) -> str:
+def spectra(loads: Sequence[Summary]) -> str:
     """Rainflow counts by joint, component and class of range, as CSV."""
-    from pkm_twin.paths.durability import rainflow
-
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(["joint", "component", "range_up_to", "cycles"])
     for load in loads:
         for k, axis in enumerate(AXES):
-            if np.isfinite(load.own[:, k]).all() and np.ptp(load.own[:, k]) > 0.0:
-                for end, count in zip(*rainflow(load.own[:, k]).spectrum(CLASSES), strict=True):
+            cycles = load.cycles(k)
+            if load.determined[k] and len(cycles.ranges):
+                for end, count in zip(*cycles.spectrum(CLASSES), strict=True):
                     writer.writerow([load.name, axis, float(end), float(count)])
     return text.getvalue()
 
 
-def draw(motion: Motion, loads: list[JointLoad], path: Path) -> None:
+def draw(motion: Motion, loads: Sequence[Summary], path: Path) -> None:
     """Forces of the joints with the largest ones over time, and their rainflow spectra."""
     from pkm_twin.atlas import figures, plots
-    from pkm_twin.paths.durability import rainflow
 
-    sizes = {load.name: np.linalg.norm(load.wrench[:, :3], axis=-1) for load in loads if load.known}
-    order = sorted(sizes, key=lambda name: -float(sizes[name].max()))[:SHOWN]
+    shown = sorted((load for load in loads if load.known), key=lambda load: -load.peaks[0])[:SHOWN]
     figure, axes = figures.subplots(1, 2, figsize=(9, 4.6), layout="constrained")
-    by_name = {load.name: load for load in loads}
-    for colour, name in zip(figures.LINES, order, strict=False):
-        axes[0].plot(motion.time, sizes[name], color=colour, lw=1, label=name)
-        own = by_name[name].own[:, :3]
-        axis = int(np.ptp(own, axis=0).argmax())
-        cycles = rainflow(own[:, axis])
+    for colour, load in zip(figures.LINES, shown, strict=False):
+        axes[0].plot(motion.time, np.concatenate(load.sizes), color=colour, lw=1, label=load.name)
+        axis = max(range(3), key=lambda k: float(np.ptp(load.reversals[k].values)))
+        cycles = load.cycles(axis)
         down = np.argsort(-cycles.ranges)
-        label = f"{name}, {AXES[axis]}"
+        label = f"{load.name}, {AXES[axis]}"
         reached = np.cumsum(cycles.counts[down])
         axes[1].step(reached, cycles.ranges[down], color=colour, where="pre", label=label)
     plots.label(axes[0], "time (s)", "force (N)", "force in the joints")
     x = "cycles of at least this range"
     plots.label(axes[1], x, "range (N)", "load cycles of one component")
     for ax in axes:
-        if order:
+        if shown:
             # Below: beside curves that fill their axes there is no room.
             ax.legend(fontsize=9, ncol=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
-    worst = f" {order[0]}, {float(sizes[order[0]].max()):.4g} N" if order else ""
+    worst = f" {shown[0].name}, {shown[0].peaks[0]:.4g} N" if shown else ""
     figure.suptitle(f"{motion.robot.name}: which joint bears most?{worst}")
     plots.save(figure, path)
+
+
+def summaries(motion: Motion, bearings: Path | None, out: Path | None) -> list[Summary]:
+    """The loads of all joints along a motion, computed and written block by block."""
+    result: list[Summary] = []
+    begin = 0
+    with ExitStack() as files, progress("loads", len(motion.time)) as update:
+        writer: Any = None
+        if out is not None:
+            hidden = files.enter_context(replacing(out))
+            text = files.enter_context(hidden.open("w", newline="", encoding="utf-8"))
+            writer = csv.writer(text)
+        for block in joint_loads(motion):
+            if not result:
+                names = tuple(load.name for load in block)
+                fitted = {} if bearings is None else read_bearings(bearings, names)
+                result = [Summary(motion.robot, name, fitted.get(name)) for name in names]
+                if writer is not None:
+                    writer.writerow(["time", *(f"{n}.{axis}" for n in names for axis in AXES)])
+            for summary, load in zip(result, block, strict=True):
+                summary.add(load)
+            end = result[0].samples
+            if writer is not None:
+                write_rows(writer, motion.time[begin:end], block)
+            begin = end
+            update(end)
+    return result
 
 
 def loads(
@@ -348,13 +400,9 @@ def loads(
     taken = motion_of(motion, machine, topic, load_of(payload, load_times), follow)
     if len(taken.time) < 2:
         raise ParameterError(str(motion), f"{len(taken.time)} samples", "2 or more")
-    found = joint_loads(taken)
-    names = tuple(load.name for load in found)
-    fitted = {} if bearings is None else read_bearings(bearings, names)
-    data, text = report(taken, found, fitted, exponent)
     with writing(out):
-        if out is not None:
-            replace_file(out, table(taken, found).encode())
+        found = summaries(taken, bearings, out)
+        data, text = report(taken, found, exponent)
         if spectrum is not None:
             replace_file(spectrum, spectra(found).encode())
         if picture is not None:

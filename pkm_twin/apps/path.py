@@ -11,6 +11,8 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from pkm_twin.apps.loads import COLUMNS as PAYLOAD
+from pkm_twin.apps.loads import Load
 from pkm_twin.apps.options import (
     Json,
     LimitShare,
@@ -24,7 +26,7 @@ from pkm_twin.apps.options import (
     loaded,
 )
 from pkm_twin.console import answer, numbers, parse_numbers, writing
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.files import STANDARD
 from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText
 from pkm_twin.paths.geometry import Path as Way
@@ -42,9 +44,12 @@ LEAST_CYCLE: Final = 1.0
 """Millimetres below which a cycle's numbers look like metres."""
 
 
-def read_waypoints(file: Path, robot: Robot, blend: float | None) -> Way:
+def read_waypoints(
+    file: Path, robot: Robot, blend: float | None, carried: Load | None = None
+) -> Way:
     """The path of a CSV of waypoints, see :func:`path_command`.
 
+    :param carried: the payload of the motion; that of the table is not used.
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
     """
     from pkm_twin.apps.columns import read_columns
@@ -52,7 +57,8 @@ def read_waypoints(file: Path, robot: Robot, blend: float | None) -> Way:
 
     columns = read_columns(file, robot)
     joints = [f"{name}.position" for name in robot.joint_names]
-    others = {f"{j}.{w}" for j in robot.joint_names for w in ("velocity", "acceleration", "effort")}
+    words = ("velocity", "acceleration", "effort")
+    others = {f"{j}.{word}" for j in (*robot.joint_names, *robot.pose_names) for word in words}
     by_joints = any(name in columns for name in joints)
     by_pose = any(name in columns for name in robot.pose_names)
     space: Space = "pose" if by_pose else "joint"
@@ -63,10 +69,13 @@ def read_waypoints(file: Path, robot: Robot, blend: float | None) -> Way:
     for name in needed:
         if name not in columns:
             raise ParameterError(f"{file}: columns", ", ".join(columns), f"a column {name}")
-    known_names = {*robot.pose_names, *joints, *others, *OPTIONS, "time"}
+    known_names = {*robot.pose_names, *joints, *others, *OPTIONS, *PAYLOAD, "time"}
     for name in columns:
         if name not in known_names:
             raise UnknownNameError(f"{file}: column", name, known_names)
+    planned = float(columns.get(PAYLOAD[0], np.zeros(1)).max())
+    if planned > 0.0 and carried is None:
+        warn(file, f"its payload of {planned:g} kg is not used; give --payload")
     points = np.stack([columns[name] for name in needed], -1)
     if blend is None and not any(name in columns for name in OPTIONS):
         return through(robot, points, space=space)
@@ -89,7 +98,7 @@ def read_waypoints(file: Path, robot: Robot, blend: float | None) -> Way:
 
 def _chosen(
     machine: Robot, waypoints: Path | None, cycle: str | None, circle: float | None,
-    at: str | None, direction: float, blend: float | None, dwell: float,
+    at: str | None, direction: float, blend: float | None, dwell: float, carried: Load | None,
 ) -> Way:  # fmt: skip
     """The path that a command line asks for."""
     from pkm_twin import paths
@@ -101,7 +110,7 @@ def _chosen(
     if waypoints is not None:
         if at is not None or dwell or direction:
             raise typer.BadParameter("--at, --direction and --dwell are for --cycle and --circle")
-        return read_waypoints(waypoints, machine, blend)
+        return read_waypoints(waypoints, machine, blend, carried)
     names = ", ".join(machine.pose_names)
     centre = None if at is None else numbers(at, len(machine.pose_names), f"a pose: {names}")
     if circle is not None:
@@ -227,7 +236,7 @@ def path_command(
 
     drawing = drawing_of(out, picture, overwrite, ENDINGS, waypoints)
     machine, carried = loaded(robot, platform, payload)
-    made = _chosen(machine, waypoints, cycle, circle, at, direction, blend, dwell)
+    made = _chosen(machine, waypoints, cycle, circle, at, direction, blend, dwell, carried)
     bounds: dict[str, Any] = {
         name: None if text is None else _limit(name, text, machine)
         for name, text in (

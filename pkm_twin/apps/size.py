@@ -18,7 +18,7 @@ from pkm_twin.apps.options import (
     load_of,
 )
 from pkm_twin.console import answer, numbers, refuse_existing, writing
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import LEAST_LIMIT, check_limit
 from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText, file_name
 
 
@@ -122,8 +122,9 @@ def size(
     gear = Gear(ratio, lead, efficiency) if geared else None
     if over_workspace is not None:
         speed, change = numbers(over_workspace, 2, "SPEED,ACCELERATION")
-        if speed < 0.0 or change < 0.0:
-            raise ParameterError("over-workspace", over_workspace, "two numbers, 0 or more")
+        for value in (speed, change):
+            # The other alone may be asked for.
+            check_limit("over-workspace", value or LEAST_LIMIT)
         if carried is not None:
             machine = carried.on(machine)
         data, text = sizes.worst_report(machine, speed, change, singularity)

@@ -26,6 +26,8 @@ from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
 
+MOST_PERCENT: Final = 1000.0
+"""A used part of more is printed as more."""
 SHIPPED: Final = "shipped"
 RPM: Final = 2 * math.pi / 60
 UNLIKE: Final = 0.05
@@ -94,15 +96,27 @@ class MotorSpec:
     then a straight line to the continuous torque at the greatest speed.
     """
 
-    inertia: float = schema.number(above=0.0, unit="kg m2")
-    continuous_torque: float = schema.number(above=0.0, unit="N m")
-    peak_torque: float = schema.number(above=0.0, unit="N m")
-    rated_speed: float = schema.number(above=0.0, unit="1/min")
-    max_speed: float = schema.number(above=0.0, unit="1/min")
+    inertia: float = schema.number(at_least=1e-10, at_most=1e4, unit="kg m2")
+    continuous_torque: float = schema.number(at_least=1e-6, at_most=1e7, unit="N m")
+    peak_torque: float = schema.number(at_least=1e-6, at_most=1e7, unit="N m")
+    rated_speed: float = schema.number(at_least=1e-3, at_most=1e7, unit="1/min")
+    max_speed: float = schema.number(at_least=1e-3, at_most=1e7, unit="1/min")
     source: str = schema.text(default="")
     curve: Any = dataclasses.field(
         default=None, metadata={"check": lambda field, value: _curve(field, value), "key": None}
     )
+
+    def verify(self, path: str) -> None:
+        """What a data sheet says of one motor agrees."""
+        most, where = self.peak_torque, "peak_torque"
+        if self.curve is not None and self.curve[:, 1].max() < most:
+            most, where = float(self.curve[:, 1].max()), "the curve's greatest torque"
+        for name, value, bound, what in (
+            ("continuous_torque", self.continuous_torque, most, where),
+            ("rated_speed", self.rated_speed, self.max_speed, "max_speed"),
+        ):
+            if value > bound:
+                raise ParameterError(f"{path}.{name}", value, f"at most {what}, {bound:g}")
 
     def motor(self, name: str) -> Motor:
         """In SI units."""
@@ -118,10 +132,18 @@ class MotorSpec:
 
 
 def _curve(field: str, value: Any) -> Array:
-    rows = np.array(value, float) if isinstance(value, list) else np.zeros(0)
-    rising = rows.ndim == 2 and rows.shape[1:] == (2,) and len(rows) > 1
-    if not (rising and (np.diff(rows[:, 0]) > 0.0).all() and (rows >= 0.0).all()):
-        raise ParameterError(field, value, "rows of speed (1/min, rising from 0) and torque (N m)")
+    try:
+        rows = np.array(value, float)
+    except (TypeError, ValueError):
+        rows = np.zeros(0)
+    pairs = rows.ndim == 2 and rows.shape[1:] == (2,) and len(rows) > 1
+    if not (
+        pairs and rows[0, 0] == 0.0 and (np.diff(rows[:, 0]) > 0.0).all()
+        and ((rows >= 0.0) & (rows <= 1e7)).all() and rows[:, 1].any()
+    ):  # fmt: skip
+        raise ParameterError(
+            field, value, "rows of speed (1/min, rising from 0) and torque (N m), up to 1e+07"
+        )
     return rows
 
 
@@ -179,8 +201,8 @@ def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], s
         for fit in sorted(d.fits, key=lambda f: (not f.good, f.motor.continuous)):
             lines.append(
                 f"  {'fits' if fit.good else 'too small'}: {fit.motor.name}: peak torque "
-                f"{100 * fit.torque:.4g} %, RMS torque {100 * fit.thermal:.4g} %, speed "
-                f"{100 * fit.speed:.4g} % of the motor's, inertia ratio {fit.inertia_ratio:.3g}"
+                f"{_percent(fit.torque)}, RMS torque {_percent(fit.thermal)}, speed "
+                f"{_percent(fit.speed)} of the motor's, inertia ratio {fit.inertia_ratio:.3g}"
             )
     lines.append(
         f"all drives: net energy {sum(total):.4g} J ({data['regenerated_J']:.4g} J regenerated), "
@@ -190,6 +212,11 @@ def report(taken: Taken, result: Sequence[DriveDuty]) -> tuple[dict[str, Any], s
     if taken.unlike:
         lines.append(f"{taken.unlike}; --efforts model uses the model's")
     return data, "\n".join(lines)
+
+
+def _percent(part: float) -> str:
+    value = 100.0 * part
+    return f"{value:.4g} %" if value <= MOST_PERCENT else f"over {MOST_PERCENT:.0f} %"
 
 
 def _words(duty: Any, force: str, rate: str) -> str:

@@ -43,6 +43,8 @@ BLOCK = 4096
 """Samples computed at a time, so that memory stays flat."""
 ENDINGS = (".csv", ".parquet", ".mat")
 FOLLOW = ("joints", "pose")
+MOST_EFFORT = 1e9
+"""Greatest effort or wrench of a file that can be a machine's, N m or N."""
 POSE_MISS = 1e-3
 """Difference between a table's pose and that of its joint positions, of the robot's size."""
 INPUTS = ("position", "velocity", "acceleration")
@@ -81,10 +83,20 @@ def motion_of(
 ) -> Motion:  # fmt: skip
     """The motion of a bag or a table; errors as of the two functions below."""
     if not is_bag(path):
-        return motion_of_csv(path, robot, carried, follow)
-    if follow is not None:
+        motion = motion_of_csv(path, robot, carried, follow)
+    elif follow is not None:
         raise ParameterError("follow", follow, "no --follow: a bag has no pose columns")
-    return motion_of_bag(path, robot, topics, carried)
+    else:
+        motion = motion_of_bag(path, robot, topics, carried)
+    given = (("wrench", motion.wrench), ("efforts", motion.measured), ("efforts", motion.planned))
+    for name, values in given:
+        if values is not None and not np.abs(values).max(initial=0.0) <= MOST_EFFORT:
+            row = int(np.abs(values).max(1).argmax())
+            value = float(np.abs(values[row]).max())
+            raise ParameterError(
+                f"{path}: {name}, sample {row}", value, f"up to {MOST_EFFORT:g} N or N m"
+            )
+    return motion
 
 
 def motion_of_bag(

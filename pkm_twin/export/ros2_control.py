@@ -21,7 +21,7 @@ import yaml
 from numpy.typing import NDArray
 
 from delta_dynamics.simulation import tuned
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import check_limit
 from pkm_twin.export.c_package import c_package, identifier
 from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS
@@ -48,10 +48,10 @@ def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]
     """The files of the package, text by path.
 
     :param bandwidth: of the controller's gains by the masses at home, Hz; zero: no gains.
-    :raises ParameterError: a robot whose file gives no masses, or a bandwidth below zero.
+    :raises ParameterError: a robot whose file gives no masses, or a bandwidth that no machine has.
     """
-    if not (math.isfinite(bandwidth) and bandwidth >= 0.0):
-        raise ParameterError("bandwidth", bandwidth, "a frequency of at least 0 Hz")
+    if bandwidth != 0.0:
+        check_limit("bandwidth", bandwidth, "Hz")
     robot.massive()
     package = package_name(robot)
     words = _words(robot, package)

@@ -17,7 +17,7 @@ import numpy as np
 from delta_dynamics.regressor import regressor
 from delta_dynamics.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, check_limit
 from pkm_twin.identification.base_parameters import independent, random_states
 from pkm_twin.identification.file_parameters import FileParameters
 from pkm_twin.robot.robot import Robot
@@ -49,12 +49,18 @@ class Bounds:
 
     ``acceleration``: of every joint, rad/s2 or m/s2, None: none. ``singularity``: least index.
     ``rate``: points a second of the written trajectory, which limit its highest frequency.
+
+    :raises ParameterError: an acceleration that no machine has.
     """
 
     share: float = 0.9
     acceleration: float | None = None
     singularity: float = 0.1
     rate: float = 100.0
+
+    def __post_init__(self) -> None:
+        if self.acceleration is not None:
+            check_limit("acceleration", self.acceleration)
 
 
 @dataclass(frozen=True, eq=False)

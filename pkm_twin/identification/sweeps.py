@@ -8,6 +8,7 @@ twice the friction, and at three speeds a Stribeck law differs from viscous fric
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -24,8 +25,8 @@ LENGTH: Final = 4.0 + 6.0 * RAMP
 """Time of a sweep, by that of half a traverse."""
 SHRINKINGS: Final = 30
 """How often a range that is not clear is made smaller."""
-STATES: Final = 400
-"""Of the sweeps of one joint, at which limits are checked."""
+STATES: Final = 200
+"""Of one sweep, at which limits are checked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +92,7 @@ def _sweep(time: Array, reach: float, speed: float) -> tuple[Array, Array, Array
 def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweeps:
     """Sweeps inside all limits.
 
-    :param duration: s; longer where the file's velocity limits ask for it.
+    :param duration: s; longer where limits of velocity or acceleration ask for it.
     :raises PkmTwinError: a joint that cannot move alone.
     """
     robot, keep = judge.robot, bounds or Bounds()
@@ -99,19 +100,26 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
     n, ratios = len(centre), np.array(SPEEDS)
     limits = robot.limits.velocity
     most = np.full(n, np.inf) if limits is None else keep.share * np.broadcast_to(limits, n)
+    lengths = LENGTH * np.sum(1.0 / ratios) * n / duration
+
+    def slowest(j: int) -> float:
+        """Speed of the slowest sweep: by the duration, and the limits of the fastest one."""
+        fastest = most[j]
+        if keep.acceleration is not None:
+            # A ramp of half a cosine has pi / 2 of its mean acceleration.
+            change = keep.share * keep.acceleration
+            fastest = min(fastest, np.sqrt(4.0 * RAMP * reach[j] * change / np.pi))
+        return float(min(lengths * reach[j], fastest / ratios[-1]))
+
     for j in range(n):
         for _ in range(SHRINKINGS):
-            slowest = n * reach[j] * LENGTH * np.sum(1.0 / ratios) / duration
-            alone = Sweeps(
-                centre[j : j + 1], reach[j : j + 1],
-                np.minimum(slowest, most[j] / ratios[-1]) * ratios[None],
-            )  # fmt: skip
-            time = np.linspace(0.0, alone.duration, STATES)
-            q = np.tile(centre, (STATES, 1))
+            alone = Sweeps(centre[j : j + 1], reach[j : j + 1], slowest(j) * ratios[None])
+            ends = np.append(0.0, np.cumsum(alone.lengths))
+            time = np.concatenate([np.linspace(*pair, STATES) for pair in pairwise(ends)])
+            q = np.tile(centre, (len(time), 1))
             qd, qdd = np.zeros_like(q), np.zeros_like(q)
             q[:, j], qd[:, j], qdd[:, j] = (one[:, 0] for one in alone.at(time))
-            quick = keep.acceleration is None or (np.abs(qdd) <= keep.acceleration).all()
-            if quick and clear(robot, keep, q, qd, qdd, 1.0):
+            if clear(robot, keep, q, qd, qdd, 1.0):
                 break
             reach[j] *= SHRINK
         else:
@@ -119,7 +127,6 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
                 f"{robot.joint_names[j]} cannot move alone inside the limits; try a smaller "
                 "--singularity or wider limits.position"
             )
-    slowest = n * reach * LENGTH * np.sum(1.0 / ratios) / duration
-    found = Sweeps(centre, reach, np.minimum(slowest, most / ratios[-1])[:, None] * ratios)
-    motion = found.at(np.linspace(0.0, found.duration, n * STATES))
+    found = Sweeps(centre, reach, np.array([slowest(j) for j in range(n)])[:, None] * ratios)
+    motion = found.at(np.linspace(0.0, found.duration, 3 * n * STATES))
     return Sweeps(centre, reach, found.speeds, judge.condition(*motion))

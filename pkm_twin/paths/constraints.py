@@ -18,23 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.errors import ParameterError
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import ParameterError, check_limit
 from pkm_twin.paths.joint_path import JointPath, place_at
 from pkm_twin.robot.robot import Robot
 
 NOTHING: Final = 1e-12
 """Part of the greatest rate below which a joint does not move."""
-
-
-LEAST, MOST = 1e-9, 1e12
-"""Least and greatest limit that is a machine's, in any unit."""
-PLAUSIBLE: Final = f"from {LEAST:g} to {MOST:g}"
-
-
-def _plausible(values: Array) -> Mask:
-    """Which limits can be a machine's; infinite is none."""
-    return ((values >= LEAST) & (values <= MOST)) | np.isposinf(values)
 
 
 @dataclass(frozen=True)
@@ -77,13 +67,15 @@ class Limits:
             if given is None:
                 return np.full(n, np.inf) if file is None else share * np.asarray(file, float)
             values = np.asarray(given, float)
-            if values.shape not in ((), (1,), (n,)) or not _plausible(values).all():
-                raise ParameterError(name, values.tolist(), f"one number, or {n}, {PLAUSIBLE}")
+            if values.shape not in ((), (1,), (n,)):
+                raise ParameterError(name, values.tolist(), f"one number, or {n}")
+            for value in values[~np.isposinf(values)].ravel().tolist():
+                check_limit(name, value)
             return np.broadcast_to(values, (n,)).astype(float)
 
         most = np.inf if speed is None else float(speed)
-        if not _plausible(np.asarray(most)).all():
-            raise ParameterError("speed", speed, f"a number {PLAUSIBLE}, m/s")
+        if most != np.inf:
+            check_limit("speed", most, "m/s")
         return cls(
             of("effort", effort, own.effort), of("velocity", velocity, own.velocity),
             of("acceleration", acceleration, None), of("jerk", jerk, None), most,

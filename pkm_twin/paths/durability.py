@@ -43,6 +43,26 @@ def turning_points(values: ArrayLike) -> Array:
     return y[np.concatenate([[0], inner, [len(y) - 1]])] if len(y) > 1 else y
 
 
+class Reversals:
+    """A load's reversals and its two ends, of blocks one after the other."""
+
+    def __init__(self) -> None:
+        self._parts: list[Array] = []
+        self._tail: Array = np.empty(0)
+
+    def add(self, values: Array) -> None:
+        """The next block, shape (samples,)."""
+        points = turning_points(np.concatenate([self._tail, values]))
+        # The last point may go on; the one before it is where it comes from.
+        self._parts.append(points[:-2])
+        self._tail = points[-2:]
+
+    @property
+    def values(self) -> Array:
+        """All of them, shape (k,)."""
+        return np.concatenate([*self._parts, self._tail])
+
+
 def rainflow(values: ArrayLike) -> Cycles:
     """Rainflow counting, ASTM E1049-85 (2017), section 5.4.4.
 

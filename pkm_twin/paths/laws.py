@@ -114,12 +114,13 @@ class LawRun:
 def shortest(
     robot: Robot, part: JointPath, law: Law, limits: Limits, wrench: Array | None
 ) -> LawRun:
-    """A stretch by a law, the shortest within the limits."""
+    """A stretch by a law, the shortest within the limits at as many times as it has points."""
     run = LawRun(part, law, 1.0)
-    interval, share, v, u = run.at(run.times)
+    time = np.linspace(0.0, 1.0, len(part.ends))
+    interval, share, v, u = run.at(time)
     _, qd, qdd = part.motion(interval, share, v, u)
-    jerk = np.gradient(qdd, run.times, axis=0)
-    travel = moving(robot, run, run.times)[4]
+    jerk = np.gradient(qdd, time, axis=0)
+    travel = moving(robot, run, time)[4]
     duration = max(
         float((np.abs(qd) / limits.velocity).max()),
         float((travel / limits.speed).max()),

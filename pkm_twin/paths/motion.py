@@ -286,16 +286,19 @@ class Samples:
     felt: Array
 
 
-def moving(robot: Robot, run: Timed, time: Array, moves: Mask | bool = True) -> tuple[Array, ...]:
+def moving(
+    robot: Robot, run: Timed, time: Array, moves: Mask | bool = True, tool: bool = True
+) -> tuple[Array, ...]:
     """A run at times (k,): q, qd, qdd, the reference point's speed, and what its limit is for.
 
     :param moves: at which times the machine moves; it rests at the others.
+    :param tool: whether the speeds are asked for; otherwise they are zero.
     """
     interval, part, v, u = run.at(time)
     creep = CREEP * run.part.ends[-1] / run.duration
     v, u = np.where(moves, np.maximum(v, creep), 0.0), np.where(moves, u, 0.0)
     q, qd, qdd = run.part.motion(interval, part, v, u)
-    speed = np.linalg.norm(velocity_of(robot, q, qd), axis=1)
+    speed = np.linalg.norm(velocity_of(robot, q, qd), axis=1) if tool else np.zeros(len(q))
     return q, qd, qdd, speed, speed * run.part.slowed(interval, part)
 
 
@@ -341,7 +344,7 @@ def run_peaks(robot: Robot, run: Timed, limits: Limits, wrench: Array | None) ->
     needs = needs_forces(robot, limits)
 
     def sample(time: Array) -> Moments:
-        q, qd, qdd, _, felt = moving(robot, run, time)
+        q, qd, qdd, _, felt = moving(robot, run, time, tool=np.isfinite(limits.speed))
         return inverse_dynamics(robot, q, qd, qdd, wrench) if needs else None, qd, qdd, felt
 
     return peaks(limits, run.times, sample)

@@ -9,7 +9,7 @@ import pytest
 from delta_dynamics import elastic_reactions, least_norm_reactions, reactions
 from delta_dynamics.elastic_reactions import reaction_energies
 from delta_dynamics.reactions import balance
-from pkm_twin.paths.durability import bearing_life, rainflow, turning_points
+from pkm_twin.paths.durability import Reversals, bearing_life, rainflow, turning_points
 from stiffness_monitor import platform_response
 from test.support.command import command
 from test.support.robots import SHIPPED, load, partly_long, random_joints, rigid
@@ -46,6 +46,36 @@ def test_cycles_hold_all_reversals(rng):
         assert ends[-1] == pytest.approx(np.ptp(load_))
     for flat in ([], [1.0], [2.0, 2.0, 2.0]):
         assert rainflow(flat).equivalent_range(5.0) == 0.0
+
+
+def test_reversals_of_blocks_are_those_of_the_whole(rng):
+    for values in (rng.normal(size=200), rng.integers(0, 3, 200), np.zeros(30), np.arange(9.0)):
+        found = Reversals()
+        for part in np.split(values, np.sort(rng.integers(0, len(values), 12))):
+            found.add(part)
+        np.testing.assert_array_equal(found.values, turning_points(values))
+
+
+def test_loads_in_blocks_are_those_of_the_whole(tmp_path, capsys, monkeypatch):
+    """Peaks, spectra, turning, life and the table do not depend on where blocks begin."""
+    robot = load("five_bar")
+    (tmp_path / "bearings.yaml").write_text("bearings: {elbow_right: {C: 5000, Y: 1.5}}")
+    results = []
+    for block in (512, 7):
+        monkeypatch.setattr("pkm_twin.apps.joint_loads.BLOCK", block)
+        out = tmp_path / f"{block}.csv"
+        done = command(
+            capsys, "loads", "five_bar", path(robot, tmp_path), "--bearings",
+            tmp_path / "bearings.yaml", "--json", "--out", out, "--payload", "0.2",
+            "--load-times", "0.2,0.5",
+        )  # fmt: skip
+        assert done.code == 0, done.err
+        results.append((json.loads(done.out)["joints"], out.read_text()))
+    (whole, table), (parts, again) = results
+    assert table == again
+    for name, entry in whole.items():
+        for key, value in entry.items():
+            assert parts[name][key] == pytest.approx(value, rel=1e-9), (name, key)
 
 
 def test_life_of_a_bearing_by_hand():
@@ -135,14 +165,16 @@ def test_turning_of_a_hinge_and_of_a_rod(rng):
     time = np.linspace(0.0, 1.0, 50)
     q = robot.graph.home + 0.1 * np.outer(np.sin(7 * time), [1.0, -0.6])
     zero = np.zeros_like(q)
-    found = {j.name: j for j in joint_loads(Motion(robot, time, q, zero, zero, np.zeros((50, 6))))}
+    found = {
+        j.name: j for j in next(joint_loads(Motion(robot, time, q, zero, zero, np.zeros((50, 6)))))
+    }
     np.testing.assert_allclose(found["left"].turned, np.abs(np.diff(q[:, 0])), atol=1e-12)
     elbow = robot.passive(q)[:, robot.passive_joints.index("elbow_right")]
     np.testing.assert_allclose(found["elbow_right"].turned, np.abs(np.diff(elbow)), atol=1e-12)
     robot = load("linear_delta")
     q = 0.3 + 0.03 * np.outer(np.sin(7 * time), [1.0, -0.6, 0.3])
     zero = np.zeros_like(q)
-    loads = joint_loads(Motion(robot, time, q, zero, zero, np.zeros((50, 6))))
+    loads = next(joint_loads(Motion(robot, time, q, zero, zero, np.zeros((50, 6)))))
     rod = robot.graph.rods["left_1"]
     way = rod.ends[1] - rod.ends[0] + robot.platform(q)[0] - robot.graph.origin
     way = way - np.outer(q[:, 0] - 0.3, [0, 0, 1])

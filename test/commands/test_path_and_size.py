@@ -3,6 +3,7 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ import yaml
 from scipy.integrate import trapezoid
 
 from delta_dynamics import inverse_dynamics, mass_matrix
+from pkm_twin.apps.sizes import read_motors
+from pkm_twin.apps.torques import write_table
 from pkm_twin.bags.reader import read_messages
+from pkm_twin.errors import ParameterError
 from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.paths import cycle, fastest, timed
 from test.support.robots import load, parameters_of
@@ -264,10 +268,53 @@ def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
     assert flat["good"]
     assert not slow["good"]
     assert slow["used_speed"] > 1.0
+    text = good(twin("size", geared, out, "--drives", drives)).out
+    assert all(float(part) <= 1000.0 for part in re.findall(r"([\d.e+]+) %", text))
     drives.write_text("drives: {one: {inertia: 1.0}}")
     assert twin("size", geared, out, "--drives", drives).code == 1
     assert twin("size", "delta", out, "--drives", "shipped").code == 1
     assert twin("size", geared, out, "--drives", "shipped", "--motor", "none").code == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"curve": [[0.0, 9.0], [200.0]]},
+        {"curve": [[10.0, 9.0], [200.0, 8.0]]},
+        {"curve": [[0.0, 0.0], [200.0, 0.0]]},
+        {"curve": [[0.0, 9.0], [200.0, float("nan")]]},
+        {"curve": [[0.0, 5.0], [200.0, 4.0]]},
+        {"curve": "flat"},
+        {"continuous_torque": 9.1},
+        {"rated_speed": 6000.0},
+        {"peak_torque": 1e300},
+        {"inertia": 0.0},
+    ],
+)
+def test_a_motor_that_cannot_be_is_rejected_by_its_field(tmp_path, change):
+    motor = {"inertia": 1.73e-5, "continuous_torque": 6.0, "peak_torque": 9.0,
+             "rated_speed": 3000.0, "max_speed": 5000.0}  # fmt: skip
+    path = tmp_path / "drives.yaml"
+    path.write_text(yaml.safe_dump({"drives": {"one": motor}}))
+    assert len(read_motors(path)) == 1
+    path.write_text(yaml.safe_dump({"drives": {"one": {**motor, **change}}}))
+    with pytest.raises(ParameterError) as error:
+        read_motors(path)
+    assert "drives.one" in error.value.field
+
+
+@pytest.mark.parametrize("column", ["arm_2.effort", "fx"])
+def test_efforts_that_no_drive_has_are_rejected(twin, tmp_path, column):
+    out = tmp_path / "cycle.csv"
+    good(twin(*CYCLE, "--out", out, "--no-picture"))
+    columns = table(out)
+    columns[column] = columns.get(column, 0.0 * columns["time"])
+    columns[column][3] = 1e300
+    write_table(columns, out)
+    for command in ("size", "loads"):
+        result = twin(command, "delta", out)
+        assert result.code == 1
+        assert "sample 3" in result.one_line_error()
 
 
 def test_a_recording_is_sized_by_its_measured_efforts(twin):
@@ -326,6 +373,12 @@ def test_way_points_are_lines_or_a_smooth_curve(twin, tmp_path):
     path.write_text(f"{joints}\n0.1,0.1,0.1\n0.2,0.3,0.1\n")
     data = json.loads(good(twin("path", "delta", path, "--law", "s-curve", "--json")).out)
     assert data["law"] == "s-curve"
+    # The table of a motion is a path too, whose payload is asked for.
+    out = tmp_path / "circle.csv"
+    line = ("path", "delta", "--circle", "0.04", "--duration", "1", "--payload", "0.2")
+    good(twin(*line, "--rate", "50", "--out", out, "--no-picture"))
+    assert "--payload" in good(twin("path", "delta", out, "--fastest")).err
+    assert not good(twin("path", "delta", out, "--fastest", "--payload", "0.2")).err
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.excitation import Bounds, Judge, excite
 from pkm_twin.identification.file_parameters import file_parameters
 from test.support.robots import load
@@ -48,3 +48,10 @@ def test_harmonics_need_points_to_show_them():
     for rate in (10.0, 100.0):
         found = excite(judge, 30.0, 6, Bounds(rate=rate), trials=10)
         assert found.harmonics[-1] / found.duration <= rate / 10.0
+
+
+@pytest.mark.parametrize("acceleration", [0.0, -1.0, np.nan, np.inf, 1e300])
+def test_an_acceleration_is_a_machines_or_rejected(acceleration):
+    with pytest.raises(ParameterError) as error:
+        Bounds(acceleration=acceleration)
+    assert error.value.field == "acceleration"

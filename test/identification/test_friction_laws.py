@@ -131,6 +131,10 @@ def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
     assert (np.abs(qd) <= robot.limits.velocity * (1.0 + 1e-12)).all()
     assert (robot.singularity(q[::50]) > 0.1 * 0.99).all()
     assert np.isfinite(found.condition)
+    for least in (0.05, 1.0):
+        slow = sweeps(judge, 60.0, Bounds(share=1.0, acceleration=least * np.abs(qdd).max()))
+        change = slow.at(np.linspace(0.0, slow.duration, 40001))[2]
+        assert np.abs(change).max() <= least * np.abs(qdd).max() * (1.0 + 1e-9)
     # Both ways, at three speeds each.
     for j, row in enumerate(found.speeds):
         for speed in row:

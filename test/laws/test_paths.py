@@ -161,7 +161,9 @@ def used_at_most(motion, count=40_000):
     return max(float(np.abs(part).max()) for part in parts)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [*range(2), *(pytest.param(k, marks=pytest.mark.long) for k in range(2, 60))]
+)
 @pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "stewart"], "delta", "five_bar"))
 def test_limits_hold_between_points_that_are_close_too(name, seed):
     robot = load(name)
