@@ -13,7 +13,7 @@ import time
 import weakref
 from typing import Any, Final
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import ClockChange, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -101,8 +101,11 @@ class TwinNode(GuardedNode):
 
     def publish_compiling(self) -> None:
         """A node that can be seen says why it does not answer."""
-        name = self.get_fully_qualified_name()
-        array = DiagnosticArray(status=[DiagnosticStatus(level=WARN, name=name, message=COMPILING)])
+        status = DiagnosticStatus(level=WARN, message=COMPILING)
+        status.name = self.get_fully_qualified_name()
+        values = {**self.health.seen, "other problems": ""}
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
