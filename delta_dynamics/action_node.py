@@ -20,7 +20,7 @@ from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from delta_dynamics.feedforward import SLICE
+from delta_dynamics.feedforward import SLICE, finished
 from pkm_twin.errors import MessageError
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
@@ -325,7 +325,7 @@ class EffortAction:
             zeros = [0.0] * len(names)
             point = JointTrajectoryPoint(positions=positions, velocities=zeros, accelerations=zeros)
             trajectory = JointTrajectory(joint_names=names, points=[point])
-            point.effort = _value(self._efforts(trajectory))[0].tolist()
+            point.effort = finished(self._efforts(trajectory))[0].tolist()
         except KeyError as error:
             self._node.log_throttled("hold", f"{NAME}: no hold point: {error} was not measured")
             return False
@@ -395,15 +395,6 @@ class EffortAction:
 
     def _never_begun(self, handle: Any) -> Any:
         raise NotImplementedError("goals end by what the controller says")
-
-
-def _value(steps: Generator[None, None, Any]) -> Any:
-    """What a generator returns, at once."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return end.value
 
 
 def _key(handle: Any) -> bytes:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from operator import gt
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -32,6 +32,9 @@ STOPPING: Final = ("non-finite result", "singular", "jump", "no wrench")
 """Reasons for which one sample stops the stream: it is none that the model describes."""
 SLICE: Final = 256
 """Points of a trajectory that are answered in one go."""
+
+
+V = TypeVar("V")
 
 
 class Torques(NamedTuple):
@@ -141,12 +144,7 @@ class Feedforward:
 
         :raises MessageError: the message is rejected, and counted.
         """
-        steps = self.trajectory_steps(message, now)
-        while True:
-            try:
-                next(steps)
-            except StopIteration as end:
-                return cast(ControllerNumbers, end.value)
+        return finished(self.trajectory_steps(message, now))
 
     def trajectory_steps(self, message: Any, now: int) -> Generator[None, None, ControllerNumbers]:
         """As :meth:`trajectory`, some points at a time: it yields between them.
@@ -360,6 +358,15 @@ class Feedforward:
             return None
         rate = None if rates is None else rates[0]
         return self._rest.push(sample.stamp, sample.q, sample.qd, rate)
+
+
+def finished(steps: Generator[None, None, V]) -> V:
+    """What a generator returns, its steps taken at once."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast(V, end.value)
 
 
 def _differentiator(s: Settings, robot: Robot) -> Differentiator:

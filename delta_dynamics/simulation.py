@@ -35,7 +35,7 @@ SINGULAR: Final = 1e-3
 """Singularity measure below which a machine has left what rigid bodies describe."""
 POSES: Final = 64
 """Random poses among which the one with the fastest position control is sought."""
-MARGIN: Final = 1.5
+MARGIN: Final = 1.25
 """Factor of all gains with which the position control has to be stable, too."""
 DELAYS: Final = 20
 """Periods of a delay that are followed one by one; a longer one is divided into as many."""

@@ -18,9 +18,12 @@ from stiffness_monitor.compliance import (
     strain_energy,
 )
 from stiffness_monitor.correction import Correction, setpoint_correction
-from stiffness_monitor.derivatives import compliance_derivatives
+from stiffness_monitor.derivatives import (
+    compliance_derivatives,
+    compliance_deviation,
+    deflection_deviation,
+)
 from stiffness_monitor.response import ElementResponse, element_response
-from stiffness_monitor.uncertainty import compliance_deviation, deflection_deviation
 from stiffness_monitor.vibration import frequency_response, tool_modes
 
 __all__ = [

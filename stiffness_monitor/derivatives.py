@@ -124,3 +124,20 @@ def _gradient(write: Write, chosen: Chosen, s: Solved) -> Program:
         numbers = [numbers[k] for k in chosen]
         q = q if min(chosen, default=math.inf) < len(t.geometry) else []
     return gradient_program(t, program, {"q": q, "numbers": numbers})
+
+
+def compliance_deviation(robot: Robot, pose: ArrayLike) -> Array:
+    """Standard deviation of :func:`compliance`, propagated from ``uncertainty``, (..., 6, 6).
+
+    To first order in the deviations, independent causes. Zero for a file that names none.
+
+    :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
+    """
+    effects = compliance_effects(robot, pose)
+    return np.asarray(np.sqrt((effects**2).sum(-1)), np.float64)
+
+
+def deflection_deviation(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> Array:
+    """Standard deviation of the deflection under a wrench by the same, shape (..., 6)."""
+    effects = np.einsum("...ijk,...j->...ik", compliance_effects(robot, pose), np.asarray(wrench))
+    return np.asarray(np.sqrt((effects**2).sum(-1)), np.float64)

@@ -11,23 +11,30 @@ import os
 import threading
 import time
 import weakref
+from collections import Counter
+from collections.abc import Callable
 from typing import Any, Final
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import ClockChange, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from std_srvs.srv import Trigger
 
+from pkm_twin.errors import ParameterError
 from pkm_twin.ros.guarded import GuardedNode
-from pkm_twin.ros.health import WARN
+from pkm_twin.ros.health import WARN, Health, cut
 from pkm_twin.ros.qos import output_qos
-from pkm_twin.ros.requests import guarded_service
 from pkm_twin.ros.turns import SELDOM_PERIOD, Task, Tasks
 
 COMPILING: Final = "compiling the robot's programs; no message is answered yet"
 COMPILING_PERIOD: Final = 1.0
 """How often a node that is not ready says so, s."""
+MAX_ASKED: Final = 1000
+"""Entries of a request that only asks; one that sets has at most as many as the node has
+parameters. More take the stream's time."""
 
 
 class TwinNode(GuardedNode):
@@ -101,8 +108,11 @@ class TwinNode(GuardedNode):
 
     def publish_compiling(self) -> None:
         """A node that can be seen says why it does not answer."""
-        name = self.get_fully_qualified_name()
-        array = DiagnosticArray(status=[DiagnosticStatus(level=WARN, name=name, message=COMPILING)])
+        status = DiagnosticStatus(level=WARN, message=COMPILING)
+        status.name = self.get_fully_qualified_name()
+        values = {**self.health.seen, "other problems": ""}
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
@@ -204,3 +214,52 @@ def _tell_compiling(node: weakref.ref[TwinNode], made: threading.Event) -> None:
         except Exception:
             return  # The middleware has ended.
         del told
+
+
+def guarded_service(
+    kind: Any, callback: Callable[[Any, Any], Any], health: Health, parameters: Callable[[], int]
+) -> Any:
+    """A service callback, rclpy's own ones too, that refuses what it cannot take.
+
+    :param parameters: how many the node has.
+    """
+
+    def guarded(request: Any, response: Any) -> Any:
+        try:
+            _check_size(request, parameters())
+            if kind is SetParameters and len(request.parameters) > 1:
+                # Each for itself, as rclpy does: what is refused does not hide what was set.
+                for parameter in request.parameters:
+                    one = guarded(kind.Request(parameters=[parameter]), kind.Response())
+                    response.results.extend(one.results)
+                return response
+            return callback(request, response)
+        except Exception as error:
+            health.seen["requests rejected"] += 1
+            text = cut(f"{type(error).__name__}: {error}")
+            health.log_throttled("request", f"{kind.__name__}: rejected, {text}")
+        response = kind.Response()
+        refusal = SetParametersResult(successful=False, reason=text)
+        if kind is SetParameters:
+            response.results = [refusal]
+        elif kind is SetParametersAtomically:
+            response.result = refusal
+        return response
+
+    return guarded
+
+
+def _check_size(request: Any, parameters: int) -> None:
+    """Refuse a request that would hold up the stream by its length.
+
+    :raises ParameterError: it has too many entries.
+    """
+    for field in ("parameters", "names", "prefixes"):
+        entries = len(getattr(request, field, ()))
+        most = parameters if field == "parameters" else MAX_ASKED
+        if entries > most:
+            raise ParameterError(field, entries, f"at most {most} in a request")
+    named = Counter(parameter.name for parameter in getattr(request, "parameters", ()))
+    for name, times in named.items():
+        if times > 1:
+            raise ParameterError(name, times, "once in a request")

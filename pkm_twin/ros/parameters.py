@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Iterable, Sequence
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rcl_interfaces.msg import (
@@ -21,13 +22,15 @@ from rclpy.parameter import Parameter
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.robot.catalogue import load
 from pkm_twin.robot.robot import Robot
-from pkm_twin.ros.internals import parameter_overrides
 from pkm_twin.streams.settings import Setting, settings_of
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 S = TypeVar("S", bound="DataclassInstance")
+
+KNOWN = "7.1"
+"""The rclpy that keeps parameter overrides as below, that of Jazzy."""
 
 
 class UnknownParametersError(PkmTwinError):
@@ -197,3 +200,21 @@ def _as_float(given: Parameter, like: Any) -> Parameter:
     ):
         return Parameter(given.name, value=[float(value) for value in given.value])
     return given
+
+
+def parameter_overrides(node: Any) -> dict[str, Any]:
+    """Parameters that the node was started with, by name; a change of it changes the node's.
+
+    rclpy has no public name for them while they are not declared.
+
+    :raises RuntimeError: an rclpy that keeps them elsewhere.
+    """
+    try:
+        overrides: dict[str, Any] = node._parameter_overrides
+    except AttributeError:
+        try:
+            found = version("rclpy")
+        except PackageNotFoundError:
+            found = "of an unknown version"
+        raise RuntimeError(f"rclpy {found} is not supported; use {KNOWN}") from None
+    return overrides

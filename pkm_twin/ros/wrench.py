@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the nodes that take a measured wrench."""
+"""Where a measured wrench is measured: parameters, or transforms where tf2 is installed."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from pkm_twin.errors import ParameterError
-from pkm_twin.streams.wrench import PLATFORM, Mounts
+import numpy as np
+from rclpy.time import Time
+
+from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.machine import rotations
+from pkm_twin.streams.wrench import PLATFORM, Mount, Mounts
 
 if TYPE_CHECKING:
     from pkm_twin.ros.node import TwinNode
@@ -24,8 +28,6 @@ def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | N
     )  # fmt: skip
     if not wanted:
         return None
-    from pkm_twin.ros.transforms import TransformMounts
-
     return TransformMounts(node, platform_frame)
 
 
@@ -39,3 +41,34 @@ def triple(node: TwinNode, name: str, text: str, unit: str) -> tuple[float, floa
         raise ParameterError(name, list(values), f"3 numbers, {unit}")
     x, y, z = values
     return float(x), float(y), float(z)
+
+
+class TransformMounts:
+    """Where a frame stands on the platform, from ``/tf`` and ``/tf_static``.
+
+    :raises ParameterError: tf2_ros is not installed.
+    """
+
+    def __init__(self, node: TwinNode, platform_frame: str) -> None:
+        try:
+            tf2 = __import__("tf2_ros")
+        except ImportError as error:
+            raise ParameterError("use_tf", True, f"false without tf2_ros ({error})") from error
+        self._platform = platform_frame
+        self._failure = tf2.TransformException
+        self._buffer: Any = tf2.Buffer()
+        self._listener = tf2.TransformListener(self._buffer, node)
+
+    def __call__(self, frame: str, stamp: int) -> Mount:
+        """The frame on the platform at a stamp, ns.
+
+        :raises MessageError: no transform between the two is known for that time.
+        """
+        try:
+            found = self._buffer.lookup_transform(self._platform, frame, Time(nanoseconds=stamp))
+        except self._failure as error:
+            text = f"no transform from {frame!r} to {self._platform!r}: {error}"
+            raise MessageError("transform", text) from error
+        move, turn = found.transform.translation, found.transform.rotation
+        position = np.array([move.x, move.y, move.z])
+        return Mount(position, rotations.from_quaternion(turn.x, turn.y, turn.z, turn.w))

@@ -7,6 +7,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Final
 
+MANY: Final = 5
+"""Rejects since a stop from which the status has their reason."""
 SMOOTHING: Final = 0.1
 """Weight of the newest period in the mean."""
 
@@ -57,9 +59,9 @@ class StreamMonitor:
 
     @property
     def status(self) -> str:
-        """Why the stream is stopped, and why messages are rejected since then."""
+        """Why the stream is stopped, and why messages are rejected since then, where many are."""
         status, (count, reason, text) = f"{self.reason}: {self.text}", self._since
-        if count:
+        if count >= MANY:
             status += f"; rejected since then: {count}"
             status += "" if reason == self.reason else f", the last: {reason}: {text}"
         return status

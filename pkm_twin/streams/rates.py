@@ -46,6 +46,9 @@ class RateAgreement:
         self.fault = ""
         self._blocks: deque[tuple[float, list[tuple[float, float]]]] = deque(maxlen=BLOCKS)
         self._begin: tuple[int, list[float]] | None = None
+        self._last, self._steps = 0, 0
+        self._rates: list[float] = []
+        self._sums: list[float] = []
 
     def push(self, stamp: int, q: Array, qd: Array) -> None:
         """Take a sample, shape (n,) each; the stamp, ns, is later than the last one's."""

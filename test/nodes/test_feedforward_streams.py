@@ -198,6 +198,9 @@ class TestRefusedSamples:
         reject(twin.joint_state, *sample(make, 14, names=("a", "b", "c")))
         twin.time_jumped_forward()
         assert (twin.stream.reason, twin.stream.text) == before
+        assert twin.stream.status == ": ".join(before)
+        for i in range(15, 20):
+            reject(twin.joint_state, *sample(make, i, names=("a", "b", "c")))
         assert "missing joint" in twin.stream.status
         assert twin.stream.stops == {"not finite": 1}
 
