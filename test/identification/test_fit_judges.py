@@ -19,6 +19,7 @@ from pkm_twin.identification.file_parameters import file_parameters
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.fit_plausible import problem_of, recording_fault
 from pkm_twin.identification.fit_rows import Recorded, rows_of
+from pkm_twin.identification.friction_laws import fit_with_laws
 from pkm_twin.machine.shared import above_zero
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy
 from test.laws.test_fit import truths
@@ -212,6 +213,36 @@ def test_what_the_model_leaves_out_is_found(what: str) -> None:
 def test_it_is_found_or_within_the_standard_deviations(what: str, name: str) -> None:
     result = judged(what, name, 3)
     assert result.verdict.answer != "explains" or worst(result, drawn(name, 3)) < 4.0
+
+
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [("delta_cu", "delta"),
+     *(pytest.param(*pair, marks=pytest.mark.long)
+       for pair in (("delta", "delta_cu"), ("delta_cu", "rps3")))],
+)  # fmt: skip
+@pytest.mark.parametrize("duration", [1.2, 8.0])
+def test_another_machine_is_rejected_or_not_explained(
+    name: str, other: str, duration: float
+) -> None:
+    m, rng = (
+        machine(load(other), np.random.default_rng(3), duration, 300.0),
+        np.random.default_rng(4),
+    )
+    try:
+        result, _ = fit_with_laws(load(name), [noisy(m.recorded(), rng)])
+    except PkmTwinError:
+        return
+    assert result.verdict.answer == "does not explain"
+
+
+def test_too_few_samples_for_the_numbers_are_rejected() -> None:
+    m, rng = (
+        machine(load("delta_cu"), np.random.default_rng(3), 0.8, 300.0),
+        np.random.default_rng(4),
+    )
+    with pytest.raises(PkmTwinError, match="too few samples"):
+        fit(m.robot, [noisy(m.recorded(), rng)])
 
 
 def test_what_is_accepted_is_marked() -> None:
