@@ -130,7 +130,7 @@ def judge(
     few = [case.thinned(step) for case in cases]
     y, base, left = _rows(few, prior)
     seen = np.linalg.norm(left, axis=0)
-    basis = _basis(base)
+    basis = basis_of(base)
     y, left = y - basis @ (basis.T @ y), left - basis @ (basis.T @ left)
     prior_sizes = np.array([one.usual or 0.0 if one.known else np.inf for one in suspects])
     chosen, after = _select(y, left, seen, _least(few), prior_sizes)
@@ -188,7 +188,7 @@ def _rows(
     return np.concatenate(values), np.concatenate(tables), np.concatenate(suspects)
 
 
-def _basis(table: Array) -> Array:
+def basis_of(table: Array) -> Array:
     """An orthonormal basis of a table's columns."""
     norms = np.linalg.norm(table, axis=0)
     vectors, sizes, _ = np.linalg.svd(table[:, norms > 0.0] / norms[norms > 0.0], False)

@@ -21,7 +21,7 @@ from pkm_twin.identification.fit_plausible import problem_of, recording_fault
 from pkm_twin.identification.fit_rows import Recorded, rows_of
 from pkm_twin.identification.friction_laws import fit_with_laws
 from pkm_twin.machine.shared import above_zero
-from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy
+from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted, unit_of
 from test.laws.test_fit import truths
 from test.support.robots import load, partly_long
 
@@ -205,6 +205,24 @@ def test_what_the_model_leaves_out_is_found(what: str) -> None:
     ]  # fmt: skip
     assert LIKELY[what] in named
     assert result.verdict.deviations in ("widened", "withheld")
+
+
+@pytest.mark.parametrize("name", partly_long(["delta_cu", "five_bar", "linear_delta"], "five_bar"))
+@pytest.mark.parametrize("late", [False, True])
+def test_an_elastic_drive_is_one_explanation_of_a_delay(name: str, late: bool) -> None:
+    """Of 1 % of a radian, or of the machine's size; efforts that are late are no elastic drive."""
+    m = drawn(name, 2)
+    give = 0.01 * unit_of(m.robot) / np.abs(m.efforts).max(0)
+    record = m.recorded(q=m.q + give * m.efforts)
+    if late:
+        record = m.recorded(effort=shifted(m.efforts, m.time, 3e-3))
+    verdict = fit(m.robot, [noisy(record, np.random.default_rng(3))], KINDS).verdict
+    named = {
+        one.kind
+        for finding in (*verdict.findings, *verdict.hints)
+        for one in (finding.suspect, *finding.others)
+    }
+    assert ("elastic drive" in named) != late
 
 
 @pytest.mark.long
