@@ -52,8 +52,9 @@ def drive_friction_command(
         torque = GRAVITY * lever * columns["mass_kg"]
     else:
         raise ParameterError(str(table), ", ".join(columns), "a column 'mass_kg' or 'torque_nm'")
-    runs = (columns.get(name) for name in ("iq_up_A", "iq_down_A", "speed", "drive"))
-    found = drive_friction(torque, *runs)
+    found = drive_friction(
+        torque, columns["iq_up_A"], columns["iq_down_A"], columns.get("speed"), columns.get("drive")
+    )
     if as_json:
         print_json(found.as_json())
         return

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
@@ -165,7 +165,7 @@ def _law(terms: dict[str, Array], friction: Array, drive: Array, told: bool) -> 
     table = np.stack(list(terms.values()), -1)
     found, covariance = _line(table, friction)
 
-    def missed(groups: Array) -> float:
+    def missed(groups: NDArray[Any]) -> float:
         """Of runs that a fit without their group predicts."""
         left = []
         for one in np.unique(groups):
