@@ -83,9 +83,9 @@ def elastic_verdict(
 
     prior = found.values - before, found.prior, np.sqrt(np.diag(found.covariance))
     names = [name for name, good in zip(directions, measured.tolist(), strict=True) if good]
-    told = judge(names, suspects, cases, prior, respond)
+    verdict = judge(names, suspects, cases, prior, respond)
     # Factors are not corrected: what the suspects probably changed is uncertain.
-    return replace(told, unseen=np.concatenate([told.unseen, told.shift[None]]))
+    return replace(verdict, unseen=np.concatenate([verdict.unseen, verdict.shift[None]]))
 
 
 def _ends(left: Sequence[Array], samples: int) -> list[int]:

@@ -15,7 +15,9 @@ from pkm_twin.identification.file_parameters import FileParameters
 from pkm_twin.identification.fit_lengths import GEOMETRY, Lengths
 from pkm_twin.identification.fit_rows import Recorded, Rows, calm_table, efforts_of
 from pkm_twin.identification.fit_signals import (
+    ELASTIC,
     INTERFERENCE,
+    LATE,
     RESONANCE,
     SPEED,
     Resonance,
@@ -23,7 +25,15 @@ from pkm_twin.identification.fit_signals import (
     suspects_of,
 )
 from pkm_twin.identification.fit_solved import Solved
-from pkm_twin.identification.judge import SIGMAS, Evidence, judge
+from pkm_twin.identification.judge import (
+    HINT,
+    NEAR,
+    SIGMAS,
+    VALUES,
+    Evidence,
+    basis_of,
+    judge,
+)
 from pkm_twin.identification.verdict import Finding, Suspect, Verdict
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.robot.robot import Robot
@@ -71,6 +81,12 @@ def verdict_of(
     if (chosen & np.isin(kinds, OF_INERTIA)).any() and not court.inertia_shown():
         answer = "explains partly" if verdict.answer == "explains" else verdict.answer
         verdict = replace(verdict, answer=answer, slow=True)
+    named = {one.suspect.kind for one in verdict.findings}
+    either = None if named & {ELASTIC, LATE} else court.late_or_elastic(chosen)
+    if either is not None:
+        finding, change = either
+        unseen = np.concatenate([verdict.unseen, change[None]])
+        verdict = replace(verdict, hints=(*verdict.hints, finding), unseen=unseen)
     rings = _resonances(robot, rows)
     if rings:
         answer = "explains partly" if verdict.answer == "explains" else verdict.answer
@@ -174,6 +190,47 @@ class _Court:
             np.sqrt(np.diag(e.covariance)),
         )  # fmt: skip
         return judge(self.robot.joint_names, suspects, cases, prior, self.solved.response)
+
+    def late_or_elastic(self, free: Mask) -> tuple[Finding, Array] | None:
+        """The delay of the efforts where elastic drives explain the residual nearly as well.
+
+        And what these change in the fitted parameters, (f,).
+        """
+        which = [k for k, one in enumerate(self.suspects) if one.kind == ELASTIC]
+        cases = [self._evidence(i, free) for i in range(len(self.recordings))]
+        step = -(-sum(case.residual.size for case in cases) // VALUES)
+        parts = []
+        for i, (case, one) in enumerate(zip(cases, self.recordings, strict=True)):
+            few = case.thinned(step)
+            weight, change = few.weight[..., None], few.nuisance[..., :1]
+            late = -change * (np.arange(len(cases)) == i)
+            measured = few.residual[..., None] - one.delay * change
+            columns = few.explained, few.nuisance[..., 1:], late, few.suspects[..., which], measured
+            whole = np.concatenate(columns, -1) * weight
+            parts.append(whole.reshape(-1, whole.shape[-1]))
+        table = np.concatenate(parts)
+        split = table.shape[1] - len(cases) - len(which) - 1
+        basis = basis_of(table[:, :split])
+        left = table[:, split:] - basis @ (basis.T @ table[:, split:])
+        late, elastic, y = np.split(left, [len(cases), len(cases) + len(which)], 1)
+        delays, gives = (np.linalg.lstsq(one, y[:, 0], rcond=None)[0] for one in (late, elastic))
+        clear, other = np.linalg.norm(late @ delays), np.linalg.norm(elastic @ gives)
+        chance = np.sqrt(HINT**2 + len(which) - 1)
+        errors = np.linalg.norm(np.linalg.pinv(elastic), axis=1)
+        if other < max(chance, NEAR * clear) or (gives < -2.0 * errors).any():
+            return None
+        place = int(np.argmax(np.abs(delays)))
+        error = float(np.linalg.norm(np.linalg.pinv(late)[place]))
+        sizes = ", ".join(
+            f"{self.suspects[k].where} {give:.2g} {self.suspects[k].unit}"
+            for k, give in zip(which, gives.tolist(), strict=True)
+        )
+        finding = Finding(
+            Suspect(LATE, "all joints", "s"), float(delays[place]), error, float(clear),
+            (Suspect(ELASTIC, sizes),),
+        )  # fmt: skip
+        signals = [case.suspects[..., which] @ gives[:, None] for case in cases]
+        return finding, self.solved.response(signals)[:, 0]
 
     def inertia_shown(self) -> bool:
         """Whether the recordings would show time at twice or half its rate, friction being any."""

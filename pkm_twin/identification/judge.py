@@ -26,6 +26,7 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.identification.estimation import WIDEN
 from pkm_twin.identification.verdict import Answer, Blind, Channel, Finding, Suspect, Verdict
 
 SIGMAS: Final = 4.5
@@ -51,7 +52,7 @@ LOUD: Final = 1.5
 MOST: Final = 0.2
 """Part of a channel's measured variation that may stay unexplained."""
 ABSURD: Final = 10.0
-"""Times its usual size from which an error is another model's."""
+"""Times its usual size from which an error, beyond doubt, is another model's."""
 MAYBE: Final = 4
 """Findings without a usual size that may be none; the others are taken for certain."""
 HARM: Final = 3.0
@@ -130,7 +131,7 @@ def judge(
     few = [case.thinned(step) for case in cases]
     y, base, left = _rows(few, prior)
     seen = np.linalg.norm(left, axis=0)
-    basis = _basis(base)
+    basis = basis_of(base)
     y, left = y - basis @ (basis.T @ y), left - basis @ (basis.T @ left)
     prior_sizes = np.array([one.usual or 0.0 if one.known else np.inf for one in suspects])
     chosen, after = _select(y, left, seen, _least(few), prior_sizes)
@@ -144,7 +145,10 @@ def judge(
     )
     loud = [channel.left_ratio for channel in told if channel.left_ratio > LOUD]
     answer: Answer = "explains"
-    absurd = [one for one in clear if abs(one.size) > ABSURD * (one.suspect.usual or np.inf)]
+    absurd = [
+        one for one in clear
+        if abs(one.size) - SIGMAS * one.deviation > ABSURD * (one.suspect.usual or np.inf)
+    ]  # fmt: skip
     if absurd or max(channel.left for channel in told) > MOST:
         answer = "does not explain"
     elif clear or loud or any(channel.held_out > LOUD for channel in told):
@@ -188,7 +192,7 @@ def _rows(
     return np.concatenate(values), np.concatenate(tables), np.concatenate(suspects)
 
 
-def _basis(table: Array) -> Array:
+def basis_of(table: Array) -> Array:
     """An orthonormal basis of a table's columns."""
     norms = np.linalg.norm(table, axis=0)
     vectors, sizes, _ = np.linalg.svd(table[:, norms > 0.0] / norms[norms > 0.0], False)
@@ -312,7 +316,8 @@ def _posterior(
         np.sqrt(weight) * np.concatenate([half, (middle - mean)[None]])
         for weight, (middle, half) in zip(weights, parts, strict=True)
     ]
-    return mean, np.asarray(np.linalg.qr(np.concatenate(factors), mode="r"), np.float64)
+    # Effects are linear and the noise is an estimate.
+    return mean, WIDEN * np.asarray(np.linalg.qr(np.concatenate(factors), mode="r"), np.float64)
 
 
 def _blind(
