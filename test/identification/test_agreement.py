@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,7 +59,7 @@ def test_an_encoder_s_noise_is_not_the_model_s_fault(name: str) -> None:
     """Velocities by the noise of 500 Hz positions would be far off."""
     rng = np.random.default_rng([5, *name.encode()])
     m = machine(load(name), rng, 10.0, 500.0)
-    recorded = m.recorded(q=m.q + 2e-5 * rng.normal(size=m.q.shape))
+    recorded = replace(noisy(m.recorded(), rng), q=m.q + 2e-5 * rng.normal(size=m.q.shape))
     result = fit(m.robot, [recorded], ("friction", "payload"))
     assert result.verdict.answer == "explains"
     friction = {n.name: n.after for n in result.numbers if n.name.startswith("friction")}
