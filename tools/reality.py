@@ -211,8 +211,18 @@ drive-friction` with `leg_currents.csv` and `--lever 0.011391` prints
 ```
 
 At one speed Coulomb and viscous friction are one number. That number alone is rejected: friction
-grows with the load. Four weights, recalled and not weighed, are few: the torque constant is as
-good as the weights.
+grows with the load. The owner has since weighed the masses (all within 10 g) and repeated the test
+with three of them: 0.0564 +- 0.0011 N m/A. Both together give 0.0570 +- 0.0008 N m/A. These two
+figures are the owner's.
+
+### What holding currents say of feedforward
+
+The owner also reports that the holding current of a leg at one pose differs by up to 1.5 A with the
+direction from which the pose was approached. Gravity needs 0.2 to 0.7 A there. Coulomb friction
+(0.88 to 1.22 A over 105 strokes) supports any load between its two limits at standstill, so the
+current depends on the motion before. No static model of pose and velocity can predict it:
+feedforward of gravity removes the mean, and what is left is for the feedback controller. Compare a
+model with currents of slow motion in both directions, not with holding currents.
 
 ## Send a recording
 

@@ -145,9 +145,9 @@ def calibrate_command(
     """Fit a robot's geometry and joint offsets to poses that an instrument measured.
 
     A robust least-squares fit with the machine's closures. A pose that does not fit the others gets
-    a small weight, and the report names its line. Numbers that the poses do not determine keep the
-    file's values and are listed. The fit does not use every fourth pose: the error there, before
-    and after, is the calibration's accuracy.
+    a small weight, and the report names its line. Changes of numbers that the poses do not
+    determine are listed and not made; a number in one may still change with others. The fit does
+    not use every fourth pose: the error there, before and after, is the calibration's accuracy.
 
     Poses that this machine cannot reach are rejected with the reason, and without --frame so are
     poses in another frame than the base's. --accept calibrates anyway and marks the file.
@@ -339,7 +339,10 @@ def _print_errors(result: Calibration) -> None:
 def _print_open(result: Estimate) -> None:
     open_lines = result.undetermined
     if open_lines:
-        typer.echo("the poses do not determine these parameters, which keep the file's values:")
+        typer.echo(
+            "the poses do not determine these changes, and the calibration makes none of them; a "
+            "number in one may still change with others:"
+        )
     for line in open_lines:
         typer.echo(fill(line, WIDTH, initial_indent="  ", subsequent_indent="    "))
 

@@ -21,8 +21,8 @@ def drive_friction_command(
     table: Annotated[
         Path,
         typer.Argument(
-            help="CSV with one row per weight: mass_kg or torque_nm, iq_up_A, iq_down_A; "
-            "optional: speed"
+            help="CSV with one row per run: mass_kg or torque_nm, iq_up_A, iq_down_A; "
+            "optional: speed, drive (a number)"
         ),
     ],
     lever: Annotated[
@@ -33,8 +33,10 @@ def drive_friction_command(
 ) -> None:
     """Fit a drive's torque constant and friction to slow traverses with weights, up and down.
 
-    Load-dependent friction is accepted if an F test at 5 % rejects constant friction (Coulomb, and
-    viscous at one speed), and if it predicts left-out runs better. Each run is left out once.
+    At least two weights are needed. A friction law has the terms that the runs determine: Coulomb,
+    viscous (two speeds or more), load-dependent. A term is accepted if an F test at 5 % rejects the
+    law without it, and if the law predicts left-out runs better. Each run is left out once. Several
+    drives of one kind share their numbers; each drive is left out once, too.
     """
     from pkm_twin.identification.hanging_mass import drive_friction, lines
 
@@ -50,7 +52,8 @@ def drive_friction_command(
         torque = GRAVITY * lever * columns["mass_kg"]
     else:
         raise ParameterError(str(table), ", ".join(columns), "a column 'mass_kg' or 'torque_nm'")
-    found = drive_friction(torque, columns["iq_up_A"], columns["iq_down_A"], columns.get("speed"))
+    runs = (columns.get(name) for name in ("iq_up_A", "iq_down_A", "speed", "drive"))
+    found = drive_friction(torque, *runs)
     if as_json:
         print_json(found.as_json())
         return

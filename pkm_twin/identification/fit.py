@@ -36,6 +36,11 @@ Status = Literal["fitted", "combination", "not excited"]
 LOADED: Final = frozenset(name for name, law in LAWS.items() if law.share is not FrictionLaw.share)
 """Laws that grow with the load."""
 LOAD_PASSES: Final = 2
+FEW: Final = 5.0
+"""Independent measured values for each fitted number, below which there are too few."""
+WORSE: Final = 1.2
+"""Held-out residual of a joint over that of the file's values that a machine like the file's does
+not leave."""
 SURE: Final = 0.2
 """A number that is known this much better than before is fitted."""
 STAYS: Final = 1e-3
@@ -173,6 +178,10 @@ def fit(
     rows = [made.only(chosen, everything.values) for made in whole]
     solved = solve(parameters, rows)
     result, delays = solved.estimate, solved.delays
+    _enough(rows, result, what)
+    if accepted is None and not faults:
+        faults = _worse(robot, recordings, rows, parameters.values, result.values)
+        refuse_faults(faults, accept)
     if trial is None:
         other = []
         for i, (recording, how) in enumerate(zip(recordings, filtering, strict=True)):
@@ -218,6 +227,41 @@ def refuse_faults(faults: Sequence[str], accept: bool) -> None:
     """
     if faults and not accept:
         raise PkmTwinError(f"{faults[0]}; --accept fits it nevertheless")
+
+
+def _enough(rows: Sequence[Rows], result: Estimate, what: Sequence[Kind]) -> None:
+    """Reject fewer independent values than the numbers need.
+
+    :raises PkmTwinError: with how many there are.
+    """
+    values = sum(float(one.counts[: held_from(one)].sum()) * one.signals.band for one in rows)
+    if values < FEW * result.directions:
+        raise PkmTwinError(
+            f"too few samples: {values:.0f} independent efforts for {result.directions} numbers of "
+            f"{', '.join(what)}, {FEW * result.directions:.0f} or more are needed; record a longer "
+            "motion, or fit less with --what"
+        )
+
+
+def _worse(
+    robot: Robot, recordings: Sequence[Recorded], rows: Sequence[Rows], before: Array, after: Array
+) -> list[str]:
+    """Recordings whose held-out part the fitted values predict worse than the file's, in words."""
+    told = []
+    for recording, made in zip(recordings, rows, strict=True):
+        end = made.part(slice(held_from(made), None))
+        old, new = (
+            np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0))
+            for v in (before, after)
+        )
+        j = int(np.argmax(new / np.maximum(old, 1e-300)))
+        if new[j] > WORSE * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
+            told.append(
+                f"{recording.name}: the fitted values leave {new[j]:.3g} {robot.effort_units[j]} "
+                f"of the held-out efforts of {robot.joint_names[j]}, the file's {old[j]:.3g} "
+                "(another machine, or a motion that is too short or changes?)"
+            )
+    return told
 
 
 def _corrected(parameters: FileParameters, result: Estimate, verdict: Verdict) -> Estimate:

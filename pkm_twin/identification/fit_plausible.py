@@ -26,7 +26,7 @@ HEAVIER: Final = 0.3
 REACH: Final = 1.5
 """Machine sizes from the platform within which a payload is."""
 SOME: Final = 2000
-"""Samples by which other positions and times are judged."""
+"""Samples by which other positions and times are judged: those that are explained worst."""
 TIMES: Final = {
     "the time is in ms, not in s": 1e-3, "the time is in us, not in s": 1e-6,
     "the time is in ns, not in s": 1e-9, "the time is in minutes, not in s": 60.0,
@@ -47,12 +47,22 @@ def recording_fault(
     """
     r = recording
     period = float(np.median(np.diff(r.time)))
+    s = rows.signals
+    still = replace(s, motion=(s.motion[0], 0.0 * s.motion[1], 0.0 * s.motion[2]))
+    both = [calm_table(robot, everything, r.carried, one) for one in (s, still)]
+    rubs = [group.kind == "friction" for group in everything.groups for _ in group.names]
+    inertial = np.where(rubs, 0.0, both[0] - both[1])
+    problem = problem_of(robot, everything, rows, inertial)
+    first = int(np.searchsorted(r.time, _worst(problem, SOME * period)))
+    first = max(0, min(first, len(r.time) - SOME))
 
     def put_right(**changes: Array) -> Callable[[], Problem | None]:
         def make() -> Problem | None:
             cut: dict[str, Any] = {"time": r.time, "q": r.q, "effort": r.effort} | changes
             cut |= {"wrench": r.wrench, "held": r.held}
-            few: dict[str, Any] = {k: None if v is None else v[:SOME] for k, v in cut.items()}
+            few: dict[str, Any] = {
+                k: None if v is None else v[first : first + SOME] for k, v in cut.items()
+            }
             try:
                 some = Recorded(r.name, **few, carried=r.carried)
                 made, _ = rows_of(robot, everything, some, None)
@@ -83,12 +93,14 @@ def recording_fault(
         retold.append((text, put_right(q=r.q[:, order])))
         text = f"{names[i]} and {names[k]} are exchanged"
         retold.append((text, put_right(q=r.q[:, order], effort=r.effort[:, order])))
-    s = rows.signals
-    still = replace(s, motion=(s.motion[0], 0.0 * s.motion[1], 0.0 * s.motion[2]))
-    both = [calm_table(robot, everything, r.carried, one) for one in (s, still)]
-    rubs = [group.kind == "friction" for group in everything.groups for _ in group.names]
-    inertial = np.where(rubs, 0.0, both[0] - both[1])
-    return fault_of(problem_of(robot, everything, rows, inertial), names, retold, period)
+    return fault_of(problem, names, retold, put_right(), period)
+
+
+def _worst(problem: Problem, duration: float) -> float:
+    """Where the part of such a duration begins that is explained worst, s."""
+    total = np.concatenate([[0.0], np.cumsum(np.sum(problem.missed() ** 2, 1))])
+    ends = np.searchsorted(problem.time, problem.time + duration)
+    return float(problem.time[np.argmax(total[ends] - total[:-1])])
 
 
 def problem_of(
@@ -107,6 +119,7 @@ def problem_of(
     bounds: list[tuple[float, float]] = []
     prior: list[tuple[slice, float, float]] = []
     friction: list[bool] = []
+    payload: list[bool] = []
     turning = turning_keys() | {"viscous"}
     for where, group in zip(everything.slices, everything.groups, strict=True):
         own, value = [table[..., where] for table in tables], float(group.values[0])
@@ -127,6 +140,7 @@ def problem_of(
         parts.append(own)
         bounds += [bound] * own[0].shape[-1]
         friction += [rubs] * own[0].shape[-1]
+        payload += [group.kind == "payload"] * own[0].shape[-1]
         if not rubs and known[1] > 0.0:
             prior.append((slice(first, len(bounds)), *known))
     rows_of_prior = np.zeros((len(prior), len(bounds)))
@@ -137,7 +151,7 @@ def problem_of(
     return Problem(
         rows.effort, rows.change, rows.rest, wholes[0], low, high, rows_of_prior,
         np.array([value / spread for _, value, spread in prior]), np.array(friction), rows.counts,
-        rows.signals.noise * np.sqrt(rows.signals.band), float(np.median(np.diff(rows.time))),
+        rows.signals.noise * np.sqrt(rows.signals.band), rows.time, np.array(payload),
         None if inertial is None else wholes[1],
     )  # fmt: skip
 

@@ -37,6 +37,8 @@ from pkm_twin.robot.robot import Robot
 BLOCK: Final = 2048
 OUTLIER: Final = 8.0
 """Robust deviations beyond which a measured effort is no measurement."""
+IN_A_ROW: Final = 10
+"""Samples in a row that are no outliers, but something that the model lacks."""
 LEAST_EFFORT: Final = 1e-9
 """Efforts that change by less are no measurement, N m or N."""
 LARGEST: Final = 1e9
@@ -283,7 +285,7 @@ def _piece(
 def _drop_outliers(
     parts: list[_Piece], parameters: FileParameters, every: int
 ) -> tuple[Array, int]:
-    """Efforts far from a first robust fit take its values, but not where they are many.
+    """Efforts far from a first robust fit take its values, but not many of them or in a row.
 
     :returns: that fit's parameters, and how many efforts.
     """
@@ -302,6 +304,7 @@ def _drop_outliers(
             np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0
         )
         far = (away > bound + LATE * near) & (bound > 1e-6 * np.abs(part.target).max(0))
+        far &= ~scipy.ndimage.binary_opening(far, np.ones((IN_A_ROW, 1)))
         if far.mean() > 0.05:
             continue
         part.target[far] = told[far]

@@ -35,6 +35,8 @@ WAVES: Final = 200.0
 """Most periods in the travel that are tried."""
 CHUNK: Final = 24
 """Values that are tried at once."""
+WORSE: Final = 1.02
+"""Held-out residual of a joint over that without a law, from which the law is not the joint's."""
 GOLDEN: Final = 14
 """Steps of the search between two of them."""
 
@@ -157,17 +159,18 @@ def _unexplained(result: Fit) -> bool:
 
 def _compared(name: str, before: Fit, after: Fit) -> Choice:
     """Two fits by what was held out."""
-    sums = np.zeros(5)
     band = np.array([max(channel.noise, 1e-300) for channel in before.verdict.channels])
+    parts = []
     for one, other in zip(before.judged, after.judged, strict=True):
         old, change = one.measured - one.least, other.least - one.least
-        sums += (
-            np.sum((old / band) ** 2), np.sum(((old - change) / band) ** 2), old.size,
-            np.sum(old * change / one.noise**2), np.sum((change / one.noise) ** 2),
-        )  # fmt: skip
-    before_rms, after_rms = np.sqrt(sums[:2] / sums[2])
-    sigmas = sums[3] / np.sqrt(max(sums[4], 1e-300))
-    good = sigmas > SIGMAS and after_rms < before_rms
+        each = (old / band) ** 2, ((old - change) / band) ** 2
+        parts.append((*each, old * change / one.noise**2, (change / one.noise) ** 2))
+    sums = np.array([np.concatenate(each).sum(0) for each in zip(*parts, strict=True)])
+    count = sum(one.measured.size for one in before.judged)
+    before_rms, after_rms = np.sqrt(sums[:2].sum(-1) / count)
+    sigmas = sums[2].sum() / np.sqrt(max(sums[3].sum(), 1e-300))
+    no_joint_worse = (sums[1] <= WORSE**2 * sums[0]).all()
+    good = sigmas > SIGMAS and after_rms < before_rms and no_joint_worse
     return Choice(name, bool(good), float(before_rms), float(after_rms), float(sigmas))
 
 

@@ -3,7 +3,8 @@
 
 At a steady speed the current is that of the load, plus friction up, less friction down: half of the
 difference of both is friction, half of their sum the load, by which the torque constant follows.
-Friction laws are compared by what they leave of runs that they were not fitted to.
+Friction laws have the terms that the runs determine, and are compared by what they leave of runs
+that they were not fitted to. Drives of one kind may be fitted together.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from pkm_twin.errors import ParameterError
 
 LEVEL: Final = 0.05
 """Probability by chance below which a law with one number more is accepted."""
-STEADY: Final = 0.02
-"""Relative difference of speeds below which viscous friction cannot be told from Coulomb's."""
+SEEN: Final = 0.02
+"""Part of a term that no other term has, below which the runs do not determine it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,7 @@ class Law:
     """A friction law as fitted: its terms with values and standard deviations, A.
 
     ``residual`` and ``held_out``: rms, A, of all runs and of each run by a fit of the others.
+    ``other_drives``: of each drive by a fit of the others, NaN where they do not determine it.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Law:
     deviations: Array
     residual: float
     held_out: float
+    other_drives: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +48,8 @@ class DriveFriction:
 
     ``torque_constant``: N m/A, with its standard deviation; ``zero``: A, current at no load (an
     offset of the sensor or a preload). ``laws``: the simplest first. ``chosen``: the simplest that
-    no law with one more term is better than by evidence. ``chance``: probability that the law
-    before would leave so much more than the chosen one if it were true, NaN for the simplest.
+    no law with one more term is better than by evidence. ``chance``: probability that the simpler
+    of the two laws that were compared last would leave so much more if it were true, NaN for none.
     """
 
     torque_constant: float
@@ -74,6 +77,9 @@ class DriveFriction:
                     },
                     "residual_a": law.residual,
                     "held_out_a": law.held_out,
+                    "held_out_drive_a": (
+                        law.other_drives if np.isfinite(law.other_drives) else None
+                    ),
                 }
                 for law in self.laws
             },
@@ -81,25 +87,30 @@ class DriveFriction:
 
 
 def drive_friction(
-    torque: ArrayLike, up: ArrayLike, down: ArrayLike, speed: ArrayLike | None = None
-) -> DriveFriction:
-    """Torque constant and friction law of a drive.
+    torque: ArrayLike, up: ArrayLike, down: ArrayLike, speed: ArrayLike | None = None,
+    drive: ArrayLike | None = None,
+) -> DriveFriction:  # fmt: skip
+    """Torque constant and friction law of a drive, or of several alike.
 
-    :param torque: of the weights at the motor, N m, shape (k,), three different ones or more.
+    :param torque: of the weights at the motor, N m, shape (k,), at least two different ones.
     :param up: mean current while they are lifted, A; ``down``: while they are lowered. Signs as
         the drive has them.
     :param speed: of the motor, any unit; absent: the same in all runs.
+    :param drive: numbers of the drives, by run; absent: the same in all runs.
     :raises ParameterError: too few runs, or currents that do not follow the weights.
     """
     load, rise, fall = (np.asarray(one, np.float64) for one in (torque, up, down))
     count = len(load)
     rate = np.ones(count) if speed is None else np.abs(np.asarray(speed, np.float64))
-    if not (load.shape == rise.shape == fall.shape == rate.shape == (count,)):
+    which = np.zeros(count) if drive is None else np.asarray(drive, np.float64)
+    every = load, rise, fall, rate, which
+    if any(one.shape != (count,) for one in every):
         raise ParameterError("runs", count, "as many torques as currents up and down, and speeds")
-    if count < 3 or len(np.unique(load)) < 3 or not np.isfinite([load, rise, fall, rate]).all():
-        raise ParameterError("runs", count, "finite currents at three different weights or more")
+    both = np.stack([load, np.ones(count)], -1)
+    if count < 3 or not np.isfinite(every).all() or not _determined(both):
+        raise ParameterError("runs", count, "3 or more with finite currents, at 2 weights or more")
     middle, half = 0.5 * (rise + fall), 0.5 * (rise - fall)
-    (slope, zero), covariance = _line(np.stack([load, np.ones(count)], -1), middle)
+    (slope, zero), covariance = _line(both, middle)
     if not abs(slope) > 3.0 * np.sqrt(covariance[0, 0]):
         raise ParameterError(
             "torque constant", f"{slope:.3g} +- {np.sqrt(covariance[0, 0]):.2g} A/(N m)",
@@ -108,24 +119,37 @@ def drive_friction(
     constant = 1.0 / slope
     # A drive whose current falls with the load counts it the other way round.
     friction = half * np.sign(np.mean(half))
-    current = np.abs(load * slope)
-    told = float(np.ptp(rate)) > STEADY * float(rate.max())
+    columns = {"viscous": rate, "load-dependent": np.abs(load * slope)}
     terms = {"Coulomb": np.ones(count)}
-    if told and count > 3:
-        terms["viscous"] = rate
-    laws = [_law("Coulomb and viscous" if told else "Coulomb or viscous", terms, friction)]
-    if count > len(terms) + 1:
-        terms = {**terms, "load-dependent": current}
-        laws.append(_law(f"{laws[0].name}, load-dependent", terms, friction))
-    chosen, chance = laws[0], np.nan
-    if len(laws) > 1:
-        chance = _chance(laws[0], laws[1], count)
-        if chance < LEVEL and laws[1].held_out < laws[0].held_out:
-            chosen = laws[1]
+    told = _determined(np.stack([terms["Coulomb"], rate], -1))
+    laws, chance = [_law(terms, friction, which, told)], np.nan
+    chosen = laws[0]
+    while True:
+        richer = []
+        for name in columns.keys() - terms.keys():
+            more = {**terms, name: columns[name]}
+            if count > len(more) and _determined(np.stack(list(more.values()), -1)):
+                law = _law(more, friction, which, told)
+                richer.append((_chance(chosen, law, count), law))
+        if not richer:
+            break
+        chance, law = min(richer, key=lambda one: one[0])
+        laws.append(law)
+        if not (chance < LEVEL and law.held_out < chosen.held_out):
+            break
+        chosen, terms = law, {name: columns.get(name, terms["Coulomb"]) for name in law.terms}
     deviation = float(np.sqrt(covariance[0, 0]) * constant**2)
     return DriveFriction(
         float(abs(constant)), deviation, float(zero), tuple(laws), chosen, float(chance), told
     )
+
+
+def _determined(table: Array) -> bool:
+    """Whether no column is nearly a combination of the others, and there are runs enough."""
+    norms = np.linalg.norm(table, axis=0)
+    if len(table) < table.shape[1] or not norms.all():
+        return False
+    return bool(np.linalg.svd(table / norms, compute_uv=False)[-1] > SEEN)
 
 
 def _line(table: Array, values: Array) -> tuple[Array, Array]:
@@ -137,17 +161,24 @@ def _line(table: Array, values: Array) -> tuple[Array, Array]:
     return np.asarray(found, np.float64), np.asarray(variance * np.linalg.pinv(table.T @ table))
 
 
-def _law(name: str, terms: dict[str, Array], friction: Array) -> Law:
+def _law(terms: dict[str, Array], friction: Array, drive: Array, told: bool) -> Law:
     table = np.stack(list(terms.values()), -1)
     found, covariance = _line(table, friction)
-    left = friction - table @ found
-    others = []
-    for k in range(len(friction)):
-        kept = np.arange(len(friction)) != k
-        others.append(friction[k] - table[k] @ _line(table[kept], friction[kept])[0])
+
+    def missed(groups: Array) -> float:
+        """Of runs that a fit without their group predicts."""
+        left = []
+        for one in np.unique(groups):
+            out = groups == one
+            if _determined(table[~out]):
+                left.append(friction[out] - table[out] @ _line(table[~out], friction[~out])[0])
+        return float(np.sqrt(np.mean(np.concatenate(left) ** 2))) if left else np.nan
+
+    names = ["Coulomb" if told else "Coulomb or viscous", *list(terms)[1:]]
     return Law(
-        name, tuple(terms), found, np.sqrt(np.diag(covariance)),
-        float(np.sqrt(np.mean(left**2))), float(np.sqrt(np.mean(np.square(others)))),
+        ", ".join(names), tuple(terms), found, np.sqrt(np.diag(covariance)),
+        float(np.sqrt(np.mean((friction - table @ found) ** 2))), missed(np.arange(len(friction))),
+        missed(drive),
     )  # fmt: skip
 
 
@@ -172,14 +203,15 @@ def lines(found: DriveFriction) -> Sequence[str]:
             f"{term} {value:.3f} +- {deviation:.3f}" + (" A" if term != "load-dependent" else "")
             for term, value, deviation in zip(law.terms, law.values, law.deviations, strict=True)
         ]
-        told.append(
-            f"{law.name}: {', '.join(each)}; residual {law.residual:.3f} A, held out "
-            f"{law.held_out:.3f} A"
-        )
+        line = f"{law.name}: {', '.join(each)}; residual {law.residual:.3f} A"
+        line += f", held-out runs {law.held_out:.3f} A"
+        if np.isfinite(law.other_drives):
+            line += f", held-out drives {law.other_drives:.3f} A"
+        told.append(line)
     if not found.viscous_told:
         told.append("one speed: Coulomb and viscous friction cannot be distinguished")
     if len(found.laws) > 1:
-        name = found.laws[0].name
-        verdict = "rejected" if found.chosen is not found.laws[0] else "not rejected"
-        told.append(f"{name} alone: {verdict} (p = {found.chance:.2g})")
+        verdict = "rejected" if found.chosen is found.laws[-1] else "not rejected"
+        simpler = found.laws[-2].name if found.chosen is found.laws[-1] else found.chosen.name
+        told.append(f"{simpler} alone: {verdict} (p = {found.chance:.2g})")
     return told

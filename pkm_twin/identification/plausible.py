@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import Any, Final
 
@@ -57,6 +58,10 @@ TURNS: Final = 4
 """Most solutions for one recording, each with what the one before has left."""
 RATES: Final = (2.0, 0.5, 3.0, 1.0 / 3.0, 4.0, 0.25, 5.0, 0.2, 10.0, 0.1)
 """Of time steps that were taken for others'."""
+SETTLED: Final = 0.05
+"""Time on each side over which a payload is the same, s."""
+SPANS: Final = 3
+"""Most times that are named."""
 LIKE_A_UNIT: Final = 1.25
 """A scale that is so near to a unit's is named by it."""
 
@@ -69,8 +74,9 @@ class Problem:
     ``columns``: by what is not, (k, n, c), about ``usual``, as far off as ``spread`` (infinite:
     nobody knows), between ``low`` and ``high``, (c,). ``friction``: which columns turn round with
     time, (c,). ``counts``: 1 for what is judged. ``noise``: deviation of the rows, (n,).
-    ``period``: of the rows, s. ``inertial``: the part of the columns that grows with the square of
-    the rate of time, (k, n, c); None where that is not asked.
+    ``time``: of the rows, s, (k,). ``payload``: which columns are the payload's, the first one a
+    mass at the platform's point, (c,). ``inertial``: the part of the columns that grows with the
+    square of the rate of time, (k, n, c); None where that is not asked.
     """
 
     effort: Array
@@ -84,8 +90,14 @@ class Problem:
     friction: Mask
     counts: Array
     noise: Array
-    period: float
+    time: Array
+    payload: Mask
     inertial: Array | None = None
+
+    @property
+    def period(self) -> float:
+        """Of the rows, s."""
+        return float(np.median(np.diff(self.time)))
 
     def backwards(self) -> Problem:
         """The same with time reversed: friction helps the motion."""
@@ -108,8 +120,43 @@ class Problem:
 
     def judged(self) -> Judged:
         """How well, and how likely, the best of these machines explains the efforts."""
+        return self._best[0]
+
+    @cached_property
+    def _best(self) -> tuple[Judged, Array]:
         none = np.zeros((*self.effort.shape, 0))
-        return self._solved(none, self.effort, self.variation)[0]
+        return self._solved(none, self.effort, self.variation)
+
+    def missed(self) -> Array:
+        """What the best of these machines leaves of the efforts, by their variation, (k, n)."""
+        x = self._best[1]
+        told = self.rest + self.columns @ x[:-1] - x[-1] * self.late
+        return np.asarray(self.counts * (self.effort - told) / self.variation, np.float64)
+
+    def loaded_in_part(self) -> tuple[str, Problem]:
+        """The same with the payload on the platform only while the efforts ask for one; in words.
+
+        What is left as a mass by time has two values, one of them zero.
+        """
+        mass = self.columns[..., int(np.argmax(self.payload))] / self.variation * self.counts
+        parts = np.stack([np.sum(mass * self.missed(), 1), np.sum(mass**2, 1)], -1)
+        size = 2 * round(SETTLED / self.period) + 1
+        smooth = scipy.ndimage.uniform_filter1d(parts, size, axis=0)
+        carried = smooth[:, 0] / np.maximum(smooth[:, 1], 1e-300)
+        held = carried > np.quantile(carried, (0.1, 0.9)).mean()
+        held = scipy.ndimage.median_filter(held.astype(np.uint8), 4 * size + 1, mode="nearest") > 0
+        share = np.where(self.payload, held[:, None, None], 1.0)
+        part = replace(
+            self, columns=share * self.columns,
+            inertial=None if self.inertial is None else share * self.inertial,
+        )  # fmt: skip
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
+        spans = edges.reshape(-1, 2)[:SPANS]
+        times = [f"{self.time[a]:.4g} to {self.time[b - 1]:.4g} s" for a, b in spans]
+        times += ["..."] if len(edges) > 2 * SPANS else []
+        kilograms = float(part._best[1][:-1][self.payload].sum())
+        text = f"an unknown payload of about {kilograms:.2g} kg at {', '.join(times)}"
+        return f"{text} (--payload, --load-times)", part
 
     def scales(self, free: Array) -> Array:
         """Factors on the efforts with which a likely machine explains them, of any sign, (n,).
@@ -173,11 +220,13 @@ Retold = tuple[str, Callable[[], Problem | None]]
 
 
 def fault_of(
-    problem: Problem, joints: Sequence[str], retold: Sequence[Retold], period: float
-) -> str | None:
+    problem: Problem, joints: Sequence[str], retold: Sequence[Retold],
+    some: Callable[[], Problem | None], period: float,
+) -> str | None:  # fmt: skip
     """The fault for which no such machine can have made a recording, or None.
 
-    :param retold: the recording with other positions or times.
+    :param retold: some samples of the recording with other positions or times. ``some``: the same
+        samples as they were recorded.
     :param period: between samples, s.
     """
     if period > SLOWEST:
@@ -186,18 +235,24 @@ def fault_of(
     if told.left < GOOD and told.cost < INDEPENDENT * np.log(2.0 * GOOD**2):
         return None
     best, cause = told, ""
-    backwards = ("time runs backwards", problem.backwards(), RARE)
-    for text, other, price in [*_efforts(problem, joints), backwards]:
+    others = [*_efforts(problem, joints), ("time runs backwards", problem.backwards(), RARE)]
+    if problem.payload.any():
+        others.append((*problem.loaded_in_part(), UNIT))
+    for text, other, price in others:
         found = other.judged()
         if found.cost + price < best.cost:
             best, cause = Judged(found.left, found.cost + price), text
     unclear = bool(cause) and best.left**2 > BESIDE_NOISE**2 + problem.noisy**2
-    if unclear or best.left > FAR:
+    here = some() if unclear or best.left > FAR else None
+    if here is not None:
+        # All of them by the same samples: how much better than as recorded?
+        gain, own = told.cost - best.cost, here.judged()
         for text, make in retold:
             made = make()
-            found = best if made is None else made.judged()
-            if made is not None and found.cost + RARE < best.cost:
-                best, cause = Judged(found.left, found.cost + RARE), text
+            found = own if made is None else made.judged()
+            if own.cost - found.cost - RARE > gain:
+                gain, told, cause = own.cost - found.cost - RARE, own, text
+                best = found
     if cause and best.left < min(NAMED * told.left, 2.0 * POOR):
         return (
             f"{cause}: put right, a machine like the file's leaves {100 * best.left:.2g} % of the "
@@ -290,7 +345,8 @@ def _delays(problem: Problem, joints: Sequence[str]) -> Iterator[tuple[str, Prob
         names = _listed([joints[j] for j in which], n)
         late = step * problem.period
         text = f"efforts of {names} are {abs(late):.2g} s {'late' if late > 0 else 'early'}"
-        cut = {name: getattr(problem, name)[inner] for name in ("rest", "columns", "counts")}
+        parts = ("rest", "columns", "counts", "time")
+        cut = {name: getattr(problem, name)[inner] for name in parts}
         effort, change = problem.effort[inner].copy(), problem.late[inner].copy()
         for j in which:
             there = slice(most + step, k - most + step)

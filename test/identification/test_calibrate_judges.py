@@ -48,6 +48,10 @@ def test_one_wrong_pose_of_sixty_moves_nothing_and_is_named(seed: int) -> None:
     robot, paths, poses = sound(seed)
     plain = calibrate(robot, poses, paths)
     assert not plain.outliers and not plain.faults
+    moved = {p.name: (p.value - p.before) / p.prior for p in plain.parameters}
+    for weights in plain.unobserved:
+        assert abs(sum(w * moved[name] for name, w in weights.items())) < 1e-6
+        assert max(abs(moved[name]) for name in weights) > 1e-3
     rng = np.random.default_rng(seed)
     for row in (8, 11):  # learnt from, and held out
         position = poses.position.copy()

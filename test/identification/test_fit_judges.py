@@ -17,8 +17,9 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.file_parameters import file_parameters
 from pkm_twin.identification.fit import Fit, fit
-from pkm_twin.identification.fit_plausible import recording_fault
+from pkm_twin.identification.fit_plausible import problem_of, recording_fault
 from pkm_twin.identification.fit_rows import Recorded, rows_of
+from pkm_twin.identification.friction_laws import fit_with_laws
 from pkm_twin.machine.shared import above_zero
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy
 from test.laws.test_fit import truths
@@ -99,6 +100,23 @@ def test_a_recording_with_gaps_is_fitted_like_the_whole_one() -> None:
 )
 def test_what_no_machine_of_the_file_makes_is_rejected(what: str) -> None:
     assert rejected(what, "linear_delta", 4)
+
+
+@pytest.mark.parametrize("name", partly_long(["delta_cu", "prru", "five_bar"], "delta_cu"))
+def test_a_payload_that_is_on_the_platform_for_a_while_is_named(name: str) -> None:
+    """No other positions or times are the cause, though some samples say nothing of a payload."""
+    m = drawn(name, 4)
+    bare = m.truth.changed(payload={"mass": 0.0, "inertia": [0.0, 0.0, 0.0]})
+    held = (m.time > 5.0) & (m.time < 9.0)
+    efforts = np.where(held[:, None], m.efforts, inverse_dynamics(bare, m.q, m.qd, m.qdd))
+    record = noisy(m.recorded(effort=efforts), np.random.default_rng(7))
+    everything = file_parameters(m.robot)
+    rows, _ = rows_of(m.robot, everything, record, None)
+    _, part = problem_of(m.robot, everything, rows).loaded_in_part()
+    used = part.time[np.abs(part.columns[..., part.payload]).max((1, 2)) > 0.0]
+    assert (used[0], used[-1]) == pytest.approx((5.0, 9.0), abs=0.2)
+    fault = recording_fault(m.robot, everything, record, rows)
+    assert fault is not None and fault.startswith("an unknown payload ")
 
 
 def test_half_its_speed_is_rejected_though_weight_makes_up_the_efforts() -> None:
@@ -195,6 +213,36 @@ def test_what_the_model_leaves_out_is_found(what: str) -> None:
 def test_it_is_found_or_within_the_standard_deviations(what: str, name: str) -> None:
     result = judged(what, name, 3)
     assert result.verdict.answer != "explains" or worst(result, drawn(name, 3)) < 4.0
+
+
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [("delta_cu", "delta"),
+     *(pytest.param(*pair, marks=pytest.mark.long)
+       for pair in (("delta", "delta_cu"), ("delta_cu", "rps3")))],
+)  # fmt: skip
+@pytest.mark.parametrize("duration", [1.2, 8.0])
+def test_another_machine_is_rejected_or_not_explained(
+    name: str, other: str, duration: float
+) -> None:
+    m, rng = (
+        machine(load(other), np.random.default_rng(3), duration, 300.0),
+        np.random.default_rng(4),
+    )
+    try:
+        result, _ = fit_with_laws(load(name), [noisy(m.recorded(), rng)])
+    except PkmTwinError:
+        return
+    assert result.verdict.answer == "does not explain"
+
+
+def test_too_few_samples_for_the_numbers_are_rejected() -> None:
+    m, rng = (
+        machine(load("delta_cu"), np.random.default_rng(3), 0.8, 300.0),
+        np.random.default_rng(4),
+    )
+    with pytest.raises(PkmTwinError, match="too few samples"):
+        fit(m.robot, [noisy(m.recorded(), rng)])
 
 
 def test_what_is_accepted_is_marked() -> None:

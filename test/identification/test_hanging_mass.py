@@ -50,14 +50,39 @@ def test_the_law_that_made_the_currents_is_chosen(sign: float, loaded: float) ->
         away = abs(found.torque_constant - constant) / found.torque_constant_deviation
         assert away < 6.0 and found.viscous_told
         values = dict(zip(found.chosen.terms, found.chosen.values, strict=True))
-        assert values["viscous"] == pytest.approx(viscous, abs=0.1)
+        assert values.get("viscous", 0.0) == pytest.approx(viscous, abs=0.1)
     assert right >= (40 if loaded else 34)
 
 
-@pytest.mark.parametrize("case", ["few", "unrelated", "nan"])
+@pytest.mark.parametrize("loaded", [0.0, 0.1])
+def test_two_weights_and_some_drives_determine_the_law(loaded: float) -> None:
+    """Only one drive lifts both weights; drives differ a little from each other."""
+    rng, right = np.random.default_rng(round(100 * loaded)), 0
+    drive = np.repeat([2.0, 0.0, 1.0, 2.0, 3.0], 3)
+    torque, rate = np.repeat([0.2, 1.0, 1.0, 1.0, 1.0], 3), np.tile([0.5, 1.0, 2.5], 5)
+    for _ in range(40):
+        constant, coulomb = rng.uniform([0.03, 0.3], [0.2, 1.5])
+        load = torque / constant
+        friction = coulomb + loaded * load + 0.02 * rng.normal(size=4)[drive.astype(int)]
+        noise = 0.02 * rng.normal(size=(2, 15))
+        up, down = load + friction + noise[0], load - friction + noise[1]
+        found = drive_friction(torque, up, down, rate, drive)
+        right += ("load-dependent" in found.chosen.terms) == (loaded > 0.0)
+        assert abs(found.torque_constant - constant) < 6.0 * found.torque_constant_deviation
+        assert found.viscous_told and 0.0 < found.chosen.other_drives < 0.2
+        assert found.chosen.residual <= found.chosen.held_out
+        one, *_ = drive_friction(torque[:6], up[:6], down[:6]).laws
+        assert one.terms == ("Coulomb",) and one.held_out > 0.0
+    # Runs of a drive share its difference: an F test takes it for evidence a little too often.
+    assert right >= (40 if loaded else 30)
+
+
+@pytest.mark.parametrize("case", ["few", "one weight", "unrelated", "nan"])
 def test_runs_of_no_use_are_rejected(case: str) -> None:
     torque, up = np.array([0.1, 0.2, 0.3, 0.4]), np.array([1.0, 1.0, 1.0, 1.0])
     count = 2 if case == "few" else 4
+    if case == "one weight":
+        torque[:] = 0.1
     if case == "nan":
         up[1] = np.nan
     rng = np.random.default_rng(3)
