@@ -79,7 +79,9 @@ class Steps:
         return [(int(k), int(np.argmax(self.jumps[k] * self.sizes[k]))) for k in rows]
 
 
-def steps_of(time: Array, q: Array, qd: Array | None, limit: Sequence[float] | None) -> Steps:
+def steps_of(
+    time: Array, q: Array, qd: Array | None, limit: Sequence[float] | Array | None
+) -> Steps:
     """Judge the steps of a recording.
 
     :param time: rising, shape (k,), s; q and qd, where it is measured, shape (k, n).
