@@ -109,7 +109,8 @@ class Compared:
         """
         away = np.abs(self.raw)
         usual = 1.4826 * np.median(away, axis=0)
-        beyond = (away > MORE * limit + 4.0 * np.minimum(usual, limit)).any(1)
+        far = away > MORE * limit + 4.0 * np.minimum(usual, limit)
+        beyond: Mask = np.asarray(far.any(1), np.bool_)
         # Two in a row: one is noise's.
         rows = np.flatnonzero(beyond[1:] & beyond[:-1])
         return float(self.time[rows[0]]) if len(rows) else None
