@@ -197,4 +197,6 @@ def _of_fit(r: Recording, leave_out: Mask) -> list[str]:
         return []
     if verdict.answer == "does not explain":
         return []
+    if verdict.answer == "explains":
+        return ["friction other than the file's explains the efforts: `pkm-twin fit`"]
     return [str(finding) for finding in verdict.findings[:FOUND]]

@@ -208,4 +208,5 @@ def _late(left: Array, change: Array) -> float:
         if not total > 0.0:
             return 0.0
         late = float(np.clip(-np.sum(weight * left * change) / total, -LATEST, LATEST))
-    return late
+    # At the bound it is another error's.
+    return late if abs(late) < LATEST else 0.0

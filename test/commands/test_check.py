@@ -460,6 +460,15 @@ class TestCauses:
         (text,) = self.cause(made)
         assert robot.joint_names[1] in text and f"{most:.4g}" in text
 
+    @pytest.mark.long
+    def test_friction_that_the_file_has_not(self, rng):
+        robot = load("delta")
+        m = machine(robot, rng, 8.0, 200.0)
+        true = robot.changed(friction={"viscous": [0.1] * 3, "coulomb": [0.2] * 3})
+        efforts = inverse_dynamics(true, m.q, m.qd, m.qdd)
+        report = judged(recording_of(robot, m, efforts))
+        assert report.answer == "bad" and "friction" in report.causes[0]
+
     def test_what_nothing_explains_has_no_cause(self, rng):
         robot = load("delta")
         m = machine(robot, rng, 6.0, 250.0)
