@@ -82,5 +82,7 @@ def test_fit_and_check_agree(name: str) -> None:
                                     "inertia": m.truth.payload.inertia.tolist()})  # fmt: skip
     assert agree(bare, sound) == "explains"
     for what in (*FAULTS, "gain"):
+        if what == "effort_columns_swapped" and bare.joints_count == 1:
+            continue
         made = noisy(WRONG[what](m, rng), rng) if what in WRONG else IMPOSSIBLE[what](sound, rng)
         agree(bare, made)
