@@ -14,7 +14,7 @@ from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.fit_rows import Recorded
 from pkm_twin.robot.entries import with_entries
-from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy
+from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
 from test.support.robots import load
 
 BOUND = 0.05
@@ -69,6 +69,18 @@ def test_an_encoder_s_noise_is_not_the_model_s_fault(name: str) -> None:
     held_out = result.judged[0]
     rms = held_out.rms(held_out.after)
     assert compared.rms == pytest.approx(rms, abs=0.01 * float(compared.peak.max()))
+
+
+def test_efforts_that_are_late_leave_noise_alone() -> None:
+    """Whatever the delay, it is found, and with it the residual is the noise of the efforts."""
+    rng = np.random.default_rng(11)
+    m = machine(load("delta"), rng, 8.0, 500.0)
+    for late in rng.uniform(-8e-3, 8e-3, 3):
+        made = noisy(m.recorded(effort=shifted(m.efforts, m.time, late)), rng)
+        found = compare(m.truth, made)
+        assert found is not None
+        assert found.late == pytest.approx(late, abs=2e-4)
+        assert (found.rms < 2.0 * found.noise).all()
 
 
 @pytest.mark.long
