@@ -58,35 +58,37 @@ def causes_of(r: Recording, efforts: Efforts, bound: float, thorough: bool = Tru
             return False
         return found is not None and bool(found.good(bound).all())
 
-    for text, other, without in _changes(r, c, bound):
-        if explained(other, without):
+    for text, other in (*_wrenches(r), *_payloads(r, c, bound)):
+        if explained(other):
             return [text]
     found = _saturated(r, c, bound)
-    return found or (_of_fit(r, leave_out) if thorough else [])
+    if found:
+        return found
+    for text, without in _contacts(r, c, bound):
+        if explained(r, without):
+            return [text]
+    return _of_fit(r, leave_out) if thorough else []
 
 
-def _changes(
-    r: Recording, c: Compared, bound: float
-) -> Iterator[tuple[str, Recording, Mask | None]]:
-    """What may be wrong, the recording with it put right, and samples to leave out."""
-    yield from _wrenches(r)
-    yield from _payloads(r, c, bound)
+def _contacts(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Mask]]:
+    """When something else begins to act on the machine, and the samples from then on."""
     begins = c.begins(c.limit(bound))
-    before = c.time < (c.time[0] if begins is None else begins)
+    if begins is None:
+        return
+    before = c.time < begins
+    if before.mean() <= BEFORE:
+        return
     # Before the motion is under way every machine agrees.
-    moved = (
-        before.mean() > BEFORE
-        and (np.abs(c.expected[before]).max(0) > MOVED * np.abs(c.expected).max(0)).all()
-    )
-    if begins is not None and moved:
+    seen = np.abs(c.expected[before]).max(0) > MOVED * np.abs(c.expected).max(0)
+    if seen.all():
         yield (
             f"before {begins:.3f} s the efforts agree with the model, from then on something else "
             "acts on the machine (contact, collision or another load?)",
-            r, r.time >= begins - 2.0 * c.edge,
+            r.time >= begins - 2.0 * c.edge,
         )  # fmt: skip
 
 
-def _wrenches(r: Recording) -> Iterator[tuple[str, Recording, None]]:
+def _wrenches(r: Recording) -> Iterator[tuple[str, Recording]]:
     """Other readings of the wrench."""
     if r.wrench is None or not r.wrench.any():
         return
@@ -96,14 +98,14 @@ def _wrenches(r: Recording) -> Iterator[tuple[str, Recording, None]]:
     else:
         turned, axes = rotation, "platform"
     moved = [np.einsum("nij,nj->ni", turned, r.wrench[:, k : k + 3]) for k in (0, 3)]
-    yield f"the wrench has {axes} axes", replace(r, wrench=np.concatenate(moved, 1)), None
+    yield f"the wrench has {axes} axes", replace(r, wrench=np.concatenate(moved, 1))
     text = "the wrench has the opposite sign: it is what the platform applies to its surroundings"
-    yield text, replace(r, wrench=-r.wrench), None
+    yield text, replace(r, wrench=-r.wrench)
     text = "without the wrench the efforts agree: it does not act on the platform"
-    yield text, replace(r, wrench=None), None
+    yield text, replace(r, wrench=None)
 
 
-def _payloads(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Recording, None]]:
+def _payloads(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Recording]]:
     """The payload that explains most, while it is held."""
     if r.load is not None:
         return
@@ -146,7 +148,7 @@ def _payloads(r: Recording, c: Compared, bound: float) -> Iterator[tuple[str, Re
     text = f"a payload of {load.mass:g} kg explains the efforts: use --payload {load.mass:g}"
     if times:
         text += " --load-times " + ",".join(f"{edge:.2f}" for pair in times for edge in pair)
-    yield text, replace(r, load=load), None
+    yield text, replace(r, load=load)
 
 
 def _saturated(r: Recording, c: Compared, bound: float) -> list[str]:
@@ -195,4 +197,6 @@ def _of_fit(r: Recording, leave_out: Mask) -> list[str]:
         return []
     if verdict.answer == "does not explain":
         return []
+    if verdict.answer == "explains":
+        return ["friction other than the file's explains the efforts: `pkm-twin fit`"]
     return [str(finding) for finding in verdict.findings[:FOUND]]

@@ -69,7 +69,8 @@ def check_one(
 ) -> CheckReport:
     """Judge a recording, and append it to the history; errors as ``read_recording``."""
     from pkm_twin import load
-    from pkm_twin.apps.check import Bounds, judged
+    from pkm_twin.apps.check import judged
+    from pkm_twin.apps.check_motion import Bounds
     from pkm_twin.apps.recorded import read_recording
 
     robot: Any = request.robot
@@ -126,8 +127,8 @@ def _check_folder(folder: Path, request: Request, jobs: int, as_json: bool) -> b
         return good
     for result in results:
         bad = [item["what"] for item in result.get("items", ()) if item["verdict"] == "bad"]
-        found = ", ".join(bad) or result.get("not_judged")
-        why = result.get("error") or f"{result['answer']}{f': {found}' if found else ''}"
+        because = ", ".join(bad) or result.get("not_judged")
+        why = result.get("error") or f"{result['answer']}{f': {because}' if because else ''}"
         typer.echo(f"{result['bag']}: {why}")
     count = sum(not result["good"] for result in results)
     open_ = sum(result.get("answer") == "not judged" for result in results)
@@ -170,13 +171,14 @@ def check(
     """Compare a recording, or a folder of them, with the model.
 
     Checks that the file is complete, that a node would accept every joint state and wrench, that
-    there are no gaps, that joints stay inside their limits and away from singularities, and that
-    the measured efforts agree with the model. An item without data (no CRCs, no efforts, a robot
-    without masses) is unknown, which is neither good nor bad. The first lines report which topics
-    and which payload were used.
+    no samples are missing, that positions and velocities belong to one moving machine, that joints
+    stay inside their limits and away from singularities, and that the measured efforts agree with
+    the model. If they do not, an explanation is named only if it makes them agree. An item without
+    data (no CRCs, no efforts, a robot without masses) is unknown, which is neither good nor bad.
+    The first lines report which topics and which payload were used.
 
-    Exit code 0: nothing is bad. 1: an item is bad, or the file is not a bag. 3: the file is
-    damaged, but `pkm-twin recover` can save part of it.
+    Exit code 0: good. 1: an item is bad, too few efforts can be compared for a verdict, or the file
+    is no recording. 3: the file is damaged, but `pkm-twin recover` can save part of it.
     """
     from pkm_twin.apps.verdict import Verdict, items_table
     from pkm_twin.bags.reader import DamagedBagError

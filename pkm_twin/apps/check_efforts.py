@@ -172,7 +172,7 @@ def _residuals(
             text += f"; largest {worst[i]:.4g} {unit} at {at[i]:.3f} s"
             text += f", begins at {begins:.3f} s" if begins is not None else ""
         items.append(judged_item(f"{RESIDUAL} of {name}", text, bound, bool(good[i])))
-    if abs(c.late) > 0.1 * c.period:
+    if good.all() and abs(c.late) > 0.1 * c.period:
         late = f"{1e3 * abs(c.late):.3g} ms {'late' if c.late > 0.0 else 'early'}, taken out"
         items.append(Item("efforts against positions", late, "", Verdict.GOOD))
     return items

@@ -143,7 +143,9 @@ def _velocities(r: Recording, qd: Array, steps: Steps, bounds: Bounds) -> list[I
     if len(span) < 2 * width:
         return []
     told = 0.5 * (qd[1:] + qd[:-1]) * span[:, None]
-    sums = [_sums(one, width) for one in (np.diff(r.q, axis=0), told, whole[:, None] * 1.0)]
+    sums = [
+        _sums(one, width) for one in (np.diff(r.q, axis=0), told, whole[:, None].astype(np.float64))
+    ]
     moved, said, full = sums
     rows = full[:, 0] > width - 0.5
     moved, said = moved[rows], said[rows]

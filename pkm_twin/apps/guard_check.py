@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pkm_twin.apps.verdict import Item, Verdict, items_table
+from pkm_twin.apps.verdict import Item, Verdict, items_table, judged_item
 from pkm_twin.console import print_json, table_console
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.messages.stamps import stamp_of
@@ -75,14 +75,15 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> GuardReport:
     least = f"at most {1e3 * a.deadline:g} ms"
     duration = (a.last - a.first) / SECOND
     rate = f", {a.count / duration:.1f} per second" if duration > 0.0 else ""
-    mean = a.ages / a.count / SECOND if a.count else math.nan
+    mean = a.ages / max(a.count, 1) / SECOND
     beyond = f", {a.silences} beyond it" if a.silences else ""
     faults = ", ".join(f"{reason}: {count}" for reason, count in a.faults.items())
 
     def item(what: str, value: str, bound: str, good: bool) -> Item:
         # Nothing is known of torques that never came.
-        known = Verdict.GOOD if good else Verdict.BAD
-        return Item(what, value, bound, known if a.count else Verdict.UNKNOWN)
+        if not a.count:
+            return Item(what, "no message", bound, Verdict.UNKNOWN)
+        return judged_item(what, value, bound, good)
 
     came = Verdict.GOOD if a.count else Verdict.BAD
     items = [

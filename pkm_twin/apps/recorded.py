@@ -30,6 +30,9 @@ Array = NDArray[np.float64]
 
 WRENCH_AXES: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 
+RECORDING: Final = "an MCAP file, a rosbag2 folder, or a CSV with columns time, JOINT.position ..."
+"""What is a recording."""
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -171,6 +174,7 @@ def recorded_table(
     :raises ParameterError: no robot is given, a column is missing, or a value is no finite number.
     """
     if robot is None:
+        _require_table(path)
         raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
     machine = robot if isinstance(robot, Robot) else load(robot)
     columns = read_columns(path, machine)
@@ -199,6 +203,20 @@ def recorded_table(
         effort=next(found, None), wrench=wrench,
         rejected=Counter(), first_reject="", source=str(path), qdd=stack("acceleration"),
     )  # fmt: skip
+
+
+def _require_table(path: Path) -> None:
+    """Refuse what is no recording of any robot.
+
+    :raises ParameterError: no table, or one without times and positions.
+    """
+    try:
+        columns = list(read_columns(path))
+    except ParameterError as error:
+        expected = f"{RECORDING} ({error})"
+        raise ParameterError(str(path), "neither a bag nor a table", expected) from None
+    if "time" not in columns or not any(name.endswith(".position") for name in columns):
+        raise ParameterError(str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING)
 
 
 def _stacked(values: list[Array | None]) -> Array | None:

@@ -22,6 +22,8 @@ from pkm_twin.identification.plausible import LATEST
 from pkm_twin.identification.samples import Filtering, Track, by_blocks, low_pass, tracks
 from pkm_twin.robot.robot import Robot
 
+LEAST: Final = 40
+"""Samples that a piece needs: fewer than for a fit, as nothing is fitted."""
 TURNS: Final = 5
 """Robust passes for how late the efforts are."""
 HUBER: Final = 1.5
@@ -107,7 +109,8 @@ class Compared:
         """
         away = np.abs(self.raw)
         usual = 1.4826 * np.median(away, axis=0)
-        beyond = (away > MORE * limit + 4.0 * np.minimum(usual, limit)).any(1)
+        far = away > MORE * limit + 4.0 * np.minimum(usual, limit)
+        beyond: Mask = np.asarray(far.any(1), np.bool_)
         # Two in a row: one is noise's.
         rows = np.flatnonzero(beyond[1:] & beyond[:-1])
         return float(self.time[rows[0]]) if len(rows) else None
@@ -132,7 +135,9 @@ def by_held(
 
         return by_blocks(int(some.sum()), BLOCK, block)
 
-    held = (track.held > 0.5) & (carried is not None)
+    held: Mask = np.zeros(len(track.time), np.bool_)
+    if carried is not None:
+        held |= track.held > 0.5
     made = np.zeros_like(track.q)
     for machine, some in ((robot, ~held), (carried, held)):
         if machine is not None and some.any():
@@ -150,7 +155,7 @@ def compare(
     """
     r, reach = recorded, friction_reach(robot)
     held = None if r.carried is None else r.held
-    pieces, how = tracks(r.time, r.q, r.effort, r.wrench, held, rates=rates)
+    pieces, how = tracks(r.time, r.q, r.effort, r.wrench, held, rates=rates, least=LEAST)
     if not pieces:
         return None
 
@@ -203,4 +208,5 @@ def _late(left: Array, change: Array) -> float:
         if not total > 0.0:
             return 0.0
         late = float(np.clip(-np.sum(weight * left * change) / total, -LATEST, LATEST))
-    return late
+    # At the bound it is another error's.
+    return late if abs(late) < LATEST else 0.0

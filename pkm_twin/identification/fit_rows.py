@@ -193,7 +193,13 @@ def shaken_efforts(
     time, q = r.time[some], r.q[some]
     told = []
     for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
-        pieces, _ = tracks(time, q + shake, np.zeros_like(q), window=how.window)
+        pieces, _ = tracks(
+            time,
+            q + shake,
+            np.zeros_like(q),
+            window=how.window,
+            least=min(LEAST // 2, len(track.time)),
+        )
         told.append(np.concatenate([efforts(t) for t in pieces]))
     return np.asarray(told[1] - told[0], np.float64)
 

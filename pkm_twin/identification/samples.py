@@ -120,13 +120,18 @@ def _derivative(window: int, degree: int, order: int, period: float) -> Array:
     return np.asarray(scipy.signal.savgol_coeffs(window, degree, order, period), np.float64)
 
 
-def even_pieces(time: Array, columns: list[Array]) -> list[tuple[Array, list[Array]]]:
-    """Pieces without gaps, on even stamps, interpolated by cubic splines where they are not."""
+def even_pieces(
+    time: Array, columns: list[Array], least: int = LEAST // 2
+) -> list[tuple[Array, list[Array]]]:
+    """Pieces without gaps, on even stamps, interpolated by cubic splines where they are not.
+
+    :param least: samples that a piece needs.
+    """
     period = float(np.median(np.diff(time)))
     edges = [0, *(np.flatnonzero(np.diff(time) > GAP * period) + 1).tolist(), len(time)]
     pieces = []
     for begin, end in pairwise(edges):
-        if end - begin < LEAST // 2:
+        if end - begin < least:
             continue
         t = time[begin:end]
         own = [c[begin:end] for c in columns]
@@ -141,17 +146,19 @@ def even_pieces(time: Array, columns: list[Array]) -> list[tuple[Array, list[Arr
 def tracks(
     time: Array, q: Array, effort: Array, wrench: Array | None = None, held: Array | None = None,
     window: int | None = None, rates: tuple[Array, Array] | None = None,
+    least: int = LEAST // 2,
 ) -> tuple[list[Track], Filtering]:  # fmt: skip
     """A recording as evenly sampled motion, the ends of each piece left out.
 
     :param wrench: (k, 6), none by default; ``held``: (k,), throughout by default.
     :param window: of the polynomial, samples; None chooses it.
     :param rates: velocities and accelerations (k, n) that are known, to be used as they are.
+    :param least: samples that a piece needs.
     """
     wrench = np.zeros((len(time), 6)) if wrench is None else wrench
     held = np.ones(len(time)) if held is None else held
     period = float(np.median(np.diff(time)))
-    pieces = even_pieces(time, [q, effort, wrench, held, *(rates or ())])
+    pieces = even_pieces(time, [q, effort, wrench, held, *(rates or ())], least)
     if not pieces:
         return [], Filtering(0, (), None, 1)
     positions = [own[0] for _, own in pieces]

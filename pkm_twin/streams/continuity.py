@@ -14,13 +14,10 @@ from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.stream import stream_kernel
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.steps import farthest
 
 MAX_MOVE: Final = 0.25
 """Largest move between two samples, in platform radii: beyond it, another assembly is likely."""
-JUMP_FACTOR: Final = 2.0
-JUMP_SLACK: Final = 5e-3
-"""How far a joint may move between two samples: so many times what its velocity limit allows,
-over the time between their stamps and this slack for stamps that are off, s."""
 
 
 @dataclass(slots=True)
@@ -94,15 +91,15 @@ class Continuity:
     def _check_jump(self, last: _State, state: _State, beyond: list[float]) -> None:
         """No joint moves farther than its velocity limit allows, no pose than its rates tell."""
         period = (state.stamp - last.stamp) / SECOND
-        factor = JUMP_FACTOR * period + JUMP_SLACK
         joints = zip(state.numbers.tolist(), last.numbers.tolist(), self._velocity, strict=False)
         for joint, (now, before, velocity) in enumerate(joints):
-            if not abs(now - before) <= velocity * factor:
+            bound = farthest(velocity, period)
+            if not abs(now - before) <= bound:
                 unit = self.robot.joint_units[joint]
                 raise MessageError(
                     "jump",
                     f"{self.robot.joint_names[joint]} moved by {now - before:g} {unit} in "
-                    f"{period:g} s, allowed {velocity * factor:g}",
+                    f"{period:g} s, allowed {bound:g}",
                 )
         worst = max(beyond)
         if not worst <= self._largest:

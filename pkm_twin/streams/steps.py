@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -23,8 +23,8 @@ from pkm_twin.streams.rest import ROBUST, SIGMAS
 SLACK: Final = 5e-3
 """By how much stamps may be off, s: at the highest rate a joint may be so far from where it should
 be."""
-SHORT: Final = 0.01
-"""Longest time between samples over which the rates at its ends bound the move, s."""
+FACTOR: Final = 2.0
+"""How many times a joint's velocity limit its mean rate between two samples may be."""
 LATE: Final = 0.01
 """By how much measured rates may be late, s."""
 AROUND: Final = 5
@@ -35,19 +35,29 @@ OFTEN: Final = 0.02
 """Part of the steps that jump from which there may be two publishers."""
 PUBLISHER: Final = 0.05
 """Part of the samples that is one publisher's at least."""
-BEFORE: Final = 4
+BEFORE: Final = 10
 """Samples before, of which one is of the same publisher."""
-FEW: Final = 0.9
+FEW: Final = 0.85
 """Part of the samples of which the largest rate is the motion's, not that of jumps."""
-QUINTILE: Final = 0.2533 * 6.0**0.5
-"""Of the sizes of second differences, over the noise's standard deviation."""
+NEARLY: Final = 0.95
+"""Part of the steps whose moves beyond the rates of steps around are the motion's."""
+LEAST: Final = 0.1
+"""Part of the second differences that are of one publisher's samples and no jump of its own,"""
+OF_NOISE: Final = 0.1257 * 6.0**0.5
+"""and their quantile of it, over the noise's standard deviation."""
 APART: Final = 0.25
 """By how much of a period a gap may miss a whole number of periods, where samples are missing."""
 
 
-def excess(move: float, low: float, high: float) -> float:
-    """How much farther a joint moved than bounds of its move allow, of the same unit."""
-    return max(move - high, low - move, 0.0)
+Numbers = TypeVar("Numbers", float, Array)
+
+
+def farthest(velocity: Numbers, period: Numbers) -> Numbers:
+    """How far a joint may move between two samples by its velocity limit, rad or m.
+
+    :param velocity: the limit; ``period``: between their stamps, s.
+    """
+    return velocity * (FACTOR * period + SLACK)
 
 
 @dataclass(frozen=True)
@@ -69,7 +79,9 @@ class Steps:
         return [(int(k), int(np.argmax(self.jumps[k] * self.sizes[k]))) for k in rows]
 
 
-def steps_of(time: Array, q: Array, qd: Array | None, limit: Sequence[float] | None) -> Steps:
+def steps_of(
+    time: Array, q: Array, qd: Array | None, limit: Sequence[float] | Array | None
+) -> Steps:
     """Judge the steps of a recording.
 
     :param time: rising, shape (k,), s; q and qd, where it is measured, shape (k, n).
@@ -90,17 +102,16 @@ def steps_of(time: Array, q: Array, qd: Array | None, limit: Sequence[float] | N
         speed = np.maximum(speed, np.quantile(np.abs(qd), FEW, axis=0))
     floor = 2.0 * SIGMAS * _noise(q) + 2.0 * tick
     off = SIGMAS * ROBUST * float(np.median(np.abs(span - period)))
-    slack = min(SLACK, max(period, off)) * speed + floor
-    near = span[:, 0] <= GAP * period
+    slack = max(min(SLACK, period), off) * speed + floor
+    near = span[:, 0] <= (GAP if qd is not None else 1.5) * period
     sizes = np.maximum(np.maximum(move - high * span, low * span - move), 0.0)
-    if qd is None:
+    if qd is None and near.any():
         # Rates of steps miss what happens within a few steps.
-        slack = slack + SIGMAS * np.quantile(sizes, FEW, axis=0)
+        slack = slack + SIGMAS * np.quantile(sizes[near], NEARLY, axis=0)
     sizes = np.where(near[:, None] & (sizes > slack), sizes, 0.0)
     if limit is not None:
-        bound = 2.0 * np.asarray(limit)
-        beyond = np.maximum(steps - bound * span, 0.0)
-        sizes = np.maximum(sizes, np.where(beyond > SLACK * np.asarray(limit), beyond, 0.0))
+        bound = farthest(np.asarray(limit, np.float64), span)
+        sizes = np.where(steps > bound, np.maximum(sizes, steps), sizes)
     jumps = sizes > 0.0
     publishers: tuple[int, ...] = ()
     if np.mean(jumps.any(1)) > OFTEN or (qd is None and _alternates(move, slack)):
@@ -123,10 +134,10 @@ def _nearest(q: Array) -> Array:
 def _noise(q: Array) -> Array:
     """Standard deviation of the positions' noise, (n,), of one publisher or of each of two."""
     found = np.full(q.shape[1], np.inf)
-    for lag in (1, 2):
+    for lag in (1, 2, 3):
         if len(q) > 2 * lag:
             bent = np.abs(q[2 * lag :] - 2.0 * q[lag:-lag] + q[: -2 * lag])
-            found = np.minimum(found, np.quantile(bent, 0.2, axis=0) / QUINTILE)
+            found = np.minimum(found, np.quantile(bent, LEAST, axis=0) / OF_NOISE)
     return np.where(np.isfinite(found), found, 0.0)
 
 
@@ -154,7 +165,7 @@ def _publishers(q: Array, slack: Array) -> tuple[int, ...]:
     """Samples of two tracks that are each smooth, where the samples are from two; else nothing."""
     scale = 1.0 / np.maximum(slack, 1e-300)
     rows = (q * scale).tolist()
-    last, counts, seen, jumps = [rows[0]], [1], [0], 0
+    last, counts, seen, jumps, turns, current = [rows[0]], [1], [0], 0, 0, 0
     for k, row in enumerate(rows[1:], 1):
         far = [max(abs(a - b) for a, b in zip(row, other, strict=True)) for other in last]
         nearest = far.index(min(far))
@@ -165,9 +176,14 @@ def _publishers(q: Array, slack: Array) -> tuple[int, ...]:
                 seen.append(k)
                 continue
             jumps += 1
+        turns += nearest != current
+        current = nearest
         last[nearest], seen[nearest] = row, k
         counts[nearest] += 1
     if len(counts) < 2 or min(counts) < PUBLISHER * len(rows) or jumps > OFTEN * len(rows):
+        return ()
+    # A stretch that is off is one publisher's.
+    if turns < min(counts) / BEFORE:
         return ()
     return tuple(counts)
 

@@ -2,15 +2,23 @@
 """check: recordings that the model contradicts, and what cannot be judged."""
 
 import json
+import re
+from collections import Counter
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from pkm_twin.apps.topics import JOINT_STATE
+from delta_dynamics import inverse_dynamics
+from pkm_twin.apps.check import judged
+from pkm_twin.apps.recorded import Recording
+from pkm_twin.apps.topics import JOINT_STATE, Topics
 from pkm_twin.bags.reader import inspect, read_messages
 from test.bags.folders import make_folder
-from test.commands.conftest import DELTA, JOINTS, MILLING, STIFFNESS, rewrite
-from test.support.robots import massless, partly_long
+from test.commands.conftest import COLLISION, DELTA, JOINTS, MILLING, STIFFNESS, rewrite
+from test.identification.machines import machine
+from test.support.robots import load, massless, partly_long
 
 
 def scaled_efforts(topic, message, time):
@@ -59,6 +67,37 @@ def doubled_joint(topic, message, time):
     return message
 
 
+def glitch(topic, message, time):
+    if topic == JOINTS and 0.9995 < time < 1.0015:
+        message.position = [message.position[0], message.position[1] + 0.3, message.position[2]]
+    return message
+
+
+def other_publisher(topic, message, time):
+    if topic == JOINTS and round(1e3 * time) % 2:
+        message.position, message.velocity = [0.3] * 3, [0.0] * 3
+        message.effort = [0.0] * 3
+    return message
+
+
+def lost(topic, message, time):
+    return None if topic == JOINTS and round(1e3 * time) % 20 == 7 else message
+
+
+def velocity_negated(topic, message, time):
+    if topic == JOINTS:
+        message.velocity = [-message.velocity[0], *message.velocity[1:]]
+    return message
+
+
+def stuck(topic, message, time):
+    if topic == JOINTS and 0.5 < time < 0.7:
+        message.position = [stuck.at, *message.position[1:]]
+    elif topic == JOINTS:
+        stuck.at = message.position[0]
+    return message
+
+
 def items_of(result):
     data = json.loads(result.out)
     return {item["what"]: item for item in data["items"]}
@@ -96,6 +135,11 @@ def test_a_cut_out_part_is_good(twin, sample):
         (beyond_a_limit, "messages that a node rejects", "allowed -0.9 to 1.3"),
         (beyond_an_effort_limit, "effort limits", "-0.5 N m"),
         (doubled_joint, "messages that a node rejects", "arm_1"),
+        (glitch, "position steps", "at 1.000 s"),
+        (other_publisher, "position steps", "two publishers interleaved, 600 and 600 samples"),
+        (lost, "missing samples", "60 of 1200"),
+        (velocity_negated, "velocities", "arm_1 200 % (wrong sign?)"),
+        (stuck, "velocities", "arm_1 stands still from 0.500 s to 0.69"),
     ],
 )
 def test_a_fault_is_bad_and_named(twin, tmp_path, change, what, value):
@@ -105,6 +149,21 @@ def test_a_fault_is_bad_and_named(twin, tmp_path, change, what, value):
     item = items_of(result)[what]
     assert item["verdict"] == "bad"
     assert value in item["value"]
+
+
+def test_a_collision_is_bad_with_its_time(twin):
+    """Also without knowing the contact's wrench, which no sensor measures."""
+    result = twin("check", COLLISION, "--json")
+    data = json.loads(result.out)
+    began = float(inspect(COLLISION).metadata["pkm_twin"]["contact_begins_s"])
+    assert (result.code, data["answer"]) == (1, "bad")
+    for joint in (1, 2, 3):
+        item = items_of(result)[f"torque residual of arm_{joint}"]
+        assert item["verdict"] == "bad"
+        found = float(re.search(r"begins at ([\d.]+) s", item["value"]).group(1))
+        assert abs(found - began) < 0.02
+    (cause,) = data["causes"]
+    assert f"before {found:.3f} s" in cause
 
 
 @pytest.mark.parametrize("effort", [0.0, 0.1])
@@ -353,3 +412,76 @@ def test_rosbag2_folders_go_straight_in(twin, tmp_path, mode):
     assert twin("torques", "delta_cu", folder, "--out", out, "--no-picture").code == 0
     assert twin("recover", folder, tmp_path / "saved.mcap").code == 0
     assert twin("check", tmp_path / "saved.mcap", "--robot", "delta_cu").code == 0
+
+
+class TestCauses:
+    """What explains a bad residual is said, and nothing else."""
+
+    def cause(self, recording):
+        report = judged(recording, thorough=False)
+        assert report.answer == "bad"
+        return report.causes
+
+    def test_a_payload_with_its_times(self, rng):
+        robot, mass = load("delta"), float(rng.uniform(0.1, 0.3))
+        m = machine(robot, rng, 8.0, 500.0)
+        carried = robot.changed(payload={"mass": mass})
+        held = (m.time > 2.0) & (m.time < 6.0)
+        efforts = np.where(
+            held[:, None], inverse_dynamics(carried, m.q, m.qd, m.qdd),
+            inverse_dynamics(robot, m.q, m.qd, m.qdd),
+        )  # fmt: skip
+        (text,) = self.cause(recording_of(robot, m, efforts))
+        found = [float(x) for x in re.findall(r"[\d.]+(?=[, ]|$)", text.partition("--payload")[2])]
+        assert found == pytest.approx([mass, 2.0, 6.0], rel=0.15)
+
+    def test_a_wrench_in_other_axes_or_of_the_other_sign(self, rng):
+        robot = load("stewart")
+        m = machine(robot, rng, 4.0, 250.0)
+        wrench = rng.normal(0.0, 200.0, 6) * np.sin(np.outer(m.time, rng.uniform(1.0, 3.0, 6)))
+        wrench[:, 3:] *= 0.1
+        efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd, wrench)
+        rotation = robot.rotation(robot.forward(m.q))
+        wrong = np.concatenate(
+            [np.einsum("kji,kj->ki", rotation, wrench[:, k : k + 3]) for k in (0, 3)], 1
+        )
+        made = recording_of(robot, m, efforts)
+        assert judged(replace(made, wrench=wrench)).answer == "good"
+        for given, word in ((-wrench, "opposite sign"), (wrong, "axes")):
+            (text,) = self.cause(replace(made, wrench=given))
+            assert word in text
+
+    def test_a_saturated_sensor(self, rng):
+        robot = load("delta")
+        m = machine(robot, rng, 6.0, 250.0)
+        efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd)
+        made, most = recording_of(robot, m, efforts), 0.7 * np.abs(efforts[:, 1]).max()
+        made.effort[:, 1] = np.clip(made.effort[:, 1], -most, most)
+        (text,) = self.cause(made)
+        assert robot.joint_names[1] in text and f"{most:.4g}" in text
+
+    @pytest.mark.long
+    def test_friction_that_the_file_has_not(self, rng):
+        robot = load("delta")
+        m = machine(robot, rng, 8.0, 200.0)
+        true = robot.changed(friction={"viscous": [0.1] * 3, "coulomb": [0.2] * 3})
+        efforts = inverse_dynamics(true, m.q, m.qd, m.qdd)
+        report = judged(recording_of(robot, m, efforts))
+        assert report.answer == "bad" and "friction" in report.causes[0]
+
+    def test_what_nothing_explains_has_no_cause(self, rng):
+        robot = load("delta")
+        m = machine(robot, rng, 6.0, 250.0)
+        efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd)
+        wave = np.abs(efforts).max(0) * np.sin(np.outer(m.time, [3.1, 4.3, 5.7]))
+        assert self.cause(recording_of(robot, m, efforts + wave)) == ()
+
+
+def recording_of(robot, m, efforts):
+    """A recording of a drawn motion, with efforts (samples, n) of 0.5 % noise."""
+    noise = np.random.default_rng(3).normal(size=efforts.shape)
+    efforts = efforts + 0.005 * np.sqrt(np.mean(efforts**2, 0)) * noise
+    stamps = np.round(1e9 * m.time).astype(np.int64)
+    return Recording(
+        robot, None, Topics("drawn"), None, stamps, m.time, m.q, m.qd, efforts, None, Counter(), ""
+    )

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""fit and check judge a recording alike: one filter, one noise model, one verdict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkm_twin import Robot
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.compare import compare
+from pkm_twin.identification.fit import Fit, fit
+from pkm_twin.identification.fit_rows import Recorded
+from pkm_twin.robot.entries import with_entries
+from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
+from test.support.robots import load
+
+BOUND = 0.05
+"""Of the residual, as `check` has it by default."""
+MACHINES = (
+    "delta", "delta_cu", "five_bar", "linear_delta", "prru", "rps3", "stewart",
+    "machines/rsur", "machines/prru3", "machines/rcuu",
+)  # fmt: skip
+FAULTS = ("one_effort_negated", "effort_columns_swapped", "half_speed", "kilogram_force")
+
+
+def fitted(result: Fit) -> Robot:
+    return with_entries(result.robot, {number.name: number.after for number in result.numbers})
+
+
+def agree(robot: Robot, recorded: Recorded) -> str:
+    """What a fit says; and `check` has to say the same, of the fitted machine or of the file's."""
+    try:
+        result = fit(robot, [recorded], ("friction", "rotor"))
+    except PkmTwinError:
+        found = compare(robot, recorded)
+        assert found is None or not found.good(BOUND).all()
+        return "rejected"
+    compared = compare(fitted(result), recorded)
+    assert compared is not None
+    good = bool(compared.good(BOUND).all())
+    if result.verdict.answer == "explains":
+        assert good
+        np.testing.assert_allclose(compared.late, result.delays[0], atol=0.2 * compared.period)
+    elif result.verdict.answer == "does not explain":
+        assert not good
+    return result.verdict.answer
+
+
+def path_of(name: str) -> str:
+    kind, _, rest = name.partition("/")
+    return f"test/machine/machines/{rest}.yaml" if rest else kind
+
+
+@pytest.mark.parametrize("name", ["delta", pytest.param("five_bar", marks=pytest.mark.long)])
+def test_an_encoder_s_noise_is_not_the_model_s_fault(name: str) -> None:
+    """Velocities by the noise of 500 Hz positions would be far off."""
+    rng = np.random.default_rng([5, *name.encode()])
+    m = machine(load(name), rng, 10.0, 500.0)
+    recorded = replace(noisy(m.recorded(), rng), q=m.q + 2e-5 * rng.normal(size=m.q.shape))
+    result = fit(m.robot, [recorded], ("friction", "payload"))
+    assert result.verdict.answer == "explains"
+    friction = {n.name: n.after for n in result.numbers if n.name.startswith("friction")}
+    robot = with_entries(m.truth, friction)
+    compared = compare(robot, recorded)
+    assert compared is not None and compared.good(BOUND).all()
+    held_out = result.judged[0]
+    rms = held_out.rms(held_out.after)
+    assert compared.rms == pytest.approx(rms, abs=0.01 * float(compared.peak.max()))
+
+
+def test_efforts_that_are_late_leave_noise_alone() -> None:
+    """Whatever the delay, it is found, and with it the residual is the noise of the efforts."""
+    rng = np.random.default_rng(11)
+    m = machine(load("delta"), rng, 8.0, 500.0)
+    for late in rng.uniform(-8e-3, 8e-3, 3):
+        made = noisy(m.recorded(effort=shifted(m.efforts, m.time, late)), rng)
+        found = compare(m.truth, made)
+        assert found is not None
+        assert found.late == pytest.approx(late, abs=2e-4)
+        assert (found.rms < 2.0 * found.noise).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", MACHINES)
+def test_fit_and_check_agree(name: str) -> None:
+    rng = np.random.default_rng([7, *name.encode()])
+    m = machine(load(path_of(name)), rng)
+    # The payload is the file's: what is fitted can explain all.
+    sound = noisy(m.recorded(), rng)
+    bare = m.robot.changed(payload={"mass": m.truth.payload.mass, "com": list(m.truth.payload.com),
+                                    "inertia": m.truth.payload.inertia.tolist()})  # fmt: skip
+    assert agree(bare, sound) == "explains"
+    for what in (*FAULTS, "gain"):
+        if what == "effort_columns_swapped" and bare.joints_count == 1:
+            continue
+        made = noisy(WRONG[what](m, rng), rng) if what in WRONG else IMPOSSIBLE[what](sound, rng)
+        agree(bare, made)
