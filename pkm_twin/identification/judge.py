@@ -55,6 +55,8 @@ ABSURD: Final = 10.0
 """Times its usual size from which an error, beyond doubt, is another model's."""
 MAYBE: Final = 4
 """Findings without a usual size that may be none; the others are taken for certain."""
+DOUBT: Final = 0.2
+"""Part of a correction that is uncertain, as effects of errors are taken to be linear."""
 HARM: Final = 3.0
 """Standard deviations of a fitted number by which an unseen error is worth a word."""
 UNSEEN: Final = 3
@@ -316,8 +318,8 @@ def _posterior(
         np.sqrt(weight) * np.concatenate([half, (middle - mean)[None]])
         for weight, (middle, half) in zip(weights, parts, strict=True)
     ]
-    # Effects are linear and the noise is an estimate.
-    return mean, WIDEN * np.asarray(np.linalg.qr(np.concatenate(factors), mode="r"), np.float64)
+    rows = np.concatenate([WIDEN * one for one in factors] + [DOUBT * mean[None]])
+    return mean, np.asarray(np.linalg.qr(rows, mode="r"), np.float64)
 
 
 def _blind(
