@@ -14,7 +14,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from pkm_twin.apps import export, maps  # noqa: F401  maps adds its commands to atlas
+from pkm_twin.apps import export, maps
 from pkm_twin.apps.calibrate import calibrate_command
 from pkm_twin.apps.certify_command import certify
 from pkm_twin.apps.check_command import check
@@ -48,7 +48,6 @@ from pkm_twin.apps.tables import tables
 from pkm_twin.apps.trend import trend
 from pkm_twin.apps.vibration import frf, lobes
 from pkm_twin.apps.view.command import view
-from pkm_twin.atlas import commands as atlases
 from pkm_twin.console import (
     flush_output,
     print_json,
@@ -348,7 +347,8 @@ def recover(
 
 
 app.command()(certify)
-app.add_typer(atlases.app, name="atlas")
+app.add_typer(maps.app, name="map")
+app.add_typer(maps.app, name="atlas", hidden=True)
 app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
 app.command("printer")(printer_command)
@@ -369,7 +369,6 @@ app.command()(view)
 app.command()(tables(fit))
 app.command()(excite)
 app.command()(record_kit)
-app.command()(atlases.show)
 
 
 def _finite(data: Any) -> Any:

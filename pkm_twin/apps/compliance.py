@@ -8,7 +8,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from pkm_twin.apps import export, maps  # noqa: F401  maps adds its commands to atlas
 from pkm_twin.apps.options import BeyondLimits, Json, RobotName
 from pkm_twin.console import numbers, print_json
 from pkm_twin.errors import PkmTwinError

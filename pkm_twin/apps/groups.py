@@ -13,7 +13,7 @@ WIDE: Final = 200
 TASKS: Final = {
     "Robots": ("robots", "info", "view", "certify", "urdf", "convert"),
     "Torques, paths and drives": ("torques", "path", "feed", "size", "loads"),
-    "Stiffness, workspace and vibration": ("compliance", "atlas", "show", "frf", "lobes"),
+    "Stiffness, workspace and vibration": ("compliance", "map", "frf", "lobes"),
     "Recordings": ("check", "trend", "recover", "play", "monitor-torques"),
     "Identification and calibration": (
         "record-kit", "excite", "fit", "drive-friction", "calibrate", "printer",

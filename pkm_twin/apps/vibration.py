@@ -27,7 +27,7 @@ from pkm_twin.files import STANDARD
 from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText, file_name
 
 if TYPE_CHECKING:
-    from pkm_twin.atlas.maps.milling import Process
+    from pkm_twin.atlas.kinds.cutting_depth import CuttingDepth
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Lobes, Milling
     from stiffness_monitor.vibration import ToolModes
@@ -83,16 +83,16 @@ def parse_damping(text: str | None) -> list[float] | None:
 def process_of(
     teeth: int, tangential: float, radial: float, immersion: float, up: bool, feed: float,
     tool: str, damping: str | None,
-) -> Process:  # fmt: skip
+) -> CuttingDepth:  # fmt: skip
     """The milling process of a command line.
 
     :raises ParameterError: a number out of range.
     """
-    from pkm_twin.atlas.maps.milling import Process
+    from pkm_twin.atlas.kinds.cutting_depth import CuttingDepth
     from stiffness_monitor.chatter import Milling
 
     ratios = parse_damping(damping)
-    return Process(
+    return CuttingDepth(
         Milling(teeth, tangential, radial, immersion, up, math.radians(feed)),
         None if ratios is None else tuple(ratios),
         tuple(numbers(tool, 3, "a tool point: x,y,z")),

@@ -62,12 +62,12 @@ def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
     return data.getvalue()
 
 
-def save(figure: Any, path: Path) -> Path:
+def save(figure: Any, path: Path, dpi: int = 110) -> Path:
     """Write a figure as PNG, whole or not at all, and close it.
 
     :raises AtlasError: the file cannot be written.
     """
-    data = rendered(figure, 110)
+    data = rendered(figure, dpi)
     with writing(path):
         replace_file(path, data)
     return path

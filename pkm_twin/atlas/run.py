@@ -26,8 +26,9 @@ from typing import Any, Final, Protocol
 import pkm_twin
 from pkm_twin.atlas.extras import require
 from pkm_twin.atlas.store import AtlasError, Parts, join, save_part, writing
-from pkm_twin.atlas.sweep import Chunk, Sweep, Values
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.atlas.sweep import Chunk, Map
+from pkm_twin.atlas.variables import Values
+from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.threads import one_blas_thread_for_children
 
 Progress = Callable[[int], None]
@@ -45,7 +46,7 @@ IN_FLIGHT: Final = 2
 
 
 class Task(Protocol):
-    """Work that workers get whole with each of its parts, as :class:`Sweep` with its chunks."""
+    """Work that workers get whole with each of its parts, as :class:`Map` with its chunks."""
 
     @property
     def fingerprint(self) -> str:
@@ -60,7 +61,7 @@ class ClusterError(PkmTwinError):
 
 
 def run(
-    sweep: Sweep,
+    sweep: Map,
     out: Path,
     *,
     workers: int | None = None,
@@ -91,7 +92,16 @@ def run(
         parts = Parts(out, sweep)
         parts.open(overwrite)
         try:
-            _fill(sweep, parts, workers, scheduler, progress or (lambda _: None))
+            tell = progress or (lambda _: None)
+            _fill(sweep, parts, False, workers, scheduler, tell)
+            # Deterministic, so that a run that is resumed has the same planes.
+            try:
+                sweep = sweep.searched(parts.grid())
+            except ParameterError:
+                # Nothing to continue from: no pose counts.
+                parts.drop()
+                raise
+            _fill(sweep, parts, True, workers, scheduler, tell)
             join(sweep, parts, out)
             parts.drop()
         finally:
@@ -100,16 +110,21 @@ def run(
 
 
 def _fill(
-    sweep: Sweep, parts: Parts, workers: int | None, scheduler: str | None, tell: Progress
+    sweep: Map,
+    parts: Parts,
+    planes: bool,
+    workers: int | None,
+    scheduler: str | None,
+    tell: Progress,
 ) -> None:
-    """Compute the chunks that are not there yet."""
+    """Compute the chunks of the grid or of the planes that are not there yet."""
     chunks = sweep.chunks()
-    pending = set(parts.pending())
-    done = sum(sweep.count(chunk) for i, chunk in enumerate(chunks) if i not in pending)
+    pending = parts.pending()
+    done = sum(map(sweep.count, chunks)) - sum(sweep.count(chunks[i]) for i in pending)
     tell(done)
-    work = [(i, chunks[i]) for i in sorted(pending)]
+    work = [(i, chunks[i]) for i in pending if (chunks[i].plane is not None) == planes]
     results: Iterator[tuple[int, Values | None]]
-    if scheduler is not None:
+    if scheduler is not None and work:
         results = on_cluster(sweep, work, scheduler)
     else:
         count = workers or os.cpu_count() or 1
@@ -122,14 +137,14 @@ def _fill(
         tell(done)
 
 
-def here(sweep: Sweep, work: Work) -> Iterator[tuple[int, Values]]:
+def here(sweep: Map, work: Work) -> Iterator[tuple[int, Values]]:
     """Chunks one after the other in this process."""
     for index, chunk in work:
         yield index, sweep.evaluate(chunk)
 
 
 def on_cores(
-    sweep: Sweep, work: Work, workers: int, folder: Path
+    sweep: Map, work: Work, workers: int, folder: Path
 ) -> Iterator[tuple[int, Values | None]]:
     """Chunks on processes of this machine, in the order in which they are done.
 
@@ -153,7 +168,7 @@ def on_cores(
                 raise ClusterError(f"processes died {ATTEMPTS} times in this sweep") from None
 
 
-def _pool(sweep: Sweep, work: Work, workers: int, folder: Path) -> Iterator[int]:
+def _pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[int]:
     # Not forked: the parent has threads (the progress bar's).
     context = multiprocessing.get_context("spawn")
     # Once, and here: a pool that cannot pass its work on waits for ever.
@@ -263,9 +278,9 @@ def _keep(packed: bytes, chunk: Chunk, folder: Path, index: int) -> int:
 
 
 @functools.lru_cache(1)
-def _unpacked(packed: bytes) -> Sweep:
+def _unpacked(packed: bytes) -> Map:
     # Once a process: what the robot derives for its first chunk serves all.
-    sweep: Sweep = pickle.loads(packed)  # noqa: S301  from the parent
+    sweep: Map = pickle.loads(packed)  # noqa: S301  from the parent
     return sweep
 
 

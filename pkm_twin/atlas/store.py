@@ -17,7 +17,7 @@ import re
 import socket
 import sys
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
@@ -26,12 +26,14 @@ import numpy as np
 
 from pkm_twin.atlas.extras import require
 from pkm_twin.atlas.soundness import SEALED, nonsense, seal, seal_holds
-from pkm_twin.atlas.sweep import Chunk, Sweep, Values
+from pkm_twin.atlas.variables import FORMAT, Values
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.files import replace_file
 
 if TYPE_CHECKING:
     from xarray import Dataset
+
+    from pkm_twin.atlas.sweep import Chunk, Map
 
 _MARK: Final = "sweep.json"
 _LOCK: Final = "lock"
@@ -53,6 +55,11 @@ class AtlasError(PkmTwinError):
 def _short(path: Path) -> str:
     text = str(path)
     return text if len(text) <= 200 else f"{text[:120]}...{text[-60:]}"
+
+
+def source(data: Dataset) -> Path:
+    """The file that a map came from, for errors."""
+    return Path(str(data.encoding.get("source", "map")))
 
 
 @contextmanager
@@ -86,7 +93,7 @@ def reading(path: Path) -> Iterator[None]:
 class Parts:
     """The finished chunks of one sweep, in ``<target>.parts``."""
 
-    def __init__(self, out: Path, sweep: Sweep) -> None:
+    def __init__(self, out: Path, sweep: Map) -> None:
         self.folder = out.with_name(out.name + ".parts")
         self._sweep = sweep
         self._chunks = sweep.chunks()
@@ -174,15 +181,22 @@ class Parts:
         """Keep a finished chunk."""
         save_part(self.folder, index, values)
 
+    def grid(self) -> list[Values]:
+        """What the chunks of the grid say besides their fields, in the order of the grid."""
+        chunks = [k for k, chunk in enumerate(self._chunks) if chunk.plane is None]
+        return [self._read(index, ("starts", "counts")) for index in chunks]
+
     def __iter__(self) -> Iterator[tuple[Chunk, Values]]:
-        """All chunks in the order of the grid."""
+        """All chunks with their values, in order."""
         for index, chunk in enumerate(self._chunks):
-            try:
-                with np.load(self._path(index), allow_pickle=False) as data:
-                    values = {name: data[name] for name in data.files}
-            except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-                raise AtlasError(self._path(index), f"damaged ({error}); remove it") from None
-            yield chunk, values
+            yield chunk, self._read(index)
+
+    def _read(self, index: int, names: Sequence[str] = ()) -> Values:
+        try:
+            with np.load(self._path(index), allow_pickle=False) as data:
+                return {name: data[name] for name in names or data.files}
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            raise AtlasError(self._path(index), f"damaged ({error}); remove it") from None
 
     def drop(self) -> None:
         """Remove what runs wrote, and the folder if it is empty then."""
@@ -260,7 +274,7 @@ class _Sink(io.RawIOBase):
         return size or 0
 
 
-def join(sweep: Sweep, parts: Parts, out: Path) -> None:
+def join(sweep: Map, parts: Parts, out: Path) -> None:
     """Write the NetCDF file of a finished sweep, chunk by chunk.
 
     :raises AtlasError: a damaged chunk.
@@ -285,39 +299,36 @@ def join(sweep: Sweep, parts: Parts, out: Path) -> None:
         hidden.unlink(missing_ok=True)
 
 
-def _join(sweep: Sweep, parts: Parts, sink: _Sink) -> None:
+def _join(sweep: Map, parts: Parts, sink: _Sink) -> None:
     h5netcdf = require("h5netcdf", "atlas")
+    summaries = sweep.summaries(parts.grid())
     with h5netcdf.File(sink, "w") as file:
-        file.dimensions = sweep.sizes
+        file.dimensions = sweep.sizes | {
+            dim: size
+            for variable in summaries.values()
+            for dim, size in zip(variable.dims, variable.values.shape, strict=True)
+        }
         for key, value in (sweep.attributes | SEALED).items():
             file.attrs[key] = value
-        for name, coordinate in sweep.coordinates.items():
+        for name, coordinate in (sweep.coordinates | summaries).items():
             _write(file, name, coordinate.dims, coordinate.values, coordinate.attrs)
-        targets = {}
-        others = [name for name, c in sweep.coordinates.items() if c.dims != (name,)]
-        for name, field in sweep.fields.items():
+        sizes = sweep.sizes
+        fields = sweep.fields
+        for name, field in fields.items():
             fill = np.nan if np.dtype(field.dtype).kind == "f" else None
-            sizes = [sweep.sizes[dim] for dim in field.dims]
-            chunks = (1, min(sweep.rows_a_chunk, sizes[1]), *sizes[2:])
+            shape = [sizes[dim] for dim in field.dims]
+            # As large as what is written at once.
+            rows = (1, *shape[1:3], 1) if field.dims[0] == "plane" else (sweep.rows, *shape[1:])
+            chunks = tuple(min(sides) for sides in zip(rows, shape, strict=True))
             target = file.create_variable(
                 name, field.dims, field.dtype, fillvalue=fill, chunks=chunks, **_STORED
             )
             target.attrs.update(_typed(field.attrs, field.dtype))
-            own = [o for o in others if set(sweep.coordinates[o].dims) <= set(field.dims)]
-            if own:
-                target.attrs["coordinates"] = " ".join(own)
-            targets[name] = target
-
-        def written() -> Iterator[Values]:
-            for chunk, values in parts:
-                if sink.error is not None:
-                    raise sink.error
-                for name, target in targets.items():
-                    target[chunk.first, chunk.start : chunk.stop] = values[name]
-                yield {name: values[name] for name in values if name not in targets}
-
-        for name, result in sweep.summaries(written()).items():
-            _write(file, name, result.dims, result.values, result.attrs)
+        for chunk, values in parts:
+            if sink.error is not None:
+                raise sink.error
+            for name in values.keys() & fields.keys():
+                file[name][chunk.place(fields[name].dims)] = values[name]
 
 
 def _write(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any) -> None:
@@ -386,9 +397,9 @@ def open_atlas(path: Path) -> Dataset:
         raise AtlasError(path, "damaged, or changed by another program: its checksum differs")
     data = _opened(xarray, path)
     try:
-        missing = [name for name in _ATTRIBUTES if name not in data.attrs]
-        if missing:
-            what = f"no map, or one of another version: it has no {missing[0]!r}"
+        if data.attrs.get("format") != FORMAT:
+            older = "kind" in data.attrs and "robot" in data.attrs
+            what = "made by an earlier version: build it again" if older else "no map"
             raise AtlasError(path, what)
         if whole is None and SEALED.keys() <= data.attrs.keys():
             what = "damaged, or written by another program: its checksum is missing"
@@ -401,6 +412,3 @@ def open_atlas(path: Path) -> Dataset:
         data.close()
         raise
     return data
-
-
-_ATTRIBUTES: Final = ("title", "kind", "robot", "settings", "pose", "layout", "lateral")

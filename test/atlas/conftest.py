@@ -3,20 +3,17 @@ import fcntl
 import os
 import pickle
 
-import numpy as np
 import pytest
 
 pytest.importorskip("xarray")
 pytest.importorskip("h5netcdf")
 pytest.importorskip("h5py")
 
-from pkm_twin.atlas import modes, workspace
-from pkm_twin.atlas.isotropy.sweep import isotropy_sweep
-from pkm_twin.atlas.modes.sweep import modes_sweep
+from pkm_twin.atlas.kinds import KINDS
+from pkm_twin.atlas.kinds.strain_energy import StrainEnergy
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import open_atlas
-from pkm_twin.atlas.strain_energy.sweep import strain_energy_sweep
-from pkm_twin.atlas.workspace.sweep import workspace_sweep
+from pkm_twin.atlas.sweep import map_of
 from test.support.robots import load
 
 
@@ -33,17 +30,21 @@ def same(one, other):
     return True
 
 
-LAYERS = 25
-"""Heights of the circles of small atlases."""
-WHOLE = "whole"
-"""Of as many heights as a command's atlas, in the name of one."""
-MAKE = {
-    "strain-energy": lambda robot: strain_energy_sweep(robot, "P1"),
-    "coarse-energy": lambda robot: strain_energy_sweep(robot, "P1", 4000),
-    "isotropy": lambda robot: isotropy_sweep(robot, 8000),
-    "workspace": lambda robot: workspace_sweep(robot, 4000),
-    "modes": lambda robot: modes_sweep(robot, 60),
-}
+POINTS = {"modes": 60, "frequency": 60, "workspace": 4000, "isotropy": 2000}
+
+
+class Few(StrainEnergy):
+    """Many chunks and a short search."""
+
+    chunk = 169
+    samples = 64
+    population = 8
+    rounds = 4
+
+
+def few(points=2000):
+    """A map of many chunks under a force upwards."""
+    return map_of(load("upr_rpu"), Few(), points)
 
 
 class Atlases:
@@ -66,14 +67,10 @@ class Atlases:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if path.exists():
                 return pickle.loads(kept.read_bytes()), path
-            kind, robot, *whole = name.split()
-            with pytest.MonkeyPatch.context() as patch:
-                if whole != [WHOLE]:
-                    for module in (workspace.sweep, modes.sweep):
-                        patch.setattr(module, "LAYERS", LAYERS)
-                sweep = MAKE[kind](load(robot))
-                kept.write_bytes(pickle.dumps(sweep))
-                return sweep, run(sweep, path, workers=1)
+            kind, robot = name.split()
+            sweep = map_of(load(robot), KINDS[kind](), POINTS.get(kind, 3000))
+            kept.write_bytes(pickle.dumps(sweep))
+            return sweep, run(sweep, path, workers=1)
 
 
 @pytest.fixture(scope="session")
@@ -87,10 +84,7 @@ def small_atlases(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def strain(small_atlases):
-    """The default strain-energy atlas under P1: its sweep and its file, computed alone."""
-    return small_atlases.get("strain-energy upr_rpu")
-
-
-def finite(values):
-    return values[np.isfinite(values)]
+def strain(tmp_path_factory):
+    """A strain-energy map of many chunks: its sweep and its file, computed alone."""
+    sweep = few()
+    return sweep, run(sweep, tmp_path_factory.mktemp("few") / "strain.nc", workers=1)

@@ -15,26 +15,17 @@ import llvmlite
 import psutil
 
 from pkm_twin import load
-from pkm_twin.atlas.isotropy.sweep import isotropy_sweep
-from pkm_twin.atlas.modes.sweep import modes_sweep
-from pkm_twin.atlas.strain_energy.sweep import strain_energy_sweep
-from pkm_twin.atlas.workspace.sweep import workspace_sweep
+from pkm_twin.atlas.kinds import KINDS
+from pkm_twin.atlas.sweep import map_of
 
-SWEEPS = {
-    "workspace": workspace_sweep,
-    "strain-energy": strain_energy_sweep,
-    "isotropy": isotropy_sweep,
-    "modes": modes_sweep,
-}
-KINDS = (
-    ("strain-energy", "upr_rpu", 10**6, "strain energy (total, nine factors, dominant element)"),
-    ("isotropy", "prru", 10**6, "isotropy (eta_KE, F_max), by direction"),
-    ("isotropy", "delta_cu", 10**6, "isotropy (eta_KE, F_max), by direction"),
-    ("workspace", "upr_rpu", 10**6, "workspace (reach, singularity, clearance, passive angles)"),
-    ("workspace", "delta_cu", 10**6, "workspace (reach, singularity, clearance)"),
-    ("workspace", "prru", 10**6, "workspace (reach, singularity, clearance)"),
-    ("modes", "upr_rpu", 10**4, "modes (six frequencies)"),
-    ("modes", "delta_cu", 10**4, "modes (six frequencies)"),
+MEASURED = (
+    ("strain-energy", "upr_rpu", 10**6, "strain energy (total, nine shares, direction)"),
+    ("compliance", "delta_cu", 10**6, "compliance and its direction"),
+    ("payload", "delta_cu", 10**6, "payload"),
+    ("isotropy", "delta_cu", 10**5, "isotropy (eta_KE and F_max in the worst directions)"),
+    ("workspace", "delta_cu", 10**6, "workspace (singularity, clearance)"),
+    ("workspace", "stewart", 10**6, "workspace (singularity, clearance)"),
+    ("frequency", "delta_cu", 10**4, "first frequency"),
 )
 SECONDS = 4.0
 """Processor time that a rate is measured over."""
@@ -44,8 +35,8 @@ RUNS = ((10**6, 2), (10**7, 2), (10**6, 1), (10**7, 1))
 
 def rate(kind: str, robot: str, points: int) -> float:
     """Samples a second of processor time, of chunks alone, kernels compiled before."""
-    sweep = SWEEPS[kind](load(robot), points=points)
-    chunks = [chunk for chunk in sweep.chunks() if sweep.count(chunk)]
+    sweep = map_of(load(robot), KINDS[kind](), points)
+    chunks = [chunk for chunk in sweep.chunks() if chunk.plane is None]
     sweep.evaluate(chunks[0])
     done, begin = 0, time.process_time()
     for chunk in itertools.cycle(chunks):
@@ -62,8 +53,8 @@ def command(points: int, processes: int, out: Path) -> tuple[float, int]:
 
     Memory is the sum of proportional set sizes: pages that processes share count once.
     """
-    words = ["atlas", "upr_rpu", "strain-energy", "--points", str(points), "--no-picture"]
-    words += ["--out", str(out), "--workers", str(processes), "--overwrite"]
+    words = ["map", "upr_rpu", "strain-energy", "--points", str(points), "--no-picture"]
+    words += ["--out", str(out), "--jobs", str(processes), "--overwrite"]
     begin = time.monotonic()
     process = psutil.Popen([sys.executable, "-m", "pkm_twin.apps.cli", *words])
     peak = 0
@@ -88,9 +79,9 @@ def power(value: float) -> str:
 
 def page() -> str:
     """docs/scale.md."""
-    rates = {(kind, robot): rate(kind, robot, points) for kind, robot, points, _ in KINDS}
+    rates = {(kind, robot): rate(kind, robot, points) for kind, robot, points, _ in MEASURED}
     first = "\n".join(
-        f"| {what} | {robot} | {power(rates[kind, robot])} |" for kind, robot, _, what in KINDS
+        f"| {what} | {robot} | {power(rates[kind, robot])} |" for kind, robot, _, what in MEASURED
     )
     second = []
     with tempfile.TemporaryDirectory() as folder:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`pkm-twin atlas` and `pkm-twin show` from the command line to the pictures."""
+"""`pkm-twin map` from the command line to the pictures."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -14,18 +15,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pkm_twin.atlas import kinds
+from pkm_twin.atlas.kinds import KINDS
 from pkm_twin.atlas.run import run
 from pkm_twin.atlas.store import Parts, open_atlas
-from pkm_twin.atlas.strain_energy.sweep import strain_energy_sweep
+from pkm_twin.atlas.sweep import map_of
 from test.atlas.conftest import same
 from test.support.command import forked
-from test.support.robots import load, partly_long
+from test.support.robots import load
 
 ROOT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "pkm_twin.apps.cli"]
-SWEEP = ["atlas", "upr_rpu", "strain-energy", "--wrench", "P2", "--points", "20000"]
-SPHERES = ["atlas", "prru", "isotropy", "--points", "2000"]
+SWEEP = ["map", "upr_rpu", "strain-energy", "--points", "100000", "--no-picture"]
+SMALL = ["map", "five_bar", "workspace", "--points", "1000"]
 
 
 def environment():
@@ -33,15 +34,9 @@ def environment():
     return {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
 
 
-@pytest.fixture(scope="module")
-def sweep():
-    """What the command SWEEP computes."""
-    return strain_energy_sweep(load("upr_rpu"), "P2", 20_000)
-
-
 @pytest.fixture
 def call(twin, tmp_path, monkeypatch):
-    """Run a command in the test's folder, in this process: call("show", "a.nc", code=1)."""
+    """Run a command in the test's folder, in this process: call("map", "show", "a.nc", code=1)."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
 
@@ -53,40 +48,36 @@ def call(twin, tmp_path, monkeypatch):
     return called
 
 
-def test_an_atlas_says_what_made_it(call, tmp_path):
-    few = [*SWEEP[:-1], "2000"]
-    out = call(*few, "--out", "a.nc", "--no-picture", "--workers", "1").out
-    assert "paper, table 2" in out
-    with open_atlas(tmp_path / "a.nc") as data:
-        assert data.attrs["robot"] == "upr_rpu"
-        assert "youngs_modulus" in data.attrs["robot_parameters"]
-        assert data.attrs["pkm_twin_version"]
-        assert data.energy.dims == ("z", "tilt", "azimuth")
-        assert data.energy.attrs["units"] == "J"
-
-
-@pytest.mark.parametrize(
-    "words", partly_long([SWEEP, SPHERES], SPHERES), ids=lambda words: words[2]
-)
-def test_atlas_to_pictures_and_show(words, call, tmp_path):
+def test_a_map_to_pictures_and_shown_again(call, tmp_path):
+    """The answer is the first line; the file says what made it; `atlas` is the older name."""
     pytest.importorskip("plotly")
-    out = call(*words, "--out", "a.nc", "--workers", "1").out
-    figures = kinds.KINDS[words[2]].figures
-    for name in figures:
-        picture = tmp_path / f"a_{name}.png"
+    out = call(*SMALL, "--out", "a.nc", "--jobs", "1").out
+    assert "reaches" in out.splitlines()[0]
+    with open_atlas(tmp_path / "a.nc") as data:
+        assert data.attrs["robot"] == "five_bar"
+        assert "arm" in data.attrs["robot_parameters"]
+        names = [str(name) for name in data.case.values]
+        assert f"{float(data.volume):.4g} {data.volume.attrs['units']}" in out
+    for name in names:
+        picture = tmp_path / (f"a_{name}.png" if len(names) > 1 else "a.png")
         assert picture.read_bytes().startswith(b"\x89PNG")
-        assert str(picture.name) in out
-    call("show", "a.nc", "--out", "b", "--html")
-    for name in figures:
-        assert (tmp_path / f"b_{name}.png").exists()
+        assert picture.name in out
+    told = json.loads(call("atlas", "show", "a.nc", "--out", "b", "--html", "--json").out)
+    assert all((tmp_path / name).exists() for name in told["pictures"])
     assert "Plotly" in (tmp_path / "b.html").read_text()
 
 
-def test_interrupted_and_resumed(call, small_atlases, tmp_path):
+def test_planes_go_through_a_given_pose(call, tmp_path):
+    call("map", "five_bar", "payload", "--points", "60", "--at", "0.05,0.3", "--out", "a.nc")
+    with open_atlas(tmp_path / "a.nc") as data:
+        assert data.through.values.tolist() == [[0.05, 0.3]]
+        assert 0.05 in data.row_value.values and 0.3 in data.column_value.values
+
+
+def test_interrupted_and_resumed(call, tmp_path):
     """Ctrl-C leaves finished parts; the same command goes on, with the same file."""
-    words = ["atlas", "prru", "modes", "--points", "60", "--no-picture"]
     process = subprocess.Popen(
-        [*COMMAND, *words, "--out", "cut.nc"],
+        [*COMMAND, *SWEEP, "--out", "cut.nc"],
         cwd=tmp_path,
         env=environment(),
         stderr=subprocess.PIPE,
@@ -105,31 +96,33 @@ def test_interrupted_and_resumed(call, small_atlases, tmp_path):
     assert "continues from there" in errors
     assert parts.exists()
     assert not (tmp_path / "cut.nc").exists()
-    call(*words, "--out", "cut.nc", "--workers", "1")
+    call(*SWEEP, "--out", "cut.nc", "--jobs", "1")
     assert not parts.exists()
-    assert same(small_atlases["modes prru whole"], tmp_path / "cut.nc")
+    call(*SWEEP, "--out", "whole.nc", "--jobs", "1")
+    assert same(tmp_path / "whole.nc", tmp_path / "cut.nc")
 
 
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [
-        (["atlas", "five_bar", "isotropy"], 1, "three pose coordinates"),
-        (["atlas", "delta", "pose-error"], 1, "uncertainty"),
-        (["atlas", "delta", "weather"], 1, "workspace"),
-        (["atlas", "upr_rpu", "strain-energy", "--wrench", "1,2"], 2, "six numbers"),
-        (["atlas", "delta", "modess"], 1, "did you mean 'modes'"),
-        (["atlas", "delt", "modes"], 1, "did you mean"),
-        (["atlas", "delta", "workspace", "--wrench", "P1"], 2, "--wrench"),
-        (["atlas", "prru", "isotropy", "--least-clearance", "0.1"], 2, "--least-clearance"),
-        (["atlas", "upr_rpu", "strain-energy", "--beyond-limits"], 2, "--beyond-limits"),
-        (["atlas", "upr_rpu", "strain-energy", "--wrench", "0,0,0,0,0,0"], 1, "not zero"),
-        (["atlas", "prru", "isotropy", "--height", "nan"], 1, "height"),
-        (["atlas", "delta", "workspace", "--points", "9" * 18], 2, "--points"),
+        (["delta", "pose-error"], 1, "uncertainty"),
+        (["delta", "weather"], 1, "workspace"),
+        (["delta", "show", "a.nc"], 1, "workspace"),
+        (["upr_rpu", "strain-energy", "--wrench", "1,2"], 2, "six numbers"),
+        (["delta", "modess"], 1, "did you mean 'modes'"),
+        (["delt", "modes"], 1, "did you mean"),
+        (["delta", "workspace", "--wrench", "0,0,1,0,0,0"], 2, "--wrench"),
+        (["upr_rpu", "strain-energy", "--energy", "3"], 2, "--energy"),
+        (["upr_rpu", "strain-energy", "--wrench", "0,0,0,0,0,0"], 1, "not all zero"),
+        (["prru", "isotropy", "--energy", "nan"], 1, "energy"),
+        (["delta", "payload", "--at", "1,2"], 2, "a pose"),
+        (["delta", "payload", "--at", "5,5,5"], 1, "pose"),
+        (["delta", "workspace", "--points", "9" * 18], 2, "--points"),
         (["show", "none.nc"], 1, "none.nc"),
     ],
 )
 def test_refusals_are_one_line(words, code, text, call, tmp_path):
-    result = call(*words, code=code)
+    result = call("map", *words, code=code)
     assert text in result.err
     assert "Traceback" not in result.err
     assert list(tmp_path.iterdir()) == []
@@ -138,18 +131,16 @@ def test_refusals_are_one_line(words, code, text, call, tmp_path):
 
 
 def test_each_kind_says_its_own_options(call):
-    shared = {"--points", "--out", "--workers", "--scheduler", "--html", "--overwrite"}
-    bounds = {"--least-singularity", "--least-clearance"}
+    shared = {"--points", "--out", "--jobs", "--at", "--along", "--singularity", "--payload"}
     own = {
-        "workspace": bounds,
-        "strain-energy": {"--wrench", "--payload", "--along", *bounds},
-        "isotropy": {"--height", "--energy", "--beyond-limits"},
-        "modes": set(),
+        "workspace": set(),
+        "strain-energy": {"--wrench"},
+        "isotropy": {"--energy"},
+        "cutting-depth": {"--teeth", "--tangential", "--damping"},
     }
-    whole = call("atlas", "delta", "--help")
-    assert whole.code == 0 and all(kind in whole.out for kind in own)
+    assert all(kind in call("map", "delta", "--help").out for kind in KINDS)
     for kind, options in own.items():
-        text = call("atlas", "delta", kind, "--help").out
+        text = call("map", "delta", kind, "--help").out
         for option in set().union(shared, *own.values()):
             assert (option in text) == (option in shared | options)
 
@@ -164,7 +155,7 @@ def test_damaged_atlases_are_one_line(strain, tmp_path):
             damaged[rng.integers(0, 60_000)] ^= 255
         (tmp_path / "b.nc").write_bytes(damaged)
         # HDF5 may end the process.
-        result = forked(tmp_path, "show", "b.nc")
+        result = forked(tmp_path, "map", "show", "b.nc")
         assert result.code == 1, result
         assert result.err.startswith("pkm-twin: b.nc: ")
         assert result.err.count("\n") == 1
@@ -172,26 +163,28 @@ def test_damaged_atlases_are_one_line(strain, tmp_path):
 
 def test_output_that_cannot_be_written_is_one_line(call, small_atlases, tmp_path):
     shutil.copy(small_atlases["workspace delta_cu"], tmp_path / "a.nc")
-    result = forked(tmp_path, "show", "a.nc", out="/dev/full")
+    result = forked(tmp_path, "map", "show", "a.nc", out="/dev/full")
     assert result.code == 1
     assert result.err.count("\n") == 1
-    (tmp_path / "a_sections.png").unlink(missing_ok=True)
-    (tmp_path / "a_sections.png").mkdir()
-    result = call("show", "a.nc", code=1)
-    assert "a_sections.png" in result.err
+    (tmp_path / "a_clearance.png").unlink(missing_ok=True)
+    (tmp_path / "a_clearance.png").mkdir()
+    result = call("map", "show", "a.nc", code=1)
+    assert "a_clearance.png" in result.err
     assert result.err.count("\n") == 1
 
 
-@pytest.mark.parametrize("limit", [20_000, 1_000_000])
-def test_a_full_disk_costs_no_finished_chunk(limit, sweep, tmp_path):
+@pytest.mark.parametrize("limit", [20_000, 2_500_000])
+def test_a_full_disk_costs_no_finished_chunk(limit, tmp_path):
     """While chunks are written, and while HDF5 joins them: one line, and the rest goes on."""
     out = tmp_path / "a.nc"
-    words = [*SWEEP, "--no-picture", "--workers", "1", "--out", out]
-    ended = forked(tmp_path, *words, limit=limit)
+    ended = forked(tmp_path, *SWEEP, "--jobs", "1", "--out", out, limit=limit)
     assert ended.code == 1, ended
     assert ended.err.count("\n") == 1
     assert "File too large" in ended.err
     assert not out.exists()
     assert not list(tmp_path.rglob("*.tmp"))
+    sweep = map_of(load("upr_rpu"), KINDS["strain-energy"](), 100_000)
+    left = len(Parts(out, sweep).pending())
+    assert left == (0 if limit > 20_000 else len(sweep.chunks()))
     run(sweep, out, workers=1)
     assert not Parts(out, sweep).folder.exists()

@@ -4,26 +4,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from delta_dynamics import inverse_dynamics
-from pkm_twin.atlas.maps.milling import Process
-from pkm_twin.atlas.maps.quantity import Case
-from pkm_twin.atlas.maps.sweep import (
-    LEAST,
-    QUANTITIES,
-    counts,
-    evolved,
-    found_of,
-    map_sweep,
-    worst_of,
-)
+from delta_dynamics import energy_transfer, inverse_dynamics, max_driving_force
+from pkm_twin.atlas.figures import shown
+from pkm_twin.atlas.kind import counts, found_of
+from pkm_twin.atlas.kinds import KINDS
+from pkm_twin.atlas.kinds.cutting_depth import CuttingDepth
+from pkm_twin.atlas.kinds.frequency import Frequency
 from pkm_twin.atlas.run import run
+from pkm_twin.atlas.search import evolved, worst_of
 from pkm_twin.atlas.store import open_atlas
+from pkm_twin.atlas.sweep import map_of
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.robot.catalogue import robot_of_data
@@ -37,6 +32,7 @@ from test.support.robots import ELASTIC, SHIPPED, load, often, parameters_of, pa
 
 DRIVEN = [name for name, robot in SHIPPED.items() if robot.limits.effort is not None]
 WRENCH = (20.0, -10.0, 30.0, 0.5, -0.3, 0.2)
+LEAST = 0.05
 LENGTHS = {
     "geometry.arm_length": {"deviation": 1e-4},
     "geometry.base_radius": {"deviation": 2e-4},
@@ -53,7 +49,13 @@ def states(robot, rng, count, least=LEAST):
 
 
 def found(robot, name, q, wrench=None):
-    return found_of(QUANTITIES[name], robot, q, Case("case", wrench))
+    kind = KINDS[name]()
+    return found_of(kind, robot, q, [case_of(kind, robot, wrench)])[0]
+
+
+def case_of(kind, robot, wrench=None, name="case"):
+    """The case of a load, or the kind's own first."""
+    return kind.cases(robot)[0] if wrench is None else kind.loaded(robot, name, wrench)
 
 
 def directions(rng, count):
@@ -157,25 +159,31 @@ WORST = ("delta compliance", "five_bar acceleration")
 def test_no_pose_is_worse_than_the_worst(what, count, rng, tmp_path):
     name, kind = what.split()
     robot = load(name)
-    sweep = map_sweep(robot, kind, 200)
+    sweep = map_of(robot, KINDS[kind](), 200)
     with open_atlas(run(sweep, tmp_path / "a.nc", workers=1)) as data:
         worst, pose = float(data.worst_value[0]), data.worst_pose.values[0]
-        stored = data.value.values
+        stored = np.concatenate([data.value.values.ravel(), data.plane_value.values.ravel()])
+        for plane in data.isel(case=0).transpose("plane", ...).plane_value:
+            # Every plane goes exactly through the worst pose, and has its value there.
+            assert (plane.values == worst).sum() >= 1
+        assert (data.through.values == data.worst_pose.values).all()
     q = robot.inverse(pose)
     assert found(robot, kind, q[None]).value[0] == pytest.approx(worst, rel=1e-9)
     assert robot.singularity(q) >= LEAST * (1 - 1e-9)
     low, high = robot.limits.position.T
     assert ((q >= low) & (q <= high)).all()
     tried = found(robot, kind, states(robot, rng, count)).value
-    bad = (lambda values: values) if sweep.quantity.largest else (lambda values: -values)
+    bad = (lambda values: values) if sweep.cases[0].largest else (lambda values: -values)
     assert bad(tried).max() <= bad(worst) + 1e-9 * abs(worst)
     assert np.nanmax(bad(stored)) <= bad(worst) + 1e-9 * abs(worst)
 
 
 def test_a_stored_map_has_all_cases_and_is_nan_where_no_pose_counts(tmp_path):
     robot = load("five_bar")
-    cases = [Case("push", (50.0, 0.0, 0.0, 0.0, 0.0, 0.0)), Case("lift", (0.0, 0.0, 50.0, 0, 0, 0))]
-    sweep = map_sweep(robot, "strain-energy", 400, cases=cases)
+    kind = KINDS["strain-energy"]()
+    loads = {"push": (50.0, 0.0, 0.0, 0.0, 0.0, 0.0), "lift": (0.0, 0.0, 50.0, 0.0, 0.0, 0.0)}
+    cases = [kind.loaded(robot, name, wrench) for name, wrench in loads.items()]
+    sweep = map_of(robot, kind, 400, cases=cases)
     with open_atlas(run(sweep, tmp_path / "a.nc", workers=1)) as data:
         grid = np.stack(np.meshgrid(data.x, data.z, indexing="ij"), -1)
         inside = reachable(robot, grid)
@@ -195,7 +203,7 @@ def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
     (tmp_path / "path.csv").write_text(points)
     done = command(
         capsys,
-        "atlas",
+        "map",
         "five_bar",
         "acceleration",
         "--along",
@@ -225,7 +233,7 @@ def test_milling_depths_are_those_of_each_pose(capsys, tmp_path, monkeypatch):
     rows = [",".join(map(repr, [0.1 * k, *pose.tolist()])) for k, pose in enumerate(poses)]
     (tmp_path / "path.csv").write_text("\n".join([header, *rows]) + "\n")
     done = command(
-        capsys, "atlas", "upr_rpu", "cutting-depth", "--teeth", "2", "--tangential", "600e6",
+        capsys, "map", "upr_rpu", "cutting-depth", "--teeth", "2", "--tangential", "600e6",
         "--radial", "0.3", "--immersion", "0.5", "--up", "--feed", "30", "--tool", "0,0,-0.1",
         "--damping", "0.03,0.02", "--along", "path.csv", "--out", "a.csv", "--no-picture", "--json",
     )  # fmt: skip
@@ -234,20 +242,23 @@ def test_milling_depths_are_those_of_each_pose(capsys, tmp_path, monkeypatch):
     assert told["value"] == pytest.approx(min(each)) and told["unit"] == "m"
     assert told["element"].startswith("mode ")
     # A process goes with its map, so that another does not continue it.
-    sweeps = [
-        map_sweep(robot, Process(each, damping, tool), 60)
+    maps = [
+        map_of(robot, CuttingDepth(each, damping, tool), 60)
         for each in (milling, Milling(3, 600e6, 0.3, 0.5))
     ]
-    assert sweeps[0].settings != sweeps[1].settings and sweeps[0].kind == "cutting-depth"
+    assert maps[0].fingerprint != maps[1].fingerprint
 
 
 def test_a_search_finds_what_is_best_at_the_border(rng):
     """The highest place of a ramp over a disc, also with few looks."""
-    few = replace(QUANTITIES["frequency"], population=8, rounds=30)
+
+    class Few(Frequency):
+        population, rounds = 8, 30
+
     best = [
         evolved(
             lambda x: np.where((x**2).sum(1) <= 1.0, x[:, 0] + 0.2 * x[:, 1], -np.inf),
-            rng.uniform(-0.7, 0.7, (8, 2)), np.full(2, -1.0), np.ones(2), few, rng, inside,
+            rng.uniform(-0.7, 0.7, (8, 2)), np.full(2, -1.0), np.ones(2), Few(), rng, inside,
         )[1]
         for inside in (lambda x: (x**2).sum(1) <= 1.0, None)
     ]  # fmt: skip
@@ -258,7 +269,7 @@ def test_a_search_finds_what_is_best_at_the_border(rng):
 def test_the_lowest_frequency_is_found():
     """The Delta rings lowest where the singularity index is as low as it may be."""
     robot = load("delta")
-    sweep = map_sweep(robot, "frequency")
+    sweep = map_of(robot, Frequency())
     worst = worst_of(sweep, sweep.cases[0], np.empty((0, 3)))
     assert robot.singularity(worst.q) == pytest.approx(LEAST, abs=2e-3)
     # 44.03 Hz by five times the rounds.
@@ -329,7 +340,7 @@ def test_ranges_of_passive_hinges_slides_and_rods(tmp_path):
 def test_what_a_file_lacks_is_named(kind, changes, field):
     data = {k: v for k, v in (parameters_of("delta") | changes).items() if v is not None}
     with pytest.raises(ParameterError) as caught:
-        map_sweep(robot_of_data(data, "delta"), kind)
+        map_of(robot_of_data(data, "delta"), KINDS[kind]())
     assert caught.value.field == field
 
 
@@ -345,3 +356,58 @@ def test_angular_acceleration_of_a_wrist(rng):
         qdd = np.linalg.solve(robot.platform_jacobian(q[k])[3:], value * ways.T).T
         share = np.abs(inverse_dynamics(robot, np.tile(q[k], (101, 1)), 0 * qdd, qdd))
         assert (share / robot.limits.effort).max() == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", partly_long(DRIVEN, "delta", "rps3"))
+def test_speeds_are_brute_force(name, rng):
+    """At the speed found the first drive is at its limit, in no direction before."""
+    robot = load(name)
+    if robot.limits.velocity is None:
+        pytest.skip("no velocity limits")
+    q = states(robot, rng, 60)[:4]
+    places = [k for k, n in enumerate(robot.pose_names) if n in "xyz"]
+    fast = found(robot, "speeds", q)
+    for k, value in enumerate(fast.value):
+        ways = np.vstack([fast.direction[k], directions(rng, 200)])
+        rates = np.zeros((len(ways), len(robot.pose_names)))
+        rates[:, places] = value * ways[:, ["xyz".index(robot.pose_names[p]) for p in places]]
+        share = np.abs(np.linalg.solve(robot.jacobian(q[k]), rates.T).T) / robot.limits.velocity
+        assert share[0].max() == pytest.approx(1.0, rel=1e-9)
+        assert share[0].argmax() == fast.element[k]
+        assert share.max() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("name", partly_long(["prru", "delta_cu", "five_bar"], "delta_cu"))
+def test_isotropy_is_that_of_directions(name, rng):
+    """The extremes over directions hold all samples, and are attained in the direction found."""
+    robot = load(name)
+    q = states(robot, rng, 60)[:3]
+    kind = KINDS["isotropy"]()
+    energy, force = found_of(kind, robot, q, kind.cases(robot))
+    ways = rng.normal(size=(300, len(robot.pose_names)))
+    for k, pose in enumerate(robot.forward(q)):
+        assert energy_transfer(robot, pose, energy.direction[k]) == pytest.approx(energy.value[k])
+        assert (energy_transfer(robot, pose, ways) >= energy.value[k] * (1 - 1e-9)).all()
+        assert max_driving_force(robot, pose, force.direction[k]) == pytest.approx(force.value[k])
+        assert (max_driving_force(robot, pose, ways) <= force.value[k] * (1 + 1e-9)).all()
+
+
+@pytest.mark.parametrize("name", partly_long(["stewart", "five_bar", "delta"], "stewart"))
+def test_a_workspace_in_which_nothing_counts_names_the_cause(name):
+    robot = load(name)
+    sweep = map_of(robot, KINDS["compliance"](), 60, least_singularity=0.999)
+    with pytest.raises(ParameterError, match=r"singularity index below 0\.999"):
+        worst_of(sweep, sweep.cases[0], np.empty((0, len(robot.pose_names))))
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (7.276, "kg", "7.276 kg"), (7276.0, "kg", "7.276 t"), (0.0123, "kg", "12.3 g"),
+        (3.277e-5, "m/N", "32.77 µm/N"), (2.5e-4, "m", "250 µm"), (1234.0, "m/s2", "1234 m/s2"),
+        (1.23e4, "J", "12.3 kJ"), (0.5, "rad", "28.65 deg"), (12.0, "rad/s2", "12 rad/s2"),
+        (0.05, "", "0.05"), (4.4e4, "Hz", "44 kHz"), (0.0, "N m", "0 N m"),
+    ],
+)  # fmt: skip
+def test_units_have_prefixes_that_exist(value, unit, text):
+    assert shown(value, unit) == text

@@ -20,24 +20,23 @@ from pkm_twin.atlas import run as running
 from pkm_twin.atlas.extras import MissingExtraError
 from pkm_twin.atlas.run import ClusterError, on_cluster, run
 from pkm_twin.atlas.store import AtlasError, Parts, open_atlas
-from pkm_twin.atlas.strain_energy.sweep import WRENCHES, strain_energy_sweep
 from pkm_twin.design.pose_path import PosePath
 from pkm_twin.design.sweep import sweep as design_sweep
 from pkm_twin.errors import PkmTwinError
-from test.atlas.conftest import same
+from test.atlas.conftest import few, same
 from test.atlas.scale import command
 from test.atlas.test_commands import environment
 
 
 @pytest.fixture(scope="module")
 def small():
-    """A sweep of few poses under P1; the circles of all heights are what it costs."""
-    return strain_energy_sweep(load("upr_rpu"), "P1", 1000)
+    """A map of few poses."""
+    return few(500)
 
 
-def under(sweep, wrench):
-    """The sweep of another wrench."""
-    return replace(sweep, wrench=WRENCHES[wrench])
+def other(sweep):
+    """The map under another wrench."""
+    return replace(sweep, cases=(sweep.kind.loaded(sweep.robot, "x", (1.0, 0, 0, 0, 0, 0)),))
 
 
 class Stop(Exception):
@@ -104,13 +103,6 @@ def test_robots_pass_between_processes(name):
     assert copy.name == robot.name
     assert (copy.inverse(home) == robot.inverse(home)).all()
     assert (copy.home() == home).all()
-
-
-@pytest.mark.long
-def test_isotropy_on_processes(small_atlases, tmp_path):
-    sweep, _ = small_atlases.get("isotropy prru")
-    out = run(sweep, tmp_path / "a.nc", workers=2)
-    assert same(small_atlases["isotropy prru"], out)
 
 
 @pytest.fixture(scope="module")
@@ -189,15 +181,15 @@ def test_chunks_of_another_sweep_are_refused(small, tmp_path):
     out = tmp_path / "a.nc"
     with pytest.raises(Stop):
         run(small, out, workers=1, progress=stop_after(2))
-    other = under(small, "P2")
+    another = other(small)
     with pytest.raises(AtlasError, match="another sweep"):
-        run(other, out, workers=1)
+        run(another, out, workers=1)
     changed = small.robot.changed(members={"shear_factor": 1.1})
     with pytest.raises(AtlasError, match="another sweep"):
         run(replace(small, robot=changed), out, workers=1)
-    run(other, out, workers=1, overwrite=True)
+    run(another, out, workers=1, overwrite=True)
     with pytest.raises(AtlasError, match="exists"):
-        run(other, out, workers=1)
+        run(another, out, workers=1)
 
 
 def test_a_damaged_chunk_is_named(small, tmp_path):
@@ -253,9 +245,9 @@ def test_one_run_at_a_time_works_on_an_atlas(held):
     """The second names the first, drops nothing, and goes on when the first is gone."""
     sweep, out, parts = held
     for overwrite in (False, True):
-        for other in (sweep, under(sweep, "P2")):
+        for another in (sweep, other(sweep)):
             with pytest.raises(AtlasError, match=f"process {os.getpid()} on .* works on this"):
-                run(other, out, workers=1, overwrite=overwrite)
+                run(another, out, workers=1, overwrite=overwrite)
     assert 0 not in parts.pending()
     parts.close()
     run(sweep, out, workers=1)

@@ -40,7 +40,7 @@ def commands(deflections, target):
         ".csv": (*EXCITE, "--out", f"{stem}.mcap"),
         ".png": ("info", "five_bar", "--picture", f"{stem}.png"),
         ".bag": ("recover", SOFT, f"{stem}.bag"),
-        ".nc": ("atlas", "five_bar", "workspace", "--points", 1000, "--out", f"{stem}.nc"),
+        ".nc": ("map", "five_bar", "workspace", "--points", 1000, "--out", f"{stem}.nc"),
     }
 
 
@@ -195,7 +195,7 @@ def test_names_of_anything_in_titles_and_comments(tmp_path, deflections):
         ("info", five.name, "--picture", f"{ODD}.png"),
         (*EXCITE, "--out", "motion.mcap"),
         ("torques", five.name, "motion.csv", "--out", f"torques {ODD}.csv"),
-        ("atlas", five.name, "workspace", "--points", 1000, "--out", f"{ODD}.nc", "--html"),
+        ("map", five.name, "workspace", "--points", 1000, "--out", f"{ODD}.nc", "--html"),
         ("urdf", robot.name),
         ("info", robot.name, "--json"),
     ):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a machine reaches: the box of all its poses, and the circles about its axis.
+"""The box of all poses that a machine reaches.
 
 A robot tells how its poses are laid out (``robot.grid()``) and where they end
 (``robot.search_box()``); nothing here knows a mechanism.
@@ -8,25 +8,16 @@ A robot tells how its poses are laid out (``robot.grid()``) and where they end
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import (
-    CLEAR,
-    circle_radii,
-    reachable,
-    try_forward,
-)
+from pkm_twin.robot.workspace import reachable, try_forward
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 JOINT_STATES: Final = 2**14
 """Joint states, evenly spread between the limits, whose poses bound a workspace."""
@@ -38,32 +29,6 @@ FULL: Final = 3
 """Most pose coordinates of which a whole grid is made."""
 
 
-def cylinder(robot: Robot, what: str) -> PoseGrid:
-    """The robot's layout, which has to be one about an axis.
-
-    :param what: what needs the axis, for the error.
-    :raises ParameterError: the poses lie in a box.
-    """
-    grid = robot.grid()
-    if grid.kind != "cylinder":
-        raise ParameterError(
-            "robot", robot.name, f"a robot whose poses lie about an axis for {what}"
-        )
-    return grid
-
-
-def height_range(robot: Robot) -> tuple[float, float]:
-    """Heights outside of which nothing is reachable, m."""
-    low, high = robot.search_box()[robot.pose_names.index(robot.grid().height)]
-    return float(low), float(high)
-
-
-def largest_distance(robot: Robot) -> float:
-    """Distance from the axis beyond which nothing is looked for, m or rad."""
-    lateral = [robot.pose_names.index(name) for name in robot.grid().lateral]
-    return float(np.abs(robot.search_box()[lateral]).max())
-
-
 def workspace_box(robot: Robot) -> Array:
     """Bounds of all reachable poses, limb interference aside, a little wider; shape (m, 2).
 
@@ -72,18 +37,6 @@ def workspace_box(robot: Robot) -> Array:
 
     :raises ParameterError: nothing bounds the workspace, or it is empty.
     """
-    return _once(robot, "box", lambda: _workspace_box(robot)).copy()
-
-
-def _once(robot: Robot, key: Hashable, make: Callable[[], Array]) -> Array:
-    """What maps of one robot ask for again and again, computed once a robot."""
-    kept: dict[Hashable, Array] = robot.calls.setdefault("workspace", {})
-    if key not in kept:
-        kept[key] = make()
-    return kept[key]
-
-
-def _workspace_box(robot: Robot) -> Array:
     bounds = np.asarray(robot.search_box(), np.float64)
     # With what interference takes away, which atlases show.
     found = _from_joints(robot)
@@ -157,78 +110,4 @@ def _farthest(robot: Robot, limits: Array, q: Array, k: int, sign: float) -> Arr
         good[good] = reachable(robot, poses[good], -math.inf)
         good &= sign * (poses[:, k] - best[:, k]) > 0.0
         q, best = np.where(good[:, None], tried, q), np.where(good[:, None], poses, best)
-    return best
-
-
-def turns(count: int) -> Array:
-    """Angles all around, evenly spaced from 0, shape (count,), rad."""
-    return ladder(2 * np.pi / count, count)
-
-
-def ladder(step: float, count: int) -> Array:
-    """Multiples of a step from 0, shape (count,)."""
-    return np.asarray(step * np.arange(count), np.float64)
-
-
-def nice(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above a value."""
-    power = 10.0 ** math.floor(math.log10(value) + 1e-12)
-    return power * max(k for k in (1, 2, 5) if k * power <= value * (1 + 1e-12))
-
-
-@dataclass(frozen=True, eq=False)
-class Reach:
-    """Largest reachable circles about the axis: heights z (n,), m, radii (n,), m or rad.
-
-    Radius 0 where the axis itself is out of reach.
-    """
-
-    z: Array
-    radius: Array
-
-
-def circles(
-    robot: Robot,
-    heights: ArrayLike,
-    steps: int = 340,
-    least: float = 0.0,
-    least_clearance: float = 0.0,
-) -> Reach:
-    """The largest circle about the axis at each height that is reachable with all its inside.
-
-    :param heights: shape (n,), m.
-    :param steps: first search along each of 360 rays; a bisection refines it.
-    :param least: singularity measure below which a pose counts as out of reach; ``CLEAR`` at least.
-    :param least_clearance: what the limbs' clearance has to be above, m.
-    """
-    z = np.atleast_1d(np.asarray(heights, np.float64))
-    cylinder(robot, "circles about it")
-    least, step = max(least, CLEAR), largest_distance(robot) / steps
-    radius = _once(
-        robot,
-        (z.tobytes(), steps, least, least_clearance),
-        lambda: circle_radii(robot, z, step, steps, least=least, least_clearance=least_clearance),
-    )
-    return Reach(z, radius.copy())
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """The largest upright cylinder about the axis in a stack of circles, m (radius m or rad)."""
-
-    low: float
-    high: float
-    radius: float
-
-
-def largest_cylinder(reach: Reach) -> Cylinder:
-    """The cylinder of greatest radius squared times height between two of the heights."""
-    best, volume = Cylinder(math.nan, math.nan, 0.0), 0.0
-    for i in range(len(reach.z)):
-        thin = np.minimum.accumulate(reach.radius[i:])
-        volumes = thin**2 * (reach.z[i:] - reach.z[i])
-        j = int(volumes.argmax())
-        if volumes[j] > volume:
-            volume = float(volumes[j])
-            best = Cylinder(float(reach.z[i]), float(reach.z[i + j]), float(thin[j]))
     return best
