@@ -103,12 +103,12 @@ def design_command(
     on the path or, without --path, over the workspace.
     """
     from pkm_twin.apps import design_report as report
-    from pkm_twin.atlas.run import on_cluster
     from pkm_twin.design import design as find
     from pkm_twin.design import sweep as sweep_box
     from pkm_twin.design.optimise import searches
     from pkm_twin.design.sweep import here
     from pkm_twin.design.variables import parse_vary
+    from pkm_twin.maps.run import on_cluster
 
     for target in (out, picture):
         if target is not None:

@@ -265,7 +265,7 @@ def spectra(loads: list[JointLoad]) -> str:
 
 def draw(motion: Motion, loads: list[JointLoad], path: Path) -> None:
     """Forces of the joints with the largest ones over time, and their rainflow spectra."""
-    from pkm_twin.atlas import figures, plots
+    from pkm_twin.maps import figures, plots
     from pkm_twin.paths.durability import rainflow
 
     sizes = {load.name: np.linalg.norm(load.wrench[:, :3], axis=-1) for load in loads if load.known}

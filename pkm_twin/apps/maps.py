@@ -28,9 +28,9 @@ from pkm_twin.apps.vibration import (
     Up,
     process_of,
 )
-from pkm_twin.atlas.kinds import KINDS
 from pkm_twin.console import numbers, print_json, progress, refuse_existing
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.maps.kinds import KINDS
 from pkm_twin.options import (
     Commands,
     OptionalFloat,
@@ -47,7 +47,7 @@ from pkm_twin.threads import one_blas_thread
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from pkm_twin.atlas.kind import Case, Found, Kind
+    from pkm_twin.maps.kind import Case, Found, Kind
     from pkm_twin.robot.robot import Robot
 
 Array = NDArray[np.float64]
@@ -222,8 +222,8 @@ def _compute(kind: Kind, wrenches: Sequence[str], options: _Options) -> None:
     """Compute a kind of map of the context's robot, and draw it."""
     from pkm_twin import load
     from pkm_twin.apps.options import load_of
-    from pkm_twin.atlas.run import run
-    from pkm_twin.atlas.sweep import map_of
+    from pkm_twin.maps.run import run
+    from pkm_twin.maps.sweep import map_of
 
     machine = load(options.context.obj, platform=options.platform)
     carried = load_of(options.payload, None)
@@ -276,11 +276,11 @@ def _cases(kind: Kind, machine: Robot, texts: Sequence[str]) -> list[Case]:
 
 def _present(file: Path, picture: bool, html: bool, as_json: bool, out: Path | None = None) -> None:
     """Print what a stored map answers, and draw it."""
-    from pkm_twin.atlas import figures
-    from pkm_twin.atlas.page import write_page
-    from pkm_twin.atlas.store import open_atlas, reading
+    from pkm_twin.maps import figures
+    from pkm_twin.maps.page import write_page
+    from pkm_twin.maps.store import open_map, reading
 
-    with open_atlas(file) as data:
+    with open_map(file) as data:
         with reading(file):
             lines, worst = figures.lines(data), figures.answers(data)
         target = out or file
@@ -315,9 +315,9 @@ def _along(
 ) -> None:
     """Print the worst of each case along a path; write table and picture where asked."""
     from pkm_twin.apps.torques import motion_of
-    from pkm_twin.atlas import figures
-    from pkm_twin.atlas.kind import counts, found_of
-    from pkm_twin.atlas.sweep import check
+    from pkm_twin.maps import figures
+    from pkm_twin.maps.kind import counts, found_of
+    from pkm_twin.maps.sweep import check
 
     out = options.out
     drawing = out.with_suffix(".png") if out is not None and options.picture else None
@@ -409,7 +409,7 @@ def _draw(
     cases: Sequence[Case], found: Sequence[Found], elements: Sequence[str],
 ) -> None:  # fmt: skip
     """The values of each case over time, in the colours of the elements to blame."""
-    from pkm_twin.atlas import figures, plots
+    from pkm_twin.maps import figures, plots
 
     count = len(found)
     indices = [one.element for one in found if one.element is not None and elements]

@@ -27,7 +27,7 @@ from pkm_twin.files import STANDARD
 from pkm_twin.options import OptionalFloat, OptionalPath, OptionalText, file_name
 
 if TYPE_CHECKING:
-    from pkm_twin.atlas.kinds.cutting_depth import CuttingDepth
+    from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Lobes, Milling
     from stiffness_monitor.vibration import ToolModes
@@ -88,7 +88,7 @@ def process_of(
 
     :raises ParameterError: a number out of range.
     """
-    from pkm_twin.atlas.kinds.cutting_depth import CuttingDepth
+    from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
     from stiffness_monitor.chatter import Milling
 
     ratios = parse_damping(damping)
@@ -221,7 +221,7 @@ def _print(data: dict[str, Any], text: list[str], as_json: bool, out: Path | Non
 
 
 def _draw_response(grid: Array, response: Any, modes: ToolModes, title: str, path: Path) -> None:
-    from pkm_twin.atlas import plots
+    from pkm_twin.maps import plots
 
     figure, axes = plots.columns(1, 2)
     size, phase = axes[0]
@@ -323,7 +323,7 @@ def _place(found: Lobes, k: int) -> dict[str, Any]:
 
 
 def _draw_lobes(found: Lobes, milling: Milling, title: str, path: Path) -> None:
-    from pkm_twin.atlas import plots
+    from pkm_twin.maps import plots
 
     figure, axes = plots.columns(1, 1)
     ax = axes[0][0]

@@ -19,9 +19,9 @@ NOT_RUN = {
     r"pkm-twin monitor-torques.*": "needs ROS and a running node: test/nodes has one",
     r"pkm-twin view .*": "serves until a signal: test/view runs it in a browser",
     r"pkm-twin play .*": "needs ROS: test_player runs it over the real middleware",
-    r"pkm-twin map .* --scheduler .*": "needs a Dask cluster: test/atlas/test_run.py has one",
+    r"pkm-twin map .* --scheduler .*": "needs a Dask cluster: test/maps/test_run.py has one",
     r"pkm-twin map \w+ [\w-]+( --html)?( --out \S+)?( --html)?": "minutes: the "
-    "whole grid of its kind; test/atlas/test_commands.py runs each on few points",
+    "whole grid of its kind; test/maps/test_commands.py runs each on few points",
     r"pkm-twin map .* --points \d{5,}.*": "minutes: as many points as the picture has",
 }
 """Lines that are parsed but not run, and why."""
