@@ -196,7 +196,7 @@ def _planes(data: Dataset) -> Any:
 def _chosen(figure: Any, buttons: list[dict[str, Any]]) -> Any:
     """A figure as its menu's first entry shows it."""
     figure.update_layout(
-        coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8}},
+        coloraxis={"colorscale": "Viridis", "colorbar": {"len": 0.8, "title.side": "right"}},
         updatemenus=[{"buttons": buttons, **MENU}],
     )
     first, layout = buttons[0]["args"]

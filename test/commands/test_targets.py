@@ -78,7 +78,7 @@ def test_a_folder_or_nothing_is_no_files_name(twin, tmp_path, monkeypatch, defle
         option = line[where - 1] if str(line[where - 1]).startswith("--") else "out"
         assert done.one_line_error().startswith(f"pkm-twin: {option}: ")
         tried += 1
-    for line in (("torques", "five_bar", "none.csv", "--out"), ("show", "none.nc", "--out")):
+    for line in (("torques", "five_bar", "none.csv", "--out"), ("map", "show", "none.nc", "--out")):
         assert twin(*line, name).one_line_error().startswith("pkm-twin: --out: ")
     assert tried == 8
     assert [p.name for p in tmp_path.iterdir()] == [deflections.name]

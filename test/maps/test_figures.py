@@ -12,7 +12,7 @@ import pytest
 
 from pkm_twin.errors import UnknownNameError
 from pkm_twin.maps import figures
-from pkm_twin.maps.kinds import modes
+from pkm_twin.maps.kinds import KINDS, modes
 from pkm_twin.maps.kinds.modes import deformed, grounded, structure_edges
 from pkm_twin.maps.page import write_page
 from pkm_twin.maps.store import open_map
@@ -103,6 +103,19 @@ def test_shapes_are_those_of_the_pose_that_rings_lowest(small_maps):
             steps = np.linalg.norm(moved - rest, axis=1)
             assert steps.max() == pytest.approx(modes.ENLARGED * size)
             assert far == pytest.approx(steps / steps.max())
+        pytest.importorskip("plotly")
+        page = KINDS["modes"].page(data)
+        frames = {frame.name: frame.data[0] for frame in page.frames}
+        assert len(frames) == modes.COUNT * modes.PHASES
+        # Half a swing later the shape is on the other side of rest.
+        one, other = (
+            np.array([v for v in frames[f"3/{n}"].x if v is not None])
+            for n in (0, modes.PHASES // 2)
+        )
+        still = np.array([v for v in page.data[0].x if v is not None])
+        assert one + other == pytest.approx(2 * still, abs=2e-5)
+        assert np.abs(one - still).max() > 1e-3
+        assert list(page.layout.updatemenus[0].buttons[3].args[0]["x"][0]) == list(frames["3/0"].x)
         ground = grounded(data)
         assert [str(n).rpartition(" ")[2] for n in data.node.values[ground]] == ["0/8"] * 3
 
