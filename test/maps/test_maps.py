@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 from delta_dynamics import energy_transfer, inverse_dynamics, max_driving_force
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.strict_yaml import read_yaml
+from pkm_twin.maps import figures
 from pkm_twin.maps.figures import shown
 from pkm_twin.maps.kind import counts, found_of
 from pkm_twin.maps.kinds import KINDS
@@ -28,6 +29,7 @@ from stiffness_monitor import Milling, compliance, stable_depth, strain_energy
 from stiffness_monitor.modes import natural_frequencies
 from test.machine.random_machines import FILES
 from test.support.command import command
+from test.support.pages import numbers
 from test.support.robots import ELASTIC, SHIPPED, load, often, parameters_of, partly_long
 
 DRIVEN = [name for name, robot in SHIPPED.items() if robot.limits.effort is not None]
@@ -191,10 +193,27 @@ def test_a_stored_map_has_all_cases_and_is_nan_where_no_pose_counts(tmp_path):
         assert list(data.case.values) == ["push", "lift"]
         np.testing.assert_array_equal(np.isfinite(data.value.values[..., 0]), inside)
         assert float(data.valid) == pytest.approx(inside.mean())
+        mean = np.nanmean(data.factor.values[..., 0, :], (0, 1))
+        most = data.element.values[mean.argmax()]
+        assert f"workspace: {most} {100 * mean.max():.1f} %" in "\n".join(figures.lines(data))
         for k, case in enumerate(cases):
             expected = strain_energy(robot, grid[inside], case.wrench)
             np.testing.assert_allclose(data.value.values[inside, k], expected.total, rtol=1e-9)
             np.testing.assert_allclose(data.factor.values[inside, k], expected.factors, rtol=1e-9)
+
+
+def test_documented_worst_values():
+    page, robot, kind = "docs/maps.md", load("delta"), KINDS["compliance"]()
+    (softest,) = numbers(page, r"softest: (\S+) µm/N along")
+    sweep = map_of(robot, kind)
+    worst = worst_of(sweep, sweep.cases[0], np.empty((0, 3)))
+    assert 1e6 * worst.found.value[0] == pytest.approx(softest, rel=0.01)
+    pattern = r"push: moves most: (\S+) µm .*? at \((\S+), (\S+), (\S+)\), arm I; .*?lift: moves "
+    push, x, y, z, lift = numbers(page, pattern + r"most: (\S+) µm")
+    q = robot.inverse([[x, y, z]])
+    for value, wrench in ((push, (30.0, 0, 0, 0, 0, 0)), (lift, (0, 0, 30.0, 0, 0, 0))):
+        moved = found_of(kind, robot, q, [kind.loaded(robot, "load", wrench)])[0]
+        assert 1e6 * moved.value[0] == pytest.approx(value, rel=1e-3)
 
 
 def test_along_a_path_and_as_numbers(capsys, tmp_path, monkeypatch):
