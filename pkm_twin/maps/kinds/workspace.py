@@ -87,6 +87,9 @@ class Workspace(Kind):
         facts = []
         if "volume" in data:
             facts.append(f"reaches {float(data.volume):.4g} {data.volume.attrs['units']}")
+        else:
+            of = "joint states within limits" if "sample" in data.sizes else "the poses tried"
+            facts.append(f"reaches {100 * float(data.valid):.3g} % of {of}")
         if "interference" in data and (lost := float(data.interference)) > 0.0:
             facts.append(f"limbs interfere in {100 * lost:.3g} % of otherwise reachable poses")
         if "cylinder_radius" in data and (radius := float(data.cylinder_radius)) > 0.0:
