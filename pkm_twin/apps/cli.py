@@ -348,7 +348,6 @@ def recover(
 
 app.command()(certify)
 app.add_typer(maps.app, name="map")
-app.add_typer(maps.app, name="atlas", hidden=True)
 app.add_typer(export.app, name="export")
 app.command("calibrate")(calibrate_command)
 app.command("printer")(printer_command)

@@ -21,6 +21,8 @@ TASKS: Final = {
     "Design and export": ("design", "export"),
 }  # fmt: skip
 """Commands in the order in which tasks need them."""
+OLDER: Final = {"atlas": "map"}
+"""Older names of commands, which help does not list."""
 GREETING: Final = """pkm-twin: torques, stiffness and recordings of parallel robots. Try
 
   pkm-twin view delta_cu                       look at a robot in the browser
@@ -34,6 +36,10 @@ pkm-twin --help lists all commands."""
 
 class Tasks(TyperGroup):
     """A group that lists its commands by task."""
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A command, by its name or an older one."""
+        return super().get_command(ctx, OLDER.get(cmd_name, cmd_name))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """A section for each task; a command that none names is in the last one."""

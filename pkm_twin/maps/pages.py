@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -90,23 +89,13 @@ main > div {{ height: calc(100vh - 4.5em); min-width: {width}px; }}
 """
 
 
-def narrow(
-    below: int = NARROW,
-    bars: Mapping[str, Mapping[str, Any]] | None = None,
-    *,
-    farther: float = 0.0,
-    **others: Any,
-) -> dict[str, Any]:
-    """What :data:`FIT` reads: how a page is laid out in windows of less than a width, pixels.
+def narrow(farther: float = 0.0) -> dict[str, Any]:
+    """What :data:`FIT` reads: how a page is laid out in narrow windows.
 
-    :param bars: of the colour axes, by name; default the only one with a thin bar.
-    :param farther: factor of the camera's distance, of one scene in perspective.
-    :param others: further entries of the layout, ``__`` for the dots of their names.
+    :param farther: factor of the camera's distance, of a scene in perspective.
     """
-    found = {name.replace("__", "."): value for name, value in others.items()}
-    for axis, bar in ({"coloraxis": {}} if bars is None else bars).items():
-        found |= {f"{axis}.colorbar.{key}": v for key, v in (THIN_BAR | dict(bar)).items()}
-    return {"below": below, "narrow": found, "farther": farther}
+    bar = {f"coloraxis.colorbar.{key}": value for key, value in THIN_BAR.items()}
+    return {"below": NARROW, "narrow": bar, "farther": farther}
 
 
 def button(
